@@ -1,14 +1,14 @@
-# docker build -t zstate .                              the command line; robots come as files or from models/
-# docker build -t zstate --build-arg EXTRAS=robots .    with the robots of example-robot-data, 414 MB more
+# docker build -t zstate .                              the command line, with the robots of models/
+# docker build -t zstate --build-arg EXTRAS=robots .    also the robots of example-robot-data (414 MB)
 # docker build --target test .                          runs the tests
 # docker run --rm --network host zstate tf panda_link0 panda_hand
 
 FROM python:3.12-slim AS base
-# Pinocchio's wheel takes OpenMP from the system, and slim images have none.
+# Pinocchio's wheel needs the system's OpenMP, which slim images lack.
 RUN apt-get update && apt-get install -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
 
 FROM python:3.12-slim AS build
-# With a compiler the buffer's C extension is built.
+# The buffer's C extension is built if there is a compiler.
 RUN apt-get update && apt-get install -y --no-install-recommends gcc libc6-dev && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
 COPY pyproject.toml setup.py README.md LICENSE ./

@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: the package has the robots of models/, and the C extension is optional."""
+"""Build steps beyond pyproject.toml: the robots of models/ in the package, and an optional C extension."""
 
 import sys
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 from setuptools import Extension, setup
 from setuptools.command.build_py import build_py
 
-# No contraction: fused operations would give other last digits than the reference in Python does.
+# No contraction: fused operations would change the last digits compared with the reference in Python.
 OPTIONS = ["/O2"] if sys.platform == "win32" else ["-O3", "-ffp-contract=off"]
 
 
 class BuildWithModels(build_py):
-    """Copies robots to zstate/models, except for an editable install, which finds them where they are."""
+    """Copies robots to zstate/models; an editable install finds them in models/ instead."""
 
     def run(self):
         super().run()
@@ -19,14 +19,14 @@ class BuildWithModels(build_py):
             models = str(Path(self.build_lib, "zstate", "models"))
             self.mkpath(models)
             for path in sorted(Path("models").iterdir()):
-                if path.is_file():  # the tutorial is read where the source is
+                if path.is_file():  # not the tutorial, which is read in the source tree
                     self.copy_file(str(path), models)
 
 
 setup(
     cmdclass={"build_py": BuildWithModels},
     ext_modules=[
-        # Where there is no C compiler it is left out, and the reference does its work.
+        # Skipped without a C compiler; the reference in Python is used instead.
         Extension(
             "zstate._kernel",
             ["zstate/buffer/_kernel.c"],

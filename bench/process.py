@@ -6,12 +6,13 @@ import json
 import os
 import queue
 import signal
+import socket
 import subprocess
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -139,3 +140,12 @@ def _handles(pids: Sequence[int]) -> list[int]:
         with suppress(ProcessLookupError):
             handles.append(os.pidfd_open(pid))
     return handles
+
+
+def free_ports(count: int) -> tuple[int, ...]:
+    """Loopback ports without a listener."""
+    with ExitStack() as opened:
+        probes = [opened.enter_context(socket.socket()) for _ in range(count)]
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return tuple(probe.getsockname()[1] for probe in probes)

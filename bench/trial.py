@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 from bench.job import Job
 from bench.measure import Costs
 from bench.poses import pose_errors
-from bench.process import ROOT, Process, RunFailed
+from bench.process import ROOT, Process, RunFailed, free_ports
 from bench.recording import Recording, Window, rate_in, reader_figures
 from bench.robot import BenchRobot, bench_robot
 from bench.scenario import Scenario
@@ -179,15 +179,6 @@ def build_job(subject: Subject, scenario: Scenario, robot: BenchRobot, folder: s
         ports=free_ports(PORTS),
         folder=folder,
     )
-
-
-def free_ports(count: int) -> tuple[int, ...]:
-    """Loopback ports without a listener."""
-    with ExitStack() as opened:
-        probes = [opened.enter_context(socket.socket()) for _ in range(count)]
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return tuple(probe.getsockname()[1] for probe in probes)
 
 
 def _is_ready(service: Service, environment: Mapping[str, str]) -> bool:

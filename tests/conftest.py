@@ -1,4 +1,4 @@
-"""What every test has: a rendezvous of its own, free ports, sessions and child processes that end with it."""
+"""Fixtures of every test: its own rendezvous, free ports, sessions and child processes that end with it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from helpers.processes import Child, find_free_port
 
 from zstate.net.session import Session, connect
 
-# The harness is no part of the package, so it is found beside it; behind the rest: an installed zstate
-# stays the one that is tested.
+# bench/ is not in the package, so it is imported from the repository. The path is appended: the tests use an
+# installed zstate if there is one.
 ROOT = str(Path(__file__).parents[1])
 if ROOT not in sys.path:
     sys.path.append(ROOT)
@@ -25,7 +25,7 @@ def free_port() -> int:
 
 @pytest.fixture(autouse=True)
 def rendezvous(monkeypatch: pytest.MonkeyPatch) -> str:
-    """Each test, with the processes it starts, meets nobody else."""
+    """A rendezvous address for this test and its processes, which isolates them from all others."""
     address = f"127.0.0.1:{find_free_port()}"
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", address)
     for variable in ("ZENOH_CONFIG", "ZSTATE_MODE", "ZSTATE_CONNECT", "ZSTATE_LISTEN", "ZSTATE_CONFIG"):
@@ -35,14 +35,14 @@ def rendezvous(monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture
 def sessions() -> Iterator[tuple[Session, Session]]:
-    """One to write with and one to read with."""
+    """A session for publishers and a session for readers."""
     with connect() as writer, connect() as reader:
         yield writer, reader
 
 
 @pytest.fixture
 def spawn() -> Iterator[Callable[..., Child]]:
-    """``spawn(code, *arguments)`` starts a Child, which does not outlive the test."""
+    """``spawn(code, *arguments)`` starts a Child, which is killed at the end of the test."""
     children: list[Child] = []
 
     def start(code: str, *arguments: str) -> Child:

@@ -276,7 +276,7 @@ def run_concurrently(kernel: Any, seconds: float) -> None:
 
 
 def main() -> int:
-    """Fuzz for so many seconds; the exit code says whether all went well."""
+    """Fuzzes for the given number of seconds; the exit code is 0 if no check failed."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
     library = os.environ.get(LIBRARY)
     if library is None:

@@ -18,14 +18,14 @@ def test_every_64_bit_integer_is_an_ordinary_stamp(stamp: int) -> None:
     assert check_stamp(np.int64(stamp)) == stamp
 
 
-def test_an_integer_of_numpy_comes_back_as_an_int() -> None:
+def test_numpy_integer_is_returned_as_an_int() -> None:
     assert type(check_stamp(np.uint32(7))) is int
 
 
 @pytest.mark.parametrize(
     "stamp", [1.0, np.float64(1.0), True, "1", None, 2**63, -(2**63) - 1, np.uint64(2**63)]
 )
-def test_a_stamp_that_is_no_64_bit_integer_is_refused_with_advice(stamp: object) -> None:
+def test_stamp_other_than_a_64_bit_integer_is_refused_with_advice(stamp: object) -> None:
     with pytest.raises(InvalidInput, match=r"time\.time_ns\(\)"):
         check_stamp(stamp)
 

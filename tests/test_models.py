@@ -1,4 +1,4 @@
-"""The robots in models/ are what their closed forms say.
+"""The robots in models/ agree with their closed forms.
 
 Every arm here moves in a plane, so its poses follow from sines and cosines alone. ``python -m
 tests.test_models`` writes the golden files from these closed forms; zstate's kinematics has no part in it.

@@ -238,9 +238,9 @@ def test_a_repr_is_one_short_line_that_tells_one_object_from_another(sessions, t
         assert "writes joint_states, robot_description, tf, tf_static" in repr(robot)
         watch.close()
     assert repr(publisher) == "<StatePublisher of 'r1' on native: 1 samples, closed>"
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
-        tale.joints("arm", START + S, swing_positions(0), log_time=START + S)
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
+        builder.joints("arm", START + S, swing_positions(0), log_time=START + S)
     with zstate.Recording(tmp_path / "r.mcap") as recording:
         assert repr(recording) == f"<Recording '{tmp_path}/r.mcap': 1 s, robots 'arm'>"
         assert repr(recording.buffer()).endswith("frames of 'arm', of a recording>")

@@ -36,9 +36,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from zstate._util.format import difference_text, format_duration, format_time
+
+E = TypeVar("E", bound="ZStateError")
 
 # A smaller clock offset does not explain a failed lookup.
 _LEAST_OFFSET_NS = 1_000_000
@@ -72,7 +74,7 @@ class ZStateError(Exception):
         return _restored, (type(self), self.args, self.facts())
 
 
-def _restored(kind: type[ZStateError], texts: tuple[Any, ...], facts: dict[str, Any]) -> ZStateError:
+def _restored(kind: type[E], texts: tuple[Any, ...], facts: dict[str, Any]) -> E:
     # Bypasses the constructor: pickle does not pass its keyword-only arguments.
     error = kind.__new__(kind)
     error.args = texts
@@ -237,10 +239,7 @@ class SecondWriter(ZStateError):
         self, message: str, *, robot: str, stream: str, first: WriterLike, edge: tuple[str, str] | None = None
     ) -> None:
         super().__init__(message)
-        self.robot = robot
-        self.stream = stream
-        self.first = first
-        self.edge = edge
+        self.robot, self.stream, self.first, self.edge = robot, stream, first, edge
 
 
 class RecordingError(ZStateError):
@@ -261,7 +260,7 @@ class LookupFailed(ZStateError):
     the reason why no more data comes, if there is one.
     ``clock_offset_ns`` is how far the clock of the edge's writer is ahead of the local one, if it was
     measured, and ``clock_uncertainty_ns`` its uncertainty. ``is_recorded`` is true if the samples
-    come from a recording.
+    come from a recording. ``facts`` of subclasses are the keyword arguments of this class.
     """
 
     clock_offset_ns: int | None = None
@@ -282,14 +281,9 @@ class LookupFailed(ZStateError):
         writer: str | None = None,
     ) -> None:
         super().__init__()
-        self.target = target
-        self.source = source
-        self.edge = edge
-        self.requested = requested
-        self.oldest = oldest
-        self.newest = newest
-        self.rate_hz = rate_hz
-        self.writer = writer
+        self.target, self.source, self.edge = target, source, edge
+        self.requested, self.oldest, self.newest = requested, oldest, newest
+        self.rate_hz, self.writer = rate_hz, writer
         self.track: str | None = None
         self.note = ""
 
@@ -334,9 +328,9 @@ class UnknownFrame(LookupFailed):
         name: str,
         near_misses: Sequence[str] | Callable[[], Sequence[str]] = (),
         frame_count: int = 0,
-        requested: int | None = None,
+        **facts: Any,
     ) -> None:
-        super().__init__(target, source, requested=requested)
+        super().__init__(target, source, **facts)
         self.name = name
         self.frame_count = frame_count
         if callable(near_misses):
@@ -389,10 +383,8 @@ class Disconnected(LookupFailed):
 
     gone_s: float | None = None
 
-    def __init__(
-        self, target: str, source: str, *, roots: tuple[str, str], requested: int | None = None
-    ) -> None:
-        super().__init__(target, source, requested=requested)
+    def __init__(self, target: str, source: str, *, roots: tuple[str, str], **facts: Any) -> None:
+        super().__init__(target, source, **facts)
         self.roots = roots
 
     def message(self) -> str:
@@ -423,12 +415,10 @@ class ClockMismatch(LookupFailed):
         edges: tuple[tuple[str, str], ...],
         robots: tuple[str, ...],
         domains: tuple[str, str],
-        requested: int | None = None,
+        **facts: Any,
     ) -> None:
-        super().__init__(target, source, edge=edges[0], requested=requested)
-        self.edges = edges
-        self.robots = robots
-        self.domains = domains
+        super().__init__(target, source, edge=edges[0], **facts)
+        self.edges, self.robots, self.domains = edges, robots, domains
 
     def message(self) -> str:
         first, *others = (
@@ -457,13 +447,19 @@ class NoData(LookupFailed):
         return f"no sample of {self._edge_text()} has arrived yet; is its writer running (`zstate ls`)?"
 
 
-class _Extrapolation(LookupFailed):
+class _OutsideHistory(LookupFailed):
     """The requested instant is outside the range of the samples."""
 
     @property
     def what_happened(self) -> str:
         """The message without advice."""
-        raise NotImplementedError
+        if isinstance(self, InPast):
+            distance, which = f"{_span(self.oldest, self.requested)} before", "oldest"
+        else:
+            distance, which = f"{_span(self.requested, self.newest)} after", "newest"
+        sample = "only" if self._has_one_sample else which
+        cause = f": {self._difference}" if self._difference else ""
+        return f"asked {distance} the {sample} sample of {self._edge_text()}{cause}"
 
     @property
     def is_of_another_time(self) -> bool:
@@ -480,11 +476,6 @@ class _Extrapolation(LookupFailed):
     def _has_one_sample(self) -> bool:
         return self.newest is not None and self.oldest == self.newest
 
-    def _asked(self, distance: str, side: str, which: str) -> str:
-        sample = "only" if self._has_one_sample else which
-        cause = f": {self._difference}" if self._difference else ""
-        return f"asked {distance} {side} the {sample} sample of {self._edge_text()}{cause}"
-
     def message(self) -> str:
         advice = _USE_ONE_CLOCK if self._difference else self._advice()
         return f"{self.what_happened}{advice}{_also(self._clock_text())}"
@@ -493,24 +484,16 @@ class _Extrapolation(LookupFailed):
         raise NotImplementedError
 
 
-class InFuture(_Extrapolation):
+class InFuture(_OutsideHistory):
     """The requested instant is after the newest sample of ``edge``."""
-
-    @property
-    def what_happened(self) -> str:
-        return self._asked(_span(self.requested, self.newest), "after", "newest")
 
     def _advice(self) -> str:
         wait = "" if self.ended else "wait for it (timeout_s=...), "
         return f"; {wait}ask for the newest instant (at=None), or predict (predict_s=...)"
 
 
-class InPast(_Extrapolation):
+class InPast(_OutsideHistory):
     """The requested instant is before the oldest sample of ``edge``; waiting does not help."""
-
-    @property
-    def what_happened(self) -> str:
-        return self._asked(_span(self.oldest, self.requested), "before", "oldest")
 
     def _advice(self) -> str:
         if self.is_recorded:
@@ -532,7 +515,6 @@ class Stale(LookupFailed):
     An edge without new samples has no instant in common with ``other`` once the history of that one begins
     after its last sample; ``other_newest`` [ns] is the newest sample of ``other``, and ``max_age_s`` None.
     ``age_s`` is the age of the answer by the buffer's clock, or how much later ``other_newest`` is.
-    ``facts`` are the keyword arguments of LookupFailed.
     """
 
     def __init__(
@@ -547,23 +529,19 @@ class Stale(LookupFailed):
         **facts: Any,
     ) -> None:
         super().__init__(target, source, **facts)
-        self.age_s = age_s
-        self.max_age_s = max_age_s
-        self.other = other
-        self.other_newest = other_newest
+        self.age_s, self.max_age_s = age_s, max_age_s
+        self.other, self.other_newest = other, other_newest
 
     def message(self) -> str:
-        if self.max_age_s is None:
-            return self._silence()
-        clocks = ", and do the clocks of both machines agree?"
-        if self.clock_offset_ns is not None:
-            clocks = f"? {self._clock_text()}".rstrip()
-        return (
-            f"the newest answer is {format_duration(round(self.age_s * 1e9))} old, {self.max_age_s:g} s are "
-            f"allowed; the oldest link is {self._edge_text()}: is its writer alive (`zstate ls`){clocks}"
-        )
-
-    def _silence(self) -> str:
+        if self.max_age_s is not None:
+            clocks = ", and do the clocks of both machines agree?"
+            if self.clock_offset_ns is not None:
+                clocks = f"? {self._clock_text()}".rstrip()
+            return (
+                f"the newest answer is {format_duration(round(self.age_s * 1e9))} old, {self.max_age_s:g} s "
+                f"are allowed; the oldest link is {self._edge_text()}: is its writer alive (`zstate ls`)"
+                f"{clocks}"
+            )
         newest, other_newest = self.newest or 0, self.other_newest or 0
         other = "the others" if self.other is None else f"{self.other[0]!r} -> {self.other[1]!r}"
         if difference := difference_text(other_newest, newest):
@@ -607,9 +585,7 @@ def as_timeout(reason: LookupFailed, waited_s: float) -> WaitTimeout:
 
 
 def _restored_timeout(reason: type[LookupFailed], facts: dict[str, Any]) -> WaitTimeout:
-    error = _timeout_class(reason).__new__(_timeout_class(reason))
-    error.__dict__.update(facts)
-    return error
+    return _restored(_timeout_class(reason), (), facts)
 
 
 @cache

@@ -7,7 +7,7 @@ is ``a_from_b``: the pose of frame b in frame a, which also maps coordinates in 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, cast, overload
 
 import numpy as np
@@ -331,9 +331,9 @@ class Transform(TransformFields):
         )
 
 
-def _frozen(numbers: Sequence[float]) -> Array:
+def _frozen(numbers: ArrayLike) -> Array:
     """A read-only copy, because writing to it would not change the transform."""
-    array = np.array(numbers)
+    array = np.array(numbers, dtype=np.float64)
     array.flags.writeable = False
     return array
 
@@ -352,10 +352,9 @@ class Twist:
     ) -> None:
         self.frame = frame
         self.reference = reference
-        self.linear = np.array(linear, dtype=np.float64)
-        self.angular = np.array(angular, dtype=np.float64)
+        self.linear = _frozen(linear)
+        self.angular = _frozen(angular)
         self.stamp = stamp
-        self.linear.flags.writeable = self.angular.flags.writeable = False
 
     @property
     def expressed_in(self) -> str:

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.micro.processes import free_port
+from bench.process import free_ports
 from zstate import SineSource, StatePublisher, TransformListener, connect, load_model
 
 SETTLE_S = 1.0
@@ -58,7 +58,7 @@ def _table(options: argparse.Namespace) -> None:
 
 
 def _run(options: argparse.Namespace, rate: float, role: str) -> list[str]:
-    environment = {**os.environ, "ZSTATE_RENDEZVOUS": f"127.0.0.1:{free_port()}"}
+    environment = {**os.environ, "ZSTATE_RENDEZVOUS": f"127.0.0.1:{free_ports(1)[0]}"}
     command = [sys.executable, "-m", "bench.micro.chain", "--robot", options.robot]
     command += ["--rates", str(rate), "--seconds", str(options.seconds), "--role"]
     reader = subprocess.Popen([*command, role], env=environment, stdout=subprocess.PIPE, text=True)

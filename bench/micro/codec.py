@@ -12,8 +12,6 @@ sides are compared first. "first" is zstate decoding a message of a new layout, 
 from __future__ import annotations
 
 import platform
-import time
-from collections.abc import Callable
 from importlib.metadata import version
 from itertools import pairwise
 from typing import Any
@@ -21,18 +19,17 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
+from bench.micro.timing import Call, mean_times_us
 from zstate.wire.messages import to_block
 from zstate.wire.ros2.cdr import to_time
-from zstate.wire.ros2.joint_state import JointStateDecoder, JointStateEncoder
-from zstate.wire.ros2.tf_message import TfMessageDecoder, TfMessageEncoder
+from zstate.wire.ros2.decoder import JointStateDecoder, TfMessageDecoder
+from zstate.wire.ros2.encoder import JointStateEncoder, TfMessageEncoder
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
 STAMP = 1_700_000_000_123_456_789
 ROUNDS = 41
 CALLS = 100
 STORE = get_typestore(Stores.ROS2_KILTED)
-
-Call = Callable[[], object]
 
 
 def header(frame_id: str) -> Any:
@@ -95,18 +92,6 @@ def stamped(parent: str, child: str, pose: np.ndarray) -> Any:
     return STORE.types["geometry_msgs/msg/TransformStamped"](header(parent), child, transform)
 
 
-def measure(calls: dict[str, Call]) -> dict[str, np.ndarray]:
-    """Thread CPU time per call [us] of each round; the first round is not counted."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(ROUNDS + 1):
-        for name, call in calls.items():
-            before = time.thread_time_ns()
-            for _ in range(CALLS):
-                call()
-            times[name].append((time.thread_time_ns() - before) / CALLS / 1e3)
-    return {name: np.array(values[1:]) for name, values in times.items()}
-
-
 def main() -> None:
     """Print the table."""
     print(
@@ -121,7 +106,7 @@ def main() -> None:
         "1 edge": tf_message_calls(1),
     }
     for what, calls in cases.items():
-        times = measure(calls)
+        times = mean_times_us(calls, ROUNDS, CALLS)
         for does in ("encode", "decode"):
             ours, theirs = times[does], times[f"rosbags {does}"]
             ratio = float(np.median(theirs) / np.median(ours))

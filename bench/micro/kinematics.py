@@ -11,14 +11,13 @@ this loop.
 from __future__ import annotations
 
 import platform
-import statistics
-import time
 from collections.abc import Callable
 from importlib.metadata import version
 
 import numpy as np
 import pinocchio as pin
 
+from bench.micro.timing import mean_times_us
 from zstate.model.kinematics import Kinematics
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
@@ -55,22 +54,6 @@ def cases(model: RobotModel) -> dict[str, Callable[[], np.ndarray]]:
     }
 
 
-def cpu_us(call: Callable[[], np.ndarray]) -> float:
-    """CPU time of this thread per call [us]."""
-    before = time.thread_time_ns()
-    for _ in range(CALLS):
-        call()
-    return (time.thread_time_ns() - before) / CALLS / 1e3
-
-
-def measure(calls: dict[str, Callable[[], np.ndarray]]) -> dict[str, float]:
-    """The median cost of each case [us]."""
-    for call in calls.values():
-        cpu_us(call)
-    rounds = [{name: cpu_us(call) for name, call in calls.items()} for _ in range(ROUNDS)]
-    return {name: statistics.median(one[name] for one in rounds) for name in calls}
-
-
 def main() -> None:
     """Print the table."""
     print(f"Python {platform.python_version()}, numpy {np.__version__}, pin {version('pin')}, ", end="")
@@ -79,7 +62,8 @@ def main() -> None:
     print(f"{'loop/edge':>11}{'loop/link':>11}")
     for name in ROBOTS:
         model = load_model(name)
-        cost = measure(cases(model))
+        times = mean_times_us(cases(model), ROUNDS, CALLS)
+        cost = {case: np.median(values) for case, values in times.items()}
         print(f"{name:<15}{len(model.links):>6}{model.position_count:>8}", end="")
         print(f"{cost['edge_poses']:>12.1f}{cost['link_poses']:>12.1f}{cost['loop']:>8.1f}", end="")
         print(f"{cost['loop'] / cost['edge_poses']:>11.1f}{cost['loop'] / cost['link_poses']:>11.1f}")

@@ -1,37 +1,42 @@
-"""zstate commands as processes, and free ports for them."""
+"""Processes that run during a micro benchmark."""
 
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from bench.process import free_ports
+
 
 def use_own_rendezvous() -> None:
     """Sets a private rendezvous address for this process and its children."""
-    os.environ["ZSTATE_RENDEZVOUS"] = f"127.0.0.1:{free_port()}"
-
-
-def free_port() -> int:
-    """An unused loopback port."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    os.environ["ZSTATE_RENDEZVOUS"] = f"127.0.0.1:{free_ports(1)[0]}"
 
 
 @contextmanager
-def running_command(*arguments: str) -> Iterator[None]:
-    """Runs ``zstate ARGUMENTS`` inside the block, from its first line of output on."""
-    command = [sys.executable, "-m", "zstate", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+def running_command(*arguments: str) -> Iterator[tuple[int, str]]:
+    """Runs ``zstate ARGUMENTS`` inside the block; yields its process id and its first line of output."""
+    with running_process(sys.executable, "-m", "zstate", *arguments) as started:
+        yield started
+
+
+@contextmanager
+def running_process(*command: str, job: str | None = None) -> Iterator[tuple[int, str]]:
+    """Runs a process with ``job`` as its input; yields its id and its first line of output."""
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin is not None
     assert process.stdout is not None
     try:
-        if not process.stdout.readline():
-            raise SystemExit(f"`zstate {' '.join(arguments)}` has ended")
-        yield
+        if job is not None:
+            process.stdin.write(job)
+            process.stdin.close()
+        first_line = process.stdout.readline().strip()
+        if not first_line:
+            raise SystemExit(f"`{' '.join(command[:4])} ...` has ended")
+        yield process.pid, first_line
     finally:
         process.terminate()
-        process.communicate()
+        process.wait()

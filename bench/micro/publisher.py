@@ -11,11 +11,11 @@ Each call follows a pause, as in a control loop: back to back they cost less.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 
 from bench.micro.kinematics import ROBOTS
+from bench.micro.timing import Call, call_times_us
 from zstate import RobotModel, SineSource, StatePublisher, TransformListener, connect, load_model
 
 ROUNDS = 30
@@ -41,7 +41,7 @@ def measure(model: RobotModel, name: str) -> dict[str, list[float]]:
         bare = session.zenoh.declare_publisher("bench/floor")
         floor = other.zenoh.declare_subscriber("bench/floor", lambda _: None)
         with TransformListener(other, name):
-            times = interleaved(
+            times = tick_times_us(
                 {
                     "bare put": lambda: bare.put(payload),
                     "positions": lambda: publisher.publish(reading.positions),
@@ -49,22 +49,14 @@ def measure(model: RobotModel, name: str) -> dict[str, list[float]]:
                 }
             )
         with TransformListener(other, name, follow="tf"):
-            times |= interleaved({"positions, tf is read": lambda: publisher.publish(reading.positions)})
+            times |= tick_times_us({"positions, tf is read": lambda: publisher.publish(reading.positions)})
         floor.undeclare()
     return times
 
 
-def interleaved(cases: dict[str, Callable[[], object]]) -> dict[str, list[float]]:
-    """Thread CPU times [us] of each call, cases interleaved."""
-    times: dict[str, list[float]] = {what: [] for what in cases}
-    for _ in range(ROUNDS):
-        for what, tick in cases.items():
-            for _ in range(TICKS):
-                start = time.thread_time_ns()
-                tick()
-                times[what].append((time.thread_time_ns() - start) * 1e-3)
-                time.sleep(PAUSE_S)
-    return times
+def tick_times_us(cases: dict[str, Call]) -> dict[str, list[float]]:
+    """Times [us] of each tick, the first ones included."""
+    return call_times_us(cases, ROUNDS, TICKS, pause_s=PAUSE_S, warm_up=0)
 
 
 if __name__ == "__main__":

@@ -12,12 +12,11 @@ way.
 from __future__ import annotations
 
 import platform
-import time
-from collections.abc import Callable
 from itertools import count
 
 import numpy as np
 
+from bench.micro.timing import Call, call_times_us
 from zstate import RobotModel, StatePublisher, TransformBuffer, connect, load_model
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
@@ -28,7 +27,7 @@ from zstate.net.session import Session
 from zstate.net.writer import WireWriter
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import JointState, RobotDescription, Sample, order_digest, to_block
-from zstate.wire.protocol import EntityId, SerializedSample
+from zstate.wire.protocol import SerializedSample, WriterNode
 from zstate.wire.registry import get_wire
 
 JOINTS = 30
@@ -36,8 +35,6 @@ ROUNDS = 31
 CALLS = 100
 PAUSE_S = 0.0005
 STAMP = 1_700_000_000_123_456_789
-
-Call = Callable[[], object]
 
 
 def main() -> None:
@@ -49,10 +46,11 @@ def main() -> None:
     with connect() as session, connect() as other:
         reader = other.zenoh.declare_subscriber("**", lambda _: None)
         for wire in ("ros2", "native"):
+            cases = write_cases(wire, session, model)
             for pause_s in (PAUSE_S, 0.0):
-                how = "after a pause" if pause_s else "back to back"
-                print_table(f"{wire}, writing {how}", interleaved(write_cases(wire, session, model), pause_s))
-            print_table(f"{wire}, reading", interleaved(read_cases(wire, model), 0.0))
+                times = call_times_us(cases, ROUNDS, CALLS, pause_s=pause_s)
+                print_table(f"{wire}, writing {'after a pause' if pause_s else 'back to back'}", times)
+            print_table(f"{wire}, reading", call_times_us(read_cases(wire, model), ROUNDS, CALLS))
         reader.undeclare()
 
 
@@ -86,10 +84,8 @@ def write_cases(wire: str, session: Session, model: RobotModel) -> dict[str, Cal
 def read_cases(wire: str, model: RobotModel) -> dict[str, Call]:
     """The cases of decoding consecutive samples, and of inserting them into a buffer."""
     wire_format = get_wire(wire)
-    node, names = EntityId("1", 0), sample_names(model)
-    encoder = wire_format.stream_encoder(
-        "r1", local_writer(1), "joint_states", node=node, number=1, sample_names=names
-    )
+    node = WriterNode("r1", local_writer(1), "1", 0, sample_names(model))
+    encoder = wire_format.stream_encoder(node, "joint_states", number=1)
     stamps = count(STAMP, 10_000_000)
 
     def arrivals() -> list[SerializedSample]:
@@ -123,21 +119,6 @@ def sample(model: RobotModel, stamp: int) -> JointState:
     """Positions and velocities, in the model's order."""
     block = to_block(np.linspace(-1.0, 1.0, model.position_count))
     return JointState(stamp, 0, 1, order_digest(model.joint_names), block, block)
-
-
-def interleaved(cases: dict[str, Call], pause_s: float) -> dict[str, list[float]]:
-    """Thread CPU times [us] of each call, cases interleaved; the first round is not counted."""
-    times: dict[str, list[float]] = {what: [] for what in cases}
-    for number in range(ROUNDS + 1):
-        for what, call in cases.items():
-            for _ in range(CALLS):
-                start = time.thread_time_ns()
-                call()
-                if number:
-                    times[what].append((time.thread_time_ns() - start) * 1e-3)
-                if pause_s:
-                    time.sleep(pause_s)
-    return times
 
 
 def print_table(what: str, times: dict[str, list[float]]) -> None:

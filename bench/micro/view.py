@@ -26,8 +26,7 @@ import sys
 import threading
 import time
 import urllib.parse
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import imageio.v3
@@ -42,7 +41,7 @@ from websockets.typing import Subprotocol
 
 from bench.environments import venv_python
 from bench.measure import cpu_ns
-from bench.micro.processes import use_own_rendezvous
+from bench.micro.processes import running_command, running_process, use_own_rendezvous
 from zstate import SineSource, StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import SystemClock
 from zstate.rate import Rate
@@ -71,10 +70,10 @@ def main() -> None:
         return
     use_own_rendezvous()
     for robot in options.robots:
-        with _commands(("publish", robot, "--source", "sine")):
+        with running_command("publish", robot, "--source", "sine"):
             _report(f"{robot} at 30 Hz, zstate view", *_measure_zstate_view(options.seconds, "view", robot))
         _report(f"{robot} at 30 Hz, ViserUrdf", *_measure_viser_urdf(options.seconds, robot))
-    with _process(sys.executable, "-m", "bench.micro.view", "--role", "fleet"):
+    with running_process(sys.executable, "-m", "bench.micro.view", "--role", "fleet"):
         what = f"{FLEET} robots of {LINKS} links at {FLEET_HZ:g} Hz, zstate view"
         _report(what, *_measure_zstate_view(options.seconds, "view"))
     for is_viewed in (False, True, False, True):
@@ -88,7 +87,7 @@ def _report(what: str, cpu_percent: float | None, kilobytes_s: float = 0.0) -> N
 
 
 def _measure_zstate_view(seconds: float, *command: str) -> tuple[float, float]:
-    with _process(sys.executable, "-m", "zstate", *command, "--port", "0") as (pid, first_line):
+    with running_command(*command, "--port", "0") as (pid, first_line):
         return _measure_page(seconds, pid, first_line.rpartition(" ")[2].strip())
 
 
@@ -97,7 +96,7 @@ def _measure_viser_urdf(seconds: float, robot: str) -> tuple[float | None, float
     if python is None:
         return None, 0.0
     script = str(Path(__file__).with_name("view_urdf.py"))
-    with _process(python, script, job=_job(robot)) as (pid, first_line):
+    with running_process(python, script, job=_job(robot)) as (pid, first_line):
         return _measure_page(seconds, pid, f"http://127.0.0.1:{int(first_line)}")
 
 
@@ -160,33 +159,6 @@ def _job(robot: str) -> str:
     return json.dumps({"urdf": urdf, "joints": model.joint_names, "rows": rows, "rate_hz": RATE_HZ})
 
 
-@contextmanager
-def _process(*command: str, job: str | None = None) -> Iterator[tuple[int, str]]:
-    """Runs a process; yields its id and its first line of output."""
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert process.stdin is not None
-    assert process.stdout is not None
-    try:
-        if job is not None:
-            process.stdin.write(job)
-            process.stdin.close()
-        first_line = process.stdout.readline().strip()
-        if not first_line:
-            raise SystemExit(f"`{' '.join(command[:4])} ...` has ended")
-        yield process.pid, first_line
-    finally:
-        process.terminate()
-        process.wait()
-
-
-@contextmanager
-def _commands(*commands: tuple[str, ...]) -> Iterator[None]:
-    with ExitStack() as running:
-        for command in commands:
-            running.enter_context(_process(sys.executable, "-m", "zstate", *command))
-        yield
-
-
 def _publish_fleet() -> None:
     """Publishes ten robots, each a chain of revolute joints with a box on every link."""
     model = load_model(_chain_urdf(LINKS))
@@ -223,7 +195,7 @@ def _measure_chain(seconds: float, *, is_viewed: bool) -> None:
     command += ("--seconds", str(seconds + SETTLE_S), "--role")
     with ExitStack() as opened:
         if is_viewed:
-            view = _process(sys.executable, "-m", "zstate", "view", "--port", "0")
+            view = running_command("view", "--port", "0")
             _, first_line = opened.enter_context(view)
             opened.enter_context(ViewerClient(first_line.rpartition(" ")[2].strip()))
         roles = {
@@ -263,8 +235,7 @@ def _first_picture() -> None:
         tab.goto("about:blank")
         tab.add_init_script(_WITHOUT_NOTICES)
         begin = time.monotonic()
-        command = (sys.executable, "-m", "zstate", "view", "panda", "--sliders", "--port", "0")
-        with _process(*command) as (_, first_line):
+        with running_command("view", "panda", "--sliders", "--port", "0") as (_, first_line):
             address_s = time.monotonic() - begin
             tab.goto(first_line.rpartition(" ")[2].strip())
             while not _shows_robot(imageio.v3.imread(tab.screenshot(), extension=".png")):

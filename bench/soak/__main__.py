@@ -18,7 +18,6 @@ routers keep some kilobytes of each reader that has left (eclipse-zenoh 1.10.2);
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -26,6 +25,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from bench.process import free_ports
 from bench.soak import roles, zenoh_control
 from bench.soak.report import build_result, write
 from bench.soak.roles import Report
@@ -50,7 +50,7 @@ def main() -> None:
 
 def soak(task: Task) -> None:
     """Starts all processes, samples them for ``task.minutes`` and writes the result."""
-    running = replace(task, endpoint=f"tcp/127.0.0.1:{_free_port()}")
+    running = replace(task, endpoint=f"tcp/127.0.0.1:{free_ports(1)[0]}")
     parts = zenoh_control if task.bare else roles
     named = {"router": ("router", 0), "reader": ("reader", 0)}
     named |= {f"publisher {share}": ("publisher", share) for share in range(task.processes)}
@@ -75,12 +75,6 @@ def soak(task: Task) -> None:
     result = build_result(task, time.monotonic() - began, ended, samples, joins)
     what = "soak-bare" if task.bare else "soak"
     write(result, RESULTS / f"{what}-{time.strftime('%Y-%m-%d')}")
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _start(task: Task) -> subprocess.Popen[str]:

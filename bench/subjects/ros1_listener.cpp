@@ -1,6 +1,6 @@
 // A tf2_ros listener in C++ that calls back when its buffer answers; a library, so that it can run
 // in the harness's reader process. All functions but ros1_listen are for any thread. Compiled as
-// ros1_cpp.py says.
+// ros1_cpp.py sets.
 #include <ros/callback_queue.h>
 #include <ros/ros.h>
 #include <tf2_msgs/TFMessage.h>

@@ -12,11 +12,11 @@ import pytest
 from helpers.processes import Child, until
 
 from bench.measure import Traffic, cpu_ns, peak_memory_kb, process_tree
-from bench.process import Process, RunFailed
+from bench.process import Process, RunFailed, free_ports
 from bench.recording import percentile
 from bench.scenario import Scenario
 from bench.subjects import subject_named
-from bench.trial import free_ports, run_trial
+from bench.trial import run_trial
 
 pytestmark = [
     pytest.mark.processes,

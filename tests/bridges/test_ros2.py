@@ -352,7 +352,7 @@ def test_messages_without_a_ros_form_are_counted_and_carrying_continues(world, c
     assert sum("the stamp is 0" in record.message for record in caplog.records) == 1
 
 
-def test_a_name_that_is_no_ros_namespace_is_logged(world, caplog):
+def test_invalid_ros_namespace_is_logged(world, caplog):
     bridge = world.bridge(wire=EACH)
     with StatePublisher(world.join("native"), RRBOT, "arm-1"):
         until(lambda: bridge.carriers and bridge.carriers[0].refused)

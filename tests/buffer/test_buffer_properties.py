@@ -20,7 +20,7 @@ World = list[Transform]
 small = st.floats(-5.0, 5.0)
 angles = st.floats(-3.0, 3.0)
 instants = st.integers(-2, 12).map(lambda n: NOW + n * S // 2)
-names = st.sampled_from(["f0", "f1", "f2", "f3", "f4", "nobody"])
+names = st.sampled_from(["f0", "f1", "f2", "f3", "f4", "unknown"])
 
 
 @st.composite

@@ -110,9 +110,9 @@ def test_edges_that_are_not_pairs_of_names_are_refused() -> None:
 def test_names_are_checked_before_connections_and_connections_before_times() -> None:
     buffer = filled(moving("a", "b", 0), moving("x", "y", 0))
     for target, source, fixed, at_fault in (
-        ("nobody", "y", "a", "nobody"),
-        ("a", "nobody", "y", "nobody"),
-        ("a", "y", "nobody", "nobody"),
+        ("unknown", "y", "a", "unknown"),
+        ("a", "unknown", "y", "unknown"),
+        ("a", "y", "unknown", "unknown"),
         ("first", "second", "third", "first"),
         ("a", "second", "third", "second"),
     ):
@@ -245,7 +245,7 @@ def test_missing_connection_is_reported_before_a_bad_time() -> None:
         with pytest.raises(Disconnected):
             buffer.lookup_between("b", stamp, "y", 0, "a")
         with pytest.raises(UnknownFrame):
-            buffer.lookup_between("b", stamp, "nobody", 0, "a")
+            buffer.lookup_between("b", stamp, "unknown", 0, "a")
 
 
 def two_robots() -> TransformBuffer:

@@ -125,7 +125,7 @@ def test_wait_for_a_past_instant_ends_when_the_last_edge_covers_it(waiting) -> N
     assert wait.result().translation.tolist() == [1.0, 0.0, 1.5]
 
 
-def test_wait_for_a_past_instant_wakes_once_however_many_samples_arrive(waiting) -> None:
+def test_wait_for_a_past_instant_wakes_once_for_any_number_of_samples(waiting) -> None:
     buffer = filled(moving("a", "b", 10 * S))
     wait = waiting(buffer, "a", "b", 5 * S)
     (waiter,) = buffer._waiters._waiters

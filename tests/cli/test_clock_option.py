@@ -114,9 +114,9 @@ def test_robots_on_another_clock_are_received_without_ages(spawn: Spawn):
         listening = started(spawn, "monitor", "--robots", "--clock", "sim", "--json")
 
         def is_followed() -> bool:
-            said = json.loads(listening.line())
-            assert (said["age_s"], said["refused"]) == (None, {})
-            return said["received"] > 0
+            report = json.loads(listening.line())
+            assert (report["age_s"], report["refused"]) == (None, {})
+            return report["received"] > 0
 
         until(is_followed)
 

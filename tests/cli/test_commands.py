@@ -19,10 +19,10 @@ def test_help_names_every_command_and_imports_nothing_heavy():
         "group.main(['--help'], standalone_mode=False)\n"
         "print({'numpy', 'zenoh', 'pinocchio', 'rich', 'msgspec'} & set(sys.modules))"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.splitlines()[-1] == "set()"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.splitlines()[-1] == "set()"
     for command in COMMANDS:
-        assert f"  {command} " in said
+        assert f"  {command} " in output
 
 
 @pytest.mark.parametrize("command", COMMANDS)

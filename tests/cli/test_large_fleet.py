@@ -1,4 +1,4 @@
-"""Commands beside more robots than Zenoh's default channel holds tokens of (256)."""
+"""Commands in a fleet of more robots than Zenoh's default channel holds tokens of (256)."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ SIZE = (100.0, 40.0)
 
 
 @given(st.lists(st.sampled_from(PAIRS), unique=True, max_size=30))
-def test_nodes_stand_apart_and_every_edge_touches_both_of_its_ends(edges: list[tuple[str, str]]):
+def test_nodes_do_not_overlap_and_every_edge_touches_both_of_its_ends(edges: list[tuple[str, str]]):
     layout = layered_layout(dict.fromkeys(NODES, SIZE), edges)
     assert layout.places.keys() == set(NODES)
     for (x, y), (other_x, other_y) in combinations(layout.places.values(), 2):
@@ -53,5 +53,5 @@ def test_crossings_are_avoided():
     assert all((one[0] < other[0]) == (one[1] < other[1]) for one, other in combinations(heights, 2))
 
 
-def test_nothing_is_drawn_of_nothing():
+def test_empty_graph_has_an_empty_drawing():
     assert not layered_layout({}, []).places

@@ -135,10 +135,10 @@ def test_ctrl_c_interrupts_connecting_to_a_router(spawn: Spawn, free_port: int):
     child = spawn(
         "import zstate.net.session as s\n"
         "connect = s.connect\n"
-        "def told(*given, **named):\n"
+        "def logged_connect(*given, **named):\n"
         "    print('connecting', flush=True)\n"
         "    return connect(*given, **named)\n"
-        "s.connect = told\n"
+        "s.connect = logged_connect\n"
         "from zstate.cli.main import main; main()",
         *("joints", RRBOT, "--mode", "client", "--connect", endpoint),
     )

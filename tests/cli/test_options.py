@@ -54,7 +54,7 @@ def test_check_takes_xacro_arguments(arm: str):
 
 @pytest.mark.processes
 @pytest.mark.parametrize("command", ["publish", "joints", "init", "demo", "check"])
-def test_a_model_that_is_no_xacro_takes_no_arguments(command: str):
+def test_plain_urdf_takes_no_xacro_arguments(command: str):
     message = failure(command, RRBOT, "prefix:=left_")
     assert "contains no xacro, so it takes no xacro arguments; got prefix:=left_" in message
 
@@ -85,7 +85,7 @@ def test_init_writes_the_arguments_and_up_publishes_with_them(spawn: Spawn, arm:
 
 
 @pytest.mark.processes
-def test_up_refuses_arguments_for_a_model_that_is_no_xacro(tmp_path: Path):
+def test_up_refuses_xacro_arguments_for_a_plain_urdf(tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text('[[robot]]\nmodel = "rrbot"\nxacro_args = { prefix = "left_", lab = true }\n')
     message = failure("up", str(file), "--check")

@@ -13,9 +13,9 @@ pytestmark = pytest.mark.processes
 
 def test_each_robot_has_a_line_a_second(spawn: Spawn):
     command = started(spawn, "monitor", "--robots")
-    heard: set[str] = set()
+    robots: set[str] = set()
     with published_robot("left"), published_robot("right"):
-        until(lambda: heard.add(command.line().split()[0]) or heard == {"left", "right"})
+        until(lambda: robots.add(command.line().split()[0]) or robots == {"left", "right"})
     assert "following zstate/left/joint_states" in command.stderr
     interrupted(command)
 
@@ -57,7 +57,7 @@ def test_many_robots_share_one_listener(spawn: Spawn):
     def threads() -> int:
         return len(list(Path(f"/proc/{command.process.pid}/task").iterdir()))
 
-    heard: set[str] = set()
+    robots: set[str] = set()
     with ExitStack() as opened:
         opened.enter_context(published_robot("bot0"))
         command = started(spawn, "monitor", "--robots", "--json")
@@ -65,7 +65,7 @@ def test_many_robots_share_one_listener(spawn: Spawn):
         before = threads()
         for number in range(1, 6):
             opened.enter_context(published_robot(f"bot{number}"))
-        until(lambda: heard.add(json.loads(command.line())["robot"]) or len(heard) == 6)
+        until(lambda: robots.add(json.loads(command.line())["robot"]) or len(robots) == 6)
         # Links of Zenoh's come to six processes' sessions, but no listeners.
         assert threads() < before + 4 * 5
     interrupted(command)

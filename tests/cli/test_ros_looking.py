@@ -10,9 +10,8 @@ from helpers.robots import wait_for_reader
 
 from zstate import StaticPublisher, Transform, connect
 from zstate.wire.identity import WriterId
-from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import JointState, order_digest, to_block
-from zstate.wire.protocol import EntityId
+from zstate.wire.protocol import WriterNode
 from zstate.wire.ros2.wire import Ros2Wire
 
 pytestmark = pytest.mark.processes
@@ -55,8 +54,8 @@ def test_tf_between_two_trees_names_the_command_that_joins_them(ros_router: str)
 
 
 def test_tree_shows_frames_by_their_ros_names_with_the_nodes_that_write_them(ros_router: str):
-    spoken = "ros2:namespace=r1,frame_prefix=r1/,node=driver"
-    with published_robot("r1", wire=spoken, router=ros_router):
+    wire = "ros2:namespace=r1,frame_prefix=r1/,node=driver"
+    with published_robot("r1", wire=wire, router=ros_router):
         lines = zstate("tree").stdout.decode().splitlines()
     assert lines[1].split() == ["r1/world", "root"]
     (upper,) = (line for line in lines if "r1/upper" in line)
@@ -79,7 +78,7 @@ def test_tree_names_a_node_that_sends_nothing(ros_router: str):
     assert b"tool" in ended.stdout
 
 
-def test_tree_of_nobody_is_a_failure(ros_router: str):
+def test_tree_without_robots_is_a_failure(ros_router: str):
     assert "no node publishes /tf in domain 5" in failure("tree", "--wire", "ros2:domain=5")
 
 
@@ -89,17 +88,15 @@ def test_echo_needs_no_robot_and_no_description(ros_router: str):
     assert document["positions"] == {"shoulder": SHOULDER, "elbow": ELBOW}
 
 
-def test_what_a_driver_does_not_measure_is_null_in_json(spawn: Spawn, ros_router: str):
+def test_unmeasured_values_are_null_in_json(spawn: Spawn, ros_router: str):
     command = started(spawn, "echo", "--json")
     unmeasured = JointState(
         5, 0, 1, order_digest(("a",)), to_block([0.5]), None, to_block([math.nan]), ("a",)
     )
     wire = Ros2Wire()
     with connect(mode="client", endpoints=ros_router) as session:
-        writer, node = WriterId("driver", "", 0, 0, 1), EntityId(session.zid, 0)
-        encoder = wire.stream_encoder(
-            "r", writer, "joint_states", node=node, number=1, sample_names=SampleLayout()
-        )
+        node = WriterNode("r", WriterId("driver", "", 0, 0, 1), session.zid, 0)
+        encoder = wire.stream_encoder(node, "joint_states", number=1)
         wait_for_reader(session, encoder.key)
         session.zenoh.put(encoder.key, encoder.encode(unmeasured), attachment=encoder.attachment(5))
         document = json.loads(command.line(), parse_constant=pytest.fail)
@@ -150,7 +147,7 @@ def test_invalid_wire_is_wrong_usage_with_the_reason():
     assert "'native'" in failure("ls", "--wire", "ros3", code=2)
 
 
-# What "tcp/127.0.0.1:7447" is to others: that port belongs to whoever runs these tests.
+# Another default router: port 7447 of the test machine may be in use.
 ELSEWHERE = """
 import sys
 import zstate.net.config as config

@@ -57,11 +57,11 @@ def test_native_joint_states_are_published_completely_on_ros(spawn: Spawn, ros_r
         published_robot(router=ros_router, positions=(0.5, -0.25), streams=("joint_states",)),
         JointStateListener(client, "rrbot", load_model(RRBOT), wire="ros2") as source,
     ):
-        heard = next(iter(source))
-    assert list(heard.positions) == [0.5, -0.25]
+        reading = next(iter(source))
+    assert list(reading.positions) == [0.5, -0.25]
 
 
-def test_a_sine_goes_out_on_all_wires(spawn: Spawn, ros_router: str, client: Session):
+def test_a_sine_is_published_on_all_wires(spawn: Spawn, ros_router: str, client: Session):
     wires = ("--wire", "native", "--wire", "ros2:namespace=r1")
     started(spawn, "publish", RRBOT, "--source", "sine", *wires).line()
     assert streams(client, "native") == EVERYTHING
@@ -69,34 +69,34 @@ def test_a_sine_goes_out_on_all_wires(spawn: Spawn, ros_router: str, client: Ses
 
 
 def test_native_and_ros_wires_together_report_the_router_option():
-    said = zstate(
+    result = zstate(
         *("publish", RRBOT, "--source", "sine", "--seconds", "0.1", "--wire", "native", "--wire", "ros2")
     )
-    assert said.returncode == 0
-    assert b"pass --connect" in said.stderr
+    assert result.returncode == 0
+    assert b"pass --connect" in result.stderr
 
 
 def test_joints_names_its_topic(spawn: Spawn, client: Session):
-    said = started(spawn, "joints", RRBOT).line()
-    assert said == "rrbot: a sine on 2 joints, 100 Hz, on ROS 2 topic /joint_states (domain 0)"
+    line = started(spawn, "joints", RRBOT).line()
+    assert line == "rrbot: a sine on 2 joints, 100 Hz, on ROS 2 topic /joint_states (domain 0)"
     assert streams(client) == {"joint_states"}
 
 
 def test_a_static_edge_of_two_ros_frames_needs_no_robot(spawn: Spawn, client: Session):
-    said = started(spawn, "static", "r1/base", "laser", "--xyz", "1", "0", "0").line()
-    assert "on ROS 2 topic /tf_static (domain 0)" in said
+    line = started(spawn, "static", "r1/base", "laser", "--xyz", "1", "0", "0").line()
+    assert "on ROS 2 topic /tf_static (domain 0)" in line
     with TransformListener(client, wire="ros2", follow="tf") as listener:
         placed = listener.buffer.wait("r1/base", "laser", timeout_s=10.0)
     assert placed.translation.tolist() == [1.0, 0.0, 0.0]
 
 
 def test_topics_have_the_configured_names(spawn: Spawn, client: Session):
-    heard: list[SerializedSample] = []
+    received: list[SerializedSample] = []
     started(spawn, "static", "r1/base", "laser", "--xyz", "1", "0", "0").line()
-    with LatchedSubscriber(client, "0/tf_static/**", heard.append):
-        until(lambda: heard)
-    assert b"r1/base\0" in heard[0].payload
-    assert b"\0laser\0" in heard[0].payload
+    with LatchedSubscriber(client, "0/tf_static/**", received.append):
+        until(lambda: received)
+    assert b"r1/base\0" in received[0].payload
+    assert b"\0laser\0" in received[0].payload
 
 
 def test_a_file_starts_robots_on_several_wires_and_the_router_of_ros(

@@ -11,7 +11,7 @@ from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.commands.ls import robots_text
 from zstate.cli.commands.tree import tree_drawing
 from zstate.cli.doctor.robot_probe import StreamSamples
-from zstate.cli.monitor import EdgeRow, EdgeStatistics, path_text
+from zstate.cli.edge_statistics import EdgeRow, EdgeStatistics, path_text
 from zstate.cli.output.drawing import ALARM, draw
 from zstate.clock import SystemClock
 from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale

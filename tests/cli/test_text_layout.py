@@ -3,11 +3,11 @@ from __future__ import annotations
 from zstate.cli.output.text_layout import Table, first_fitting, short_labels, wrap
 
 
-def test_what_fits_stays_as_it_is():
+def test_fitting_text_is_unchanged():
     assert wrap("a line\n  and  another", 14) == "a line\n  and  another"
 
 
-def test_a_long_cell_goes_on_below_itself():
+def test_a_long_cell_is_folded_below_itself():
     line = "mode  client  option --connect, which alone means a router"
     assert wrap(line, 44).splitlines() == [
         "mode  client  option --connect, which alone",
@@ -15,14 +15,14 @@ def test_a_long_cell_goes_on_below_itself():
     ]
 
 
-def test_where_the_last_column_is_too_narrow_a_line_goes_on_with_an_indent():
-    line = "  frame  " + "x" * 30 + "  and what is to be said of it"
-    assert wrap(line, 45).splitlines() == [f"  frame  {'x' * 30}  and", "    what is to be said of it"]
+def test_line_with_a_too_narrow_last_column_is_folded_with_an_indent():
+    line = "  frame  " + "x" * 30 + "  and a remark about this frame"
+    assert wrap(line, 45).splitlines() == [f"  frame  {'x' * 30}  and", "    a remark about this frame"]
 
 
 def test_prose_is_folded_between_words_which_stay_whole():
-    said = wrap("zstate: nothing answers at 'tcp/a-host-with-a-long-name:7447' (refused)", 30)
-    assert said.splitlines() == [
+    wrapped = wrap("zstate: nothing answers at 'tcp/a-host-with-a-long-name:7447' (refused)", 30)
+    assert wrapped.splitlines() == [
         "zstate: nothing answers at",
         "  'tcp/a-host-with-a-long-name:7447'",
         "  (refused)",

@@ -27,7 +27,7 @@ def overlap(one: str, other: str, layout: Layout, sizes: Mapping[str, Size]) -> 
 
 
 @given(TREES)
-def test_every_node_has_a_place_of_its_own_below_its_parent(nodes: list[tuple[int, float, bool]]):
+def test_every_node_has_its_own_place_below_its_parent(nodes: list[tuple[int, float, bool]]):
     # Every eighth node is a root; the others hang on any node before them.
     names = [f"n{number}" for number in range(len(nodes))]
     parents = {names[n]: names[nodes[n][0] % n] for n in range(len(nodes)) if n % 8}
@@ -49,7 +49,7 @@ def test_every_node_has_a_place_of_its_own_below_its_parent(nodes: list[tuple[in
     assert all(x > -1e-9 and y > -1e-9 for x, y in layout.places.values())
 
 
-def test_an_only_child_stands_under_the_middle_of_its_parent():
+def test_an_only_child_is_centred_below_its_parent():
     sizes = {"base": (100.0, 38.0), "arm": (60.0, 38.0), "hand": (80.0, 38.0), "tip": (50.0, 38.0)}
     layout = drawn({"arm": "base", "hand": "arm", "tip": "hand"}, sizes)
     middles = {layout.places[name][0] + sizes[name][0] / 2 for name in ("base", "arm", "hand")}

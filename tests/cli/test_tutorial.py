@@ -1,4 +1,4 @@
-"""A tutorial's exercise, from an empty folder and without ROS: make a robot, look, break it, be told why."""
+"""The tutorial's exercise, from an empty folder and without ROS: build, inspect and break a robot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from helpers.tutorial_terminal import FILES, FOLDER, blocks, masked, terminal, t
 pytestmark = pytest.mark.processes
 
 ARM, SWING, CELL = ((FOLDER / name).read_text() for name in ("arm.urdf", "swing.py", "cell.toml"))
-"""A robot; the driver, which says joint states and nothing else; and what makes poses of them."""
+"""A robot; its driver, which publishes only joint states; and a cell that computes its transforms."""
 
 XACRO = """\
 <robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -36,7 +36,7 @@ XACRO = """\
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the exercise is done; no more is in it than its three files."""
+    """The folder of the exercise, with its three files only."""
     monkeypatch.chdir(tmp_path)
     for name, text in (("arm.urdf", ARM), ("swing.py", SWING), ("cell.toml", CELL)):
         Path(name).write_text(text)
@@ -53,7 +53,7 @@ def cell(folder: Path, spawn: Spawn) -> Child:
 
 @pytest.fixture
 def driver(folder: Path) -> Iterator[Callable[[], subprocess.Popen[bytes]]]:
-    """Starts `python swing.py`, as it is in the folder."""
+    """Starts `python swing.py` in the folder."""
     running: list[subprocess.Popen[bytes]] = []
 
     def start() -> subprocess.Popen[bytes]:
@@ -73,7 +73,7 @@ def ready(child: Child, text: str) -> None:
 
 @pytest.fixture
 def without_xacro(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where nobody has installed the expander."""
+    """An environment without an xacro expander."""
     (folder / ".without").mkdir()
     for name in ("xacro", "xacrodoc"):
         (folder / ".without" / f"{name}.py").write_text("raise ImportError")
@@ -81,7 +81,7 @@ def without_xacro(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def stamped(stamp: str) -> None:
-    """Have the driver stamp its samples so."""
+    """Changes the driver to stamp its samples with the expression ``stamp``."""
     Path("swing.py").write_text(SWING.replace("-angle})", f"-angle}}, stamp={stamp})"))
 
 
@@ -108,11 +108,13 @@ def test_a_stamp_is_masked_whatever_the_uptime_of_the_machine(uptime_s: int):
 def test_the_terminal_blocks_match_real_output(folder: Path, without_xacro: None):
     with terminal(folder) as shell:
         for one in terminal_steps():
-            said, expected = masked(shell.run(one)), masked(one.lines)
-            assert said == expected or (one.is_background and sorted(said) == sorted(expected)), one.command
+            output, expected = masked(shell.run(one)), masked(one.lines)
+            assert output == expected or (one.is_background and sorted(output) == sorted(expected)), (
+                one.command
+            )
 
 
-def test_the_robot_runs_and_can_be_looked_at(cell: Child, driver):
+def test_the_robot_runs_and_can_be_inspected(cell: Child, driver):
     driver()
     assert zstate("wait", "robot", "arm").stdout == b"ready: 'arm' (3 frames)\n"
     (robot,) = json.loads(zstate("ls", "--json").stdout)
@@ -151,7 +153,7 @@ def test_1_without_a_publisher_the_robot_is_missing(folder: Path):
     assert "its publisher is not running" in found["text"]
 
 
-def test_2_a_path_with_a_space_works_and_is_named_where_the_quotes_are_forgotten(folder: Path, spawn: Spawn):
+def test_2_a_path_with_a_space_works_and_missing_quotes_are_reported(folder: Path, spawn: Spawn):
     place = folder / "my robot"
     place.mkdir()
     for name in ("arm.urdf", "cell.toml"):
@@ -164,22 +166,22 @@ def test_2_a_path_with_a_space_works_and_is_named_where_the_quotes_are_forgotten
 
 
 @pytest.mark.parametrize(
-    ("right", "wrong", "told"),
+    ("right", "wrong", "message"),
     [
         ('child link="lower"', 'child link="lowr"', "its child 'lowr' is not a link; did you mean 'lower'?"),
         ("</joint>\n</robot>", "</robot>", "</robot> closes <joint>, which was opened in line 10"),
         (ARM, "", "the text is empty"),
     ],
 )
-def test_3_bad_urdf_is_refused_by_every_reader(folder: Path, driver, right: str, wrong: str, told: str):
+def test_3_bad_urdf_is_refused_by_every_reader(folder: Path, driver, right: str, wrong: str, message: str):
     Path("arm.urdf").write_text(ARM.replace(right, wrong))
-    assert told in zstate("check", "arm.urdf").stdout.decode()
-    assert told in failure("publish", "arm.urdf")
-    assert told in failure("up", "cell.toml")
+    assert message in zstate("check", "arm.urdf").stdout.decode()
+    assert message in failure("publish", "arm.urdf")
+    assert message in failure("up", "cell.toml")
     process = driver()
     assert process.wait(15.0) == 1
     assert process.stderr
-    assert told in process.stderr.read().decode()
+    assert message in process.stderr.read().decode()
 
 
 @pytest.mark.parametrize(
@@ -191,30 +193,32 @@ def test_3_bad_urdf_is_refused_by_every_reader(folder: Path, driver, right: str,
         ("0", "1970 and after"),
     ],
 )
-def test_4_stamps_of_the_future_and_of_1970_are_used_and_named(cell: Child, driver, stamp: str, cause: str):
+def test_4_stamps_of_the_future_and_of_1970_are_used_and_reported(
+    cell: Child, driver, stamp: str, cause: str
+):
     stamped(stamp)
     process = driver()
     assert zstate("wait", "robot", "arm").returncode == 0
-    said = doctor("arm", code=1)
-    found = said["first_broken"]
+    report = doctor("arm", code=1)
+    found = report["first_broken"]
     assert found["name"] == "stamps"
     assert cause in found["text"]
     assert f"swing@{os.uname().nodename} pid {process.pid}" in found["text"]
     # Nothing is dropped for it: the pose is known.
-    assert [check["state"] for check in said["checks"] if check["name"] == "poses"] == ["ok"]
+    assert [check["state"] for check in report["checks"] if check["name"] == "poses"] == ["ok"]
 
 
 def test_5_unexpanded_xacro_is_recognised(folder: Path, without_xacro: None):
     Path("arm.urdf").write_text(XACRO)
-    told = "this is a xacro file, which must be expanded: pip install 'zstate[xacro]'"
-    assert told in zstate("check", "arm.urdf").stdout.decode()
-    assert told in failure("publish", "arm.urdf")
-    assert told in failure("up", "cell.toml")
+    message = "this is a xacro file, which must be expanded: pip install 'zstate[xacro]'"
+    assert message in zstate("check", "arm.urdf").stdout.decode()
+    assert message in failure("publish", "arm.urdf")
+    assert message in failure("up", "cell.toml")
 
 
-def test_5_a_xacro_expression_that_was_left_over_is_recognised(folder: Path):
+def test_5_a_leftover_xacro_expression_is_recognised(folder: Path):
     lines = XACRO.splitlines(keepends=True)
     Path("arm.urdf").write_text('<robot name="arm">\n' + "".join(lines[2:]))
-    told = failure("publish", "arm.urdf")
-    assert "line 6" in told
-    assert "'0 0 ${length}' is a xacro expression, not a number" in told
+    message = failure("publish", "arm.urdf")
+    assert "line 6" in message
+    assert "'0 0 ${length}' is a xacro expression, not a number" in message

@@ -17,7 +17,7 @@ def notes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return texts
 
 
-def test_a_condition_that_is_true_is_not_waited_for():
+def test_true_condition_ends_the_wait_at_once():
     assert ConditionWaiter().wait_for(lambda: True, timeout_s=0.0)
 
 

@@ -43,7 +43,7 @@ def test_compose_router_refuses_writes_of_other_identities(deployment: Deploymen
                 StatePublisher(session, model, "r1")
         with StatePublisher(robot, model, "r1"):
             until(lambda: [info.name for info in discover(viewer)] == ["r1"])
-            assert discover(other, 0.3) == ()  # r2 is nobody here
+            assert discover(other, 0.3) == ()  # r2 has a certificate, but no rule
 
 
 def test_client_without_certificate_is_refused(deployment: Deployment, spawn: Any):

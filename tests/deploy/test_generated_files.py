@@ -15,7 +15,7 @@ from helpers.processes import DEADLINE_S
 pytestmark = pytest.mark.processes
 
 
-def said(*arguments: str) -> str:
+def output(*arguments: str) -> str:
     command = [sys.executable, "-m", "zstate", *arguments]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert ended.returncode == 0, ended.stderr
@@ -37,17 +37,17 @@ def router_command(contains: str, certs: Path) -> list[str]:
 
 def test_router_configuration_is_generated_by_the_readme_command(certs: Path, tmp_path):
     acl = tmp_path / "acl.json5"
-    acl.write_text(said("acl", "--robot", "r1", "--viewer", "desk"))
+    acl.write_text(output("acl", "--robot", "r1", "--viewer", "desk"))
     options = [str(acl) if word == "acl.json5" else word for word in router_command("--acl", certs)]
-    made = said(*options).replace(str(certs), "/certs")
-    assert made == (DEPLOY / "router.json5").read_text()
+    generated = output(*options).replace(str(certs), "/certs")
+    assert generated == (DEPLOY / "router.json5").read_text()
 
 
 def test_site_router_configuration_is_generated_by_the_readme_command(certs: Path):
-    made = said(*router_command("--wan", certs)).replace(str(certs), "/etc/zstate/certs")
-    assert made == (DEPLOY / "site-router.json5").read_text()
+    generated = output(*router_command("--wan", certs)).replace(str(certs), "/etc/zstate/certs")
+    assert generated == (DEPLOY / "site-router.json5").read_text()
 
 
 def test_other_commands_of_the_readme_exist():
     for words in commands_in_the_readme():
-        said(words[1], "--help")
+        output(words[1], "--help")

@@ -1,11 +1,21 @@
-"""Routers with different access control."""
+"""Routers with different access control, and checks of what their clients can do."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import zenoh
+from helpers.processes import find_free_port, until
+from helpers.robots import SampleCollector
+
+from zstate.net.security.acl import AclRoles, access_control
 from zstate.net.security.credentials import Credentials
+from zstate.net.session import Session, connect
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
 
 ROUTERS_PROGRAM = """
     import sys
@@ -44,3 +54,63 @@ class AccessRouters:
 
     def identity(self, name: str, user: str | None = None, password: str | None = None) -> Credentials:
         return Credentials.from_folder(self.folder, name, user=user, password=password)
+
+
+def write_users(folder: Path, users: Iterable[str]) -> Path:
+    """A file of ``users``, all with the password "secret"."""
+    path = folder / "users.txt"
+    path.touch(0o600)
+    path.write_text("".join(f"{name}:secret\n" for name in users))
+    return path
+
+
+@contextmanager
+def router_with_users(folder: Path, roles: AclRoles, users: Iterable[str]) -> Iterator[str]:
+    """A router that ``users`` can join, with the access control of ``roles``; yields its endpoint."""
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
+    settings = {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint]},
+        "scouting": {"multicast": {"enabled": False}},
+        "timestamping": {"enabled": False},
+        "transport": {"auth": {"usrpwd": {"dictionary_file": str(write_users(folder, users))}}},
+        "access_control": access_control(roles),
+    }
+    with connect(settings):
+        yield endpoint
+
+
+def join(endpoint: str, user: str) -> Session:
+    """A client with the identity ``user``."""
+    return connect(mode="client", endpoints=endpoint, credentials=Credentials(user=user, password="secret"))
+
+
+def assert_only_allowed_writes_arrive(
+    writes: Sequence[tuple[str, str, bool]], writers: Mapping[str, Session], viewer: Session, *keys: str
+) -> None:
+    """Puts samples as each user of ``writes`` on its key; only the allowed ones arrive at ``viewer``."""
+    collectors = [SampleCollector(viewer, key) for key in keys]
+    allowed = {(user.encode(), key) for user, key, is_allowed in writes if is_allowed}
+
+    def received() -> list[tuple[bytes, str]]:
+        return [(one.payload, one.key) for collector in collectors for one in collector.arrivals]
+
+    def publish_until_received() -> bool:
+        for user, key, _ in writes:
+            writers[user].zenoh.put(key, user.encode())
+        return set(received()) >= allowed and len(received()) >= 10 * len(allowed)
+
+    until(publish_until_received)
+    assert set(received()) == allowed
+
+
+def publish_and_check(publisher: StatePublisher, listener: TransformListener) -> bool:
+    """Publishes a sample of rrbot; whether the listener can look up a moving link."""
+    publisher.publish([0.1, 0.2])
+    return listener.buffer.can_lookup("base", "lower")
+
+
+def replies(session: Session, key: str) -> list[str]:
+    """The replies to a query of all queryables on ``key``."""
+    answers = session.zenoh.get(key, target=zenoh.QueryTarget.ALL, timeout=1.0)
+    return [answer.ok.payload.to_string() for answer in answers if answer.ok]

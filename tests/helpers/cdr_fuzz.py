@@ -2,10 +2,10 @@
 
     python tests/helpers/cdr_fuzz.py [SECONDS]
 
-Messages that are whole, cut off, changed in a few bytes or counts, put together from two, or noise go
-to every decoder: once to a new one, which reads value by value, and once to one that has seen all that
-came before. Ends with an exception, and the bytes, at the first that raises anything but a MessageError
-or where the two do not agree.
+The inputs are messages that are complete, truncated, changed in a few bytes or counts or spliced from two,
+and noise. Each goes to every decoder twice: to a new one, which decodes value by value, and to one that has
+decoded all earlier inputs. Stops with an AssertionError that has the bytes if a decoder raises anything but
+MessageError, or if the two results differ.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import pairwise
 
-from helpers import manual_cdr as by_hand
+from helpers import manual_cdr
 
 from zstate.errors import MessageError
 from zstate.wire.ros2.cdr import decode_clock, decode_string
-from zstate.wire.ros2.joint_state import JointStateDecoder
-from zstate.wire.ros2.tf_message import TfMessageDecoder
+from zstate.wire.ros2.decoder import JointStateDecoder, TfMessageDecoder
 
 REASONS = {"truncated", "malformed", "no positions"}
 COUNTS = (0, 1, 2, 3, 4, 5, 255, 256, 10**9, 2**31 - 1, 2**31, 2**32 - 8, 2**32 - 1)
@@ -36,7 +35,7 @@ NEW: dict[str, Callable[[], Callable[[bytes], object]]] = {
 
 
 class Fuzz:
-    """One seed's worth of inputs, a few messages and what becomes of them."""
+    """The inputs of one seed, made from a few messages, and the outcomes of decoding them."""
 
     def __init__(self, seed: int, old: dict[str, Callable[[bytes], object]]) -> None:
         self.random = random.Random(seed)
@@ -47,11 +46,11 @@ class Fuzz:
         return self.random.choice(choices)()
 
     def message(self) -> bytes:
-        """A message as ROS 2 may send it; its gaps and its end hold anything."""
+        """A valid ROS 2 message, with any bytes in its padding and after its end."""
         values = self.random.choice([self.joint_state, self.joint_state, self.tf_message, self.plain])()
-        fill = self.random.choice([self.random.randbytes, by_hand.zeros])
+        fill = self.random.choice([self.random.randbytes, manual_cdr.zeros])
         order = self.random.choice("<<<>")
-        return by_hand.cdr(values, order, fill) + self.random.choice([b"", b"", self.random.randbytes(5)])
+        return manual_cdr.cdr(values, order, fill) + self.random.choice([b"", b"", self.random.randbytes(5)])
 
     def names(self, count: int) -> list[str]:
         return [f"{'abcdefgh'[: self.random.randrange(1, 9)]}{number}" for number in range(count)]
@@ -66,18 +65,18 @@ class Fuzz:
             row if self.random.random() < chance else []
             for chance, row in zip((0.9, 0.5, 0.5), rows, strict=True)
         ]
-        return by_hand.joint_state(self.stamp(), "base"[: self.random.randrange(5)], names, *rows)
+        return manual_cdr.joint_state(self.stamp(), "base"[: self.random.randrange(5)], names, *rows)
 
     def tf_message(self):
         edges = list(pairwise(self.names(1 + self.random.randrange(4))))
         stamps = [self.stamp()] * len(edges)
         if edges and self.random.random() < 0.3:
             stamps[-1] = self.stamp()
-        return by_hand.tf_message(stamps, edges, [[self.random.random() for _ in range(7)] for _ in edges])
+        return manual_cdr.tf_message(stamps, edges, [[self.random.random() for _ in range(7)] for _ in edges])
 
     def plain(self):
         text = "".join(self.names(self.random.randrange(3)))
-        return self.random.choice([iter([("s", text)]), by_hand.time(self.stamp())])
+        return self.random.choice([iter([("s", text)]), manual_cdr.time(self.stamp())])
 
     def known(self) -> bytes:
         return self.random.choice(self.messages)
@@ -99,14 +98,14 @@ class Fuzz:
         return bytes(data)
 
     def counted(self) -> bytes:
-        """One of the words, perhaps a count or a length, holds another number."""
+        """Another number in one of the words, which may be a count or a length."""
         data = bytearray(self.known())
         at = 4 * self.random.randrange(len(data) // 4)
         struct.pack_into(self.random.choice("<>") + "I", data, at, self.random.choice(COUNTS))
         return bytes(data)
 
     def renumbered(self) -> bytes:
-        """Another word of time or number: mostly a message that is whole, and known but for that."""
+        """Another word, mostly in a time or a number: the message stays valid, with a known layout."""
         data = bytearray(self.known())
         at = 4 * self.random.randrange(1, len(data) // 4)
         data[at : at + 4] = self.random.randbytes(4)
@@ -130,12 +129,12 @@ class Fuzz:
         return outcomes
 
     def outcome(self, kind: str, old: Callable[[bytes], object], data: bytes) -> str:
-        """What became of it: "read", or why it was not."""
+        """The outcome of decoding: "read", or the reason of the error."""
         try:
             new, known = decode_outcome(NEW[kind](), data), decode_outcome(old, data)
         except Exception as error:
             raise AssertionError(f"{type(error).__name__} from {kind} on {data.hex()}") from error
-        assert new == known, f"{kind} reads {new}, but knows {known}: {data.hex()}"
+        assert new == known, f"{kind}: a new decoder returns {new}, a used one {known}: {data.hex()}"
         return new[0]
 
 
@@ -153,7 +152,7 @@ def long_lived() -> dict[str, Callable[[bytes], object]]:
 
 
 def main() -> int:
-    """Fuzz for so many seconds."""
+    """Fuzzes for the given number of seconds."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
     outcomes: Counter[str] = Counter()
     old, start, inputs, seed = long_lived(), time.monotonic(), 0, 0

@@ -1,4 +1,4 @@
-"""Starting the processes of ``roles``, and asking them."""
+"""Starts the processes of fault_programs.py and sends them queries."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 from helpers.processes import DEADLINE_S, Child
 
 SLACK = 3.0
-"""A machine of CI is busy with other tests: what exceeds a stated bound by so much does not come back at all.
+"""Factor on the stated bounds, as a CI machine is busy with other tests; beyond it, recovery has failed.
 
-The figures are printed (``-rP``); hold them against the bounds where nothing else runs (``-n 0``).
+The figures are printed (``-rP``); compare them with the bounds on an idle machine (``-n 0``).
 """
 
 TESTS = str(Path(__file__).parents[1])
@@ -23,7 +23,7 @@ _CODE = (
 
 
 class FaultProcess:
-    """A process of the suite."""
+    """A process of the fault suite, which replies to queries."""
 
     def __init__(self, child: Child) -> None:
         self.child = child
@@ -34,15 +34,15 @@ class FaultProcess:
         self.ready_at = time.time_ns()
         return self
 
-    def query(self, question: str, *arguments: Any, timeout_s: float = DEADLINE_S + 5.0) -> Any:
-        self.send(question, *arguments)
+    def query(self, name: str, *arguments: Any, timeout_s: float = DEADLINE_S + 5.0) -> Any:
+        self.send(name, *arguments)
         return self.receive(timeout_s)
 
-    def send(self, question: str, *arguments: Any) -> None:
-        self.child.send_line(json.dumps([question, *arguments]))
+    def send(self, name: str, *arguments: Any) -> None:
+        self.child.send_line(json.dumps([name, *arguments]))
 
     def receive(self, timeout_s: float = DEADLINE_S + 5.0) -> Any:
-        """The answer to a question that was told before."""
+        """The reply to the oldest query without one."""
         return json.loads(self.child.line(timeout_s))
 
     def signal(self, number: int) -> None:
@@ -56,11 +56,11 @@ Start = Callable[..., FaultProcess]
 
 
 def starter(spawn: Callable[..., Child]) -> Start:
-    """``start(role, **options)``: a process that is ready; with ``wait=False`` perhaps not yet."""
+    """``start(role, **options)`` starts a process and, unless ``wait=False``, waits until it is ready."""
 
     def start(role: str, *, wait: bool = True, **options: Any) -> FaultProcess:
-        party = FaultProcess(spawn(_CODE, role, json.dumps(options)))
-        return party.wait_ready() if wait else party
+        process = FaultProcess(spawn(_CODE, role, json.dumps(options)))
+        return process.wait_ready() if wait else process
 
     return start
 
@@ -70,14 +70,14 @@ def client(*endpoints: str) -> dict[str, Any]:
 
 
 def assert_no_growth(before: dict[str, int], after: dict[str, int], *, rss_kb: int = 30_000) -> None:
-    """Nothing that a round of the fault leaves behind. Zenoh's pool of threads comes and goes by a few."""
+    """Asserts that a round of the fault leaks no resources. Zenoh's thread pools vary by a few threads."""
     assert after["threads"] <= before["threads"] + 6, (before, after)
     assert after["fds"] <= before["fds"] + 3, (before, after)
     assert after["rss_kb"] <= before["rss_kb"] + rss_kb, (before, after)
 
 
 def print_figures(title: str, seconds: list[float]) -> None:
-    """What was measured, for `pytest -rP`."""
+    """Prints the median and the largest of the figures, for `pytest -rP`."""
     ordered = sorted(seconds)
     print(
         f"{title}: median {ordered[len(ordered) // 2]:.3f} s, largest {ordered[-1]:.3f} s, of {len(ordered)}"

@@ -129,7 +129,7 @@ class RosNode:
         self._nid = next(_NUMBERS)
 
     def publisher(self, topic: Topic, written: str = "", namespace: str = "") -> RosPublisher:
-        """On ``topic``, in ``namespace`` without slashes outside; ``written`` replaces the type's hash."""
+        """On ``topic``, in ``namespace`` without outer slashes; ``written`` replaces the type hash."""
         name, dds, its_hash, qos = topic
         path = f"%{namespace}%{name}" if namespace else f"%{name}"
         token = (

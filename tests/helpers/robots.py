@@ -26,7 +26,7 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 def wait_for_reader(session: Session, key: str) -> None:
-    """Waits until ``session`` knows a reader of ``key``: later puts arrive."""
+    """Waits until ``session`` has discovered a subscriber of ``key``, which receives all later samples."""
     with StreamPublisher(session, key, "") as probe:
         until(lambda: probe.has_readers)
 

@@ -40,7 +40,7 @@ BRIDGE = f"""
 TF2_LISTENER = """
     import json, sys
     import rospy, tf2_ros
-    rospy.init_node("asker", anonymous=True, disable_signals=True)
+    rospy.init_node("tf2_listener", anonymous=True, disable_signals=True)
     buffer = tf2_ros.Buffer()
     listener = tf2_ros.TransformListener(buffer)
     print("ready")
@@ -166,7 +166,7 @@ class Roscore:
         self._master = Master(environment["ROS_MASTER_URI"])
         self._process = subprocess.Popen(
             [ROSCORE, "-p", self._master.uri.rpartition(":")[2]],
-            # Its programs run with the first python3 there is.
+            # Its programs run with the first python3 in the PATH.
             env={**environment, "PATH": "/usr/bin:/bin"},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

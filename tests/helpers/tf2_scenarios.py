@@ -156,7 +156,7 @@ def _inserts(rng: random.Random, begin: int) -> list[list[Any]]:
 
 def _question(rng: random.Random, frames: list[str], stamps: list[int]) -> list[Any]:
     def frame() -> str:
-        return rng.choice(frames) if rng.random() < 0.97 else rng.choice(["nobody", "", "/f1"])
+        return rng.choice(frames) if rng.random() < 0.97 else rng.choice(["unknown", "", "/f1"])
 
     def stamp() -> int | None:
         draw = rng.random()

@@ -1,4 +1,4 @@
-"""The tutorial's document: its files, and what its terminal is told and says."""
+"""The tutorial's page: its files, and the commands and output of its terminal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FILES = {"xml": "arm.urdf", "python": "swing.py", "toml": "cell.toml"}
 
 _DONE = "exercise done: "
 
-# What differs from run to run, the first that fits.
+# Patterns of text that differs from run to run; the first match applies.
 _MASKS = {
     r"pid \d+": "pid N",
     r"@[\w.-]+ pid": "@HOST pid",
@@ -27,7 +27,7 @@ _MASKS = {
     r"127\.0\.0\.1:\d+": "PORT",
     r"\d+\.\d+\.\d+\w*": "VERSION",
     r"\(\d+\.\d{9}\)": "(STAMP)",
-    # Ten digits: a second after the machine was started, whose uptime is the stamp in one exercise.
+    # Ten digits are 1 s: in one exercise, the stamp is the machine's uptime [ns].
     r"\d+\.\d{9}|\b\d{10,}\b": "STAMP",
     r"\d+\.\d Hz": "RATE",
     r"-?\d+(\.\d+)? (ns|us|ms|s|days)\b": "TIME",
@@ -42,14 +42,14 @@ _MASKS = {
 
 
 class TerminalStep(NamedTuple):
-    """A command, and the lines that stand below it."""
+    """A command, and the output below it on the page."""
 
     command: str
     lines: list[str]
 
     @property
     def is_background(self) -> bool:
-        """Whether it runs in the background; what it prints may come in another order."""
+        """Whether it runs in the background; its lines may come in another order."""
         return self.command.endswith(" &")
 
 
@@ -58,7 +58,7 @@ def blocks(language: str) -> list[str]:
 
 
 def terminal_steps() -> Iterator[TerminalStep]:
-    """The terminal, from the first command to the last."""
+    """All commands of the page, in order."""
     for block in blocks("console"):
         for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
             command, *lines = part.splitlines()
@@ -66,17 +66,17 @@ def terminal_steps() -> Iterator[TerminalStep]:
 
 
 def masked(lines: list[str]) -> list[str]:
-    """The lines without what differs from run to run, and without those that tell of waiting."""
-    said: list[str] = []
+    """The lines, with masks for text that differs from run to run, and without messages about waiting."""
+    found: list[str] = []
     for line in lines:
         for pattern, name in _MASKS.items():
-            line = re.sub(pattern, name, line)  # noqa: PLW2901  # one after the other
-        said.append(line.rstrip())
-    return [line for line in said if line and not line.startswith(("waiting: ", "heard ", "receiving "))]
+            line = re.sub(pattern, name, line)  # noqa: PLW2901 - one mask after the other
+        found.append(line.rstrip())
+    return [line for line in found if line and not line.startswith(("waiting: ", "receiving "))]
 
 
 class Terminal:
-    """bash in the folder of the exercise."""
+    """A bash process in the folder of the exercise."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -94,7 +94,7 @@ class Terminal:
         )
 
     def run(self, one: TerminalStep) -> list[str]:
-        """What is printed; by a program in the background, once it has printed all that is expected."""
+        """The output of a command; of a background program, once it has the expected number of lines."""
         command = one.command.removesuffix(" &")
         if not one.is_background:
             return self._done(f"{{ {command}; }} </dev/null")
@@ -113,7 +113,7 @@ class Terminal:
         return [line.rstrip("\n") for line in iter(self._bash.stdout.readline, f"{_DONE}\n")]
 
     def close(self) -> None:
-        """End bash and all that it has started."""
+        """Kills bash and all processes that it has started."""
         os.killpg(self._bash.pid, 9)
         self._bash.communicate()
 

@@ -237,7 +237,7 @@ def test_another_joint_order_than_the_models_is_refused():
         "<robot name='x'><xacro:if value='1'/></robot>",
     ],
 )
-def test_description_that_is_no_urdf_text_is_refused_and_opens_no_file(urdf: str):
+def test_description_without_urdf_text_is_refused_and_opens_no_file(urdf: str):
     case = IngestCase(JointStateIngest)
     case.ingest.describe(description(urdf=urdf, digest="ff"))
     assert case.counters.stats().refused == {"robot description": 1}

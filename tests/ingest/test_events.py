@@ -7,7 +7,7 @@ import time
 import pytest
 from helpers.processes import until
 
-from zstate._util.bounded_dict import MAX_ENTRIES
+from zstate._util.bounded import MAX_ENTRIES
 from zstate.ingest.events import KEPT, EventLog, StaticEdgeOwners, WriterEvent
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream

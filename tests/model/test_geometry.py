@@ -6,7 +6,7 @@ import pytest
 
 from zstate import load_model
 from zstate.model.catalog import catalog
-from zstate.model.geometry import Box, Cylinder, MeshFile, Shape, Sphere, parse_shapes, read_shapes
+from zstate.model.geometry import Box, Cylinder, MeshFile, Shape, Sphere, read_shapes
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 
@@ -21,7 +21,7 @@ def visual(geometry: str = '<sphere radius="1"/>', more: str = "", tag: str = "v
 
 
 def only(model: RobotModel) -> Shape:
-    (shape,) = parse_shapes(model)
+    (shape,) = read_shapes(model)[0]
     return shape
 
 
@@ -51,7 +51,7 @@ def test_a_shape_without_origin_is_at_the_links_frame():
 
 def test_a_link_may_have_several_shapes_of_both_roles():
     model = robot(visual() + visual(tag="collision") + visual())
-    assert [(shape.link, shape.role) for shape in parse_shapes(model)] == [
+    assert [(shape.link, shape.role) for shape in read_shapes(model)[0]] == [
         ("base", "visual"),
         ("base", "collision"),
         ("base", "visual"),
@@ -63,7 +63,7 @@ def test_a_colour_inside_the_link_is_read():
     assert only(robot(visual(more=inside))).color == (0.1, 0.2, 0.3, 0.4)
 
 
-def test_a_material_that_is_only_named_means_the_one_in_the_robot():
+def test_named_material_refers_to_the_definition_in_the_robot():
     top = '<material name="red"><color rgba="1 0 0 1"/></material>'
     assert only(robot(visual(more='<material name="red"/>'), top)).color == (1, 0, 0, 1)
 
@@ -72,10 +72,10 @@ def test_a_material_defined_in_one_link_may_be_named_by_an_earlier_one():
     there = '<link name="tip">' + visual(more='<material name="red"><color rgba="1 0 0 1"/></material>')
     joint = '<joint name="j" type="fixed"><parent link="base"/><child link="tip"/></joint>'
     model = robot(visual(more='<material name="red"/>'), f"{there}</link>{joint}")
-    assert [shape.color for shape in parse_shapes(model)] == [(1, 0, 0, 1)] * 2
+    assert [shape.color for shape in read_shapes(model)[0]] == [(1, 0, 0, 1)] * 2
 
 
-def test_the_robots_material_wins_over_the_links_as_in_rviz():
+def test_material_of_the_robot_precedes_that_of_the_link_as_in_rviz():
     top = '<material name="red"><color rgba="1 0 0 1"/></material>'
     inside = '<material name="red"><color rgba="0.9 0 0 1"/></material>'
     assert only(robot(visual(more=inside), top)).color == (1, 0, 0, 1)
@@ -94,7 +94,7 @@ def test_colours_outside_the_range_are_clamped():
 
 def test_a_faulty_shape_is_a_finding_and_the_others_are_drawn():
     model = robot(visual('<box size="1 2"/>') + visual())
-    assert [shape.geometry for shape in parse_shapes(model)] == [Sphere(1.0)]
+    assert [shape.geometry for shape in read_shapes(model)[0]] == [Sphere(1.0)]
     assert complaints(model) == [
         (2, "link 'base': a <visual> is not drawn: box size: '1 2' has 2 of 3 numbers"),
     ]
@@ -113,7 +113,7 @@ def test_a_faulty_shape_is_a_finding_and_the_others_are_drawn():
 )
 def test_the_fault_of_a_shape_is_named(text: str, words: str):
     model = robot(visual(text))
-    assert parse_shapes(model) == ()
+    assert read_shapes(model)[0] == ()
     ((line, message),) = complaints(model)
     assert line == 2
     assert words in message
@@ -138,6 +138,6 @@ def test_an_unreadable_colour_is_one_finding():
 def test_every_robot_of_the_catalog_with_geometry_has_shapes_of_its_own_links():
     for name in ("panda", "talos", "anymal_c", "pr2", "ur5"):
         model = load_model(next(entry.path for entry in catalog() if entry.name == name))
-        shapes = parse_shapes(model)
+        shapes = read_shapes(model)[0]
         assert {shape.link for shape in shapes} <= set(model.links)
         assert {shape.role for shape in shapes} == {"visual", "collision"}

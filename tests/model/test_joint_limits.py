@@ -72,7 +72,7 @@ def test_an_angle_within_a_turn_or_too_large_even_in_degrees_is_only_outside(ang
     assert "degrees" not in text
 
 
-def test_millimetres_of_a_prismatic_joint_are_not_taken_for_degrees():
+def test_millimetres_of_a_prismatic_joint_are_not_reported_as_degrees():
     assert limits_of(*ARM).explanation(np.array([[0.0, 0.0, 20.0]])) == "'j2' at 20.0 m is outside 0 to 0.5"
 
 

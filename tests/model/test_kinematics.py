@@ -102,7 +102,7 @@ def test_every_joint_type_agrees_with_matrices_multiplied_from_the_xml() -> None
 
 
 @pytest.mark.parametrize("name", ["rrbot", "diffbot", "gripper"])
-def test_our_own_robots_agree_with_matrices_multiplied_from_the_xml(name: str) -> None:
+def test_repository_robots_agree_with_matrices_multiplied_from_the_xml(name: str) -> None:
     assert_agrees_with_matrices(local_model(name).model)
 
 

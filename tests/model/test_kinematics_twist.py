@@ -92,7 +92,7 @@ def test_velocities_of_a_floating_joint_are_in_the_axes_of_its_zero_frame() -> N
 
 
 @pytest.mark.parametrize("link", ["root_joint", "nail"])
-def test_a_link_stands_still_as_seen_from_itself(link: str) -> None:
+def test_twist_of_a_link_in_itself_is_zero(link: str) -> None:
     kinematics = every_joint()
     velocities = np.ones(kinematics.model.velocity_count)
     twist = kinematics.twist(link, random_positions(kinematics.model, 5), velocities, link)

@@ -218,7 +218,7 @@ def test_common_forms_of_existing_files_give_no_warning(text: str):
     assert warnings(text) == []
 
 
-def test_a_foreign_joint_is_not_the_robots():
+def test_joint_outside_of_the_robot_element_is_ignored():
     model = parse_urdf(robot(ARM + '<gazebo><joint type="revolute" name="g"/></gazebo>'), "arm.urdf")
     assert model.joint_names == ("shoulder", "elbow")
 

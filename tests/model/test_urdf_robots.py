@@ -34,7 +34,7 @@ def _robots_installed() -> None:
         pytest.skip("example-robot-data is not installed")
 
 
-def test_67_of_the_69_load():
+def test_67_of_the_69_robots_load():
     assert (len(FILES), {path.name for path in FILES if not loads(path)}) == (69, REFUSED)
 
 

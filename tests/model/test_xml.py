@@ -96,7 +96,7 @@ def test_text_reads_the_same_in_every_encoding(data: str | bytes):
     assert read_document(data, "small.urdf").root.attributes["name"] == "\u00e9"
 
 
-def test_a_codec_that_is_no_text_encoding_is_refused():
+def test_codec_that_is_not_a_text_encoding_is_refused():
     data = b'<?xml version="1.0" encoding="rot13"?><robot/>'
     assert finding(data) == (1, "the declared encoding 'rot13' is not read; save the file as UTF-8")
 

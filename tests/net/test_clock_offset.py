@@ -85,7 +85,7 @@ def test_each_writer_of_each_robot_has_its_own_offset(sessions):
 
 def test_invalid_and_missing_replies_are_ignored(sessions):
     writer, reader = sessions
-    key = "zstate/r1/@clock/somebody"
+    key = "zstate/r1/@clock/unknown"
     queryable = writer.zenoh.declare_queryable(key, lambda query: query.reply(key, b"noon"))
     assert measure_offsets(reader, "r1", timeout_s=0.3) == ()
     queryable.undeclare()

@@ -71,7 +71,7 @@ def only_error(errors: Sequence[SecondWriter | None]) -> tuple[int, SecondWriter
     return place, error
 
 
-def test_simultaneous_static_writers_of_a_frame_one_gets_second_writer_and_the_other_edge_holds(pair):
+def test_one_of_two_simultaneous_static_writers_of_a_frame_gets_second_writer(pair):
     for _ in range(ROUNDS):
         with (
             TransformListener(pair[1], "*", history_on_join=False) as listener,

@@ -11,12 +11,12 @@ from zstate.errors import InvalidInput
 from zstate.net.presence import (
     LivelinessToken,
     RobotInfo,
+    WriterWatch,
     announce,
     announce_reader,
     discover,
     discover_readers,
     local_writer,
-    watch,
 )
 from zstate.net.session import Session, connect
 from zstate.wire.identity import Announcement, WriterId
@@ -156,7 +156,10 @@ def test_foreign_tokens_are_ignored_and_counted():
             stranger.zenoh.liveliness().declare_token(f"zstate/r1/@writer/{rest}")
             for rest in ("joint_states/nonsense", "unknown_stream/a,b,1,2,3", "tf/a,b,1,2,x")
         ]
-        with announced(stranger, "r1", "tf", DRIVER), watch(session, "*", lambda *event: None) as follower:
+        with (
+            announced(stranger, "r1", "tf", DRIVER),
+            WriterWatch(session, "*", lambda *event: None) as follower,
+        ):
             until(lambda: follower.foreign == 3)
             assert discover(session) == (RobotInfo("r1", (("tf", DRIVER),)),)
         for token in tokens:
@@ -170,7 +173,7 @@ def test_watch_reports_current_new_and_leaving_writers():
         connect() as writer,
         connect() as reader,
         announced(writer, "r1", "tf", CAMERA),
-        watch(reader, "r1", lambda *event: events.append(event)),
+        WriterWatch(reader, "r1", lambda *event: events.append(event)),
     ):
         until(lambda: (camera, True) in events)
         token = announced(writer, "r1", "joint_states", DRIVER)
@@ -184,7 +187,7 @@ def test_watch_reports_current_new_and_leaving_writers():
 
 def test_watch_reports_a_killed_writer(spawn):
     events: list[tuple[Announcement, bool]] = []
-    with connect() as reader, watch(reader, "*", lambda *event: events.append(event)):
+    with connect() as reader, WriterWatch(reader, "*", lambda *event: events.append(event)):
         child: Child = spawn(WRITER, "r1")
         until(lambda: len(events) == 1)
         child.kill()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from helpers.processes import until
 
-from zstate.net.presence import RouterLossDetector, announce, watch
+from zstate.net.presence import RouterLossDetector, WriterWatch, announce
 from zstate.net.session import connect
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import writer_key
@@ -28,7 +28,7 @@ def test_leaving_writer_is_distinguished_from_a_lost_router(spawn, free_port):
     with (
         connect(mode="client", endpoints=endpoint) as theirs,
         connect(mode="client", endpoints=endpoint) as ours,
-        watch(
+        WriterWatch(
             ours,
             "*",
             lambda _, alive: changes.append("there" if alive else "gone"),

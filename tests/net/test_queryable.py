@@ -107,7 +107,7 @@ def test_slow_answer_delays_no_subscription_and_overflows_are_counted(
         may_answer.set()
         assert len(list(slow)) == 1
         assert [len(list(get)) for get in flood[36:]] == [1, 1, 1, 1]
-        until(lambda: service.overflows == 1)
+        until(lambda: service.full_batches == 1)
 
 
 def next_reply(get) -> bool:

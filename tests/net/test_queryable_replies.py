@@ -14,7 +14,14 @@ from helpers.processes import SOON_S, until
 
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net import queryable
-from zstate.net.presence import RobotInfo, current_tokens, discover, discover_readers, local_writer, watch
+from zstate.net.presence import (
+    RobotInfo,
+    WriterWatch,
+    current_tokens,
+    discover,
+    discover_readers,
+    local_writer,
+)
 from zstate.net.queryable import query, query_tokens
 from zstate.net.session import Session, connect
 from zstate.net.writer import WireWriter, write_all
@@ -54,7 +61,7 @@ def test_more_tokens_than_the_default_channel_holds_are_discovered_in_the_sessio
     with (
         connect() as session,
         many_tokens(session, MORE_THAN_THE_DEFAULT),
-        watch(session, "*", lambda announced, _: received.append(announced)),
+        WriterWatch(session, "*", lambda announced, _: received.append(announced)),
     ):
         assert len(discover(session)) == MORE_THAN_THE_DEFAULT
         assert len(discover_readers(session)) == MORE_THAN_THE_DEFAULT
@@ -66,7 +73,7 @@ def test_more_tokens_than_the_default_channel_holds_are_discovered_in_a_watching
     sessions: tuple[Session, Session],
 ):
     ours, theirs = sessions
-    with many_tokens(theirs, MORE_THAN_THE_DEFAULT), watch(ours, "*", lambda *_: None):
+    with many_tokens(theirs, MORE_THAN_THE_DEFAULT), WriterWatch(ours, "*", lambda *_: None):
         until(lambda: len(current_tokens(ours, "zstate/*/@writer/*/*", 1.0)) == MORE_THAN_THE_DEFAULT)
         assert len(discover(ours)) == MORE_THAN_THE_DEFAULT
         ours.zenoh.put("zstate/r1/joint_states", b"")
@@ -129,7 +136,7 @@ def test_watch_loses_no_token_if_a_burst_overflows_its_ring(monkeypatch: pytest.
         may_go_on.wait()
         (alive.add if is_alive else alive.discard)(announced)
 
-    with connect() as writer, connect() as reader, watch(reader, "*", note):
+    with connect() as writer, connect() as reader, WriterWatch(reader, "*", note):
         with many_tokens(writer, 300):
             until(lambda: len(current_tokens(reader, "zstate/*/@writer/*/*", 1.0)) == 300)
             may_go_on.set()
@@ -147,7 +154,7 @@ def test_failing_callback_does_not_affect_other_tokens(monkeypatch: pytest.Monke
 
     raised: list[object] = []
     monkeypatch.setattr(threading, "excepthook", raised.append)
-    with connect() as session, many_tokens(session, 9), watch(session, "*", note) as follower:
+    with connect() as session, many_tokens(session, 9), WriterWatch(session, "*", note) as follower:
         until(lambda: len(received) == 8 and follower.failures)
     assert len(raised) == 1
 

@@ -37,7 +37,7 @@ def test_unregistered_session_registers_and_discovers_all_sessions(peer: str):
         until(has_met_both)
 
 
-def test_link_to_a_process_without_a_rendezvous_peer_is_no_registration(peer: str):
+def test_link_to_a_process_without_a_rendezvous_peer_is_not_a_registration(peer: str):
     elsewhere, endpoint, stop = free_endpoint(), free_endpoint(), threading.Event()
     with (
         open_zenoh(default_config("peer", (), [elsewhere])) as ghost,

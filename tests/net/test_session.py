@@ -78,7 +78,7 @@ def test_remote_listen_address_error_has_no_source_locations():
     assert ".rs" not in str(caught.value)
 
 
-def test_data_goes_through_a_router_process_and_comes_back_after_it_is_replaced(spawn, free_port: int):
+def test_data_passes_a_router_process_and_resumes_after_its_replacement(spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router: Child = spawn(ROUTER, endpoint)
     router.line()
@@ -248,8 +248,8 @@ def test_zenoh_prints_nothing_on_the_terminal(spawn, free_port: int):
         import sys
         from zstate.errors import NetworkError
         from zstate.net.session import connect
-        nobody = {"mode": "client", "endpoints": sys.argv[1], "timeout_s": 0.3}
-        for arguments in (nobody, {"listen": "tcp/192.0.2.1:1"}):
+        unreachable = {"mode": "client", "endpoints": sys.argv[1], "timeout_s": 0.3}
+        for arguments in (unreachable, {"listen": "tcp/192.0.2.1:1"}):
             try:
                 connect(**arguments)
             except NetworkError:

@@ -39,7 +39,7 @@ def publish_and_check(publisher: StatePublisher, listener: TransformListener, af
     return listener.buffer.latest("base", "lower") > after
 
 
-def test_clients_use_the_next_router_when_theirs_is_killed(spawn: Spawn):
+def test_clients_use_the_next_router_when_one_is_killed(spawn: Spawn):
     first, second = endpoint(), endpoint()
     dying = router(spawn, first)
     router(spawn, second, "--connect", first)
@@ -107,7 +107,7 @@ def test_streams_resume_when_the_fleet_router_returns(spawn: Spawn):
     with client(site) as robot, StatePublisher(robot, RRBOT, "r1") as publisher:
         dying.kill()
         # The robot's own programs are not affected.
-        with client(site) as beside, TransformListener(beside, "r1") as listener:
+        with client(site) as local, TransformListener(local, "r1") as listener:
             until(lambda: publish_and_check(publisher, listener))
         router(spawn, fleet)
         with client(fleet) as hall, TransformListener(hall, "r1") as listener:

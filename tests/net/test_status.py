@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from zstate.errors import Closed, InvalidInput
 from zstate.net.presence import discover
 from zstate.net.session import Session, connect
-from zstate.net.status import StatusPublisher, watch_status
+from zstate.net.status import StatusPublisher, StatusSubscriber
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource
@@ -34,7 +34,7 @@ class Statuses:
     def __init__(self, session: Session, robot: str = "*") -> None:
         self.statuses: list[tuple[str, Status]] = []
         self.times: list[float] = []
-        self.watch = watch_status(session, robot, self._on_status)
+        self.watch = StatusSubscriber(session, robot, self._on_status)
 
     def _on_status(self, robot: str, status: Status) -> None:
         self.times.append(time.monotonic())
@@ -58,7 +58,7 @@ def test_publisher_sends_its_status_once_a_second(sessions):
         running = threading.Thread(target=publisher.run, args=(SineSource(RRBOT), 50.0))
         running.start()
         until(lambda: len(received.statuses) >= 3)
-        (writer,) = {said for robot in discover(sessions[1]) for _, said in robot.writers}
+        (writer,) = {one for robot in discover(sessions[1]) for _, one in robot.writers}
     running.join()
     robot, status = received.statuses[-1]
     assert robot == "r1"
@@ -81,7 +81,7 @@ def test_status_ends_with_its_publisher_and_leaves_no_thread(sessions):
     with StatePublisher(sessions[0], RRBOT, "r2"):
         until(lambda: received.statuses[-1][0] == "r2")
     names = [robot for robot, _ in received.statuses]
-    assert names == sorted(names), "r1 spoke after its publisher was closed"
+    assert names == sorted(names), "r1 published after its publisher was closed"
 
 
 def test_late_subscriber_receives_only_the_status_of_the_last_second(sessions):
@@ -99,7 +99,7 @@ def test_late_subscriber_receives_only_the_status_of_the_last_second(sessions):
         assert len(received.statuses) == 1
 
 
-def test_publisher_that_stands_still_is_stale(sessions):
+def test_silent_publisher_is_stale(sessions):
     received = Statuses(sessions[1], "r1")
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         publisher.publish([0.0, 0.0])
@@ -164,19 +164,19 @@ def test_ended_process_sends_no_status(spawn):
         with StatePublisher(session, RRBOT, "r2"):
             until(lambda: len([robot for robot, _ in received.statuses if robot == "r2"]) == 2)
     names = [robot for robot, _ in received.statuses]
-    assert names == sorted(names), "r1 spoke after its process was killed"
+    assert names == sorted(names), "r1 published after its process was killed"
 
 
 def test_invalid_status_is_counted_and_ignored(sessions):
     received = Statuses(sessions[1], "r1")
     key = status_key("r1", ME)
     with ExitStack() as opened:
-        said = {
+        publishers = {
             encoding: opened.enter_context(StreamPublisher(sessions[0], key, encoding))
             for encoding in ("", ENCODINGS[Status])
         }
         wait_for_reader(sessions[0], key)
-        for stream in said.values():
+        for stream in publishers.values():
             stream.put(b"\xff\x00 noise")
         until(lambda: sum(received.watch.refused.values()) == 2)
     assert received.watch.refused == {"foreign": 1, "malformed": 1}

@@ -31,20 +31,22 @@ def test_other_readers_and_writers_of_a_session_continue_when_one_reader_closes(
     here, there = sessions
     ours, theirs = "zstate/ours/joint_states", "zstate/theirs/joint_states"
     gone: list[SerializedSample] = []
-    heard: dict[str, list[SerializedSample]] = {"here": [], "there": []}
+    received: dict[str, list[SerializedSample]] = {"here": [], "there": []}
     many = "zstate/*/joint_states"
     with (
         StreamPublisher(here, ours, "") as mine,
         StreamPublisher(there, theirs, "") as other,
-        StreamSubscriber(here, many, heard["here"].extend),
-        StreamSubscriber(there, many, heard["there"].extend),
+        StreamSubscriber(here, many, received["here"].extend),
+        StreamSubscriber(there, many, received["there"].extend),
     ):
 
         def all_receive(payload: bytes) -> bool:
             mine.put(payload)
             other.put(payload)
-            said = {(ours, payload), (theirs, payload)}
-            return all(said <= {(arrival.key, arrival.payload) for arrival in ear} for ear in heard.values())
+            expected = {(ours, payload), (theirs, payload)}
+            return all(
+                expected <= {(arrival.key, arrival.payload) for arrival in one} for one in received.values()
+            )
 
         with StreamSubscriber(here, many, gone.extend):
             until(lambda: all_receive(b"while both are there"))  # discovery may take a moment
@@ -60,9 +62,9 @@ def test_attachment_arrives_with_its_sample(sessions):
         StreamSubscriber(sessions[1], KEY, got.extend),
     ):
         until(lambda: publisher.has_readers)
-        publisher.put(b"payload", b"beside")
+        publisher.put(b"payload", b"attached")
         until(lambda: got)
-    assert (got[0].payload, got[0].attachment) == (b"payload", b"beside")
+    assert (got[0].payload, got[0].attachment) == (b"payload", b"attached")
 
 
 def test_has_readers_follows_the_subscribers(sessions):

@@ -63,7 +63,7 @@ def test_a_key_without_a_robot_is_reported_as_foreign(sessions):
     assert received == []
 
 
-def test_a_withdrawn_value_is_reported_by_its_key_and_is_no_error(sessions):
+def test_withdrawn_value_is_reported_by_its_key_without_an_error(sessions):
     received: list[Received] = []
     withdrawn: list[str] = []
     errors: list[object] = []

@@ -38,18 +38,18 @@ def opened(session, wire: str) -> WireWriter:
 def test_open_streams_are_announced_and_received_until_close(sessions, wire: str):
     writer, reader = sessions
     joints, described = KEYS[wire]
-    ear = KeySubscriber(reader, joints)
+    subscriber = KeySubscriber(reader, joints)
     with opened(writer, wire) as out:
         stream = out.open_stream("joint_states")
         write_all([out.open_latched("robot_description")], DESCRIBED)
         wait_for_reader(writer, joints)
         write_all([stream], STATE)
-        ear.wait_for(1)
+        subscriber.wait_for(1)
         late = KeySubscriber(reader, described, latched=True)
         late.wait_for(1)
         until(lambda: len(discover(reader, wire=wire)) == 1)
         (robot,) = discover(reader, wire=wire)
-        assert {said for said, _ in robot.writers} == {"joint_states", "robot_description"}
+        assert {stream for stream, _ in robot.writers} == {"joint_states", "robot_description"}
     until(lambda: discover(reader, timeout_s=0.1, wire=wire) == ())
     until(lambda: tokens(reader) == [])
 
@@ -57,7 +57,7 @@ def test_open_streams_are_announced_and_received_until_close(sessions, wire: str
 @pytest.mark.parametrize(("wire", "kinds"), [("native", ["PUT", "DELETE"]), ("ros2", ["PUT", "PUT"])])
 def test_value_is_withdrawn_only_if_the_wire_can(sessions, wire: str, kinds: list[str]):
     writer, reader = sessions
-    ear = KeySubscriber(reader, KEYS[wire][1])
+    subscriber = KeySubscriber(reader, KEYS[wire][1])
     wait_for_reader(writer, KEYS[wire][1])
     with opened(writer, wire) as out:
         latched = out.open_latched("robot_description")
@@ -65,7 +65,7 @@ def test_value_is_withdrawn_only_if_the_wire_can(sessions, wire: str, kinds: lis
         latched.withdraw()
         if wire == "ros2":
             write_all([latched], DESCRIBED)
-        assert [str(sample.kind).rpartition(".")[2] for sample in ear.wait_for(2)] == kinds
+        assert [str(sample.kind).rpartition(".")[2] for sample in subscriber.wait_for(2)] == kinds
 
 
 @pytest.mark.parametrize("wire", WIRES)
@@ -74,9 +74,9 @@ def test_has_readers_is_true_with_a_subscriber(sessions, wire: str):
     with opened(writer, wire) as out:
         stream = out.open_stream("joint_states")
         assert not stream.has_readers
-        ear = KeySubscriber(reader, KEYS[wire][0])
+        subscriber = KeySubscriber(reader, KEYS[wire][0])
         until(lambda: stream.has_readers)
-    assert ear.samples == []
+    assert subscriber.samples == []
 
 
 @pytest.mark.parametrize("wire", WIRES)

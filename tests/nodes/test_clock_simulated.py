@@ -90,7 +90,7 @@ def test_first_time_ends_the_wait(sessions):
         assert clock.now() == 7
 
 
-def test_wait_ends_when_its_instant_is_reached_and_not_while_time_stands_still(sessions):
+def test_wait_ends_at_its_instant_and_not_while_the_clock_is_paused(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         wait_for_reader(writer, "zstate/clock")

@@ -107,7 +107,7 @@ def test_writer_frozen_for_longer_than_its_lease_is_cut_off_then_back(collector,
     collector.await_samples()
 
 
-def test_writer_is_cut_off_with_its_router_and_comes_back_with_it(spawn: Spawn, free_port: int):
+def test_writer_disconnects_and_reconnects_with_its_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = spawn(ROUTER, endpoint)
     router.line()

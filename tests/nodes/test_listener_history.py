@@ -184,7 +184,7 @@ def test_large_history_is_received_page_by_page_through_a_router(spawn: Callable
                 assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
 
 
-def test_samples_published_while_the_router_was_away_are_received_afterwards(
+def test_samples_published_without_a_router_are_received_afterwards(
     spawn: Callable[..., Child], free_port: int
 ):
     endpoint = f"tcp/127.0.0.1:{free_port}"

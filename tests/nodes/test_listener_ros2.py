@@ -221,7 +221,7 @@ def test_restarted_bag_starts_a_new_epoch(sessions, follow: str):
 
 @pytest.mark.parametrize("behind", [3 * SECOND, 30 * SECOND, -SECOND])
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_restarted_node_starts_a_new_epoch_whatever_its_clock(sessions, follow, behind: int):
+def test_restarted_node_starts_a_new_epoch_on_any_clock(sessions, follow, behind: int):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow=follow) as listener:
         publish_description(writer)

@@ -37,8 +37,8 @@ DEVICE = """
     with zenoh.open(config) as session:
         for selector in map(str.strip, sys.stdin):
             for reply in session.get(selector):
-                said = reply.ok or reply.err
-                print(bool(reply.ok), said.encoding, said.payload.to_string())
+                result = reply.ok or reply.err
+                print(bool(reply.ok), result.encoding, result.payload.to_string())
             print("end")
 """
 

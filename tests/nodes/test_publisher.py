@@ -180,7 +180,7 @@ def test_publisher_of_a_closed_session_raises_closed():
 
 
 @pytest.mark.parametrize("name", ["a/b", "a b", "*", "a$", "@a", "r?", "r#1", "tab\t"])
-def test_robot_name_that_is_no_key_chunk_is_refused(sessions, name: str):
+def test_invalid_robot_name_is_refused(sessions, name: str):
     with pytest.raises(InvalidInput, match=r"robot name .* one chunk of a Zenoh key"):
         StatePublisher(sessions[0], RRBOT, name)
 

@@ -55,10 +55,12 @@ class DecodedFile:
 
 
 def test_joint_state_is_decoded_with_its_writer_and_every_number(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm", {7: "driver@host pid 1"}) as tale:
-        tale.describe("arm", session=7)
+    with RecordingBuilder(tmp_path / "r.mcap", "arm", {7: "driver@host pid 1"}) as builder:
+        builder.describe("arm", session=7)
         states = [
-            tale.joints("arm", START + n * MS + 1, swing_positions(n / 10), swing_positions(n / 7), session=7)
+            builder.joints(
+                "arm", START + n * MS + 1, swing_positions(n / 10), swing_positions(n / 7), session=7
+            )
             for n in range(20)
         ]
     read = DecodedFile(tmp_path / "r.mcap")
@@ -78,9 +80,9 @@ def test_joint_state_is_decoded_with_its_writer_and_every_number(tmp_path: Path)
 
 
 def test_frames_of_several_robots_keep_their_names(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
         for robot in ("r1", "r2"):
-            tale.edges(robot, START, {("odom", "base"): pose(1.0), ("fleet/map", "odom"): pose(2.0)})
+            builder.edges(robot, START, {("odom", "base"): pose(1.0), ("fleet/map", "odom"): pose(2.0)})
     edges = {
         decoded.writer.robot: decoded.message.edges
         for decoded in DecodedFile(tmp_path / "r.mcap").of(TransformSample)
@@ -90,10 +92,10 @@ def test_frames_of_several_robots_keep_their_names(tmp_path: Path):
 
 
 def test_static_writers_keep_their_names(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.statics("arm", START, {("tool", "camera"): pose(z=0.1)}, writer="camera")
-        tale.statics("arm", START, {("world", "base"): pose()}, writer=MODEL_WRITER)
-        tale.encoder.withdraw("arm", "camera", START + S)
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.statics("arm", START, {("tool", "camera"): pose(z=0.1)}, writer="camera")
+        builder.statics("arm", START, {("world", "base"): pose()}, writer=MODEL_WRITER)
+        builder.encoder.withdraw("arm", "camera", START + S)
     found = DecodedFile(tmp_path / "r.mcap").of(StaticTransforms)
     assert [(decoded.writer.static_writer, decoded.message.edges) for decoded in found] == [
         ("camera", (("tool", "camera"),)),
@@ -103,10 +105,10 @@ def test_static_writers_keep_their_names(tmp_path: Path):
 
 
 def test_restarted_writer_is_another_writer(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
-        tale.joints("arm", START, swing_positions(0), session=1)
-        tale.joints("arm", START + S, swing_positions(1), session=2)
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
+        builder.joints("arm", START, swing_positions(0), session=1)
+        builder.joints("arm", START + S, swing_positions(1), session=2)
     assert [decoded.writer.session for decoded in DecodedFile(tmp_path / "r.mcap").of(JointState)] == [1, 2]
 
 
@@ -148,7 +150,7 @@ def test_messages_of_a_foreign_topic_are_counted(tmp_path: Path):
     ]
 
 
-def test_other_topics_of_a_bag_are_listed_and_left_out(tmp_path: Path):
+def test_other_topics_of_a_bag_are_listed_and_skipped(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.joints(START, {"shoulder": 0.0}, "/joint_commands")
         bag.write("/chatter", START, STORE.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String")
@@ -166,24 +168,24 @@ def test_selected_robot_includes_the_root_namespace_of_a_bag(tmp_path: Path):
     assert {(s.writer.robot, s.writer.stream) for s in decoded} == {("dog", "joint_states"), ("ros", "tf")}
 
 
-def test_undecodable_messages_are_reported_and_left_out(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
-        tale.joints("arm", START, swing_positions(0))
+def test_undecodable_messages_are_reported_and_skipped(tmp_path: Path):
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
+        builder.joints("arm", START, swing_positions(0))
         facts = {"zstate.robot": "arm", "zstate.session": "1"}
-        joints = tale.writer.channel("/joint_states", JOINT_STATE, STREAM_QOS["joint_states"], facts)
-        tale.writer.write(joints, b"\0\1\0\0" + bytes(4), START + MS, START + MS)
-        tale.joints("arm", START + 2 * MS, swing_positions(1))
+        joints = builder.writer.channel("/joint_states", JOINT_STATE, STREAM_QOS["joint_states"], facts)
+        builder.writer.write(joints, b"\0\1\0\0" + bytes(4), START + MS, START + MS)
+        builder.joints("arm", START + 2 * MS, swing_positions(1))
     read = DecodedFile(tmp_path / "r.mcap")
     assert len(read.of(JointState)) == 2
     assert read.refused == ["truncated"]
 
 
 def test_interval_of_log_times_can_be_read_alone(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(10):
-            tale.joints("arm", START + n * S, swing_positions(n), log_time=START + n * S)
+            builder.joints("arm", START + n * S, swing_positions(n), log_time=START + n * S)
     found = DecodedFile(
         tmp_path / "r.mcap", streams=("joint_states",), begin=START + 3 * S, end=START + 5 * S
     )
@@ -191,12 +193,12 @@ def test_interval_of_log_times_can_be_read_alone(tmp_path: Path):
 
 
 def test_truncated_recording_is_decoded_as_far_as_possible(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(2000):
-            tale.joints("arm", START + n * MS, swing_positions(n / 100))
+            builder.joints("arm", START + n * MS, swing_positions(n / 100))
             if n % 100 == 99:
-                tale.writer.flush()
+                builder.writer.flush()
     whole = (tmp_path / "r.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: len(whole) // 2])

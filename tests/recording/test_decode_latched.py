@@ -10,13 +10,13 @@ from zstate.wire.messages import JointState, RobotDescription, StaticTransforms,
 
 
 def fixed(edges: dict[tuple[str, str], list[float]], writer: str | None = "camera") -> DecodedMessage:
-    speaker = RecordedWriter("arm", "tf_static", 1, writer, None, foreign=writer is None)
-    return DecodedMessage(speaker, StaticTransforms(1, tuple(edges), to_block(list(edges.values()))), START)
+    recorded = RecordedWriter("arm", "tf_static", 1, writer, None, foreign=writer is None)
+    return DecodedMessage(recorded, StaticTransforms(1, tuple(edges), to_block(list(edges.values()))), START)
 
 
 def described(urdf: str) -> DecodedMessage:
-    speaker = RecordedWriter("arm", "robot_description", 1, None, None, foreign=False)
-    return DecodedMessage(speaker, RobotDescription(1, urdf, "", (), ()), START)
+    recorded = RecordedWriter("arm", "robot_description", 1, None, None, foreign=False)
+    return DecodedMessage(recorded, RobotDescription(1, urdf, "", (), ()), START)
 
 
 def test_repeated_value_does_not_change_the_state():
@@ -58,6 +58,6 @@ def test_new_description_replaces_the_previous_one():
 
 
 def test_samples_are_not_latched():
-    speaker = RecordedWriter("arm", "joint_states", 1, None, None, foreign=False)
+    recorded = RecordedWriter("arm", "joint_states", 1, None, None, foreign=False)
     state = JointState(START, 0, 1, order_digest(()), b"")
-    assert LatchedState().update(DecodedMessage(speaker, state, START)) is None
+    assert LatchedState().update(DecodedMessage(recorded, state, START)) is None

@@ -30,10 +30,10 @@ def models(
 
 
 def test_described_robot_with_recorded_joints_has_a_model(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
         for robot in ("r1", "r2"):
-            tale.describe(robot)
-            tale.joints(robot, START, swing_positions(0))
+            builder.describe(robot)
+            builder.joints(robot, START, swing_positions(0))
     found, refused = models(tmp_path / "r.mcap")
     assert {robot: model and model.digest for robot, model in found.items()} == {
         "r1": RRBOT.digest,
@@ -44,8 +44,8 @@ def test_described_robot_with_recorded_joints_has_a_model(tmp_path: Path):
 
 
 def test_description_without_joint_states_gives_no_model(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
     assert models(tmp_path / "r.mcap") == ({"arm": None}, [])
 
 

@@ -281,7 +281,7 @@ def test_withdrawn_statics_end_with_an_empty_message(case: EncoderCase):
     case.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
     case.encoder.withdraw("cart", "mount", NOW + 1)
     case.encoder.withdraw("cart", "mount", NOW + 2)
-    case.encoder.withdraw("cart", "nobody", NOW + 2)
+    case.encoder.withdraw("cart", "unknown", NOW + 2)
     assert repeated(case) == []
     assert [len(message.transforms) for message in case.read("/tf_static")] == [1, 0]
 

@@ -47,6 +47,6 @@ def test_info_of_a_truncated_recording_is_incomplete(tmp_path: Path):
     assert "cut off" in loss
 
 
-def test_file_that_is_no_recording_is_refused(tmp_path: Path):
+def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):
     with pytest.raises(RecordingError):
         read_info(tmp_path / "nothing.mcap")

@@ -27,11 +27,11 @@ CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
 def cart(tmp_path: Path) -> Path:
     """A cart without a model, on which two writers have put the same camera."""
     path = tmp_path / "cart.mcap"
-    with RecordingBuilder(path, "cart") as tale:
+    with RecordingBuilder(path, "cart") as builder:
         for writer in ("mount", "gripper"):
-            tale.statics("cart", START, {("cart/base", "cart/camera"): pose(z=0.1)}, writer=writer)
+            builder.statics("cart", START, {("cart/base", "cart/camera"): pose(z=0.1)}, writer=writer)
         for n in range(COUNT):
-            tale.edges("cart", START + n * 10 * MS, {("odom", "base"): pose(n)})
+            builder.edges("cart", START + n * 10 * MS, {("odom", "base"): pose(n)})
     return path
 
 

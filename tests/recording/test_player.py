@@ -49,11 +49,13 @@ PATHS = [("world", "tool"), ("tool", "lens"), ("laser_link", "world")]
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A second of an arm at 100 Hz, with a lens on its tool."""
     path = tmp_path_factory.mktemp("arm") / "arm.mcap"
-    with RecordingBuilder(path, "arm") as tale:
-        tale.describe("arm")
-        tale.statics("arm", START, {("tool", "lens"): pose(z=0.1)})
+    with RecordingBuilder(path, "arm") as builder:
+        builder.describe("arm")
+        builder.statics("arm", START, {("tool", "lens"): pose(z=0.1)})
         for n in range(COUNT):
-            tale.joints("arm", START + n * 10 * MS + n % 3, swing_positions(n / 50), swing_velocities(n / 50))
+            builder.joints(
+                "arm", START + n * 10 * MS + n % 3, swing_positions(n / 50), swing_velocities(n / 50)
+            )
     return path
 
 
@@ -181,13 +183,13 @@ def test_lateness_is_reported(sessions, arm: Path):
 
 def test_start_within_the_recording_has_the_latched_values_of_that_time(sessions, tmp_path: Path):
     path = tmp_path / "r.mcap"
-    with RecordingBuilder(path, "arm") as tale:
-        tale.describe("arm")
-        tale.statics("arm", START, {("tool", "lens"): pose(z=0.1)})
-        tale.statics("arm", START + S, {("tool", "lens"): pose(z=0.2)})
+    with RecordingBuilder(path, "arm") as builder:
+        builder.describe("arm")
+        builder.statics("arm", START, {("tool", "lens"): pose(z=0.1)})
+        builder.statics("arm", START + S, {("tool", "lens"): pose(z=0.2)})
         for n in range(5):
-            tale.joints("arm", START + n * S, swing_positions(n))
-        tale.statics("arm", START + 4 * S + MS, {("tool", "lens"): pose(z=0.3)})
+            builder.joints("arm", START + n * S, swing_positions(n))
+        builder.statics("arm", START + 4 * S + MS, {("tool", "lens"): pose(z=0.3)})
     writer, reader = sessions
     tap = SampleCollector(reader, "zstate/arm/joint_states")
     heights: list[float] = []
@@ -245,10 +247,10 @@ def test_recording_time_is_published_on_the_clock(sessions, arm: Path):
 
 
 def test_recorded_clock_is_published_unchanged(sessions, tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(5):
-            tale.encoder.write_message("ros", ClockMessage(n * MS, n, 9), START + n * S)
+            builder.encoder.write_message("ros", ClockMessage(n * MS, n, 9), START + n * S)
     writer, reader = sessions
     tap = SampleCollector(reader, "zstate/clock")
     wait_for_reader(writer, "zstate/clock")
@@ -312,9 +314,11 @@ def test_player_ends_when_it_is_closed(sessions, arm: Path):
 
 def test_robot_without_a_model_is_published_unchanged(sessions, tmp_path: Path):
     path = tmp_path / "r.mcap"
-    with RecordingBuilder(path, "cart") as tale:
+    with RecordingBuilder(path, "cart") as builder:
         for n in range(20):
-            tale.edges("cart", START + n * 10 * MS, {("odom", "base"): pose(n), ("map", "odom"): pose(1.0)})
+            builder.edges(
+                "cart", START + n * 10 * MS, {("odom", "base"): pose(n), ("map", "odom"): pose(1.0)}
+            )
     writer, reader = sessions
     tap = SampleCollector(reader, "zstate/cart/tf")
     with TransformListener(reader, "cart", follow="tf") as listener:
@@ -374,12 +378,12 @@ def test_robot_is_played_back_to_ros(sessions, arm: Path):
 
 def test_model_replaced_in_the_recording_is_replaced_in_playback(sessions, tmp_path: Path):
     longer = parse_urdf(RRBOT.urdf.replace('"0 0 0.6"', '"0 0 0.9"'), "longer")
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
         for second, model in ((0, RRBOT), (1, longer)):
-            tale.describe("arm", model, session=second, at=START + second * S)
+            builder.describe("arm", model, session=second, at=START + second * S)
             for n in range(10):
                 stamp = START + second * S + n * 10 * MS
-                tale.joints("arm", stamp, swing_positions(n), session=second, model=model)
+                builder.joints("arm", stamp, swing_positions(n), session=second, model=model)
     writer, reader = sessions
     with TransformListener(reader, "arm") as listener:
         wait_for_stream_readers(writer, "arm")
@@ -405,12 +409,12 @@ def test_unpublishable_messages_are_counted(sessions, tmp_path: Path):
 
 def test_truncated_recording_is_played_as_far_as_possible(sessions, tmp_path: Path):
     path = tmp_path / "r.mcap"
-    with RecordingBuilder(path, "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(path, "arm") as builder:
+        builder.describe("arm")
         for n in range(1000):
-            tale.joints("arm", START + n * MS, swing_positions(n))
+            builder.joints("arm", START + n * MS, swing_positions(n))
             if n % 100 == 0:
-                tale.writer.flush()
+                builder.writer.flush()
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with Player(sessions[0], path, rate=math.inf) as replayer:
         report = replayer.run()

@@ -97,7 +97,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_topics_are_selected_by_name(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(5))
     assert payloads(tmp_path / "run.mcap", topics=["/robot_description"]) == [DESCRIPTION]
-    assert payloads(tmp_path / "run.mcap", topics=["/nobody"]) == []
+    assert payloads(tmp_path / "run.mcap", topics=["/unknown"]) == []
     assert payloads(tmp_path / "run.mcap", topics=[]) == []
 
 
@@ -134,7 +134,7 @@ def test_split_files_are_read_as_one_and_separately(tmp_path: Path):
     assert alone == [DESCRIPTION, *(payload for _, payload in states[200:400])]
 
 
-def test_files_of_an_older_recording_of_that_name_are_left_out(tmp_path: Path):
+def test_files_of_an_older_recording_with_that_name_are_ignored(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(500), max_seconds=2.0)
     write_run(tmp_path / "run.mcap", joint_states(300), max_seconds=2.0, overwrite=True)
     assert (tmp_path / "run_2.mcap").exists()
@@ -236,7 +236,7 @@ def test_every_variant_that_mcap_writes_is_read(tmp_path: Path, options: dict[st
     mixed = random.Random(3).sample(states, len(states))
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=5000, **options)
-        writer.start("ros2", "somebody")
+        writer.start("ros2", "another library")
         schema = writer.register_schema("sensor_msgs/msg/JointState", "ros2msg", b"")
         channel = writer.register_channel("/joint_states", "cdr", schema)
         writer.add_attachment(0, 0, "note", "text/plain", b"hello")
@@ -436,7 +436,7 @@ def test_query_that_takes_too_long_for_the_file_size_is_ended(
         database.commit()
     with RecordingReader(path) as reader:
         assert reader.span == (0, 19_999)
-    monkeypatch.setattr("zstate.recording.sqlite_file._STEPS", 0)
-    monkeypatch.setattr("zstate.recording.sqlite_file._STEPS_PER_BYTE", 0)
+    monkeypatch.setattr("zstate.recording.reader._STEPS", 0)
+    monkeypatch.setattr("zstate.recording.reader._STEPS_PER_BYTE", 0)
     with pytest.raises(RecordingError, match="took more than 0 steps"):
         RecordingReader(path)

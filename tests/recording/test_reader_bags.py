@@ -132,7 +132,7 @@ def test_unsupported_metadata_is_refused_with_the_reason(
     assert caught.value.path == str(folder / "metadata.yaml")
 
 
-def test_metadata_that_is_no_text_is_refused(tmp_path: Path):
+def test_binary_metadata_is_refused(tmp_path: Path):
     folder = bag(tmp_path / "bag", "")
     (folder / "metadata.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RecordingError, match="cannot be read"):

@@ -25,7 +25,7 @@ def test_several_subscriptions_share_one_queue_with_reception_times(sessions):
     ):
         value.set(b"holds")
         inbox.subscribe("joint_states", "a/samples", "r1")
-        inbox.subscribe_latched("robot_description", "a/*", None)
+        inbox.subscribe("robot_description", "a/*", None)
         until(lambda: samples.has_readers)
         wait_for_reader(writer, "a/value")
         before = time.time_ns()

@@ -25,10 +25,10 @@ from zstate.transform import Transform
 
 
 def test_repr_has_duration_and_robots(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap") as tale:
-        tale.describe("r1")
-        tale.joints("r1", START + S, swing_positions(0), log_time=START + 2 * S)
-        tale.describe("r2", at=START + 3 * S)
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        builder.describe("r1")
+        builder.joints("r1", START + S, swing_positions(0), log_time=START + 2 * S)
+        builder.describe("r2", at=START + 3 * S)
     with Recording(tmp_path / "r.mcap") as recording:
         assert recording.robots == ("r1", "r2")
         assert recording.info.duration_s == 3.0
@@ -36,15 +36,15 @@ def test_repr_has_duration_and_robots(tmp_path: Path):
 
 
 def test_unknown_robot_is_refused(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap") as tale:
-        tale.describe("r1")
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        builder.describe("r1")
     with pytest.raises(InvalidInput, match="'r1'"):
         Recording(tmp_path / "r.mcap", "r2")
 
 
 def test_closed_recording_raises(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
     recording = Recording(tmp_path / "r.mcap")
     recording.close()
     recording.close()
@@ -55,35 +55,37 @@ def test_closed_recording_raises(tmp_path: Path):
 def wild(path: Path, seed: int) -> None:
     """Two writers after each other, late samples, repeated stamps, clocks set back, edges that move over."""
     dice = random.Random(seed)
-    with RecordingBuilder(path, "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(path, "arm") as builder:
+        builder.describe("arm")
         offset = 0
         for n in range(600):
-            heard = START + n * 10 * MS
+            log_time = START + n * 10 * MS
             if n == 150:
                 offset = -3600 * S
             session = 1 + (n > 300)
-            stamp = heard + offset - dice.choice([0, 0, 0, 35 * MS, 70 * MS])
-            tale.joints(
+            stamp = log_time + offset - dice.choice([0, 0, 0, 35 * MS, 70 * MS])
+            builder.joints(
                 "arm",
                 stamp,
                 swing_positions(dice.random()),
                 swing_velocities(n),
                 session=session,
-                log_time=heard,
+                log_time=log_time,
             )
             if n % 3 == 0:
                 world = pose(dice.random(), dice.random(), yaw=dice.random())
-                tale.edges("arm", stamp, {("odom", "world"): world, ("map", "odom"): pose(n)}, log_time=heard)
+                builder.edges(
+                    "arm", stamp, {("odom", "world"): world, ("map", "odom"): pose(n)}, log_time=log_time
+                )
             if n % 50 == 7:
-                tale.edges("arm", stamp, {("map", "odom"): pose(-n)}, log_time=heard, session=5)
+                builder.edges("arm", stamp, {("map", "odom"): pose(-n)}, log_time=log_time, session=5)
             if n in {20, 400}:
-                tale.statics("arm", heard, {("tool", "tip"): pose(z=n)})
+                builder.statics("arm", log_time, {("tool", "tip"): pose(z=n)})
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_lookup_many_equals_that_of_a_full_buffer(tmp_path: Path, seed: int, monkeypatch):
-    monkeypatch.setattr("zstate.recording.load._BATCH", 37)
+    monkeypatch.setattr("zstate.recording.recording._BATCH", 37)
     wild(tmp_path / "r.mcap", seed)
     dice = np.random.default_rng(seed)
     begin = START - 3600 * S
@@ -94,9 +96,9 @@ def test_lookup_many_equals_that_of_a_full_buffer(tmp_path: Path, seed: int, mon
         for target, source in [("map", "tip"), ("world", "tool"), ("odom", "map"), ("tool", "tip")]:
             poses, valid = buffer.lookup_many(target, source, stamps)
             assert valid.sum() > 5
-            told, is_told = recording.lookup_many(target, source, stamps)
-            assert np.array_equal(is_told, valid)
-            assert np.array_equal(told, poses, equal_nan=True)
+            streamed_poses, streamed_valid = recording.lookup_many(target, source, stamps)
+            assert np.array_equal(streamed_valid, valid)
+            assert np.array_equal(streamed_poses, poses, equal_nan=True)
 
 
 def test_lookup_many_of_no_stamps_is_empty(tmp_path: Path):
@@ -107,10 +109,10 @@ def test_lookup_many_of_no_stamps_is_empty(tmp_path: Path):
 
 
 def test_unknown_and_disconnected_frames_raise(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
-        tale.joints("arm", START, swing_positions(0))
-        tale.statics("arm", START, {("table", "cup"): pose()})
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
+        builder.joints("arm", START, swing_positions(0))
+        builder.statics("arm", START, {("table", "cup"): pose()})
     with Recording(tmp_path / "r.mcap") as recording:
         with pytest.raises(UnknownFrame, match="tol"):
             recording.lookup_many("world", "tol", [START])
@@ -121,13 +123,13 @@ def test_unknown_and_disconnected_frames_raise(tmp_path: Path):
 
 
 def test_edges_refused_live_are_refused_from_a_recording(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap") as tale:
-        tale.statics("thief", START, {("thief/map", "arm/camera"): pose(x=9.0)})
-        tale.statics("thief", START, {("arm/base", "arm/laser"): pose(x=9.0)}, writer="laser")
-        tale.statics("arm", START + MS, {("lower", "world"): pose(x=9.0)}, writer="mix-up")
-        tale.statics("arm", START + 2 * MS, {("tool", "camera"): pose(x=1.0)})
-        tale.describe("arm", at=START + 3 * MS)
-        tale.joints("arm", START + 4 * MS, swing_positions(0))
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        builder.statics("thief", START, {("thief/map", "arm/camera"): pose(x=9.0)})
+        builder.statics("thief", START, {("arm/base", "arm/laser"): pose(x=9.0)}, writer="laser")
+        builder.statics("arm", START + MS, {("lower", "world"): pose(x=9.0)}, writer="mix-up")
+        builder.statics("arm", START + 2 * MS, {("tool", "camera"): pose(x=1.0)})
+        builder.describe("arm", at=START + 3 * MS)
+        builder.joints("arm", START + 4 * MS, swing_positions(0))
     with Recording(tmp_path / "r.mcap") as recording:
         buffer = recording.buffer()
     placed = {frame.name: frame.parent for frame in buffer.frames() if frame.parent is not None}
@@ -166,10 +168,10 @@ def test_lookup_many_memory_does_not_grow_with_the_recording(tmp_path: Path, spa
     # 40 edges of 64 bytes: the large recording would fill a buffer with 50 MB.
     sizes = {"small": 1_000, "large": 20_000}
     for name, count in sizes.items():
-        with RecordingBuilder(tmp_path / name, "cart") as tale:
+        with RecordingBuilder(tmp_path / name, "cart") as builder:
             for n in range(count):
                 edges = {("odom", f"base{k}"): pose(n, k) for k in range(40)}
-                tale.edges("cart", START + n * 10 * MS, edges)
+                builder.edges("cart", START + n * 10 * MS, edges)
     child: Child = spawn(MEMORY, str(tmp_path / "small"), str(tmp_path / "large"))
     small, large = int(child.line(60)), int(child.line(60))
     assert large - small < 20, (small, large)
@@ -189,10 +191,10 @@ def test_buffer_keeps_samples_around_requested_stamps():
 
 
 def test_lookup_before_the_recording_does_not_suggest_a_listener(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(3):
-            tale.joints("arm", START + n * S, swing_positions(n))
+            builder.joints("arm", START + n * S, swing_positions(n))
     with Recording(tmp_path / "r.mcap") as recording:
         buffer = recording.buffer()
     frames = [frame for frame in buffer.frames() if frame.kind == "joint"]

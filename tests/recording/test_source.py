@@ -20,10 +20,10 @@ NOW = 1_900_000_000 * S
 
 
 def arm(path: Path, count: int = 100, **options: object) -> Path:
-    with RecordingBuilder(path, "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(path, "arm") as builder:
+        builder.describe("arm")
         for n in range(count):
-            tale.joints(
+            builder.joints(
                 "arm", START + n * 10 * MS + n % 3, swing_positions(n), swing_velocities(n), **options
             )
     return path
@@ -85,22 +85,22 @@ def test_states_that_do_not_fit_the_model_are_counted_and_skipped(tmp_path: Path
 
 
 def test_restarted_writer_continues_at_its_log_times(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
-        tale.joints("arm", 500 * S, [1, 0], session=1, log_time=START)
-        tale.joints("arm", 3 * S, [2, 0], session=2, log_time=START + 2 * S)
-        tale.joints("arm", 4 * S, [3, 0], session=2, log_time=START + 3 * S)
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
+        builder.joints("arm", 500 * S, [1, 0], session=1, log_time=START)
+        builder.joints("arm", 3 * S, [2, 0], session=2, log_time=START + 2 * S)
+        builder.joints("arm", 4 * S, [3, 0], session=2, log_time=START + 3 * S)
     with RecordedSource(tmp_path / "r.mcap", None, RRBOT) as source:
         stamps = [source.read(NOW + n * S) for n in range(4)]
-    told = [None if reading is None else (reading.stamp, reading.positions[0]) for reading in stamps]
-    assert told == [(NOW, 1.0), None, (NOW + 2 * S, 2.0), (NOW + 3 * S, 3.0)]
+    found = [None if reading is None else (reading.stamp, reading.positions[0]) for reading in stamps]
+    assert found == [(NOW, 1.0), None, (NOW + 2 * S, 2.0), (NOW + 3 * S, 3.0)]
 
 
 def test_late_sample_does_not_move_the_robot_back(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for number, millisecond in enumerate([0, 20, 10, 30]):
-            tale.joints("arm", START + millisecond * MS, [number, 0], log_time=START + number * MS)
+            builder.joints("arm", START + millisecond * MS, [number, 0], log_time=START + number * MS)
     with RecordedSource(tmp_path / "r.mcap", None, RRBOT) as source:
         seen = [source.read(NOW + n * 10 * MS) for n in range(4)]
     assert [None if reading is None else reading.positions[0] for reading in seen] == [0.0, None, 1.0, 3.0]
@@ -115,5 +115,5 @@ def test_publisher_runs_with_a_recorded_source(tmp_path: Path):
     ):
         report = publisher.run(source, 1000.0, seconds=source.duration_s + 0.001)
         assert source.ended
-        # From the description to the last state, 90 ms later, which took 200 us to be heard.
+        # From the description to the last state, 90 ms later, which arrived 200 us after its stamp.
         assert report.ticks == 91

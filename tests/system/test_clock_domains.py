@@ -83,7 +83,7 @@ def test_robots_of_two_clocks_share_a_buffer_and_a_path_across_them_raises_clock
 
 
 def two_clocks() -> TransformBuffer:
-    """A buffer with r1 of the system's clock and r2 of a simulated one, joined by a static edge."""
+    """A buffer with r1 on the system clock and r2 on a simulated one, joined by a static edge."""
     buffer = TransformBuffer()
     for robot, domain, stamp in (("r1", "system", NOW), ("r2", "sim", 5 * SECOND)):
         track = buffer.add_robot(RRBOT, robot)
@@ -182,7 +182,7 @@ def test_default_domain_is_that_of_most_robots_with_samples(sessions):
             until(lambda before=before: listener.stats.received > before)
             if name != "v2":
                 assert domain.name == expected
-        # A robot that has left counts no more.
+        # A robot that has left does not count.
         robots["r1"].close()
         until(lambda: domain.name == "sim")
         assert domain.domain_of("r1") == "system"
@@ -213,7 +213,7 @@ def test_age_limit_of_another_clock_is_an_error_naming_both(sessions):
         virtual.publish([0.5, 0.5])
         listener.buffer.wait("world", "tool", timeout_s=5.0)
         until(lambda: listener.buffer.domain.domain_of("r1") == "sim")
-        for timeout_s in (0.0, 60.0):  # the clock that was given stays: nothing to wait for
+        for timeout_s in (0.0, 60.0):  # the given clock does not change, so waiting is no use
             with pytest.raises(ClockMismatch, match="max_age_s is measured by a clock of 'system'") as caught:
                 listener.buffer.lookup("world", "tool", max_age_s=1.0, timeout_s=timeout_s)
         assert (caught.value.domains, caught.value.robots) == (("sim", "system"), ("r1",))
@@ -323,15 +323,15 @@ def test_clock_set_back_by_less_than_the_history_starts_a_new_history_of_that_ro
     assert "'r2'" not in caplog.text
 
 
-def a_follower(history_s: float = 10.0) -> tuple[TransformBuffer, JointStateIngest]:
+def joint_ingest(history_s: float = 10.0) -> tuple[TransformBuffer, JointStateIngest]:
     buffer = TransformBuffer(history_s)
     ingest = JointStateIngest("r1", FrameOwnership(buffer, Counters()))
     ingest.describe(RobotDescription(1, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, ()))
     return buffer, ingest
 
 
-def take(ingest: JointStateIngest, *samples: tuple[int, int]) -> None:
-    """Take samples of these numbers and stamps [ms after NOW]."""
+def insert_samples(ingest: JointStateIngest, *samples: tuple[int, int]) -> None:
+    """Inserts samples with these sequence numbers and stamps [ms after NOW]."""
     for seq, stamp in samples:
         order = order_digest(RRBOT.joint_names)
         ingest.insert_sample(
@@ -340,22 +340,22 @@ def take(ingest: JointStateIngest, *samples: tuple[int, int]) -> None:
 
 
 def test_reordered_samples_are_sorted_in():
-    buffer, ingest = a_follower()
-    take(ingest, (0, 0), (1, 1_000), (5, 5_000), (2, 2_000), (3, 3_000), (4, 4_000), (6, 6_000))
+    buffer, ingest = joint_ingest()
+    insert_samples(ingest, (0, 0), (1, 1_000), (5, 5_000), (2, 2_000), (3, 3_000), (4, 4_000), (6, 6_000))
     for stamp in range(0, 7_000, 1_000):
         assert buffer.lookup("world", "tool", NOW + stamp * MS).kind == "exact"
 
 
 def test_one_wrong_stamp_does_not_restart_a_history():
-    buffer, ingest = a_follower()
-    take(ingest, (0, 0), (1, 10), (2, -5_000), (3, 20), (4, 30))
+    buffer, ingest = joint_ingest()
+    insert_samples(ingest, (0, 0), (1, 10), (2, -5_000), (3, 20), (4, 30))
     assert buffer.can_lookup("world", "tool", NOW)
     assert buffer.latest("world", "tool") == NOW + 30 * MS
 
 
 def test_clock_set_back_is_detected_if_samples_are_lost_at_that_moment():
-    buffer, ingest = a_follower()
-    take(ingest, (0, 0), (1, 10), (9, -5_000), (10, -4_990))
+    buffer, ingest = joint_ingest()
+    insert_samples(ingest, (0, 0), (1, 10), (9, -5_000), (10, -4_990))
     assert buffer.latest("world", "tool") == NOW - 4_990 * MS
     assert not buffer.can_lookup("world", "tool", NOW)
 
@@ -369,7 +369,7 @@ def test_restarted_simulation_is_a_new_epoch_at_its_second_sample(sessions, foll
         TransformListener(reader, "r1", follow=follow, history_s=10.0) as listener,
     ):
         wait_for_stream_readers(writer, "r1", follow)
-        # Eight seconds, well inside of the history, then the start again.
+        # Eight seconds, less than the history, then a restart.
         for stamp in (0, 4 * SECOND, 8 * SECOND, 0, 10 * MS):
             clock.set(stamp)
             publisher.publish([0.5, 0.5])
@@ -387,7 +387,7 @@ def test_stamps_far_off_are_used_counted_and_logged_once_per_program(sessions, c
     ):
         for start in (1, 2):
             with StatePublisher(writer, RRBOT, "r1", program="driver") as publisher:
-                # Its model, and so whose time it keeps, and its name.
+                # The listener has the description, which has the clock, and the name of the writer.
                 until(lambda: any("driver@" in (one.writer or "") for one in listener.buffer.frames()))
                 wait_for_stream_readers(writer, "r1")
                 for number in range(5):
@@ -432,11 +432,11 @@ def test_stamps_of_transforms_are_checked_without_a_description(sessions):
     edges = (("base", "hand"),)
     pose = to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     with (
-        StreamPublisher(writer, "zstate/r1/tf", ENCODINGS[TransformSample]) as stranger,
+        StreamPublisher(writer, "zstate/r1/tf", ENCODINGS[TransformSample]) as publisher,
         TransformListener(reader, "r1", follow="tf") as listener,
     ):
-        until(lambda: stranger.has_readers)
-        stranger.put(encode(TransformSample(5, 0, 9, order_digest(edges), pose, edges)))
+        until(lambda: publisher.has_readers)
+        publisher.put(encode(TransformSample(5, 0, 9, order_digest(edges), pose, edges)))
         until(lambda: listener.stats.off_clock == 1)
         assert listener.buffer.lookup("base", "hand").stamp == 5
 
@@ -444,14 +444,14 @@ def test_stamps_of_transforms_are_checked_without_a_description(sessions):
 def test_simulated_time_is_never_far_off(sessions):
     writer, reader = sessions
     with (
-        ClockPublisher(writer) as told,
+        ClockPublisher(writer) as clock_publisher,
         SimulatedClock(reader) as clock,
         StatePublisher(writer, RRBOT, "r1", clock=simulated()) as publisher,
         TransformListener(reader, "r1", clock=clock) as listener,
     ):
         wait_for_reader(writer, "zstate/clock")
         wait_for_stream_readers(writer, "r1")
-        told.publish(HOUR)
+        clock_publisher.publish(HOUR)
         publisher.publish([0.5, 0.5])
         until(lambda: listener.stats.received == 1)
         assert listener.stats.off_clock == 0
@@ -459,11 +459,11 @@ def test_simulated_time_is_never_far_off(sessions):
 
 def test_replay_has_its_own_clock_domain(sessions, tmp_path):
     writer, reader = sessions
-    with RecordingBuilder(tmp_path / "run.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as builder:
+        builder.describe("arm")
         for number in range(10):
-            tale.joints("arm", START + number * 10 * MS, [0.1 * number, 0.0])
-        tale.edges("cart", START + 20 * MS, {("floor", "cart"): [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]})
+            builder.joints("arm", START + number * 10 * MS, [0.1 * number, 0.0])
+        builder.edges("cart", START + 20 * MS, {("floor", "cart"): [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]})
     with (
         StatePublisher(writer, RRBOT, "r1"),
         TransformListener(reader, "*", clock=SystemClock()) as listener,

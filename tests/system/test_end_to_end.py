@@ -196,10 +196,12 @@ def test_restarted_publisher_is_received_again_and_other_robots_are_unaffected(s
 
 def test_wait_for_a_missing_robot_can_be_interrupted(spawn):
     child = started(spawn(WAITER))
-    # Python loses a signal between its last check and the wait itself; that is not tested here.
-    asleep = Path(f"/proc/{child.process.pid}/stat")
-    looks: list[bool] = []
-    until(lambda: looks.append(") S " in asleep.read_text()) or (len(looks) >= 20 and all(looks[-20:])))
+    # Python loses a signal between its last check and the wait itself, which is not tested here.
+    stat = Path(f"/proc/{child.process.pid}/stat")
+    sleeping: list[bool] = []
+    until(
+        lambda: sleeping.append(") S " in stat.read_text()) or (len(sleeping) >= 20 and all(sleeping[-20:]))
+    )
     interrupt(child)
 
 

@@ -12,7 +12,7 @@ from helpers.robots import wait_for_reader, wait_for_stream_readers
 
 from zstate import SineSource, StatePublisher, Transform, TransformBuffer, load_model
 from zstate.recording.recorder import Recorder
-from zstate.view.data_source import FixedFrame, ViewSource, default_fixed_frame
+from zstate.view.data_source import FixedFrame, ViewSource
 
 MODEL = load_model("rrbot")
 SECOND = 1_000_000_000
@@ -177,7 +177,7 @@ def test_default_fixed_frame_is_the_root_with_the_most_frames():
     buffer = rrbot_buffer()
     buffer.insert_static(Transform("map", "odom", [0, 0, 0], [0, 0, 0, 1]))
     with ViewSource(None, buffer=buffer) as source:
-        assert default_fixed_frame(source.snapshot().tree) == f"r1/{MODEL.root}"
+        assert FixedFrame().resolve(source.snapshot().tree) == f"r1/{MODEL.root}"
 
 
 def test_requested_fixed_frame_is_used_while_it_exists():

@@ -14,7 +14,7 @@ from PIL import Image
 trimesh = pytest.importorskip("trimesh")
 
 from zstate import load_model  # noqa: E402
-from zstate.model.geometry import Box, Cylinder, MeshFile, Shape, Sphere, parse_shapes  # noqa: E402
+from zstate.model.geometry import Box, Cylinder, MeshFile, Shape, Sphere, read_shapes  # noqa: E402
 from zstate.se3 import IDENTITY  # noqa: E402
 from zstate.view.mesh_geometry import smooth_normals  # noqa: E402
 from zstate.view.mesh_paths import MissingFile  # noqa: E402
@@ -247,7 +247,7 @@ def test_unsupported_format_error_lists_supported_formats(tmp_path):
 @pytest.mark.parametrize("name", ["panda", "talos", "ur5", "anymal_c"])
 def test_all_meshes_of_known_robots_are_found(name):
     meshes = Meshes()
-    for one in parse_shapes(load_model(name)):
+    for one in read_shapes(load_model(name))[0]:
         assert not isinstance(meshes.load(one), MissingFile)
         assert meshes.missing_texture(one) is None
 

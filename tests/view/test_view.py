@@ -62,13 +62,13 @@ def test_drawing_error_is_logged_once_shown_on_the_page_and_retried(page, caplog
         drawing(view, page) as thread,
     ):
         until(lambda: source.tries > 3)
-        assert not view.fault
+        assert not view.layout.fault
         source.fails = True
-        until(lambda: "ValueError: try number" in view.fault)
+        until(lambda: "ValueError: try number" in view.layout.fault)
         tried = source.tries
         until(lambda: source.tries > tried + 3)
         source.fails = False
-        until(lambda: not view.fault)
+        until(lambda: not view.layout.fault)
         assert thread.is_alive()
     (logged,) = [record.getMessage() for record in caplog.records]
     assert "failed to draw a picture (ValueError: try number" in logged

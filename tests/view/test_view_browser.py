@@ -13,7 +13,7 @@ from helpers.processes import DEADLINE_S, repeated, until
 from numpy.typing import NDArray
 
 from zstate import StatePublisher, load_model
-from zstate.model.geometry import parse_shapes
+from zstate.model.geometry import read_shapes
 from zstate.net.session import Session
 from zstate.view.camera import FIELD_OF_VIEW, CameraPose, fit_camera
 from zstate.view.data_source import ViewSource
@@ -98,7 +98,7 @@ def test_robot_meshes_are_drawn_at_the_poses_of_their_links(robot: str, open_tab
         framing = fit_camera(snapshot, placed, 1.0, shown.view.scene.corners(snapshot.tree, placed))
         assert framing is not None
         height, width = surface.shape
-        drawn = {shape.link for shape in parse_shapes(shown.source.models[robot]) if shape.role == "visual"}
+        drawn = {shape.link for shape in read_shapes(shown.source.models[robot])[0] if shape.role == "visual"}
         rows = [row for row, name in enumerate(snapshot.tree.names) if name.partition("/")[2] in drawn]
         places = pixels_of(placed[rows, :3], framing, (width, height))
         # Every link with a mesh is drawn at its frame ...

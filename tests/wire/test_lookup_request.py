@@ -91,7 +91,7 @@ def test_an_error_in_json_names_its_class_its_text_and_its_facts():
         b'{"error": "SystemExit", "message": "late"}',
     ],
 )
-def test_whatever_else_somebody_answers_is_a_network_error_with_what_was_said(text: bytes):
+def test_any_other_reply_is_a_network_error_with_its_text(text: bytes):
     error = error_from_json(text)
     assert type(error) is NetworkError
     assert ("late" if b"late" in text else repr(text)) in str(error)

@@ -17,7 +17,7 @@ from zstate.wire.messages import (
 EDGES = (("base", "arm"), ("arm", "hand"))
 
 
-def test_a_block_is_little_endian_float64_whatever_the_array_was():
+def test_block_is_little_endian_float64_for_any_array():
     # 1.0 is sign 0, exponent 1023, fraction 0: 3f f0 00 .. read from the high end
     assert to_block([1, -2]) == bytes.fromhex("000000000000f03f 00000000000000c0")
     big_endian = np.array([1.0, -2.0], dtype=">f8")
@@ -34,7 +34,7 @@ def test_numbers_read_from_a_block_share_its_memory_and_cannot_be_written():
         numbers[0] = 1.0
 
 
-def test_poses_come_back_as_rows_of_seven_even_when_there_are_none():
+def test_poses_are_rows_of_seven_even_without_poses():
     poses = np.arange(14.0).reshape(2, 7)
     np.testing.assert_array_equal(poses_from_block(to_block(poses)), poses)
     assert poses_from_block(b"").shape == (0, 7)

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from zstate.errors import MessageError
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     ClockMessage,
@@ -24,7 +23,7 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, NativeWire, decode, encode
-from zstate.wire.protocol import EntityId, SerializedSample, StreamEncoder, Wire
+from zstate.wire.protocol import SerializedSample, StreamEncoder, Wire, WriterNode
 
 WRITER = WriterId("arm", "jetson", 412, 5, 7)
 NAMES = ("j1", "j2")
@@ -221,7 +220,7 @@ def test_the_wire_does_not_check_for_infinite_numbers():
 
 
 @given(st.binary(max_size=200), st.sampled_from(list(ENCODINGS)))
-def test_arbitrary_bytes_raise_nothing_but_a_message_error(payload: bytes, kind: type[Message]):
+def test_arbitrary_bytes_raise_only_message_error(payload: bytes, kind: type[Message]):
     try:
         decode(payload, ENCODINGS[kind], kind)
     except MessageError as error:
@@ -229,7 +228,7 @@ def test_arbitrary_bytes_raise_nothing_but_a_message_error(payload: bytes, kind:
 
 
 @given(st.sampled_from(MESSAGES), st.integers(0, 10_000), st.integers(0, 255))
-def test_one_changed_byte_raises_nothing_but_a_message_error(message: Message, at: int, value: int):
+def test_one_changed_byte_raises_only_message_error(message: Message, at: int, value: int):
     payload = bytearray(encode(message))
     payload[at % len(payload)] = value
     try:
@@ -239,10 +238,7 @@ def test_one_changed_byte_raises_nothing_but_a_message_error(message: Message, a
 
 
 def encoder_of(stream: Stream, name: str = "") -> StreamEncoder:
-    node = EntityId("z1", 0)
-    return NativeWire().stream_encoder(
-        "r1", WRITER, stream, node=node, number=0, sample_names=SampleLayout(), name=name
-    )
+    return NativeWire().stream_encoder(WriterNode("r1", WRITER, "z1", 0), stream, number=0, name=name)
 
 
 def test_native_wire_implements_the_protocol_for_every_stream():

@@ -1,8 +1,10 @@
-"""Texts of durations and stamps, and the likely reason why two stamps are far apart."""
+"""Texts in messages: durations and stamps, why two stamps are far apart, suggestions for misspelled names."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import datetime, timezone
+from difflib import get_close_matches
 
 _SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * _SECOND_NS
@@ -64,3 +66,14 @@ def difference_text(requested: int, newest: int) -> str:
         f"{requested_text}, is wall-clock time, but the samples have simulated stamps, or those of a "
         f"machine whose clock was never set {newest_text}"
     )
+
+
+def did_you_mean(name: str, candidates: Iterable[str], *, count: int = 1) -> str:
+    """``; did you mean 'x'?`` with the ``candidates`` most similar to ``name``; empty without any."""
+    return suggestion_text(*get_close_matches(name, list(candidates), n=count))
+
+
+def suggestion_text(*names: str | None) -> str:
+    """``; did you mean 'x' or 'y'?``; empty without names. None stands for no name."""
+    found = [repr(name) for name in names if name is not None]
+    return f"; did you mean {' or '.join(found)}?" if found else ""

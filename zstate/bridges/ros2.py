@@ -23,7 +23,7 @@ from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.transforms import StaticTransformIngest
 from zstate.model.robot import RobotModel
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import watch
+from zstate.net.presence import WriterWatch
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
@@ -234,8 +234,7 @@ class Bridge(Closeable):
             BridgeSide(native, "native", "native to ROS"),
             BridgeSide(ros, ros_wire, "ROS to native"),
         )
-        ignore: Callable[[str, Way | None], object] = lambda _robot, _way: None  # noqa: E731
-        self._on_change = on_change or ignore
+        self._on_change: Callable[[str, Way | None], object] = on_change or (lambda _robot, _way: None)
         self._writers: defaultdict[str, tuple[set[Announcement], ...]] = defaultdict(lambda: (set(), set()))
         self._carriers: dict[str, RobotBridge] = {}
         self._conflicts: set[str] = set()
@@ -245,7 +244,7 @@ class Bridge(Closeable):
             for number, side in enumerate(self._sides):
                 for robot in robots or (ANY,):
                     on_writer = partial(self._on_writer, number)
-                    opening.enter_context(watch(side.session, robot, on_writer, side.wire))
+                    opening.enter_context(WriterWatch(side.session, robot, on_writer, side.wire))
             self._opened = opening.pop_all()
 
     @property

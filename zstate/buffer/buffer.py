@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import AsyncIterable, Callable, Collection
 from contextlib import suppress
 from functools import partial
-from typing import TypeVar
+from numbers import Real
+from operator import attrgetter
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer.core import BufferCore, Query, check_duration
-from zstate.buffer.path import Plan, joints_path
-from zstate.buffer.snapshot import (
-    FramePoses,
-    FrameTable,
-    JointHistory,
-    SnapshotReader,
-    TimeSpan,
-    joint_history,
-)
-from zstate.buffer.tracks import JointTrack
-from zstate.buffer.waiting import MessageFilter, TransformWatch, frame_of, stamp_of
+from zstate.buffer.core import BufferCore
+from zstate.buffer.path import Plan, TransformPath, joints_path
+from zstate.buffer.snapshot import FramePoses, FrameTable, JointHistory, SnapshotReader, TimeSpan
+from zstate.buffer.tracks import JointTrack, Track
+from zstate.buffer.waiting import MessageFilter, RequiredStamps, TransformWatch, Waiter, WakeCondition
 from zstate.checks import check_names
 from zstate.clock import Clock, check_stamp, check_stamps, wait_interruptible
-from zstate.errors import Closed, InvalidInput, LookupFailed, NotFinite, as_timeout
+from zstate.errors import (
+    AmbiguousFrame,
+    ClockMismatch,
+    Closed,
+    Disconnected,
+    InFuture,
+    InPast,
+    InvalidInput,
+    LookupFailed,
+    NotFinite,
+    Stale,
+    UnknownFrame,
+    as_timeout,
+)
 from zstate.transform import Transform, Twist
 
 S = TypeVar("S")
@@ -36,6 +45,23 @@ DEFAULT_HISTORY_S = 10.0
 
 # The number of choices of robots whose snapshot readers are cached.
 _MAX_CACHED_READERS = 16
+
+
+# No stamp of 64 bits is further away.
+_MAX_PREDICTION_S = 2e10
+
+# Errors that only a change of the tree can end.
+_NO_PATH = (UnknownFrame, AmbiguousFrame, Disconnected, ClockMismatch)
+
+
+class Query(NamedTuple):
+    """The checked arguments of a lookup."""
+
+    target: str
+    source: str
+    at: int | None
+    predict_ns: int = 0
+    max_age_s: float | None = None
 
 
 class TransformBuffer(BufferCore):
@@ -220,6 +246,77 @@ class TransformBuffer(BufferCore):
                 if not wait_interruptible(event, deadline - time.monotonic()):
                     raise as_timeout(outcome, timeout_s)
 
+    def _query(
+        self,
+        target: str,
+        source: str,
+        at: int | None,
+        *,
+        predict_s: float = 0.0,
+        max_age_s: float | None = None,
+    ) -> Query:
+        check_names(target, source)
+        if max_age_s is not None:
+            check_duration("max_age_s", max_age_s)
+        predict_ns = round(check_duration("predict_s", predict_s, _MAX_PREDICTION_S) * 1e9)
+        return Query(target, source, None if at is None else check_stamp(at), predict_ns, max_age_s)
+
+    def _lookup(self, query: Query) -> Transform:
+        try:
+            path = self._cached_path(query.target, query.source).path
+            transform = path.transform(query.at, query.predict_ns)
+        except LookupFailed as reason:
+            if reason.requested is None:
+                reason.requested = query.at
+            if self._stop_reason:
+                reason.ended = self._stop_reason
+            raise
+        if query.max_age_s is None:
+            return transform
+        if path.domain not in ("", self.clock.domain):
+            use, names, domains = path.uses[0], (path.target, path.source), (path.domain, self.clock.domain)
+            raise ClockMismatch(*names, edges=(use.edge,), robots=(use.track.name,), domains=domains)
+        age_s = transform.age(self.clock)
+        if path.uses and age_s > query.max_age_s:
+            raise path.stale(transform.stamp, age_s, query.max_age_s)
+        return transform
+
+    def _lookup_or_expect(self, query: Query, waiter: Waiter) -> Transform | LookupFailed:
+        """The transform, or the reason that ``waiter`` expects to end. Raises one that no insert can end."""
+        version = self._tree.version
+        try:
+            return self._lookup(query)
+        except LookupFailed as reason:
+            return self._expect_change(query, reason, waiter, version)
+
+    def _lookup_newest(self, query: Query, waiter: Waiter) -> Transform | LookupFailed:
+        """The newest transform, with ``waiter`` expecting a newer one; else as ``_lookup_or_expect``."""
+        version = self._tree.version
+        try:
+            _, path, dependencies = self._cached_path(query.target, query.source)
+            transform = path.transform(None)
+        except LookupFailed as reason:
+            return self._expect_change(query, reason, waiter, version)
+        newer = None if transform.stamp is None else transform.stamp + 1
+        waiter.expect(WakeCondition(dependencies, {use.track: newer for use in path.uses}), version)
+        return transform
+
+    def _expect_change(
+        self, query: Query, reason: LookupFailed, waiter: Waiter, version: int
+    ) -> LookupFailed:
+        condition = WakeCondition()
+        if isinstance(reason, _NO_PATH):
+            with self._lock:
+                condition = WakeCondition(self._tree.dependencies(query.target, query.source))
+        else:
+            with suppress(LookupFailed):  # the tree has changed since, which its version shows
+                _, path, dependencies = self._cached_path(query.target, query.source)
+                condition = WakeCondition(dependencies, _required_stamps(query, reason, path), query.at)
+        waiter.expect(condition, version)
+        if _is_final(query, reason, condition):
+            raise reason
+        return reason
+
     def watch(
         self,
         target: str,
@@ -245,8 +342,8 @@ class TransformBuffer(BufferCore):
         samples: AsyncIterable[S],
         target: str,
         *,
-        frame: Callable[[S], str] = frame_of,
-        stamp: Callable[[S], int] = stamp_of,
+        frame: Callable[[S], str] = attrgetter("frame"),
+        stamp: Callable[[S], int] = attrgetter("stamp"),
         timeout_s: float = 1.0,
     ) -> MessageFilter[S]:
         """``async for sample, transform in buffer.join(samples, target)``: each with its own transform.
@@ -268,11 +365,11 @@ class TransformBuffer(BufferCore):
         """
         self._check_owned(track)
         path = joints_path(track, self._read_views)
-        readout = path.read(None if at is None else check_stamp(at))
-        positions = np.hstack([np.empty(0), *readout.values[0]])
+        values, stamp, *_ = path.read(None if at is None else check_stamp(at))
+        positions = np.hstack([np.empty(0), *values[0]])
         if not np.isfinite(positions).all():
-            raise path.not_finite(readout.values, readout.stamp)
-        return positions, readout.stamp
+            raise path.not_finite(values, stamp)
+        return positions, stamp
 
     def link_poses(self, track: JointTrack, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """Every link of one robot at a stamp, and that stamp: (L, 7), rows as ``track.model.links``.
@@ -291,7 +388,13 @@ class TransformBuffer(BufferCore):
         self, track: JointTrack, until: int, duration_s: float, points: int = 240
     ) -> JointHistory:
         """The samples of ``duration_s`` up to ``until`` [ns]; every n-th of more than ``points``."""
-        return joint_history(track, until, duration_s, points)
+        view = track.history.view
+        stamps, rows = view.kept_stamps(), view.kept_rows()
+        first, end = np.searchsorted(stamps, (until - round(duration_s * 1e9), until + 1)).tolist()
+        step = max(1, -(-(end - first) // points))
+        # Counted from the first sample kept, so that consecutive plots choose the same samples.
+        chosen = slice(first + (-first) % step, end, step)
+        return JointHistory(stamps[chosen], rows[chosen, : track.model.position_count])
 
     def snapshot(
         self, at: int | None = None, *, robots: Collection[str] = (), hold_s: float = 0.0
@@ -334,3 +437,40 @@ class TransformBuffer(BufferCore):
         newest = max(view.newest for view in views)
         oldest = min(view.oldest for view in views)
         return TimeSpan(max(oldest, newest - round(self.history_s * 1e9)), newest)
+
+
+def _required_stamps(query: Query, reason: LookupFailed, path: TransformPath) -> RequiredStamps:
+    """The stamp that each track of the path must reach before another lookup may succeed."""
+    at = None if query.at is None else query.at - query.predict_ns
+    if isinstance(reason, Stale | NotFinite):
+        # After a silent edge, where the query had no instant, any newer sample may help.
+        last = reason.newest if reason.requested is None else reason.requested
+        at = None if last is None else last + 1
+    required: dict[Track, int | None] = {use.track: at for use in path.uses}
+    if isinstance(reason, InFuture) and at is not None and reason.newest is not None:
+        # If prediction is not possible from the samples there are, only a newer one helps.
+        limiting = [use.track for use in path.uses if use.edge == reason.edge]
+        required.update((track, max(at, reason.newest + 1)) for track in limiting)
+    return required
+
+
+def _is_final(query: Query, reason: LookupFailed, condition: WakeCondition) -> bool:
+    """Whether no later insert can turn the reason into a transform."""
+    if isinstance(reason, InPast):
+        # Before that, late samples are sorted in, and the history of a new listener is back-filled.
+        return condition.is_hopeless()
+    if isinstance(reason, Stale | NotFinite):
+        return query.at is not None
+    if isinstance(reason, ClockMismatch):
+        # Each of two robots may restart with the clock of the other; the clock given by the user stays.
+        return len(reason.edges) < 2
+    return isinstance(reason, AmbiguousFrame)
+
+
+def check_duration(name: str, value: float, most: float = 1e300) -> float:
+    """``value`` if it is a number of seconds of at most ``most``; else raises InvalidInput."""
+    if not isinstance(value, Real) or not 0.0 <= value < math.inf:
+        raise InvalidInput(f"{name} is a number of seconds, zero or more; got {value!r}")
+    if value > most:
+        raise InvalidInput(f"{name} is at most {most:g} seconds; got {value!r}")
+    return value

@@ -5,25 +5,24 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
-
-_CAPACITY = 4096
-"""The number of robots and of frames that are remembered; then the oldest are dropped."""
 
 
 class ClockDomain:
     """The clock domain of each robot. Robots of different domains may share one buffer.
 
     Stamps of two domains cannot be compared, so a path across both has no answer. ``name`` is the domain to
-    use where one has to be chosen: that of the clock given by the user, else that of most robots.
+    use where one has to be chosen: that of the clock given by the user, else that of most robots. The newest
+    4096 robots and frames are remembered.
     """
 
     def __init__(self, given: str | None = None) -> None:
         self.given = given
         """The domain of the user's clock, None without one."""
-        self._by_robot: dict[str, str] = {}
+        self._by_robot: BoundedDict[str, str] = BoundedDict()
         self._present: dict[str, None] = {}
-        self._robot_by_child: dict[str, str] = {}
+        self._robot_by_child: BoundedDict[str, str] = BoundedDict()
         self._lock = fork_safe_lock()
 
     @property
@@ -50,7 +49,7 @@ class ClockDomain:
         """Set the domain of ``robot``, as its description gives it. Returns whether that is a change."""
         with self._lock:
             before = self._by_robot.get(robot)
-            _set_newest(self._by_robot, robot, domain)
+            self._by_robot[robot] = domain
         return before != domain
 
     def place(self, robot: str, children: Iterable[str]) -> None:
@@ -59,7 +58,7 @@ class ClockDomain:
             if child.partition("/")[0] == robot:
                 self._robot_by_child.pop(child, None)
             else:
-                _set_newest(self._robot_by_child, child, robot)
+                self._robot_by_child[child] = robot
 
     def join(self, robot: str) -> None:
         """Count ``robot`` for the majority: it has samples."""
@@ -70,10 +69,3 @@ class ClockDomain:
         """Count ``robot`` no more: its writer has left. Samples it sent stay in its domain."""
         with self._lock:
             self._present.pop(robot, None)
-
-
-def _set_newest(values: dict[str, str], key: str, value: str) -> None:
-    values.pop(key, None)
-    values[key] = value
-    while len(values) > _CAPACITY:
-        del values[next(iter(values))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -18,44 +17,19 @@ from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencie
 from zstate.buffer.history import HistoryView, insert_together, keep_only_around
 from zstate.buffer.path import TrackUse, TransformPath, compile_path
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, check_poses, second_writer
-from zstate.buffer.tracks import ClockOffsets, Interpolation, JointTrack, PoseTrack, Track, TrackOwner
-from zstate.buffer.waiting import RequiredStamps, Waiter, WaiterRegistry, WakeCondition
+from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack, Track, TrackOwner
+from zstate.buffer.waiting import WaiterRegistry
 from zstate.checks import check_names, name_problem
 from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import (
-    AmbiguousFrame,
-    ClockMismatch,
-    Disconnected,
-    InFuture,
-    InPast,
     InsertRefused,
     InvalidInput,
-    LookupFailed,
-    NotFinite,
-    Stale,
-    UnknownFrame,
 )
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
 
 # The number of pairs of frames whose paths are cached; more than any program uses on purpose.
 _MAX_CACHED_PATHS = 4096
-
-# No stamp of 64 bits is further away.
-_MAX_PREDICTION_S = 2e10
-
-# Errors that only a change of the tree can end.
-_NO_PATH = (UnknownFrame, AmbiguousFrame, Disconnected, ClockMismatch)
-
-
-class Query(NamedTuple):
-    """The checked arguments of a lookup."""
-
-    target: str
-    source: str
-    at: int | None
-    predict_ns: int = 0
-    max_age_s: float | None = None
 
 
 class CachedPath(NamedTuple):
@@ -82,6 +56,8 @@ class BufferCore:
         self.ignored = 0
         """The number of samples that were older than the history reaches."""
         self._owner = TrackOwner()
+        self.clock_offsets = self._owner.clock_offsets
+        """By writer: a function that returns how far its clock is ahead of this host's, None if not known."""
         self._span_ns = round(history_s * 1e9)
         self._lock = fork_safe(threading.RLock())
         self._writes = 0
@@ -90,11 +66,6 @@ class BufferCore:
         self._pose_tracks = PoseTrackTable(self._tree, self._span_ns, self._owner)
         self._paths: dict[tuple[str, str], CachedPath] = {}
         self._stop_reason = ""
-
-    @property
-    def clock_offsets(self) -> ClockOffsets:
-        """By writer: a function that returns how far its clock is ahead of this host's, None if not known."""
-        return self._owner.clock_offsets
 
     @property
     def is_recording(self) -> bool:
@@ -133,37 +104,29 @@ class BufferCore:
                 raise InvalidInput(f"the prefix of a robot begins its frames' names; {problem}")
             prefix = prefix.removesuffix("/")
         if interpolation not in get_args(Interpolation):
-            raise InvalidInput(
-                f"interpolation is one of {', '.join(get_args(Interpolation))}; got {interpolation!r}"
-            )
+            kinds = ", ".join(get_args(Interpolation))
+            raise InvalidInput(f"interpolation is one of {kinds}; got {interpolation!r}")
         track = JointTrack(model, prefix, self._span_ns, interpolation)
         track.owner = self._owner
         with self._lock, self._tree.transaction():
             if prefix and self._tree.robots.get(prefix) is not None:
-                raise InsertRefused(
-                    f"there is a robot {prefix!r} in this buffer; remove_robot first",
-                    reason="second writer",
-                    edge=(prefix, model.root),
-                )
+                text = f"there is a robot {prefix!r} in this buffer; remove_robot first"
+                raise InsertRefused(text, reason="second writer", edge=(prefix, model.root))
             self._tree.add_frame(track.frame(model.root))
-            for index in range(len(track.forms)):
-                self._attach_joint(track, index)
+            for index, form in enumerate(track.forms):
+                parent, child = track.edge(form)
+                existing = self._tree.frames.get(child)
+                if existing is not None and existing.parent == parent:
+                    raise second_writer(parent, child, existing, f"the model of {model.name!r}")
+                self._tree.check_edge(parent, child, f"the model of {model.name!r}")
+                if form.kind == "fixed":
+                    edge = Edge(parent, child, "static", pose=form.origin, robot=track)
+                else:
+                    edge = Edge(parent, child, "joint", track=track, index=index, robot=track)
+                self._tree.attach(edge)
             self._tree.robots[prefix] = track
         self._waiters.notify()
         return track
-
-    def _attach_joint(self, track: JointTrack, index: int) -> None:
-        form = track.forms[index]
-        parent, child = track.edge(form)
-        existing = self._tree.frames.get(child)
-        if existing is not None and existing.parent == parent:
-            raise second_writer(parent, child, existing, f"the model of {track.model.name!r}")
-        self._tree.check_edge(parent, child, f"the model of {track.model.name!r}")
-        if form.kind == "fixed":
-            edge = Edge(parent, child, "static", pose=form.origin, robot=track)
-        else:
-            edge = Edge(parent, child, "joint", track=track, index=index, robot=track)
-        self._tree.attach(edge)
 
     def remove_robot(self, track: JointTrack) -> None:
         """Remove a robot's edges and history. Its frames stay, without a parent.
@@ -219,8 +182,10 @@ class BufferCore:
         """
         with self._lock:
             if track.owner is not self._owner:
-                raise _not_owned(track)
-            inserted = track.try_insert(stamp, positions, velocities)
+                self._check_owned(track)
+            inserted = None
+            if track.has_plain_joints:
+                inserted = track.history.try_insert(stamp, positions, velocities, track.position_count)
         if inserted:
             # Nearly every sample ends here, without the call in between.
             self._waiters.notify(track)
@@ -239,8 +204,18 @@ class BufferCore:
         return self._count(track, inserted=inserted)
 
     def _check_owned(self, track: Track) -> None:
-        if track.owner is not self._owner:
-            raise _not_owned(track)
+        if track.owner is self._owner:
+            return
+        if isinstance(track, JointTrack) and track.owner is None:
+            text = f"the robot {track.name!r} was removed from its buffer; add_robot gives a new track"
+            reason = "removed robot"
+        else:
+            text = f"the track {track.name!r} belongs to another buffer; use the buffer that made it"
+            reason = "another buffer"
+        edge = (
+            (track.name, track.frame(track.model.root)) if isinstance(track, JointTrack) else track.edges[0]
+        )
+        raise InsertRefused(text, reason=reason, edge=edge)
 
     def restart(self, track: JointTrack | PoseTrack) -> None:
         """Begin a new epoch: remove the samples of one track, because its writer or its clock restarted.
@@ -260,11 +235,8 @@ class BufferCore:
         """
         edge = (transform.target, transform.source)
         if transform.stamp is None:
-            raise InsertRefused(
-                f"{edge[0]!r} -> {edge[1]!r} has no stamp; use insert_static for an edge that never moves",
-                reason="no stamp",
-                edge=edge,
-            )
+            text = f"{edge[0]!r} -> {edge[1]!r} has no stamp; use insert_static for an edge that never moves"
+            raise InsertRefused(text, reason="no stamp", edge=edge)
         return self._insert_poses((edge,), transform.stamp, transform.pose7[None], writer)
 
     def insert_many(
@@ -333,11 +305,8 @@ class BufferCore:
                 raise InvalidInput(f"there is no frame {child!r} to withdraw{hint}")
             edge = self._tree.frames[name]
             if edge is not None and edge.robot is not None:
-                raise InsertRefused(
-                    f"{name!r} is placed by {edge.writer}; remove_robot removes the whole robot",
-                    reason="second writer",
-                    edge=edge.names,
-                )
+                text = f"{name!r} is placed by {edge.writer}; remove_robot removes the whole robot"
+                raise InsertRefused(text, reason="second writer", edge=edge.names)
             if edge is not None:
                 self._pose_tracks.split_edge(edge.names)
             self._tree.detach(name)
@@ -394,8 +363,7 @@ class BufferCore:
                 f"the buffer was given a clock of {given!r} time, and now one of {clock.domain!r} time; "
                 "give both the same, or a buffer without a clock"
             )
-        self.clock = clock
-        self.domain.given = clock.domain
+        self.clock, self.domain.given = clock, clock.domain
 
     def domain_between(self, target: str, source: str) -> str | None:
         """The clock domain of transforms between two frames, None if not known. Raises as ``plan``."""
@@ -403,6 +371,7 @@ class BufferCore:
 
     def path(self, target: str, source: str, *, compiled: bool = True) -> TransformPath:
         """The cached path between two frames; a new one without the extension if not ``compiled``."""
+        check_names(target, source)
         if compiled:
             return self._cached_path(target, source).path
         with self._lock:
@@ -410,17 +379,12 @@ class BufferCore:
             return compile_path(target, source, edges, self._read_views, compiled=False)
 
     def _cached_path(self, target: str, source: str) -> CachedPath:
-        version = self._tree.version
-        try:
-            cached = self._paths.get((target, source))
-        except TypeError:  # of a list, which has no hash and is no name
-            cached = None
+        version, cached = self._tree.version, self._paths.get((target, source))
         if cached is not None and cached.version == version:
             return cached
         if cached is not None and self._tree.is_current(cached.dependencies):
             cached = cached._replace(version=version)
         else:
-            check_names(target, source)
             with self._lock:
                 edges = self._tree.path(target, source)
                 path = compile_path(target, source, edges, self._read_views)
@@ -438,128 +402,3 @@ class BufferCore:
             return views
         with self._lock:
             return [use.track.history.view for use in uses]
-
-    def _query(
-        self,
-        target: str,
-        source: str,
-        at: int | None,
-        *,
-        predict_s: float = 0.0,
-        max_age_s: float | None = None,
-    ) -> Query:
-        check_names(target, source)
-        if max_age_s is not None:
-            check_duration("max_age_s", max_age_s)
-        predict_ns = round(check_duration("predict_s", predict_s, _MAX_PREDICTION_S) * 1e9)
-        return Query(target, source, None if at is None else check_stamp(at), predict_ns, max_age_s)
-
-    def _lookup(self, query: Query) -> Transform:
-        try:
-            path = self._cached_path(query.target, query.source).path
-            transform = path.transform(query.at, query.predict_ns)
-        except LookupFailed as reason:
-            if reason.requested is None:
-                reason.requested = query.at
-            if self._stop_reason:
-                reason.ended = self._stop_reason
-            raise
-        if query.max_age_s is not None:
-            self._check_age(path, transform, query.max_age_s)
-        return transform
-
-    def _check_age(self, path: TransformPath, transform: Transform, max_age_s: float) -> None:
-        if path.domain not in ("", self.clock.domain):
-            use, domains = path.uses[0], (path.domain, self.clock.domain)
-            names = (path.target, path.source)
-            raise ClockMismatch(*names, edges=(use.edge,), robots=(use.track.name,), domains=domains)
-        age_s = transform.age(self.clock)
-        if path.uses and age_s > max_age_s:
-            raise path.stale(transform.stamp, age_s, max_age_s)
-
-    def _lookup_or_expect(self, query: Query, waiter: Waiter) -> Transform | LookupFailed:
-        """The transform; or the reason against it, with the wake condition of ``waiter`` set.
-
-        Raises a reason that no later insert can end.
-        """
-        version = self._tree.version
-        try:
-            return self._lookup(query)
-        except LookupFailed as reason:
-            return self._expect_change(query, reason, waiter, version)
-
-    def _lookup_newest(self, query: Query, waiter: Waiter) -> Transform | LookupFailed:
-        """The newest transform, with ``waiter`` expecting a newer one; else as ``_lookup_or_expect``."""
-        version = self._tree.version
-        try:
-            _, path, dependencies = self._cached_path(query.target, query.source)
-            transform = path.transform(None)
-        except LookupFailed as reason:
-            return self._expect_change(query, reason, waiter, version)
-        newer = None if transform.stamp is None else transform.stamp + 1
-        waiter.expect(WakeCondition(dependencies, dict.fromkeys(path.tracks, newer)), version)
-        return transform
-
-    def _expect_change(
-        self, query: Query, reason: LookupFailed, waiter: Waiter, version: int
-    ) -> LookupFailed:
-        condition = WakeCondition()
-        if isinstance(reason, _NO_PATH):
-            with self._lock:
-                condition = WakeCondition(self._tree.dependencies(query.target, query.source))
-        else:
-            with suppress(LookupFailed):  # the tree has changed since, which its version shows
-                _, path, dependencies = self._cached_path(query.target, query.source)
-                condition = WakeCondition(dependencies, _required_stamps(query, reason, path), query.at)
-        waiter.expect(condition, version)
-        if _is_final(query, reason, condition):
-            raise reason
-        return reason
-
-
-def _required_stamps(query: Query, reason: LookupFailed, path: TransformPath) -> RequiredStamps:
-    """The stamp that each track of the path must reach before another lookup may succeed."""
-    at = None if query.at is None else query.at - query.predict_ns
-    if isinstance(reason, Stale | NotFinite):
-        # After a silent edge, where the query had no instant, any newer sample may help.
-        last = reason.newest if reason.requested is None else reason.requested
-        at = None if last is None else last + 1
-    required: dict[Track, int | None] = {use.track: at for use in path.uses}
-    if isinstance(reason, InFuture) and at is not None and reason.newest is not None:
-        # If prediction is not possible from the samples there are, only a newer one helps.
-        limiting = [use.track for use in path.uses if use.edge == reason.edge]
-        required.update((track, max(at, reason.newest + 1)) for track in limiting)
-    return required
-
-
-def _is_final(query: Query, reason: LookupFailed, condition: WakeCondition) -> bool:
-    """Whether no later insert can turn the reason into a transform."""
-    if isinstance(reason, InPast):
-        # Before that, late samples are sorted in, and the history of a new listener is back-filled.
-        return condition.is_hopeless()
-    if isinstance(reason, Stale | NotFinite):
-        return query.at is not None
-    if isinstance(reason, ClockMismatch):
-        # Each of two robots may restart with the clock of the other; the clock given by the user stays.
-        return len(reason.edges) < 2
-    return isinstance(reason, AmbiguousFrame)
-
-
-def check_duration(name: str, value: float, most: float = 1e300) -> float:
-    """``value`` if it is a number of seconds of at most ``most``; else raises InvalidInput."""
-    if not isinstance(value, Real) or not 0.0 <= value < math.inf:
-        raise InvalidInput(f"{name} is a number of seconds, zero or more; got {value!r}")
-    if value > most:
-        raise InvalidInput(f"{name} is at most {most:g} seconds; got {value!r}")
-    return value
-
-
-def _not_owned(track: Track) -> InsertRefused:
-    if isinstance(track, JointTrack) and track.owner is None:
-        what = f"the robot {track.name!r} was removed from its buffer; add_robot gives a new track"
-        reason = "removed robot"
-    else:
-        what = f"the track {track.name!r} belongs to another buffer; use the buffer that made it"
-        reason = "another buffer"
-    edge = (track.name, track.frame(track.model.root)) if isinstance(track, JointTrack) else track.edges[0]
-    return InsertRefused(what, reason=reason, edge=edge)

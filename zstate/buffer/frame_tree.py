@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from functools import partial
+from operator import itemgetter
 from typing import Literal, NamedTuple
 
 from zstate import se3
@@ -151,32 +151,24 @@ class FrameNameIndex:
         The search takes milliseconds among thousands of names, so it runs only when an error is read. It
         covers the names there are now, even if others are added in between.
         """
-        return partial(_near, name, self._all, len(self._all))
+        count = len(self._all)
 
+        def search() -> list[str]:
+            candidates = self._all[:count]
+            if "/" not in name:
+                bares = Counter(map(_bare, candidates))
+                candidates = [
+                    bare if (bare := _bare(full)) and bares[bare] == 1 else full for full in candidates
+                ]
+            return get_close_matches(name, candidates, n=3, cutoff=0.7)
 
-def _near(name: str, names: list[str], count: int) -> list[str]:
-    candidates = names[:count]
-    if "/" not in name:
-        bares = [_bare(candidate) for candidate in candidates]
-        counts = Counter(bares)
-        candidates = [
-            bare if bare and counts[bare] == 1 else full for full, bare in zip(candidates, bares, strict=True)
-        ]
-    return get_close_matches(name, candidates, n=3, cutoff=0.7)
+        return search
 
 
 def _bare(name: str) -> str:
     """The name without its robot; empty if it has none, or if the rest is no frame name."""
     bare = name.partition("/")[2]
     return "" if bare.startswith("/") else bare
-
-
-class _RemovedEdge(NamedTuple):
-    """An edge that was removed, its writer, and when, by a monotonic clock [s]."""
-
-    edge: tuple[str, str]
-    writer: str | None
-    at_s: float
 
 
 class FrameTree:
@@ -192,7 +184,8 @@ class FrameTree:
         self.frames: dict[str, Edge | None] = {}
         self.robots: dict[str, JointTrack | None] = {}
         self.names = FrameNameIndex()
-        self._removed: dict[str, _RemovedEdge] = {}
+        # By child: when its edge was removed, by a monotonic clock [s], the edge's names and its writer.
+        self._removed: dict[str, tuple[float, tuple[str, str], str | None]] = {}
         # The edges of frames before a transaction changed them; None outside of one.
         self._before: dict[str, Edge | None] | None = None
 
@@ -230,7 +223,7 @@ class FrameTree:
         """Remove the edge that places ``child``; the frame stays."""
         edge = self.frames.get(child)
         if edge is not None:
-            self._removed[child] = _RemovedEdge(edge.names, edge.writer, time.monotonic())
+            self._removed[child] = (time.monotonic(), edge.names, edge.writer)
         self._place(child, None)
 
     def invalidate(self, track: JointTrack) -> None:
@@ -250,44 +243,35 @@ class FrameTree:
         """Raises InsertRefused for bad names, a self edge, a second parent and a loop."""
         self.check_names(parent, child)
         if parent == child:
-            raise InsertRefused(
-                f"{parent!r} -> {child!r}: a frame cannot be placed on itself",
-                reason="self edge",
-                edge=(parent, child),
-            )
+            text = f"{parent!r} -> {child!r}: a frame cannot be placed on itself"
+            raise InsertRefused(text, reason="self edge", edge=(parent, child))
         existing = self.frames.get(child)
         if existing is not None and existing.parent != parent:
-            raise InsertRefused(
+            text = (
                 f"{child!r} has the parent {existing.parent!r}{_by(existing.writer)} and cannot get a second "
-                f"one, {parent!r}{_by(writer)}; withdraw({child!r}) first if it really moved",
-                reason="second parent",
-                edge=(parent, child),
+                f"one, {parent!r}{_by(writer)}; withdraw({child!r}) first if it really moved"
             )
-        if existing is None and child in self.frames:
-            self._check_loop(parent, child, writer)
+            raise InsertRefused(text, reason="second parent", edge=(parent, child))
+        if existing is not None or child not in self.frames:
+            return
+        chain = [child]
+        for edge in self.edges_above(parent):
+            chain.insert(1, edge.child)
+            if edge.parent == child:
+                text = (
+                    f"{parent!r} -> {child!r}{_by(writer)} would close the loop "
+                    f"{' -> '.join(map(repr, chain))} -> {child!r}; "
+                    f"{edge.parent!r} -> {edge.child!r} is written{_by(edge.writer) or ' by hand'}"
+                )
+                raise InsertRefused(text, reason="loop", edge=(parent, child))
 
     @staticmethod
     def check_names(parent: str, child: str) -> None:
         """Raises InsertRefused if a name cannot be a frame name."""
         for name in (parent, child):
             if problem := name_problem(name):
-                raise InsertRefused(
-                    f"{parent!r} -> {child!r}: {problem}", reason="frame name", edge=(parent, child)
-                )
-
-    def _check_loop(self, parent: str, child: str, writer: str | None) -> None:
-        chain = list(self.edges_above(parent))
-        top = next((n for n, edge in enumerate(chain) if edge.parent == child), None)
-        if top is None:
-            return
-        edge = chain[top]
-        loop = " -> ".join(map(repr, (child, *(edge.child for edge in reversed(chain[: top + 1])))))
-        raise InsertRefused(
-            f"{parent!r} -> {child!r}{_by(writer)} would close the loop {loop} -> {child!r}; "
-            f"{edge.parent!r} -> {edge.child!r} is written{_by(edge.writer) or ' by hand'}",
-            reason="loop",
-            edge=(parent, child),
-        )
+                text = f"{parent!r} -> {child!r}: {problem}"
+                raise InsertRefused(text, reason="frame name", edge=(parent, child))
 
     def edges_above(self, frame: str) -> Iterable[Edge]:
         """The edges from ``frame`` up to its root, nearest first."""
@@ -337,11 +321,8 @@ class FrameTree:
             return name
         candidates = [full for full in self.names.with_bare(name) if full.split("/", 1)[0] in self.robots]
         if len(candidates) > 1:
-            raise InsertRefused(
-                f"the frame name {name!r} is not unique: {', '.join(candidates)}; name it in full",
-                reason="frame name",
-                edge=(name, name),
-            )
+            text = f"the frame name {name!r} is not unique: {', '.join(candidates)}; name it in full"
+            raise InsertRefused(text, reason="frame name", edge=(name, name))
         return candidates[0] if candidates else name
 
     def resolve(self, name: str, target: str, source: str) -> str:
@@ -355,10 +336,7 @@ class FrameTree:
         raise UnknownFrame(target, source, name=name, near_misses=near, frame_count=len(self.names))
 
     def path(self, target: str, source: str) -> TreePath:
-        """The edges between two frames.
-
-        Raises UnknownFrame, AmbiguousFrame, Disconnected or ClockMismatch.
-        """
+        """The edges between both. Raises UnknownFrame, AmbiguousFrame, Disconnected or ClockMismatch."""
         target_frame = self.resolve(target, target, source)
         source_frame = self.resolve(source, target, source)
         parts = self._split_at_common_ancestor(target_frame, source_frame)
@@ -367,14 +345,11 @@ class FrameTree:
             failure = Disconnected(target, source, roots=roots)
             removed = [self._removed[root] for root in roots if root in self._removed]
             if removed:
-                last = max(removed, key=lambda one: one.at_s)
-                failure.edge, failure.writer = last.edge, last.writer
-                failure.gone_s = time.monotonic() - last.at_s
+                at_s, failure.edge, failure.writer = max(removed, key=itemgetter(0))
+                failure.gone_s = time.monotonic() - at_s
             raise failure
         edges = [edge for part in parts for edge in part]
-        names = tuple({target: target_frame, source: source_frame}.items())
-        placed = tuple((edge.child, edge) for edge in edges)
-        dependencies = PathDependencies(names, placed, self._domains(edges))
+        dependencies = self._depend_on({target: target_frame, source: source_frame}, edges)
         return TreePath(*parts, self._common_domain(target, source, edges), dependencies)
 
     def _split_at_common_ancestor(
@@ -389,22 +364,28 @@ class FrameTree:
                 return above_target[: depth_by_frame[name]][::-1], above_source[:count][::-1]
         return None
 
-    def _domains(self, edges: Iterable[Edge]) -> tuple[tuple[Edge, str | None], ...]:
+    def _depend_on(
+        self,
+        frame_by_name: Mapping[str, str | None],
+        edges: Iterable[Edge],
+        roots: tuple[tuple[str, None], ...] = (),
+    ) -> PathDependencies:
+        placed = tuple((edge.child, edge) for edge in edges)
         moving = {edge.track: edge for edge in edges if edge.track is not None}
-        return tuple((edge, self.domain_of(edge)) for edge in moving.values())
+        domains = tuple((edge, self.domain_of(edge)) for edge in moving.values())
+        return PathDependencies(tuple(frame_by_name.items()), placed + roots, domains)
 
     def _common_domain(self, target: str, source: str, edges: Sequence[Edge]) -> str:
         """The clock domain of all moving edges; empty if none is known. Raises ClockMismatch for two."""
-        first: Edge | None = None
-        common = ""
-        for edge in edges:
-            if edge.track is not None and (domain := self.domain_of(edge)):
-                if first is None:
-                    first, common = edge, domain
-                elif domain != common:
-                    pair, domains = (first.names, edge.names), (common, domain)
-                    robots = (self.robot_of(first), self.robot_of(edge))
-                    raise ClockMismatch(target, source, edges=pair, robots=robots, domains=domains)
+        known = [(edge, name) for edge in edges if edge.track is not None and (name := self.domain_of(edge))]
+        if not known:
+            return ""
+        first, common = known[0]
+        for edge, domain in known:
+            if domain != common:
+                pair, domains = (first.names, edge.names), (common, domain)
+                robots = (self.robot_of(first), self.robot_of(edge))
+                raise ClockMismatch(target, source, edges=pair, robots=robots, domains=domains)
         return common
 
     def dependencies(self, target: str, source: str) -> PathDependencies:
@@ -412,18 +393,12 @@ class FrameTree:
         frame_by_name = {name: self._find(name) for name in (target, source)}
         frames = [frame for frame in frame_by_name.values() if frame is not None]
         if len(frames) < len(frame_by_name):
-            return PathDependencies(
-                tuple((name, frame) for name, frame in frame_by_name.items() if frame is None)
-            )
+            return PathDependencies(tuple((name, None) for name, found in frame_by_name.items() if not found))
         parts = self._split_at_common_ancestor(frames[0], frames[-1])
         if parts is not None:
-            edges = [edge for part in parts for edge in part]
-            roots = ()
-        else:
-            edges = [edge for frame in frames for edge in self.edges_above(frame)]
-            roots = tuple((self.root(frame), None) for frame in frames)
-        placed = tuple((edge.child, edge) for edge in edges)
-        return PathDependencies(tuple(frame_by_name.items()), placed + roots, self._domains(edges))
+            return self._depend_on(frame_by_name, [edge for part in parts for edge in part])
+        edges = [edge for frame in frames for edge in self.edges_above(frame)]
+        return self._depend_on(frame_by_name, edges, tuple((self.root(frame), None) for frame in frames))
 
     def is_current(self, dependencies: PathDependencies) -> bool:
         """Whether nothing of it has changed. May be called without the lock."""

@@ -102,23 +102,18 @@ class ReferenceHistory:
     def insert(self, stamp: int, row: NDArray[np.float64]) -> bool:
         """Insert a sample; False if it is older than the history reaches."""
         view = self.view
-        if view.end == view.first or stamp > view.stamps[view.end - 1]:
-            self._append(stamp, row)
-        elif not self.reaches(stamp):
-            return False
-        else:
-            stamps, rows = view.kept_stamps(), view.kept_rows()
-            at = int(stamps.searchsorted(stamp))
-            after = at + 1 if stamps[at] == stamp else at
+        if view.size and stamp <= view.newest:
+            if not self.reaches(stamp):
+                return False
+            kept, old = view.kept_stamps(), view.kept_rows()
+            at = int(kept.searchsorted(stamp))
+            after = at + 1 if kept[at] == stamp else at
             new = self._empty(view.size + 1 + view.size // 8)
-            end = at + 1 + len(stamps) - after
-            new.stamps[:at], new.stamps[at], new.stamps[at + 1 : end] = stamps[:at], stamp, stamps[after:]
-            new.rows[:at], new.rows[at], new.rows[at + 1 : end] = rows[:at], row, rows[after:]
+            end = at + 1 + len(kept) - after
+            new.stamps[:at], new.stamps[at], new.stamps[at + 1 : end] = kept[:at], stamp, kept[after:]
+            new.rows[:at], new.rows[at], new.rows[at + 1 : end] = old[:at], row, old[after:]
             self.view = new._replace(end=end)
-        return True
-
-    def _append(self, stamp: int, row: NDArray[np.float64]) -> None:
-        view = self.view
+            return True
         if view.end == len(view.stamps):
             # An eighth more: both copies exist for a moment; a long history of a large robot is megabytes.
             fresh = self._empty(_MIN_CAPACITY + view.size + view.size // 8)
@@ -132,6 +127,7 @@ class ReferenceHistory:
         if stamps[first] < limit:
             first += int(stamps[first:end].searchsorted(limit))
         self.view = HistoryView(stamps, rows, first, end + 1)
+        return True
 
 
 if TYPE_CHECKING or kernel == "reference":

@@ -78,16 +78,6 @@ def bracket_at(view: HistoryView, at: int, *, for_rate: bool = False) -> Bracket
     return Bracket(a, b, ratio, seconds, se3.SCALARS)
 
 
-def bracket_of_edges(view: HistoryView, at: int) -> Bracket | None:
-    """The bracket of one instant of a pose track, of arrays over its edges: columns are those of one pose."""
-    around = rows_around(view, at)
-    if around is None:
-        return None
-    before, after, ratio, seconds = around
-    a, b = (view.rows[index].reshape(-1, 7).T for index in (before, after))
-    return Bracket(a, b, ratio, seconds, se3.ARRAYS)
-
-
 def brackets_at(view: HistoryView, stamps: NDArray[np.int64]) -> Bracket:
     """The bracket of many instants, all of which the view covers, of arrays over them."""
     kept = view.kept_stamps()
@@ -193,8 +183,7 @@ class PoseInterpolator:
     velocity: int = -1
 
     def _pose(self, row: Any) -> Pose:
-        c = self.column
-        return (row[c], row[c + 1], row[c + 2], row[c + 3], row[c + 4], row[c + 5], row[c + 6])
+        return tuple(row[self.column : self.column + 7])  # type: ignore[return-value]
 
     def value(self, now: Bracket) -> Pose:
         """The pose at the instant."""
@@ -243,63 +232,41 @@ class StaticStep:
 
 
 @dataclass(frozen=True, slots=True)
-class RevoluteStep:
-    """A revolute or continuous joint; ``zstate.model.joint_transforms`` has the formula."""
+class JointStep:
+    """A revolute, continuous, prismatic or planar joint; ``zstate.model.joint_transforms`` has the formulas.
+
+    A planar joint has three interpolators, one after the other: x, y and yaw.
+    """
 
     form: JointTransform
     use: int
     column: int
 
     def pose(self, values: Values, f: Backend) -> Pose:
-        form = self.form
-        half = 0.5 * (form.scale * values[self.use][self.column] + form.shift)
+        form, numbers = self.form, values[self.use]
+        if form.kind == "planar":
+            x, y, yaw = numbers[self.column : self.column + 3]
+            return se3.compose(form.origin, (x, y, 0.0, 0.0, 0.0, f.sin(0.5 * yaw), f.cos(0.5 * yaw)))
+        position = form.scale * numbers[self.column] + form.shift
+        x, y, z = form.t0
+        if form.kind == "prismatic":
+            dx, dy, dz = form.t1
+            return (x + dx * position, y + dy * position, z + dz * position, *form.q_cos)
+        half = 0.5 * position
         c, s = f.cos(half), f.sin(half)
         a, b = form.q_cos, form.q_sin
-        x, y, z = form.t0
         return (x, y, z, a[0] * c + b[0] * s, a[1] * c + b[1] * s, a[2] * c + b[2] * s, a[3] * c + b[3] * s)
 
     def rate(self, values: Values, rates: Values) -> Rate:
-        speed = self.form.scale * rates[self.use][self.column]
-        x, y, z = se3.rotate(self.form.q_cos, self.form.axis)
-        return _AT_REST[0], (x * speed, y * speed, z * speed)
-
-
-@dataclass(frozen=True, slots=True)
-class PrismaticStep:
-    """A prismatic joint."""
-
-    form: JointTransform
-    use: int
-    column: int
-
-    def pose(self, values: Values, f: Backend) -> Pose:
-        form = self.form
-        n = form.scale * values[self.use][self.column] + form.shift
-        translation = (form.t0[0] + form.t1[0] * n, form.t0[1] + form.t1[1] * n, form.t0[2] + form.t1[2] * n)
-        return (*translation, *form.q_cos)
-
-    def rate(self, values: Values, rates: Values) -> Rate:
-        speed = self.form.scale * rates[self.use][self.column]
-        x, y, z = self.form.t1
-        return (x * speed, y * speed, z * speed), _AT_REST[1]
-
-
-@dataclass(frozen=True, slots=True)
-class PlanarStep:
-    """A joint that moves in a plane: interpolators of x, y and yaw, one after the other."""
-
-    form: JointTransform
-    use: int
-    column: int
-
-    def pose(self, values: Values, f: Backend) -> Pose:
-        x, y, yaw = values[self.use][self.column : self.column + 3]
-        return se3.compose(self.form.origin, (x, y, 0.0, 0.0, 0.0, f.sin(0.5 * yaw), f.cos(0.5 * yaw)))
-
-    def rate(self, values: Values, rates: Values) -> Rate:
-        vx, vy, spin = rates[self.use][self.column : self.column + 3]
-        q = self.form.origin[3:]
-        return se3.rotate(q, (vx, vy, 0.0)), se3.rotate(q, (0.0, 0.0, spin))
+        form, numbers = self.form, rates[self.use]
+        if form.kind == "planar":
+            vx, vy, spin = numbers[self.column : self.column + 3]
+            q = form.origin[3:]
+            return se3.rotate(q, (vx, vy, 0.0)), se3.rotate(q, (0.0, 0.0, spin))
+        speed = form.scale * numbers[self.column]
+        x, y, z = form.t1 if form.kind == "prismatic" else se3.rotate(form.q_cos, form.axis)
+        velocity = (x * speed, y * speed, z * speed)
+        return (velocity, _AT_REST[1]) if form.kind == "prismatic" else (_AT_REST[0], velocity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,7 +287,7 @@ class PoseStep:
         return se3.rotate(q, linear), se3.rotate(q, angular)
 
 
-Step: TypeAlias = StaticStep | RevoluteStep | PrismaticStep | PlanarStep | PoseStep
+Step: TypeAlias = StaticStep | JointStep | PoseStep
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -20,13 +21,11 @@ from zstate.buffer.history import HistoryView
 from zstate.buffer.interpolation import (
     AngleInterpolator,
     Interpolator,
+    JointStep,
     LinearInterpolator,
     Motion,
-    PlanarStep,
     PoseInterpolator,
     PoseStep,
-    PrismaticStep,
-    RevoluteStep,
     StaticStep,
     Step,
     Values,
@@ -36,10 +35,11 @@ from zstate.buffer.interpolation import (
     chain_pose,
     newest_bracket,
 )
-from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage, with_track_info
+from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage
 from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InFuture, InPast, InvalidInput, LookupFailed, NoData, NotFinite, Stale
 from zstate.extension import kernel
+from zstate.model.joint_transforms import JointTransform
 from zstate.transform import Kind, Transform
 
 if TYPE_CHECKING or kernel == "c":
@@ -53,7 +53,7 @@ StepTuple: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
 """A step as the extension takes it: kind, track, column, whether the angle is continuous, numbers."""
 
 # In the order of the extension's StepKind and Failure.
-_KINDS = (StaticStep, RevoluteStep, PrismaticStep, PlanarStep, PoseStep)
+_KINDS = ("fixed", "revolute", "prismatic", "planar", "floating")
 _FAILURES: tuple[type[LookupFailed], ...] = (InPast, NoData, InFuture)
 
 
@@ -61,85 +61,56 @@ class TrackUse(NamedTuple):
     """A track of a path, with the interpolators that read it and the first of its edges on the path."""
 
     track: Track
-    interpolators: tuple[Interpolator, ...]
+    interpolators: list[Interpolator]
     edge: tuple[str, str]
 
 
-class PathResult(NamedTuple):
-    """target_from_source as seven floats, its stamp [ns], and how it was made."""
-
-    pose: se3.Pose
-    stamp: int | None
-    kind: Kind
-    predicted_s: float = 0.0
-
-
-class JointReadout(NamedTuple):
-    """The values of all interpolators of a path at an instant, and how they were made."""
-
-    values: list[list[se3.Component]]
-    stamp: int
-    kind: Kind
-    predicted_ns: int
-
-
+@dataclass(eq=False, repr=False)
 class TransformPath:
-    """From ``source`` to ``target`` by their common ancestor.
+    """A path, from the common ancestor of two frames down to each; ``uses`` are the tracks that it reads.
 
     ``domain`` is the clock domain of its moving edges, empty if none is known.
     """
 
-    def __init__(
-        self,
-        names: tuple[str, str],
-        steps_to_target: Sequence[Step],
-        steps_to_source: Sequence[Step],
-        uses: Sequence[TrackUse],
-        read_views: ViewReader,
-        *,
-        domain: str = "",
-    ) -> None:
-        self.target, self.source = names
-        self.steps_to_target = steps_to_target
-        self.steps_to_source = steps_to_source
-        self.uses = tuple(uses)
-        self.tracks = tuple(use.track for use in uses)
-        self.domain = domain
-        self._read_views = read_views
+    target: str
+    source: str
+    steps_to_target: Sequence[Step]
+    steps_to_source: Sequence[Step]
+    uses: Sequence[TrackUse]
+    read_views: ViewReader
+    domain: str = ""
 
     def at(self, stamp: object = None, /) -> Transform | None:
-        """The transform, if it is found at once; None if ``result`` has to be used."""
+        """The transform, if it is found at once; None if ``transform`` has to be used."""
 
     def raise_if_outside(self, stamp: object, /) -> None:
         """Raises the reason why there is no transform now, if it is found at once."""
 
     def transform(self, stamp: int | None, predict_ns: int = 0) -> Transform:
-        """The transform at ``stamp``, or at the latest instant. Raises as ``result``."""
+        """The transform at ``stamp``, or the latest. Raises NoData, InPast, InFuture, Stale or NotFinite."""
         transform = self.at(stamp)
         if transform is not None:
             return transform
-        return Transform.trusted(self.target, self.source, *self.result(stamp, predict_ns))
+        if not predict_ns:
+            self.raise_if_outside(stamp)
+        if not self.uses:
+            return Transform.trusted(self.target, self.source, self._finite_pose((), stamp), stamp, "static")
+        values, at, kind, predicted_ns = self.read(stamp, predict_ns)
+        pose = se3.normalize(self._finite_pose(values, at), se3.SCALARS)
+        return Transform.trusted(self.target, self.source, pose, at, kind, predicted_ns * 1e-9)
 
     def latest_common_stamp(self) -> int:
         """The newest instant that every moving edge has reached [ns]. Raises NoData or Stale."""
         if not self.uses:
             raise NoData(self.target, self.source)
-        return self._latest(self._read_views(self.uses))
+        return self._latest(self.read_views(self.uses))
 
-    def result(self, stamp: int | None, predict_ns: int = 0) -> PathResult:
-        """The pose at ``stamp``, or at the latest instant.
+    def read(self, stamp: int | None, predict_ns: int = 0) -> tuple[Values, int, Kind, int]:
+        """The values of each track at ``stamp``, or at the latest instant. Raises as ``transform``.
 
-        Raises NoData, InPast, InFuture, Stale or NotFinite.
+        Also the stamp [ns], how the values were made, and how far they are predicted [ns].
         """
-        if not self.uses:
-            return PathResult(self._finite_pose((), stamp), stamp, "static")
-        readout = self.read(stamp, predict_ns)
-        pose = se3.normalize(self._finite_pose(readout.values, readout.stamp), se3.SCALARS)
-        return PathResult(pose, readout.stamp, readout.kind, readout.predicted_ns * 1e-9)
-
-    def read(self, stamp: int | None, predict_ns: int = 0) -> JointReadout:
-        """The values of each track at ``stamp``, or at the latest instant. Raises as ``result``."""
-        views = self._read_views(self.uses)
+        views = self.read_views(self.uses)
         at = self._latest(views) if stamp is None else stamp
         kind: Kind = "exact"
         predicted_ns = 0
@@ -155,11 +126,11 @@ class TransformPath:
                     raise self.failure_at(at, views, predict_ns)
                 kind, predicted_ns = "predicted", max(predicted_ns, at - view.newest)
                 values.append(predicted)
-        return JointReadout(values, at, kind, predicted_ns)
+        return values, at, kind, predicted_ns
 
     def motion(self, stamp: int | None) -> tuple[Motion, int | None]:
-        """Pose and velocity of the source in the target. Raises as ``result``, and NoData without a rate."""
-        views = self._read_views(self.uses)
+        """Pose and velocity of the source in the target. Raises as ``transform``; NoData without rates."""
+        views = self.read_views(self.uses)
         at = stamp if stamp is not None or not self.uses else self._latest(views)
         values: list[list[se3.Component]] = []
         rates: list[list[se3.Component]] = []
@@ -171,7 +142,7 @@ class TransformPath:
             rates.append([one.rate(now) for one in use.interpolators])
         if any(np.isnan(_flat(numbers)).any() for numbers in rates):
             number = next((number for number, view in enumerate(views) if view.size < 2), 0)
-            failure = self._failure(NoData, number, views, None)
+            failure = self._failure(NoData, number, None, coverage(views[number]))
             failure.note = "a rate of change needs two samples, or published velocities"
             raise failure
         above_target = chain_motion(self.steps_to_target, values, rates, se3.SCALARS)
@@ -182,7 +153,7 @@ class TransformPath:
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """The pose at each stamp: (T, 7), NaN where it is not known, and (T,) where it is."""
-        views = self._read_views(self.uses)
+        views = self.read_views(self.uses)
         valid = np.ones(len(stamps), dtype=np.bool_)
         for view in views:
             valid &= (stamps >= view.oldest) & (stamps <= view.newest) if view.size else False
@@ -204,63 +175,52 @@ class TransformPath:
 
     def stale(self, stamp: int | None, age_s: float, max_age_s: float) -> Stale:
         """The error for a transform that is too old, naming the edge that is most behind."""
-        views = [use.track.history.view for use in self.uses]
-        number = min(range(len(views)), key=lambda n: coverage(views[n]).newest or 0)
-        return self._failure(Stale, number, views, stamp, age_s=age_s, max_age_s=max_age_s)
+        covered = [coverage(use.track.history.view) for use in self.uses]
+        number = min(range(len(covered)), key=lambda n: covered[n].newest or 0)
+        return self._failure(Stale, number, stamp, covered[number], age_s=age_s, max_age_s=max_age_s)
 
     def failure_at(self, at: int, views: Sequence[HistoryView], predict_ns: int = 0) -> LookupFailed:
         """The error of the limiting track: one that begins later, else an empty one, else one that ends."""
         numbered = list(enumerate(views))
         too_young = [(view.oldest, n) for n, view in numbered if view.size and at < view.oldest]
         if too_young:
-            return self._failure(InPast, max(too_young)[1], views, at)
+            number = max(too_young)[1]
+            return self._failure(InPast, number, at, coverage(views[number]))
         empty = [n for n, view in numbered if not view.size]
         if empty:
-            return self._failure(NoData, empty[0], views, at)
+            return self._failure(NoData, empty[0], at, coverage(views[empty[0]]))
         newest = [
             (view.newest, n)
             for n, view in numbered
             if at > view.newest and self._extrapolate(self.uses[n], view, at, predict_ns) is None
         ]
-        failure = self._failure(InFuture, min(newest)[1], views, at)
-        if predict_ns and at <= min(newest)[0] + predict_ns:
+        end, number = min(newest)
+        failure = self._failure(InFuture, number, at, coverage(views[number]))
+        if predict_ns and at <= end + predict_ns:
             failure.note = "it cannot be predicted: no velocity is known there"
         return failure
 
     def _failure(
-        self, error: type[F], number: int, views: Sequence[HistoryView], at: int | None, **facts: Any
+        self, error: type[F], number: int, at: int | None, samples: Sequence[Any], **facts: Any
     ) -> F:
-        """The error of track ``number``; ``facts`` are further ones of its type."""
-        return self._error(error, number, at, *coverage(views[number])[:3], **facts)
-
-    def _error(  # noqa: PLR0917 - what a failed lookup in a control loop costs
-        self,
-        error: type[F],
-        number: int,
-        requested: int | None,
-        oldest: int | None,
-        newest: int | None,
-        rate_hz: float | None,
-        **facts: Any,
-    ) -> F:
-        use = self.uses[number]
-        failure = error(
-            self.target,
-            self.source,
-            edge=use.edge,
-            requested=requested,
-            oldest=oldest,
-            newest=newest,
-            rate_hz=rate_hz,
-            writer=use.track.writer,
-            **facts,
-        )
-        return with_track_info(failure, use.track)
+        """The error of track ``number``, whose ``samples`` begin as Coverage; ``facts`` are of its type."""
+        track, _, edge = self.uses[number]
+        oldest, newest, rate_hz = samples[:3]
+        span = {"requested": at, "oldest": oldest, "newest": newest, "rate_hz": rate_hz}
+        failure = error(self.target, self.source, edge=edge, writer=track.writer, **span, **facts)
+        failure.track = track.name
+        if track.owner is not None:
+            failure.is_recorded = track.owner.is_recording
+            measured = None if track.writer is None else track.owner.clock_offsets.get(track.writer)
+            offset = None if measured is None else measured()
+            if offset is not None:
+                failure.clock_offset_ns, failure.clock_uncertainty_ns = offset
+        return failure
 
     def _latest(self, views: Sequence[HistoryView]) -> int:
         for number, view in enumerate(views):
             if not view.size:
-                raise self._failure(NoData, number, views, None)
+                raise self._failure(NoData, number, None, coverage(view))
         newest = min(view.newest for view in views)
         begins_last = max(range(len(views)), key=lambda n: views[n].oldest)
         if views[begins_last].oldest > newest:
@@ -269,7 +229,7 @@ class TransformPath:
             other, other_newest = self.uses[begins_last].edge, views[begins_last].newest
             age_s = (other_newest - newest) * 1e-9
             facts = {"age_s": age_s, "other": other, "other_newest": other_newest}
-            raise self._failure(Stale, number, views, None, **facts)
+            raise self._failure(Stale, number, None, coverage(views[number]), **facts)
         return newest
 
     def _finite_pose(self, values: Values, at: int | None) -> se3.Pose:
@@ -283,8 +243,8 @@ class TransformPath:
         if not self.uses:
             return NotFinite(self.target, self.source, requested=at)
         sizes = [np.abs(_flat(numbers)).max(initial=0.0) for numbers in values]
-        views = [use.track.history.view for use in self.uses[: len(sizes)]]
-        return self._failure(NotFinite, int(np.argmax(sizes)), views, at)
+        number = int(np.argmax(sizes))
+        return self._failure(NotFinite, number, at, coverage(self.uses[number].track.history.view))
 
     def _pose(self, values: Values, f: se3.Backend) -> se3.Pose:
         target_from_top = chain_pose(self.steps_to_target, values, f)
@@ -332,15 +292,11 @@ class CompiledPath(TransformPath):
         # An attribute of the instance: a method in between would cost a third of the whole lookup.
         self.at = self._compiled.at
 
-    def result(self, stamp: int | None, predict_ns: int = 0) -> PathResult:
-        if not predict_ns:
-            self.raise_if_outside(stamp)
-        return super().result(stamp, predict_ns)
-
     def raise_if_outside(self, stamp: object, /) -> None:
         failure = self._compiled.failure_at(stamp)
         if failure is not None:
-            raise self._error(_FAILURES[failure[0]], *failure[1:])
+            kind, number, at, *samples = failure
+            raise self._failure(_FAILURES[kind], number, at, samples)
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         poses, valid = np.empty((len(stamps), 7)), np.empty(len(stamps), np.bool_)
@@ -355,46 +311,28 @@ def compile_path(
     target: str, source: str, edges: TreePath, read_views: ViewReader, *, compiled: bool = True
 ) -> TransformPath:
     """The path over ``edges``; the reference if ``compiled`` is False or the extension cannot evaluate it."""
-    table = _TrackUseTable()
-    steps_to_target = _steps(edges.to_target, table)
-    steps_to_source = _steps(edges.to_source, table)
-    uses = table.uses()
+    by_track: dict[Track, TrackUse] = {}
+    steps_to_target, steps_to_source = _steps(edges.to_target, by_track), _steps(edges.to_source, by_track)
+    uses = tuple(by_track.values())
     is_cubic = any(getattr(one, "cubic", False) for use in uses for one in use.interpolators)
     kind = CompiledPath if compiled and kernel == "c" and not is_cubic else TransformPath
-    return kind((target, source), steps_to_target, steps_to_source, uses, read_views, domain=edges.domain)
+    return kind(target, source, steps_to_target, steps_to_source, uses, read_views, edges.domain)
 
 
 def joints_path(track: JointTrack, read_views: ViewReader) -> TransformPath:
     """A path without steps that reads every joint of a robot."""
     joints = [(index, joint) for index, joint in enumerate(track.model.joints) if joint.driven]
-    interpolators = tuple(one for index, _ in joints for one in _joint_interpolators(track, index))
+    interpolators = [one for index, _ in joints for one in _joint_interpolators(track, index)]
     root = track.frame(track.model.root)
     edge = track.edge(track.forms[joints[0][0]]) if joints else (root, root)
-    return TransformPath((root, root), (), (), [TrackUse(track, interpolators, edge)], read_views)
+    return TransformPath(root, root, (), (), [TrackUse(track, interpolators, edge)], read_views)
 
 
-class _TrackUseTable:
-    """The tracks of a path and the interpolators that read each, in the order of their edges."""
-
-    def __init__(self) -> None:
-        self._uses: dict[Track, tuple[list[Interpolator], tuple[str, str]]] = {}
-
-    def add(self, edge: Edge, track: Track, interpolators: Sequence[Interpolator]) -> tuple[int, int]:
-        """The index of the track, and that of the first of ``interpolators`` among its own."""
-        known, _ = self._uses.setdefault(track, ([], edge.names))
-        if interpolators[0] not in known:
-            known.extend(interpolators)
-        return list(self._uses).index(track), known.index(interpolators[0])
-
-    def uses(self) -> list[TrackUse]:
-        return [TrackUse(track, tuple(known), edge) for track, (known, edge) in self._uses.items()]
-
-
-def _steps(edges: Sequence[Edge], table: _TrackUseTable) -> list[Step]:
-    """One step for each edge; consecutive static ones multiplied."""
+def _steps(edges: Sequence[Edge], uses: dict[Track, TrackUse]) -> list[Step]:
+    """One step for each edge; consecutive static ones multiplied. Adds what they read to ``uses``."""
     steps: list[Step] = []
     for edge in edges:
-        step = _step(edge, table)
+        step = _step(edge, uses)
         last = steps[-1] if steps else None
         if isinstance(step, StaticStep) and isinstance(last, StaticStep):
             steps[-1] = StaticStep(se3.compose(last.constant, step.constant))
@@ -403,20 +341,21 @@ def _steps(edges: Sequence[Edge], table: _TrackUseTable) -> list[Step]:
     return steps
 
 
-def _step(edge: Edge, table: _TrackUseTable) -> Step:
-    if edge.track is None:
+def _step(edge: Edge, uses: dict[Track, TrackUse]) -> Step:
+    track = edge.track
+    if track is None:
         return StaticStep(edge.pose)
-    if isinstance(edge.track, PoseTrack):
-        return PoseStep(se3.IDENTITY, *table.add(edge, edge.track, [PoseInterpolator(7 * edge.index)]))
-    form = edge.track.forms[edge.index]
-    place = table.add(edge, edge.track, _joint_interpolators(edge.track, edge.index))
-    if form.kind == "revolute":
-        return RevoluteStep(form, *place)
-    if form.kind == "prismatic":
-        return PrismaticStep(form, *place)
-    if form.kind == "planar":
-        return PlanarStep(form, *place)
-    return PoseStep(form.origin, *place)
+    if isinstance(track, PoseTrack):
+        form, interpolators = None, [PoseInterpolator(7 * edge.index)]
+    else:
+        form, interpolators = track.forms[edge.index], _joint_interpolators(track, edge.index)
+    known = uses.setdefault(track, TrackUse(track, [], edge.names)).interpolators
+    if interpolators[0] not in known:
+        known.extend(interpolators)
+    place = (list(uses).index(track), known.index(interpolators[0]))
+    if form is None or form.kind == "floating":
+        return PoseStep(se3.IDENTITY if form is None else form.origin, *place)
+    return JointStep(form, *place)
 
 
 def _joint_interpolators(track: JointTrack, index: int) -> list[Interpolator]:
@@ -443,28 +382,24 @@ def _step_tuples(steps: Sequence[Step], uses: Sequence[TrackUse]) -> tuple[StepT
         if isinstance(step, StaticStep):
             before = se3.compose(before, step.constant)
         else:
-            one = uses[step.use].interpolators[step.column]
-            is_angle, numbers = isinstance(one, AngleInterpolator), _step_numbers(step, before)
-            tuples.append((_KINDS.index(type(step)), step.use, one.column, is_angle, numbers))
+            one, kind = uses[step.use].interpolators[step.column], "floating"
+            if isinstance(step, PoseStep):
+                numbers = se3.compose(before, step.origin)
+            else:
+                kind, numbers = step.form.kind, _joint_numbers(step.form, before)
+            is_angle = isinstance(one, AngleInterpolator)
+            tuples.append((_KINDS.index(kind), step.use, one.column, is_angle, numbers))
             before = se3.IDENTITY
     if before != se3.IDENTITY or not tuples:
         tuples.append((0, 0, 0, False, before))
     return tuple(tuples)
 
 
-def _step_numbers(
-    step: RevoluteStep | PrismaticStep | PlanarStep | PoseStep, before: se3.Pose
-) -> tuple[float, ...]:
-    if isinstance(step, PlanarStep):
-        return se3.compose(before, step.form.origin)
-    if isinstance(step, PoseStep):
-        return se3.compose(before, step.origin)
-    form = step.form
-    placed = se3.compose(before, (*form.t0, *form.q_cos))
-    if isinstance(step, RevoluteStep):
-        axis = se3.multiply(before[3:], form.q_sin)
-    else:
-        axis = se3.rotate(before[3:], form.t1)
+def _joint_numbers(form: JointTransform, before: se3.Pose) -> tuple[float, ...]:
+    if form.kind == "planar":
+        return se3.compose(before, form.origin)
+    placed, q = se3.compose(before, (*form.t0, *form.q_cos)), before[3:]
+    axis = se3.multiply(q, form.q_sin) if form.kind == "revolute" else se3.rotate(q, form.t1)
     return (form.scale, form.shift, *placed[3:], *placed[:3], *axis)
 
 
@@ -513,7 +448,7 @@ class Plan:
         poses, valid = path.poses(instants)
         while not valid.all():
             # A lookup of the first missing stamp raises the reason, unless its sample has arrived since.
-            path.result(int(instants[valid.argmin()]))
+            path.transform(int(instants[valid.argmin()]))
             poses, valid = path.poses(instants)
         if out is None:
             return poses

@@ -39,10 +39,7 @@ class PoseTrackTable:
         self._version = -1
 
     def track_rows(self, names: tuple[EdgeNames, ...], stamp: int, writer: str | None) -> TrackRows:
-        """The tracks for a sample of these edges.
-
-        Raises InsertRefused for an edge that is not possible, TooOld for a stamp before a history.
-        """
+        """The tracks for a sample of these edges. Raises InsertRefused, or TooOld for too old a stamp."""
         if self._version != self._tree.version:
             self._cache.clear()
         try:
@@ -120,31 +117,26 @@ def _check_reached(tracks: Iterable[PoseTrack], stamp: int) -> None:
 
 def second_writer(parent: str, child: str, existing: Edge, writer: str | None) -> InsertRefused:
     """The error for an edge that has another writer."""
-    return InsertRefused(
-        f"{parent!r} -> {child!r} is written by {existing.writer or 'hand'} already"
-        f"{f'; refused: {writer}' if writer else ''}; one edge has one writer",
-        reason="second writer",
-        edge=(parent, child),
-    )
+    refused = f"; refused: {writer}" if writer else ""
+    text = f"{parent!r} -> {child!r} is written by {existing.writer or 'hand'} already{refused}"
+    return InsertRefused(f"{text}; one edge has one writer", reason="second writer", edge=(parent, child))
 
 
 def check_poses(edges: Sequence[EdgeNames], poses: ArrayLike) -> Poses:
     """``poses`` as (N, 7), quaternions of length one. Raises InvalidInput or InsertRefused."""
     array = real_numbers(poses, "poses")
     if not edges or array.shape != (len(edges), 7):
-        raise InvalidInput(
-            f"{len(edges)} edges take poses of shape ({len(edges)}, 7), at least one; got {array.shape}"
-        )
+        count = len(edges)
+        raise InvalidInput(f"{count} edges take poses of shape ({count}, 7), at least one; got {array.shape}")
     # einsum, as numpy warns of an overflow in a sum of squares, and the check below refuses that anyway
     norms: Poses = np.sqrt(np.einsum("ij,ij->i", array[:, 3:], array[:, 3:]))
     valid = np.isfinite(array).all(axis=1) & (np.abs(norms - 1.0) <= QUATERNION_TOLERANCE)
     if not valid.all():
         first = int(valid.argmin())
         parent, child = edges[first]
-        raise InsertRefused(
+        text = (
             f"{parent!r} -> {child!r}: a pose is seven finite numbers, the last four a quaternion x y z w of "
-            f"length 1; got {array[first].tolist()}",
-            reason="not a pose",
-            edge=(parent, child),
+            f"length 1; got {array[first].tolist()}"
         )
+        raise InsertRefused(text, reason="not a pose", edge=(parent, child))
     return np.hstack((array[:, :3], array[:, 3:] / norms[:, None]))

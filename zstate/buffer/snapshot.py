@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from zstate import se3
 from zstate.buffer.frame_tree import Edge, TreeSnapshot
 from zstate.buffer.history import HistoryView
-from zstate.buffer.interpolation import PoseInterpolator, bracket_of_edges
+from zstate.buffer.interpolation import rows_around
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
 from zstate.errors import InPast, InvalidInput, UnknownFrame, format_duration
 
@@ -32,7 +32,6 @@ JointReader: TypeAlias = Callable[[JointTrack, int], tuple[NDArray[np.float64], 
 """``joint_positions`` of a buffer."""
 
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
-_EDGE_POSE = PoseInterpolator(0)
 
 
 class TimeSpan(NamedTuple):
@@ -159,14 +158,6 @@ class FramePoses:
         return up, duals
 
 
-class _TrackPart(NamedTuple):
-    """A track of a snapshot: row ``rows[k]`` of the table is edge ``edges[k]`` of the track."""
-
-    track: Track
-    rows: Rows
-    edges: Rows
-
-
 class SnapshotReader:
     """Reads all frames of a tree; of ``robots`` only, with the frames above theirs, if there are any."""
 
@@ -189,14 +180,13 @@ class SnapshotReader:
         for row, edge in enumerate(edges):
             if edge is not None and edge.track is not None:
                 places.setdefault(edge.track, []).append((row, edge.index))
-        self._parts = tuple(
-            _TrackPart(track, *np.array(pairs, dtype=np.intp).T) for track, pairs in places.items()
-        )
-        self._writers = [part.track.writer for part in self._parts]
+        # Of each track: row ``rows[k]`` of the table is edge ``edges[k]`` of the track.
+        self._parts = {track: np.array(pairs, dtype=np.intp).T for track, pairs in places.items()}
+        self._writers = [track.writer for track in self._parts]
 
     def is_current(self, version: int) -> bool:
         """Whether tree and writers are unchanged. A writer may become known after its first samples."""
-        return version == self._version and self._writers == [part.track.writer for part in self._parts]
+        return version == self._version and self._writers == [track.writer for track in self._parts]
 
     def read(self, joint_positions: JointReader, stamp: int | None, hold_ns: int) -> FramePoses:
         """As ``TransformBuffer.snapshot``."""
@@ -204,7 +194,7 @@ class SnapshotReader:
         known = np.ones(len(poses), dtype=np.bool_)
         reasons: dict[int, str] = {}
         newest: list[int] = []
-        for track, rows, edges in self._parts:
+        for track, (rows, edges) in self._parts.items():
             view = track.history.view
             reason = _reason_against(track, view, stamp, hold_ns)
             if reason is None:
@@ -270,26 +260,16 @@ def _edge_poses(joint_positions: JointReader, track: Track, view: HistoryView, s
             return last.reshape(-1, 7)
         return track.kinematics.edge_poses(last[: track.model.position_count])
     if isinstance(track, PoseTrack):
-        now = bracket_of_edges(view, stamp)
-        assert now is not None  # the view covers the stamp
-        return np.stack(se3.normalize(_EDGE_POSE.value(now), se3.ARRAYS), axis=-1)
+        around = rows_around(view, stamp)
+        assert around is not None  # the view covers the stamp
+        before, after, ratio, _ = around
+        first, second = (se3.unstack(view.rows[row].reshape(-1, 7)) for row in (before, after))
+        return np.stack(se3.normalize(se3.interpolate(first, second, ratio, se3.ARRAYS), se3.ARRAYS), axis=-1)
     try:
         positions, _ = joint_positions(track, stamp)
     except (InPast, InvalidInput):  # since then the history has moved on, or the robot was removed
         positions = view.rows[view.first, : track.model.position_count]
     return track.kinematics.edge_poses(positions)
-
-
-def joint_history(track: JointTrack, until: int, duration_s: float, points: int) -> JointHistory:
-    """The samples of ``duration_s`` up to ``until`` [ns]; of more than ``points`` every n-th."""
-    view = track.history.view
-    stamps, rows = view.kept_stamps(), view.kept_rows()
-    first, end = np.searchsorted(stamps, (until - round(duration_s * 1e9), until + 1)).tolist()
-    step = max(1, -(-(end - first) // points))
-    # Counted from the first sample kept, so that consecutive plots choose the same samples.
-    start = first + (-first) % step
-    chosen = slice(start, end, step)
-    return JointHistory(stamps[chosen], rows[chosen, : track.model.position_count])
 
 
 def to_dual(poses: Poses) -> Duals:

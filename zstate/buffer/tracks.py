@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.history import History, HistoryView
 from zstate.clock import ClockOffset
-from zstate.errors import LookupFailed
 from zstate.model.joint_transforms import JointTransform, JointTransforms
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
@@ -20,16 +20,14 @@ Interpolation = Literal["linear", "hermite"]
 ClockOffsets: TypeAlias = dict[str, Callable[[], ClockOffset | None]]
 
 
+@dataclass(eq=False, slots=True)
 class TrackOwner:
     """Facts about a buffer that its tracks and their errors need."""
 
-    __slots__ = ("clock_offsets", "is_recording")
-
-    def __init__(self) -> None:
-        self.clock_offsets: ClockOffsets = {}
-        """By writer: how far its clock is ahead of the clock of this host."""
-        self.is_recording = False
-        """Whether the samples come from a file: no sample is added later."""
+    clock_offsets: ClockOffsets = field(default_factory=dict[str, Callable[[], ClockOffset | None]])
+    """By writer: how far its clock is ahead of the clock of this host."""
+    is_recording: bool = False
+    """Whether the samples come from a file: no sample is added later."""
 
 
 class JointTrack:
@@ -53,9 +51,9 @@ class JointTrack:
         self.model_writer: str | None = None
         self.owner: TrackOwner | None = None
         self.history = History(model.position_count, span_ns)
-        # Quaternions of floating joints have to be checked and normalised.
-        self._has_plain_joints = all(form.kind != "floating" for form in self.forms)
-        self._position_count = model.position_count
+        self.position_count = model.position_count
+        self.has_plain_joints = not self._table.has_floats
+        """Whether there are no floating joints, whose quaternions have to be checked and normalised."""
 
     def __repr__(self) -> str:
         return f"<track of {self.name!r}, {self.history.view.size} samples>"
@@ -103,12 +101,6 @@ class JointTrack:
         if isinstance(positions, bytes) and len(positions) % 8 == 0:
             positions = np.frombuffer(positions, "<f8")
         return self._table.normalised(self.model.check_positions(positions))
-
-    def try_insert(self, stamp: object, positions: object, velocities: object) -> bool | None:
-        """``insert`` of unchecked input; None if ``check_positions`` and ``insert`` have to be used."""
-        if not self._has_plain_joints:
-            return None
-        return self.history.try_insert(stamp, positions, velocities, self._position_count)
 
     def insert(
         self, stamp: int, positions: NDArray[np.float64], velocities: NDArray[np.float64] | None
@@ -161,23 +153,6 @@ class PoseTrack:
 
 
 Track: TypeAlias = JointTrack | PoseTrack
-
-
-F = TypeVar("F", bound=LookupFailed)
-
-
-def with_track_info(failure: F, track: Track) -> F:
-    """The same failure, with what is known of the track and of its writer's clock."""
-    failure.track = track.name
-    owner = track.owner
-    if owner is None:
-        return failure
-    failure.is_recorded = owner.is_recording
-    measured = None if track.writer is None else owner.clock_offsets.get(track.writer)
-    offset = None if measured is None else measured()
-    if offset is not None:
-        failure.clock_offset_ns, failure.clock_uncertainty_ns = offset
-    return failure
 
 
 class Coverage(NamedTuple):

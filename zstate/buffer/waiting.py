@@ -22,7 +22,7 @@ from collections.abc import (
 from contextlib import ExitStack, contextmanager
 from numbers import Real
 from types import MappingProxyType
-from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import Generic, NamedTuple, TypeAlias, TypeVar
 
 from zstate import se3
 from zstate._util.closeable import Closeable
@@ -169,23 +169,20 @@ def _without(waiters: tuple[Waiter, ...], waiter: Waiter) -> tuple[Waiter, ...]:
     return tuple(other for other in waiters if other is not waiter)
 
 
-NewestLookup: TypeAlias = Callable[[Waiter], Transform | LookupFailed]
-"""The newest transform, with the condition for a newer one set; or the reason why there is none."""
-
-
 class TransformWatch(Closeable):
     """Calls ``callback(transform)`` with each newest transform of a pair, until closed.
 
     With ``translation_m`` or ``rotation_rad``, only once the source has moved or rotated so far in the target
-    since the last call. The callback runs on the thread whose insert brought the sample: keep it short. Its
-    exceptions are counted in ``failures``; ``last_failure`` is the last of them. A context manager.
+    since the last call. ``lookup_newest`` also sets the condition for a newer transform. The callback runs on
+    the thread whose insert brought the sample: keep it short. Its exceptions are counted in ``failures``;
+    ``last_failure`` is the last of them. A context manager.
     """
 
     def __init__(
         self,
         waiters: WaiterRegistry,
         names: tuple[str, str],
-        lookup_newest: NewestLookup,
+        lookup_newest: Callable[[Waiter], Transform | LookupFailed],
         callback: Callable[[Transform], object],
         *,
         translation_m: float | None,
@@ -257,20 +254,6 @@ class TransformWatch(Closeable):
         )
 
 
-Wait: TypeAlias = Callable[[str, str, int, float], Awaitable[Transform]]
-"""``wait_async`` of a buffer: target, source, stamp, timeout_s."""
-
-
-def frame_of(sample: Any) -> str:
-    """The frame of a sample: its attribute ``frame``."""
-    return sample.frame
-
-
-def stamp_of(sample: Any) -> int:
-    """The stamp of a sample [ns]: its attribute ``stamp``."""
-    return sample.stamp
-
-
 class MessageFilter(Generic[S]):
     """``async for sample, transform in filter``: samples in their order, each with ``target_from_frame``.
 
@@ -280,19 +263,19 @@ class MessageFilter(Generic[S]):
 
     def __init__(
         self,
-        wait: Wait,
+        wait_async: Callable[[str, str, int, float], Awaitable[Transform]],
         samples: AsyncIterable[S],
         target: str,
         *,
-        frame: Callable[[S], str] = frame_of,
-        stamp: Callable[[S], int] = stamp_of,
-        timeout_s: float = 1.0,
+        frame: Callable[[S], str],
+        stamp: Callable[[S], int],
+        timeout_s: float,
     ) -> None:
         self.target = target
         self.joined = 0
         self.dropped: Counter[str] = Counter()
         self.last_reason: LookupFailed | None = None
-        self._wait = wait
+        self._wait_async = wait_async
         # One iterator, so that a loop over the filter can be left and continued.
         self._samples = samples.__aiter__()
         self._frame = frame
@@ -311,7 +294,7 @@ class MessageFilter(Generic[S]):
         async for sample in self._samples:
             frame, stamp = self._frame(sample), self._stamp(sample)
             try:
-                transform = await self._wait(self.target, frame, stamp, self._timeout_s)
+                transform = await self._wait_async(self.target, frame, stamp, self._timeout_s)
             except LookupFailed as reason:
                 self.last_reason = reason
                 # A timeout is counted under the error that the lookup ended with.

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 from zstate._util.closeable import Closeable
 from zstate.clock import wait_interruptible
-from zstate.errors import MessageError, ModelError, ZStateError
+from zstate.errors import ModelError, ZStateError
 from zstate.model.urdf import parse_urdf
-from zstate.net.latched import LatchedSubscriber
-from zstate.transform import Transform
+from zstate.net.subscription import Received, subscribe
 from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import RobotDescription, StaticTransforms
 from zstate.wire.registry import get_wire
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.static_publisher import StaticPublisher
-    from zstate.wire.protocol import SerializedSample
+    from zstate.transform import Transform
 
 _MODEL_WITHIN_S = 1.5
 
@@ -36,21 +35,17 @@ def unknown_target_warnings(
     Waits up to 1.5 s for the model of each robot that a target belongs to. Without a model, or if access
     control hides it, only similar names among other static frames are reported.
     """
-    full = [
-        Transform(
-            full_name(publisher.robot, edge.target),
-            full_name(publisher.robot, edge.source),
-            edge.translation,
-            edge.rotation,
-        )
-        for edge in edges
-    ]
+    owner = publisher.robot
+    full = {full_name(owner, edge.target): full_name(owner, edge.source) for edge in edges}
+    placed = {full_name(owner, edge.source) for edge in edges}
     warnings: list[str] = []
-    for robot in dict.fromkeys(edge.target.partition("/")[0] for edge in full):
-        with suppress(ZStateError), KnownFrames(session, robot, publisher.writer) as frames:
-            frames.wait_for_model()
-            edges_on = [edge for edge in full if edge.target.startswith(f"{robot}/")]
-            warnings += frames.warnings(edges_on, {edge.source for edge in full})
+    for robot in dict.fromkeys(target.partition("/")[0] for target in full):
+        with suppress(ZStateError), _KnownFrames(session, robot, publisher.writer) as frames:
+            wait_interruptible(frames.described, _MODEL_WITHIN_S)
+            known = frames.names()
+            for target, source in full.items():
+                if target.startswith(f"{robot}/") and target not in known | placed:
+                    warnings += frames.warnings(target, source, known)
     return warnings
 
 
@@ -66,66 +61,51 @@ def without_program_advice(text: str) -> str:
     return re.sub(r"; withdraw\('[^']*'\) first if it really moved", "", text)
 
 
-class KnownFrames(Closeable):
+class _KnownFrames(Closeable):
     """The links of ``robot`` and the frames of its static writers other than ``writer``."""
 
     def __init__(self, session: Session, robot: str, writer: str) -> None:
         self._robot, self._writer = robot, writer
         self._wire = get_wire("native")
         self._model: RobotModel | None = None
-        self._described = threading.Event()
+        self.described = threading.Event()
         self._statics: dict[str, frozenset[str]] = {}
         with ExitStack() as opening:
-            key = self._wire.expression(robot, "tf_static")
-            opening.enter_context(LatchedSubscriber(session, key, self._on_statics))
-            key = self._wire.expression(robot, "robot_description")
-            opening.enter_context(LatchedSubscriber(session, key, self._on_description))
+            for stream in ("tf_static", "robot_description"):
+                opening.enter_context(subscribe(session, self._wire, robot, stream, self._on_messages))
             self._opened = opening.pop_all()
 
     def close(self) -> None:
         self._opened.close()
 
-    def _on_description(self, arrival: SerializedSample) -> None:
-        with suppress(MessageError, ModelError):
-            for message in self._wire.decode("robot_description", arrival, self._robot):
-                if isinstance(message, RobotDescription):
-                    self._model = parse_urdf(message.urdf, f"the URDF of {self._robot!r}")
-                    self._described.set()
-
-    def _on_statics(self, arrival: SerializedSample) -> None:
-        writer = self._wire.static_writer_name(arrival.key) or ""
-        if writer in (MODEL_WRITER, self._writer):
-            return
-        with suppress(MessageError):
-            for message in self._wire.decode("tf_static", arrival, self._robot):
-                if isinstance(message, StaticTransforms):
+    def _on_messages(self, received: list[Received]) -> None:
+        for _, key, message in received:
+            if isinstance(message, StaticTransforms):
+                writer = self._wire.static_writer_name(key) or ""
+                if writer not in (MODEL_WRITER, self._writer):
                     names = (full_name(self._robot, frame) for edge in message.edges for frame in edge)
                     self._statics[writer] = frozenset(names)
+            elif isinstance(message, RobotDescription):
+                with suppress(ModelError):
+                    self._model = parse_urdf(message.urdf, f"the URDF of {self._robot!r}")
+                    self.described.set()
 
-    def wait_for_model(self) -> None:
-        """Wait until the model has arrived, at most 1.5 s."""
-        wait_interruptible(self._described, _MODEL_WITHIN_S)
-
-    def warnings(self, edges: Sequence[Transform], placed: Collection[str]) -> list[str]:
-        """Warnings about ``edges``; frames that are ``placed`` with them count as known."""
+    def names(self) -> frozenset[str]:
+        """The full names of all known frames."""
         links = () if self._model is None else self._model.links
-        known = frozenset(full_name(self._robot, link) for link in links).union(*self._statics.values())
-        targets = dict.fromkeys(edge.target for edge in edges if edge.target not in known.union(placed))
-        sources = {edge.target: edge.source for edge in edges}
-        found = [self._warning(target, sources[target], known) for target in targets]
-        return list(filter(None, found))
+        return frozenset(full_name(self._robot, link) for link in links).union(*self._statics.values())
 
-    def _warning(self, target: str, source: str, known: frozenset[str]) -> str:
+    def warnings(self, target: str, source: str, known: frozenset[str]) -> Iterator[str]:
+        """The warning about an unknown ``target``; none without a model and a similar name."""
         bare, robot = target.removeprefix(f"{self._robot}/"), self._robot
-        near = similar_frames(target, known)
-        if near:
+        if near := similar_frames(target, known):
             which = " or ".join(map(repr, near))
-            return f"{robot!r} has no frame {bare!r}; did you mean {which}? (--new if it is a new frame)"
-        if self._model is None:
-            return ""
-        if source in known:
-            return (
+            yield f"{robot!r} has no frame {bare!r}; did you mean {which}? (--new if it is a new frame)"
+        elif self._model is not None and source in known:
+            yield (
                 f"{target!r} is a new frame of {robot!r} alone; name a frame that robots share in full, "
                 f"for instance fleet/{bare} (--new if it is a new frame)"
             )
-        return f"{robot!r} has no frame {bare!r}: {source!r} is not joined to it (--new if it is a new frame)"
+        elif self._model is not None:
+            fact = f"{robot!r} has no frame {bare!r}: {source!r} is not joined to it"
+            yield f"{fact} (--new if it is a new frame)"

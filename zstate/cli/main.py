@@ -1,4 +1,4 @@
-"""Entry point of the command line: loads the called command, handles signals and exit codes."""
+"""Entry point of the command line: loads and completes commands, handles signals and exit codes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -61,6 +62,10 @@ _COMMANDS = {
 COMPLETION_VARIABLE = "_ZSTATE_COMPLETE"
 """Set by the completion function of a shell."""
 
+# Robots on this host are discovered in a fraction of this; a longer delay is annoying at a prompt.
+_ROBOTS_WITHIN_S = 0.4
+# The arguments that are models, by command.
+_MODELS = {"check": "file", "demo": "robot", "init": "robot", "joints": "robot", "publish": "robot"}
 
 # Columns that click leaves free at the right.
 _MARGIN = 2
@@ -92,14 +97,15 @@ class HelpFormatter(click.HelpFormatter):
         self.indent()
 
     def getvalue(self) -> str:
-        return "\n".join(part for line in super().getvalue().split("\n") for part in self._wrap_example(line))
-
-    def _wrap_example(self, line: str) -> list[str]:
-        example = _EXAMPLE.fullmatch(line)
-        if example is None or len(line) <= self.width + _MARGIN:
-            return [line]
-        indent, command, comment = example.groups()
-        return [indent + comment, indent + command]
+        lines: list[str] = []
+        for line in super().getvalue().split("\n"):
+            example = _EXAMPLE.fullmatch(line)
+            if example is None or len(line) <= self.width + _MARGIN:
+                lines.append(line)
+            else:
+                indent, command, comment = example.groups()
+                lines += [indent + comment, indent + command]
+        return "\n".join(lines)
 
 
 class HelpContext(click.Context):
@@ -121,12 +127,11 @@ class Commands(click.Group):
         assert isinstance(command, click.Command)
         for one in (command, *(command.commands.values() if isinstance(command, click.Group) else ())):
             one.context_class = HelpContext
+            for parameter in one.params if COMPLETION_VARIABLE in os.environ else ():
+                if isinstance(parameter, click.Argument):
+                    parameter.type = _completed_type(one.name or "", parameter)
         if logs.log_format_option not in command.params:
             command.params.append(logs.log_format_option)
-        if COMPLETION_VARIABLE in os.environ:
-            from zstate.cli.completion import with_completion
-
-            return with_completion(command)
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
@@ -161,6 +166,58 @@ class Commands(click.Group):
                 formatter.write_dl(rows)
 
 
+class _Completed(click.types.StringParamType):
+    """Text that a shell completes with the names of ``complete(context, incomplete)``, or else as a file."""
+
+    def __init__(self, complete: Callable[[click.Context, str], Iterable[str]], *, or_file: bool) -> None:
+        self._complete, self._or_file = complete, or_file
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        from click.shell_completion import CompletionItem
+
+        found = [CompletionItem(name) for name in self._complete(ctx, incomplete)]
+        return [CompletionItem(incomplete, type="file")] if self._or_file and not found else found
+
+
+def _completed_type(command: str, argument: click.Argument) -> Any:
+    """The type of an argument while a shell completes: robots, models, files and parameters."""
+    if _MODELS.get(command) == argument.name:
+        return _Completed(_catalog_names, or_file=True)
+    if command == "up" and argument.name == "parameters":
+        return _Completed(_settings, or_file=False)
+    if argument.name in ("robot", "robots"):
+        return _Completed(_announced_names, or_file=False)
+    return click.Path() if argument.name in ("file", "folder") else argument.type
+
+
+def _catalog_names(_: click.Context, incomplete: str) -> Iterator[str]:
+    from zstate.model.catalog import catalog
+
+    return (entry.name for entry in catalog() if entry.name.startswith(incomplete))
+
+
+def _announced_names(ctx: click.Context, incomplete: str) -> Iterator[str]:
+    from zstate.cli.session import SessionOptions
+    from zstate.net.presence import discover
+
+    get = ctx.params.get
+    network = SessionOptions(get("mode"), get("connect") or (), get("listen") or (), get("config"))
+    with suppress(ZStateError), network.open(_ROBOTS_WITHIN_S) as session:  # the command reports errors
+        robots = discover(session, _ROBOTS_WITHIN_S, wire=get("wire") or "native")
+        yield from (robot.name for robot in robots if robot.name.startswith(incomplete))
+
+
+def _settings(ctx: click.Context, incomplete: str) -> Iterator[str]:
+    """KEY=VALUE with the parameters of the file of `zstate up` and their current values."""
+    from zstate.cli.up.toml_file import TomlFile
+
+    with suppress(ZStateError):
+        parameters = TomlFile(Path(str(ctx.params.get("file")))).tables.get("parameters", {})
+        yield from (f"{key}={value}" for key, value in parameters.items() if key.startswith(incomplete))
+
+
 def _print_version(ctx: click.Context, _: click.Parameter, is_set: bool) -> None:
     if is_set:
         from zstate import __version__, kernel
@@ -192,30 +249,30 @@ def main() -> NoReturn:
     logs.use_environment_format()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _end)
+    text: str | None = None
+    code: str | int | None = 0
     try:
         code = group.main(prog_name="zstate", standalone_mode=False)
     except getattr(click.exceptions, "NoArgsIsHelpError", ()) as error:
         click.echo(error.format_message())  # click before 8.2 prints the help itself
-        code = 0
     except click.UsageError as error:
         from zstate.cli.usage_hints import usage_hint
 
         text = usage_hint(sys.argv[1:], error) or error.format_message()
-        _report_error(f"{text}\nSee `{error.ctx.command_path} --help`." if error.ctx else text)
+        text += f"\nSee `{error.ctx.command_path} --help`." if error.ctx else ""
         code = error.exit_code
     except click.ClickException as error:
-        _report_error(error.format_message())
-        code = error.exit_code
+        text, code = error.format_message(), error.exit_code
     except ZStateError as error:
-        _report_error(str(error))
-        code = 1
+        text, code = str(error), 1
     except SystemExit as leaving:
         code = leaving.code
-    _exit(code)
+    if text is not None:
+        logs.write(text, level="error", event="failed")
+    _exit(code or 0)
 
 
-def _exit(code: str | int | None) -> NoReturn:
-    code = code or 0
+def _exit(code: str | int) -> NoReturn:
     # A thread inside Zenoh during Python's shutdown, such as one still connecting, aborts the process. The
     # thread "zstate exit" is idle if all sessions are closed.
     is_busy = any(thread.daemon and thread.name != "zstate exit" for thread in threading.enumerate())
@@ -233,7 +290,3 @@ def _end(number: int, _: FrameType | None) -> None:
     # An orderly exit takes well under a second; a second signal ends it at once.
     signal.signal(number, lambda number, _: os._exit(128 + number))
     raise SystemExit(128 + number)
-
-
-def _report_error(text: str) -> None:
-    logs.write(text, level="error", event="failed")

@@ -27,91 +27,105 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 PASSWORD_VARIABLE = "ZSTATE_PASSWORD"
 
+
+class Checked(click.types.StringParamType):
+    """A parameter type: the value is ``convert(text)``, and InvalidInput from that is wrong usage."""
+
+    def __init__(self, metavar: str, convert: Callable[[Any], Any]) -> None:
+        self.name, self._convert = metavar, convert
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return self._convert(value)
+        except InvalidInput as error:
+            self.fail(str(error), param, ctx)
+
+
+def number(metavar: str, check: Callable[[float], float]) -> Checked:
+    """A number that ``check`` returns unchanged."""
+    return Checked(metavar, lambda value: check(click.FLOAT.convert(value, None, None)))
+
+
+def _check_rate(rate_hz: float) -> float:
+    from zstate.rate import check_rate  # loads numpy, which --help does not need
+
+    return check_rate(rate_hz)
+
+
+def _check_seconds(seconds: float) -> float:
+    if not (math.isfinite(seconds) and seconds > 0.0):
+        raise InvalidInput(f"a duration is a positive number of seconds; got {seconds}")
+    return seconds
+
+
+RATE = number("HZ", _check_rate)
+SECONDS = number("S", _check_seconds)
+
+EXISTING_FILE = click.Path(exists=True, dir_okay=False)
+
+
 _IDENTITY_OPTIONS = (
     click.option(
         "--certs",
+        envvar="ZSTATE_CERTS",
         type=click.Path(exists=True, file_okay=False),
         metavar="DIR",
-        envvar="ZSTATE_CERTS",
         help="Encrypt with ca.pem, NAME.pem and NAME.key of this folder (`zstate certs` makes them).",
     ),
     click.option(
         "--identity",
-        metavar="NAME",
         envvar="ZSTATE_IDENTITY",
+        metavar="NAME",
         help="The certificate in --certs to use; access control identifies this command by it.",
     ),
     click.option(
         "--user",
-        metavar="NAME",
         envvar="ZSTATE_USER",
+        metavar="NAME",
         help=f"User name for a router; its password is in {PASSWORD_VARIABLE}, or in --password-file.",
     ),
     click.option(
         "--password-file",
-        type=click.Path(exists=True, dir_okay=False),
-        metavar="FILE",
         envvar="ZSTATE_PASSWORD_FILE",
+        type=EXISTING_FILE,
         help="A file that only you can read; its first line is the password of --user.",
     ),
 )
-_USERS = click.option(
+_USERS_OPTION = click.option(
     "--users",
-    type=click.Path(exists=True, dir_okay=False),
-    metavar="FILE",
     envvar="ZSTATE_USERS",
+    type=EXISTING_FILE,
     help="The users that may connect: user:password lines in a file that only you can read; default: all.",
 )
-
-
-def identity_options(command: Command) -> Command:
-    """Add the credential options to a command, which receives ``credentials``."""
-    return _with_credentials(command, _IDENTITY_OPTIONS)
-
-
-def router_identity_options(command: Command) -> Command:
-    """The credential options with ``--users``."""
-    return _with_credentials(command, (*_IDENTITY_OPTIONS, _USERS))
+_CREDENTIALS = ("certs", "identity", "user", "password_file", "users")
+_NETWORK = (*_CREDENTIALS, "mode", "connect", "listen", "config")
 
 
 def session_options(command: Command) -> Command:
     """Add the session and credential options to a command, which receives ``network``, a SessionOptions."""
 
     @functools.wraps(command)
-    def with_network(
-        *,
-        mode: str | None,
-        connect: tuple[str, ...],
-        listen: tuple[str, ...],
-        config: str | None,
-        credentials: Credentials | None,
-        **options: Any,
-    ) -> Any:
-        return command(network=SessionOptions(mode, connect, listen, config, credentials), **options)
+    def with_network(**params: Any) -> Any:
+        own = {name: value for name, value in params.items() if name not in _NETWORK}
+        return command(network=build_network(params), **own)
 
-    return _with_options(_with_credentials(with_network, _IDENTITY_OPTIONS), _SESSION_OPTIONS)
+    return plain_session_options(with_network)
 
 
-def plain_session_options(command: Command) -> Command:
+def plain_session_options(command: Any) -> Any:
     """The session and credential options, each passed on unchanged."""
     return _with_options(command, (*_SESSION_OPTIONS, *_IDENTITY_OPTIONS))
 
 
-def _with_credentials(command: Any, options: Sequence[Callable[[Any], Any]]) -> Any:
-    @functools.wraps(command)
-    def with_credentials(
-        *,
-        certs: str | None,
-        identity: str | None,
-        user: str | None,
-        password_file: str | None,
-        users: str | None = None,
-        **others: Any,
-    ) -> Any:
-        credentials = build_credentials(certs, identity, user, password_file, users)
-        return command(credentials=credentials, **others)
+def router_identity_options(command: Command) -> Command:
+    """Add the credential options and ``--users`` to a command, which receives ``credentials``."""
 
-    return _with_options(with_credentials, options)
+    @functools.wraps(command)
+    def with_credentials(**params: Any) -> Any:
+        own = {name: value for name, value in params.items() if name not in _CREDENTIALS}
+        return command(credentials=build_credentials(params), **own)
+
+    return _with_options(with_credentials, (*_IDENTITY_OPTIONS, _USERS_OPTION))
 
 
 def _with_options(command: Any, options: Sequence[Callable[[Any], Any]]) -> Any:
@@ -120,14 +134,15 @@ def _with_options(command: Any, options: Sequence[Callable[[Any], Any]]) -> Any:
     return command
 
 
-def build_credentials(
-    certs: str | None,
-    identity: str | None,
-    user: str | None,
-    password_file: str | None,
-    users: str | None,
-) -> Credentials | None:
-    """Credentials from options. Raises UsageError for half a pair, ConfigError for unusable files."""
+def build_network(params: Mapping[str, Any]) -> SessionOptions:
+    """The session options among the ``params`` of a command. Raises as ``build_credentials`` does."""
+    mode, connect, listen, config = (params[name] for name in ("mode", "connect", "listen", "config"))
+    return SessionOptions(mode, connect, listen, config, build_credentials(params))
+
+
+def build_credentials(params: Mapping[str, Any]) -> Credentials | None:
+    """Credentials from ``params``. Raises UsageError for half a pair, ConfigError for unusable files."""
+    certs, identity, user, password_file, users = map(params.get, _CREDENTIALS)
     if (certs is None) != (identity is None):
         has, lacks = ("--certs", "--identity NAME") if identity is None else ("--identity", "--certs DIR")
         raise click.UsageError(f"{has} needs {lacks}")
@@ -159,84 +174,72 @@ def _password(user: str, file: str | None) -> str:
 
 config_option = click.option(
     "--config",
-    type=click.Path(exists=True, dir_okay=False),
-    metavar="FILE",
     envvar="ZSTATE_CONFIG",
+    type=EXISTING_FILE,
     help="A Zenoh configuration (JSON5); default: the file that ZENOH_CONFIG names.",
 )
-
 _SESSION_OPTIONS = (
     click.option(
         "--mode",
-        type=click.Choice(["peer", "loopback", "lan", "client", "router"]),
         envvar="ZSTATE_MODE",
+        type=click.Choice(["peer", "loopback", "lan", "client", "router"]),
         help="How to join the network: loopback never leaves this host, lan is open to the local network and "
         "found by multicast; default: client with --connect alone, client of tcp/127.0.0.1:7447 for a ROS "
         "wire alone, else peer.",
     ),
     click.option(
         "--connect",
+        envvar="ZSTATE_CONNECT",
         multiple=True,
         metavar="ENDPOINT",
-        envvar="ZSTATE_CONNECT",
         help="An endpoint to connect to, such as tcp/192.168.1.10:7447; may be repeated.",
     ),
     click.option(
         "--listen",
+        envvar="ZSTATE_LISTEN",
         multiple=True,
         metavar="ENDPOINT",
-        envvar="ZSTATE_LISTEN",
         help="An endpoint to listen on, such as tcp/0.0.0.0:7448; may be repeated.",
     ),
     config_option,
 )
 
 
-def _checked_wire(_: click.Context, __: click.Parameter, wires: str | tuple[str, ...]) -> Any:
+def _check_wire(wire: str) -> str:
     from zstate.wire.registry import get_wire
 
-    try:
-        for wire in (wires,) if isinstance(wires, str) else wires:
-            get_wire(wire)
-    except InvalidInput as error:
-        raise click.BadParameter(str(error)) from None
-    return wires
+    get_wire(wire)
+    return wire
 
+
+_WIRE = Checked("WIRE", _check_wire)
 
 wire_option = click.option(
     "--wire",
+    envvar="ZSTATE_WIRE",
+    type=_WIRE,
     default="native",
     show_default=True,
-    callback=_checked_wire,
-    metavar="WIRE",
-    envvar="ZSTATE_WIRE",
     help="The wire format: native, ros2 (for rmw_zenoh nodes) or ros2dds (through its bridge); with "
     "options, such as ros2:domain=5,namespace=r1.",
 )
 wires_option = click.option(
     "--wire",
     "wires",
+    envvar="ZSTATE_WIRE",
+    type=_WIRE,
     multiple=True,
     default=("native",),
     show_default=True,
-    callback=_checked_wire,
-    metavar="WIRE",
-    envvar="ZSTATE_WIRE",
     help="The wire format, as in `--wire native --wire ros2:domain=5,namespace=r1`; may be repeated.",
 )
 
 
-def _checked_address(_: click.Context, __: click.Parameter, text: str | None) -> BindAddress | None:
-    if text is None:
-        return None
+def _bind_address(text: str) -> BindAddress:
     from zstate.metrics.endpoint import BindAddress, check_library
 
     check_library()  # before anything runs
-
-    try:
-        return BindAddress.parse(text)
-    except InvalidInput as error:
-        raise click.BadParameter(str(error)) from None
+    return BindAddress.parse(text)
 
 
 takeover_option = click.option(
@@ -246,8 +249,7 @@ takeover_option = click.option(
 )
 metrics_option = click.option(
     "--metrics",
-    callback=_checked_address,
-    metavar="[HOST:]PORT",
+    type=Checked("[HOST:]PORT", _bind_address),
     help="Serve metrics for Prometheus over HTTP, by default on this host only; 0 is a free port.",
 )
 
@@ -271,15 +273,7 @@ def form_options(json: str, svg: str) -> Callable[[Command], Command]:
 
 def timeout_option(what: str, default_s: float = 10.0) -> Callable[[Command], Command]:
     """``--timeout`` [s]; ``what`` is its help."""
-    return click.option(
-        "--timeout",
-        type=float,
-        callback=checked_seconds,
-        default=default_s,
-        metavar="S",
-        show_default=True,
-        help=what,
-    )
+    return click.option("--timeout", type=SECONDS, default=default_s, show_default=True, help=what)
 
 
 def named_robot(session: Session, robot: str | None, wire: str) -> str:
@@ -358,51 +352,24 @@ def load_robot(
         raise InvalidInput(f"{error}; choose another name with --name") from None
 
 
-def checked_rate(_: click.Context, __: click.Parameter, rate_hz: float | None) -> float | None:
-    """The callback of a ``--rate`` option; refuses rates that cannot be achieved."""
-    from zstate.rate import check_rate
-
-    try:
-        return None if rate_hz is None else check_rate(rate_hz)
-    except InvalidInput as error:
-        raise click.BadParameter(str(error)) from None
-
-
-def checked_seconds(_: click.Context, __: click.Parameter, seconds: float | None) -> float | None:
-    """The callback of a duration option: positive and finite."""
-    if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
-        raise click.BadParameter(f"a duration is a positive number of seconds; got {seconds}")
-    return seconds
-
-
 _CLOCKS = click.Choice(["system", "sim"])
 
 clock_option = click.option(
     "--clock",
+    envvar="ZSTATE_CLOCK",
     type=_CLOCKS,
     default="system",
     show_default=True,
-    envvar="ZSTATE_CLOCK",
     help="The clock for stamps and rates: the system's, or the simulated time on zstate/clock or /clock.",
 )
 reading_clock_option = click.option(
     "--clock",
-    type=_CLOCKS,
     envvar="ZSTATE_CLOCK",
+    type=_CLOCKS,
     help="The clock that ages are measured with, and that is preferred if robots have different clocks.",
 )
-rate_option = click.option(
-    "--rate",
-    type=float,
-    default=100.0,
-    show_default=True,
-    callback=checked_rate,
-    metavar="HZ",
-    help="Samples a second.",
-)
-seconds_option = click.option(
-    "--seconds", type=float, callback=checked_seconds, metavar="N", help="End after N seconds."
-)
+rate_option = click.option("--rate", type=RATE, default=100.0, show_default=True, help="Samples a second.")
+seconds_option = click.option("--seconds", type=SECONDS, metavar="N", help="End after N seconds.")
 robot_filter_option = click.option(
     "--robot", default="*", metavar="NAME", help="Subscribe to this robot only; default: all robots."
 )

@@ -73,15 +73,16 @@ class BackgroundCall(Generic[Result]):
     def __init__(self, name: str, work: Callable[[], Result]) -> None:
         self._outcome: Future[Result] = Future()
         self._is_done = threading.Event()
-        threading.Thread(target=self._run, args=(work,), name=name, daemon=True).start()
 
-    def _run(self, work: Callable[[], Result]) -> None:
-        try:
-            self._outcome.set_result(work())
-        except Exception as error:  # raised again by result()
-            self._outcome.set_exception(error)
-        finally:
-            self._is_done.set()
+        def run() -> None:
+            try:
+                self._outcome.set_result(work())
+            except Exception as error:  # raised again by result()
+                self._outcome.set_exception(error)
+            finally:
+                self._is_done.set()
+
+        threading.Thread(target=run, name=name, daemon=True).start()
 
     def result(self, timeout_s: float | None = None) -> Result:
         """The value that ``work`` returned, or its exception. Raises TimeoutError after ``timeout_s``."""
@@ -130,8 +131,8 @@ class ChildProcess(Closeable):
         self._on_line = on_line
         self._on_end = on_end
         self._readers = [
-            threading.Thread(target=read, name=f"zstate {name}", daemon=True)
-            for read in (self._follow_lines, self._follow_errors)
+            threading.Thread(target=self._read, args=output, name=f"zstate {name}", daemon=True)
+            for output in ((self._process.stdout, False), (self._process.stderr, True))
         ]
         for thread in (*self._readers, threading.Thread(target=self._follow, daemon=True)):
             thread.start()
@@ -173,17 +174,15 @@ class ChildProcess(Closeable):
             reader.join(END_WITHIN_S)
         self._on_end(self)
 
-    def _follow_lines(self) -> None:
-        for line in _lines(self._process.stdout):
-            self._on_line(line, False)
-
-    def _follow_errors(self) -> None:
-        for line in _lines(self._process.stderr):
-            if line.strip():
+    def _read(self, stream: IO[str] | None, is_error: bool) -> None:
+        for line in _lines(stream):
+            if is_error and not line.strip():
+                continue
+            if is_error:
                 # An indented line continues the one before, as in findings and Python's tracebacks.
                 goes_on = line[0].isspace() and len(self.last_error) < _LONGEST_ERROR
                 self.last_error = f"{self.last_error} {line.strip()}".strip() if goes_on else text_in(line)
-                self._on_line(line, True)
+            self._on_line(line, is_error)
 
 
 def _lines(stream: IO[str] | None) -> Iterator[str]:

@@ -53,7 +53,7 @@ class RobotDirectory(Closeable):
         wire: str = "native",
         on_change: Callable[[], object] = lambda: None,
     ) -> None:
-        from zstate.net.presence import watch
+        from zstate.net.presence import WriterWatch
 
         self.messages = messages_for(wire)
         announced: set[Announcement] = set()
@@ -63,7 +63,7 @@ class RobotDirectory(Closeable):
             (announced.add if alive else announced.discard)(announcement)
             on_change()
 
-        self._watch = watch(session, robot if is_ros(wire) else "*", update, wire)
+        self._watch = WriterWatch(session, robot if is_ros(wire) else "*", update, wire)
 
     def close(self) -> None:
         self._watch.close()

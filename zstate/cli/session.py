@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 NATIVE = ("native",)
 
 # A router on this host answers in milliseconds; a remote one gets the library's default.
-_ROS_ROUTER_WITHIN_S = 2.0
+_LOCAL_ROUTER_WITHIN_S = 2.0
 _ROUTER_WITHIN_S = 5.0
 
 
@@ -49,6 +49,30 @@ class SessionOptions:
 
         return self.mode or implied_mode(self.connect, self.listen, self.config)
 
+    def for_wires(self, wires: tuple[str, ...]) -> SessionOptions:
+        """The options that ``open_session`` uses.
+
+        If all of ``wires`` are ROS wires and no option is set, the session is a client of the router on this
+        host, which ROS nodes use.
+        """
+        from zstate.net.config import ROUTER_ENDPOINT
+
+        is_default = all(map(is_ros, wires)) and not self.is_explicit
+        return SessionOptions("client", (ROUTER_ENDPOINT,)) if is_default else self
+
+    def open(self, timeout_s: float) -> Session:
+        """Connect with these options."""
+        from zstate.net.session import connect
+
+        return connect(
+            self.config,
+            mode=self.joins_as,
+            endpoints=self.connect,
+            listen=self.listen,
+            timeout_s=timeout_s,
+            credentials=self.credentials,
+        )
+
 
 @contextmanager
 def open_session(
@@ -56,54 +80,31 @@ def open_session(
 ) -> Generator[Session]:
     """A session for commands on ``wires``; connecting to a router may take ``timeout_s``, or a few seconds.
 
-    If all of ``wires`` are ROS wires and no option is set, it is a client of the router on this host, which
-    ROS nodes use. From now on, warnings of the library go to standard error.
+    From now on, warnings of the library go to standard error.
     """
+    from zstate.cli.processes import BackgroundCall
+
     configured = network.config or os.environ.get("ZENOH_CONFIG")
     if network.mode == "client" and not network.connect and not configured:
         raise click.UsageError("--mode client needs --connect, for instance tcp/192.168.1.10:7447")
     warn_on_standard_error()
-    connect = _connect_to_ros if all(map(is_ros, wires)) else _connect
-    with connect(network, timeout_s) as session:
-        yield session
-
-
-def _connect_to_ros(network: SessionOptions, timeout_s: float | None) -> Session:
-    from zstate.net.config import ROUTER_ENDPOINT
-
+    options = network.for_wires(wires)
+    within_s = timeout_s or (_ROUTER_WITHIN_S if options is network else _LOCAL_ROUTER_WITHIN_S)
+    # In a background thread: a signal interrupts waiting for it, but not Zenoh's own wait.
+    call = BackgroundCall("zstate connect", lambda: options.open(within_s))
     try:
-        if network.is_explicit:
-            return _connect(network, timeout_s)
-        return _connect(SessionOptions("client", (ROUTER_ENDPOINT,)), timeout_s or _ROS_ROUTER_WITHIN_S)
+        session = call.result()
     except Unreachable as error:
+        if not all(map(is_ros, wires)):
+            raise _with_advice(error) from None
         where = " or ".join(map(repr, error.endpoints)) or "the configured endpoints"
         fail(
             f"nothing answers at {where}, where the router of the ROS 2 nodes should be; start one "
             "(`ros2 run rmw_zenoh_cpp rmw_zenohd`, or `zstate router --ros2`), or set its address: "
             "--connect tcp/HOST:7447"
         )
-
-
-def _connect(network: SessionOptions, timeout_s: float | None) -> Session:
-    from zstate.cli.processes import BackgroundCall
-    from zstate.net.session import connect
-
-    # In a background thread: a signal interrupts waiting for it, but not Zenoh's own wait.
-    call = BackgroundCall(
-        "zstate connect",
-        lambda: connect(
-            network.config,
-            mode=network.joins_as,
-            endpoints=network.connect,
-            listen=network.listen,
-            timeout_s=timeout_s or _ROUTER_WITHIN_S,
-            credentials=network.credentials,
-        ),
-    )
-    try:
-        return call.result()
-    except Unreachable as error:
-        raise _with_advice(error) from None
+    with session:
+        yield session
 
 
 def _with_advice(error: Unreachable) -> Unreachable:

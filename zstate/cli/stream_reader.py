@@ -11,12 +11,11 @@ from zstate.cli.output.console import fail, print_status
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.waiting import ConditionWaiter
 from zstate.clock import LONGEST_WAIT_S
-from zstate.errors import MessageError
 from zstate.net.presence import announce_reader
-from zstate.net.streams import CAPACITY, StreamSubscriber
+from zstate.net.streams import CAPACITY
+from zstate.net.subscription import Received, subscribe
 from zstate.wire.keys import Stream, check_robot
 from zstate.wire.messages import Sample
-from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
@@ -39,14 +38,15 @@ class StreamReader(Closeable):
     def __init__(self, session: Session, robot: str, stream: Stream, wire: str = "native") -> None:
         self.robot = check_robot(robot)
         self._stream: Stream = stream
-        self._wire = get_wire(wire)
         self._refused: set[str] = set()
         self._samples: queue.SimpleQueue[TimedSample] = queue.SimpleQueue()
         self._waiter = ConditionWaiter()
         self._directory = RobotDirectory(session, robot, wire, self._waiter.notify)
-        key = self._wire.expression(robot, stream)
-        self._subscriber = StreamSubscriber(session, key, self._on_samples)
-        self._announcements = announce_reader(session, self._wire, robot, (stream,))
+        wire_format = get_wire(wire)
+        self._subscriber = subscribe(
+            session, wire_format, robot, stream, self._on_messages, on_error=self._on_error
+        )
+        self._announcements = announce_reader(session, wire_format, robot, (stream,))
 
     def close(self) -> None:
         for announcement in self._announcements:
@@ -54,22 +54,19 @@ class StreamReader(Closeable):
         self._subscriber.close()
         self._directory.close()
 
-    def _on_samples(self, arrivals: list[SerializedSample]) -> None:
+    def _on_messages(self, received: list[Received]) -> None:
         now = time.monotonic_ns()
-        for arrival in arrivals:
-            try:
-                samples = self._wire.decode(self._stream, arrival, self.robot)
-            except MessageError as error:
-                if error.reason not in self._refused:
-                    self._refused.add(error.reason)
-                    print_status(f"{arrival.key}: {error}; further ones are not reported")
-                continue
-            for sample in samples:
-                assert isinstance(sample, Sample)
-                # If the queue is not read, as on a stopped terminal, the newest samples are dropped.
-                if self._samples.qsize() < CAPACITY:
-                    self._samples.put(TimedSample(now, sample))
+        for _, _, sample in received:
+            assert isinstance(sample, Sample)
+            # If the queue is not read, as on a stopped terminal, the newest samples are dropped.
+            if self._samples.qsize() < CAPACITY:
+                self._samples.put(TimedSample(now, sample))
         self._waiter.notify()
+
+    def _on_error(self, reason: str, text: str) -> None:
+        if reason not in self._refused:
+            self._refused.add(reason)
+            print_status(f"{text}; further ones are not reported")
 
     def next(self, timeout_s: float) -> TimedSample | None:
         """The next sample, or None if none arrives within ``timeout_s``, at most 0.5 s."""

@@ -66,7 +66,6 @@ _NEAR = 0.75
 _XYZ = ("--x", "--y", "--z")
 _RPY = ("--roll", "--pitch", "--yaw")
 _QUATERNION = ("--qx", "--qy", "--qz", "--qw")
-_FRAMES = ("--frame-id", "--child-frame-id")
 
 
 def command_hint(name: str, commands: Iterable[str]) -> str:
@@ -80,23 +79,23 @@ def command_hint(name: str, commands: Iterable[str]) -> str:
 
 def usage_hint(arguments: Sequence[str], error: click.UsageError) -> str:
     """The cause of ``error`` and the correction; empty if click's own message is as good."""
-    return _unquoted_path(arguments) or _ros_static_hint(arguments) or _unknown_option_hint(error)
+    hint = _unquoted_path(arguments) or _ros_static_hint(arguments)
+    if hint or not isinstance(error, click.NoSuchOption) or not error.possibilities:
+        return hint
+    # An unknown option, with suggestions only if they are similar.
+    name = error.option_name
+    near = [option for option in error.possibilities if SequenceMatcher(None, name, option).ratio() >= _NEAR]
+    return f"{error.message} Did you mean {' or '.join(map(repr, near))}?" if near else error.message
 
 
 def _unquoted_path(arguments: Sequence[str]) -> str:
     """A hint for a path with a space, which the shell has split into several arguments."""
     for first, end in combinations(range(len(arguments) + 1), 2):
         path = " ".join(arguments[first:end])
-        if end - first > 1 and not path.startswith("-") and _exists(path):
-            return f"{path!r} is one path with a space in it; write it in quotes: {shlex.quote(path)}"
+        with suppress(OSError, ValueError):  # no path
+            if end - first > 1 and not path.startswith("-") and Path(path).exists():
+                return f"{path!r} is one path with a space in it; write it in quotes: {shlex.quote(path)}"
     return ""
-
-
-def _exists(path: str) -> bool:
-    try:
-        return Path(path).exists()
-    except (OSError, ValueError):
-        return False
 
 
 def _ros_static_hint(arguments: Sequence[str]) -> str:
@@ -104,9 +103,8 @@ def _ros_static_hint(arguments: Sequence[str]) -> str:
     if not arguments or arguments[0] != "static":
         return ""
     static = _from_options(arguments[1:]) or _from_positions(arguments[1:])
-    if not static:
-        return ""
-    return f"that is the form of ROS's static_transform_publisher; here it is\n  zstate static {static}"
+    form = "that is the form of ROS's static_transform_publisher; here it is"
+    return f"{form}\n  zstate static {static}" if static else ""
 
 
 def _from_positions(arguments: Sequence[str]) -> str:
@@ -114,23 +112,18 @@ def _from_positions(arguments: Sequence[str]) -> str:
     numbers, frames = arguments[:-2], arguments[-2:]
     if len(numbers) not in (6, 7) or not all(map(_is_number, numbers)) or any(map(_is_number, frames)):
         return ""
-    if len(numbers) == 7:
-        rotation = f"--quat-xyzw {' '.join(numbers[3:])}"
-    else:
-        rotation = f"--rpy {' '.join(reversed(numbers[3:]))}"
-    return f"{shlex.join(frames)} --xyz {' '.join(numbers[:3])} {rotation}"
+    rotation = ("--quat-xyzw", *numbers[3:]) if len(numbers) == 7 else ("--rpy", *numbers[:2:-1])
+    return f"{shlex.join(frames)} --xyz {' '.join((*numbers[:3], *rotation))}"
 
 
 def _from_options(arguments: Sequence[str]) -> str:
     """``--x 1 ... --frame-id parent --child-frame-id child``."""
-    options = {*_XYZ, *_RPY, *_QUATERNION, *_FRAMES}
+    options = {*_XYZ, *_RPY, *_QUATERNION, "--frame-id", "--child-frame-id"}
     parts = [part for argument in arguments for part in argument.split("=", 1)]
     values = {name: value for name, value in zip(parts[::2], parts[1::2], strict=False) if name in options}
     if not values or 2 * len(values) != len(parts):
         return ""
-    frames = [
-        values.get(name, placeholder) for name, placeholder in zip(_FRAMES, ("TARGET", "SOURCE"), strict=True)
-    ]
+    frames = values.get("--frame-id", "TARGET"), values.get("--child-frame-id", "SOURCE")
     static = [shlex.join(frames)]
     for option, names, default in (
         ("--xyz", _XYZ, "0 0 0"),
@@ -148,12 +141,3 @@ def _is_number(text: str) -> bool:
         float(text)
         return True
     return False
-
-
-def _unknown_option_hint(error: click.UsageError) -> str:
-    """An unknown option, with suggestions only if they are similar."""
-    if not isinstance(error, click.NoSuchOption) or not error.possibilities:
-        return ""
-    name = error.option_name
-    near = [option for option in error.possibilities if SequenceMatcher(None, name, option).ratio() >= _NEAR]
-    return f"{error.message} Did you mean {' or '.join(map(repr, near))}?" if near else error.message

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, NoReturn
 
 from zstate._util.closeable import Closeable
@@ -19,9 +19,7 @@ from zstate.clock import wait_interruptible
 from zstate.errors import (
     InFuture,
     InPast,
-    InvalidInput,
     LookupFailed,
-    MessageError,
     NoData,
     UnknownFrame,
     WaitTimeout,
@@ -31,10 +29,10 @@ from zstate.errors import (
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
     from zstate.net.session import Session
+    from zstate.net.subscription import Received
     from zstate.nodes.listener import Follow, TransformListener
     from zstate.transform import Transform
     from zstate.wire.keys import Stream
-    from zstate.wire.protocol import SerializedSample
 
 # A burst of notifications costs one check: conditions on a large fleet take milliseconds.
 _CHECK_INTERVAL_S = 0.02
@@ -49,7 +47,7 @@ _NOT_RECEIVED = (
 class ConditionWaiter:
     """Wakes the waiting main thread when a condition may have become true.
 
-    ``notify`` is a callback for subscriptions: any thread, any arguments. ``noted`` is the last reason that
+    ``notify`` is a callback for subscriptions: any thread, any arguments. ``last_reason`` is the one that
     the latest ``wait_for`` printed, empty if it printed none.
     """
 
@@ -126,12 +124,11 @@ class RobotReadiness(Closeable):
     """Readiness of ``robots``: a robot is ready when every moving edge has a sample."""
 
     def __init__(self, session: Session, robots: Sequence[str], wire: str) -> None:
-        from zstate.net.latched import LatchedSubscriber
+        from zstate.net.subscription import subscribe
         from zstate.wire.registry import get_wire
 
         self._session, self._wire = session, wire
         self._robots = tuple(dict.fromkeys(robots))
-        self._format = get_wire(wire)
         self._rigid: set[str] = set()
         self._listeners: dict[str, list[TransformListener]] = {}
         self._waiter = ConditionWaiter()
@@ -141,8 +138,8 @@ class RobotReadiness(Closeable):
             directory = RobotDirectory(session, robot, wire, self._waiter.notify)
             self._directory = opening.enter_context(directory)
             if not is_ros(wire):
-                key = self._format.expression(robot, "robot_description")
-                opening.enter_context(LatchedSubscriber(session, key, self._on_description))
+                rigid = subscribe(session, get_wire(wire), robot, "robot_description", self._on_descriptions)
+                opening.enter_context(rigid)
             self._opened = opening.pop_all()
 
     def close(self) -> None:
@@ -166,13 +163,21 @@ class RobotReadiness(Closeable):
         streams, directory = self._directory.streams(robot), self._directory
         if not streams:
             return directory.messages.unknown(robot, directory.robots())
+        from zstate.nodes.listener import TransformListener
+
         stream: Stream = "joint_states" if "robot_description" in streams else "robot_description"
         # Without a writer of joint states, transforms may be published instead.
         follows: list[Follow] = ["joint_states"] if "joint_states" in streams else ["joint_states", "tf"]
         if is_ros(self._wire):
             stream, follows = "tf", ["tf"]
         if robot not in self._listeners:
-            self._listeners[robot] = [self._listen(robot, follow) for follow in follows]
+            self._listeners[robot] = []
+            for follow in follows:
+                listener = TransformListener(
+                    self._session, robot, wire=self._wire, follow=follow, history_on_join=False
+                )
+                listener.add_observer(self._waiter.notify)
+                self._listeners[robot].append(self._opened.enter_context(listener))
         for listener in self._listeners[robot]:
             moving = [frame for frame in listener.buffer.frames() if frame.kind in ("joint", "pose")]
             if (moving or robot in self._rigid) and all(frame.count for frame in moving):
@@ -180,25 +185,14 @@ class RobotReadiness(Closeable):
         refused = "; ".join(text for one in self._listeners[robot] for text in one.refusals.values())
         return refused or directory.no_sample_text(robot, stream)
 
-    def _on_description(self, arrival: SerializedSample) -> None:
+    def _on_descriptions(self, received: list[Received]) -> None:
         """Register robots without moving joints: they publish no samples."""
         from zstate.wire.messages import RobotDescription
 
-        with suppress(MessageError, InvalidInput):  # withdrawn; or invalid, which the listener reports
-            robot = self._format.robot_from_key(arrival.key)
-            for message in self._format.decode("robot_description", arrival, robot):
-                if isinstance(message, RobotDescription) and not message.moving_edges:
-                    self._rigid.add(robot)
-                    self._waiter.notify()
-
-    def _listen(self, robot: str, follow: Follow) -> TransformListener:
-        from zstate.nodes.listener import TransformListener
-
-        listener = TransformListener(
-            self._session, robot, wire=self._wire, follow=follow, history_on_join=False
-        )
-        listener.add_observer(self._waiter.notify)
-        return self._opened.enter_context(listener)
+        for robot, _, message in received:
+            if isinstance(message, RobotDescription) and not message.moving_edges:
+                self._rigid.add(robot)
+                self._waiter.notify()
 
 
 class PoseWaiter:

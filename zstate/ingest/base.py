@@ -7,8 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
-from zstate._util.bounded_dict import BoundedDict
-from zstate._util.bounded_queue import BoundedQueue
+from zstate._util.bounded import BoundedDict, BoundedQueue
 from zstate._util.fork_safe import fork_safe
 from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput, MessageError, format_duration

@@ -8,7 +8,7 @@ from collections import Counter, deque
 from collections.abc import Hashable
 from dataclasses import dataclass
 
-from zstate._util.bounded_dict import MAX_ENTRIES, BoundedDict
+from zstate._util.bounded import MAX_ENTRIES, BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 

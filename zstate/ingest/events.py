@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Literal
 
-from zstate._util.bounded_dict import MAX_ENTRIES, BoundedDict
+from zstate._util.bounded import MAX_ENTRIES, BoundedDict
 from zstate._util.callback_thread import CallbackThread
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock

@@ -22,22 +22,70 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import count
 from typing import NamedTuple
 
-from zstate._util.bounded_dict import BoundedDict
+import numpy as np
+
+from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.frame_tree import Edge
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
-from zstate.ingest.edge_claims import CONTESTED, Admitted, EdgeClaim, EdgeSource, is_same_pose
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
 from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, foreign_edge_problem, frame_owner
 
-_MODEL, _OWN, _OTHERS = range(3)
+CONTESTED = ("second parent", "second writer", "loop")
+"""The refusal reasons of edges that exclude each other."""
+
+# A static edge this close to the model's [m, or the sine of an angle] was computed from the same URDF.
+_SAME_POSE = 1e-6
+
+# The ranks of edges; the lowest is that of edges inserted by the caller.
+_MODEL, _OWN, _OTHERS, _CALLER = range(4)
+
+
+@dataclass(eq=False, slots=True)
+class EdgeClaim:
+    """An edge that one source publishes. ``pose`` is None for a moving one."""
+
+    source: EdgeSource
+    parent: str
+    child: str
+    order: int
+    published: int = 0
+    pose: Transform | None = None
+    is_accepted: bool = False
+    refusal: InsertRefused | None = None
+
+    @property
+    def names(self) -> EdgeNames:
+        """(parent, child)."""
+        return self.parent, self.child
+
+
+@dataclass(eq=False, slots=True)
+class EdgeSource:
+    """A writer of edges: the ``robot`` whose key they arrive on, and the ``session`` in its messages.
+
+    ``name`` is only printed, no rule depends on it. ``is_model`` marks the edges of the robot's model.
+    """
+
+    robot: str
+    name: str
+    session: int = 0
+    is_model: bool = False
+    claims: dict[EdgeNames, EdgeClaim] = field(default_factory=dict[EdgeNames, EdgeClaim])
+
+
+class Admitted(NamedTuple):
+    """The ``rows`` of a sample that may be inserted, None for all, and the refusal of another row."""
+
+    rows: tuple[int, ...] | None = None
+    refusal: InsertRefused | None = None
 
 
 class _AcceptedEdge(NamedTuple):
@@ -45,13 +93,15 @@ class _AcceptedEdge(NamedTuple):
 
     parent: str
     writer: str
+    rank: int
     claim: EdgeClaim | None
     pose: Transform | None
-    is_model: bool = False
 
     def is_as_good_as(self, claim: EdgeClaim) -> bool:
         """Whether both fix the child at the same pose, as a ROS robot_state_publisher repeats the model."""
-        return self.pose is not None and claim.pose is not None and is_same_pose(self.pose, claim.pose)
+        if self.pose is None or claim.pose is None:
+            return False
+        return np.allclose(self.pose.matrix, claim.pose.matrix, rtol=0.0, atol=_SAME_POSE)
 
 
 class FrameOwnership:
@@ -120,10 +170,7 @@ class FrameOwnership:
                 self._insert(claim)
 
     def place_model(self, robot: str, model: RobotModel, before: JointTrack | None) -> JointTrack:
-        """Add a robot's model to the buffer, replacing the track ``before``.
-
-        Conflicting edges of any writer are withdrawn. Raises InsertRefused.
-        """
+        """Replace the track ``before`` by a model; conflicting edges are withdrawn. Raises InsertRefused."""
         with self._lock:
             if before is not None:
                 self.buffer.remove_robot(before)
@@ -162,10 +209,7 @@ class FrameOwnership:
     def set_statics(
         self, source: EdgeSource, edges: Mapping[EdgeNames, Transform], *, adds: bool = False
     ) -> None:
-        """Replace the static edges of ``source``.
-
-        With ``adds``, as in ROS, only earlier edges of the same children are replaced.
-        """
+        """Replace the static edges of ``source``; with ``adds``, as in ROS, only of the same children."""
         with self._lock:
             edges = {self._named(names): pose for names, pose in edges.items()}
             children = {child for _, child in edges}
@@ -322,12 +366,6 @@ class FrameOwnership:
             return _MODEL if claim.source.is_model else _OWN
         return _OTHERS if owner in self._robots else _OWN
 
-    def _rank_of(self, there: _AcceptedEdge) -> int:
-        """The rank of an accepted edge; an edge inserted by the caller has the lowest."""
-        if there.claim is None:
-            return _MODEL if there.is_model else _OTHERS + 1
-        return self._rank(there.claim)
-
     def resolve(self, published: Collection[EdgeClaim] = ()) -> None:
         """Compare all edges, those in the buffer included, and make the buffer hold the accepted ones.
 
@@ -336,22 +374,20 @@ class FrameOwnership:
         with self._lock:
             accepted, roots = self._caller_edges()
             claims = [claim for claims in self._claims.values() for claim in claims]
-            claims.sort(
-                key=lambda claim: (
-                    self._rank(claim),
-                    claim.child in roots,
-                    self._is_departed(claim),
-                    claim.pose is not None,
-                    claim.order,
-                )
-            )
+
+            def precedence(claim: EdgeClaim) -> tuple[int, bool, bool, bool, int]:
+                is_departed, is_static = self._is_departed(claim), claim.pose is not None
+                return self._rank(claim), claim.child in roots, is_departed, is_static, claim.order
+
+            claims.sort(key=precedence)
             refusals: dict[EdgeClaim, InsertRefused] = {}
             for claim in claims:
                 error = self._refusal(claim, accepted)
                 if error is not None:
                     refusals[claim] = error
                 elif self._prevails(claim, accepted.get(claim.child)):
-                    accepted[claim.child] = _AcceptedEdge(claim.parent, claim.source.name, claim, claim.pose)
+                    by, rank = claim.source.name, self._rank(claim)
+                    accepted[claim.child] = _AcceptedEdge(claim.parent, by, rank, claim, claim.pose)
             before = [claim for claim in claims if claim.is_accepted]
             for claim in refusals:
                 if self._is_in_buffer(claim):
@@ -375,25 +411,24 @@ class FrameOwnership:
         layout = self.buffer.tree_snapshot()
         accepted: dict[str, _AcceptedEdge] = {}
         for child, edge in layout.edges.items():
-            if edge is not None and (edge.robot is not None or not self._is_claimed(edge)):
-                pose = None
-                if edge.kind == "static":
-                    pose = Transform.from_pose7(edge.parent, edge.child, edge.pose)
-                by = edge.writer or "hand"
-                accepted[child] = _AcceptedEdge(edge.parent, by, None, pose, edge.robot is not None)
+            if edge is None:
+                continue
+            is_static, is_model = edge.kind == "static", edge.robot is not None
+            if is_static:
+                placed, found = self._placed.get(child), (edge.parent, edge.static_writer)
+                is_claimed = placed is not None and found == (placed.parent, placed.source.name)
+            else:
+                claims = self._claims.get(child, ())
+                is_claimed = any(claim.pose is None and claim.parent == edge.parent for claim in claims)
+            if is_model or not is_claimed:
+                pose = Transform.from_pose7(edge.parent, child, edge.pose) if is_static else None
+                rank = _MODEL if is_model else _CALLER
+                accepted[child] = _AcceptedEdge(edge.parent, edge.writer or "hand", rank, None, pose)
         roots = {track.frame(track.model.root) for track in layout.robots.values()}
         all_claims = (claim for claims in self._claims.values() for claim in claims)
         of_models = [claim for claim in all_claims if self._rank(claim) == _MODEL]
         roots |= {claim.parent for claim in of_models} - {claim.child for claim in of_models}
         return accepted, roots
-
-    def _is_claimed(self, edge: Edge) -> bool:
-        placed = self._placed.get(edge.child)
-        if edge.kind == "static":
-            found = (edge.parent, edge.static_writer)
-            return placed is not None and found == (placed.parent, placed.source.name)
-        claims = self._claims.get(edge.child, ())
-        return any(claim.pose is None and claim.parent == edge.parent for claim in claims)
 
     def _is_departed(self, claim: EdgeClaim) -> bool:
         return (claim.source.robot, claim.source.session) in self._departed
@@ -412,10 +447,10 @@ class FrameOwnership:
         is_same_edge = there.parent == parent
         # Of static edges the last value counts; samples of two writers would alternate. ROS allows that.
         both_move = there.claim is not None and there.pose is None and claim.pose is None
-        may_share = self._rank_of(there) == rank and (self._is_shared or not both_move)
+        may_share = there.rank == rank and (self._is_shared or not both_move)
         if is_same_edge and (there.is_as_good_as(claim) or may_share):
             return None
-        if rank == _OTHERS and self._rank_of(there) < _OTHERS:
+        if rank == _OTHERS and there.rank < _OTHERS:
             text = (
                 f"{child!r} is placed on {there.parent!r} by robot {frame_owner(child)!r} itself "
                 f"({there.writer}), whose edge counts; that of robot {claim.source.robot!r}, on {parent!r}, "
@@ -437,7 +472,7 @@ class FrameOwnership:
             return True
         if there.claim is None or there.pose is None or claim.pose is None:
             return False
-        if self._rank(there.claim) != self._rank(claim):
+        if there.rank != self._rank(claim):
             return False
         if self._is_departed(claim) != self._is_departed(there.claim):
             return self._is_departed(there.claim)

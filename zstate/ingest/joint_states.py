@@ -20,6 +20,11 @@ def _parsed(urdf: str) -> RobotModel:
     return parse_urdf(urdf, "its URDF")
 
 
+def joint_order(model: RobotModel) -> JointOrder:
+    """Reader of the joint states of a robot with this model."""
+    return JointOrder(model.joint_names, coordinate_names(model), velocity_columns_by_position(model))
+
+
 class JointStateIngest(StreamIngest):
     """Inserts joint states as positions of the joints of the robot's model."""
 
@@ -52,9 +57,7 @@ class JointStateIngest(StreamIngest):
             self._insert_early()
 
     def _replace_model(self, model: RobotModel) -> None:
-        self._order = JointOrder(
-            model.joint_names, coordinate_names(model), velocity_columns_by_position(model)
-        )
+        self._order = joint_order(model)
         before, self._track = self._track, None
         self._track = self._ownership.place_model(self.robot, model, before)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.format import counts_from_start, format_duration, guess_unit
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM, format_stamp

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput
 from zstate.ingest.base import ClockSetBack, StreamIngest
-from zstate.ingest.edge_claims import CONTESTED, Admitted, EdgeSource
-from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.frame_ownership import CONTESTED, Admitted, EdgeSource, FrameOwnership
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
 from zstate.wire.keys import EdgeNames, full_name

@@ -9,10 +9,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import Any
 
 from numpy.typing import ArrayLike
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.buffer.tracks import JointTrack
@@ -62,7 +63,8 @@ class InstrumentedBuffer(TransformBuffer):
         super().__init__(history_s, clock)
         self.latency = Histogram(LATENCY_BOUNDS_S)
         self._counting = fork_safe_lock()
-        self._lookups = 0
+        self.lookups = 0
+        """Number of calls of ``lookup``."""
         self._failures: Counter[str] = Counter()
 
     def latency_of(self, robot: str) -> Histogram:
@@ -70,32 +72,16 @@ class InstrumentedBuffer(TransformBuffer):
         return self.latency
 
     @property
-    def lookups(self) -> int:
-        """Number of calls of ``lookup``."""
-        return self._lookups
-
-    @property
     def failures(self) -> dict[str, int]:
         """Number of failed lookups by error class: "InFuture", ..., also after a wait."""
         with self._counting:
             return dict(self._failures)
 
-    def lookup(
-        self,
-        target: str,
-        source: str,
-        at: int | None = None,
-        *,
-        timeout_s: float = 0.0,
-        max_age_s: float | None = None,
-        predict_s: float = 0.0,
-    ) -> Transform:
+    def lookup(self, target: str, source: str, at: int | None = None, **options: Any) -> Transform:
         with self._counting:
-            self._lookups += 1
+            self.lookups += 1
         try:
-            return super().lookup(
-                target, source, at, timeout_s=timeout_s, max_age_s=max_age_s, predict_s=predict_s
-            )
+            return super().lookup(target, source, at, **options)
         except LookupFailed as error:
             kind = error.reason if isinstance(error, WaitTimeout) else type(error)
             with self._counting:
@@ -144,10 +130,7 @@ class RobotMeasure:
 
 
 class MeteredBuffer(InstrumentedBuffer):
-    """An InstrumentedBuffer that also measures, for each robot, when each sample can be looked up.
-
-    ``has_samples`` is set at the first one.
-    """
+    """An InstrumentedBuffer that also measures each robot; ``has_samples`` is set at the first sample."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         super().__init__(clock=clock)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Protocol
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import ListenerStats
 from zstate.metrics.buffer import Histogram, InstrumentedBuffer
@@ -129,29 +129,29 @@ class PublisherMetrics:
 
     def collect(self) -> Iterable[Metric]:
         families = MetricFamilies()
-        for publisher in self._publishers:
-            if publisher.stats.streams:
-                self._add(families, publisher)
-        return families
-
-    def _add(self, families: MetricFamilies, publisher: StatePublisher) -> None:
-        robot, stats = publisher.robot, publisher.stats
         count, gauge = families.count, families.gauge
-        for (wire, stream), counts in stats.streams.items():
-            labels = {"robot": robot, "wire": wire, "stream": stream}
-            count("zstate_publisher_samples", "Samples published.", counts.samples, **labels)
-            count("zstate_publisher_bytes", "Their payloads [bytes].", counts.bytes, **labels)
-            text = "Samples not published because the stream has no reader."
-            count("zstate_publisher_suppressed", text, counts.suppressed, **labels)
-            rate_hz = self._rates.update((id(publisher), wire, stream), counts.samples)
-            gauge("zstate_publisher_rate_hertz", "Samples published per second.", rate_hz, **labels)
-        count("zstate_publisher_refused", "Samples that could not be published.", stats.refused, robot=robot)
-        if (rate := stats.rate) is not None:
-            gauge("zstate_publisher_commanded_hertz", "The commanded rate.", rate.commanded_hz, robot=robot)
-            count("zstate_publisher_ticks", "Ticks of that rate.", rate.ticks, robot=robot)
-            count("zstate_publisher_late_ticks", "Ticks over a period late.", rate.late, robot=robot)
-            text = "Ticks skipped after a long delay."
-            count("zstate_publisher_skipped_ticks", text, rate.skipped, robot=robot)
+        for publisher in self._publishers:
+            robot, stats = publisher.robot, publisher.stats
+            if not stats.streams:
+                continue
+            for (wire, stream), counts in stats.streams.items():
+                labels = {"robot": robot, "wire": wire, "stream": stream}
+                count("zstate_publisher_samples", "Samples published.", counts.samples, **labels)
+                count("zstate_publisher_bytes", "Their payloads [bytes].", counts.bytes, **labels)
+                text = "Samples not published because the stream has no reader."
+                count("zstate_publisher_suppressed", text, counts.suppressed, **labels)
+                rate_hz = self._rates.update((id(publisher), wire, stream), counts.samples)
+                gauge("zstate_publisher_rate_hertz", "Samples published per second.", rate_hz, **labels)
+            text = "Samples that could not be published."
+            count("zstate_publisher_refused", text, stats.refused, robot=robot)
+            if (rate := stats.rate) is not None:
+                text = "The commanded rate."
+                gauge("zstate_publisher_commanded_hertz", text, rate.commanded_hz, robot=robot)
+                count("zstate_publisher_ticks", "Ticks of that rate.", rate.ticks, robot=robot)
+                count("zstate_publisher_late_ticks", "Ticks over a period late.", rate.late, robot=robot)
+                text = "Ticks skipped after a long delay."
+                count("zstate_publisher_skipped_ticks", text, rate.skipped, robot=robot)
+        return families
 
 
 class Listened(Protocol):
@@ -186,24 +186,28 @@ class ListenerMetrics:
         families = MetricFamilies()
         listeners = sorted(self._listeners(), key=lambda listener: listener.robot)
         for listener in listeners[:MAX_ROBOTS]:
-            self._add_counts(families, listener)
+            robot, counts, buffer = listener.robot, asdict(listener.stats), listener.buffer
+            text = "Messages that could not be used."
+            for reason, count in counts.pop("refused").items():
+                families.count("zstate_listener_refused", text, count, robot=robot, reason=reason)
+            for name, count in counts.items():
+                text = f"Samples {name.replace('_', ' ')}, as TransformListener.stats counts them."
+                families.count(f"zstate_listener_{name}", text, count, robot=robot)
+            rate_hz = self._rates.update(id(listener), counts["received"])
+            families.gauge("zstate_listener_rate_hertz", "Samples received per second.", rate_hz, robot=robot)
             _add_ages(families, listener)
-            if isinstance(listener.buffer, InstrumentedBuffer):
-                _add_lookups(families, listener.robot, listener.buffer)
+            if isinstance(buffer, InstrumentedBuffer):
+                text = "Time from a sample's stamp until it could be looked up."
+                latency = buffer.latency_of(robot)
+                families.histogram("zstate_listener_latency_seconds", text, latency, robot=robot)
+                text = "Lookups in the buffer."
+                families.count("zstate_listener_lookups", text, buffer.lookups, robot=robot)
+                for kind, count in buffer.failures.items():
+                    text = "Failed lookups by the kind of the error."
+                    families.count("zstate_listener_lookup_errors", text, count, robot=robot, kind=kind)
         left_out = max(0, len(listeners) - MAX_ROBOTS)
         families.gauge("zstate_listener_robots_left_out", "Robots without their own rows.", left_out)
         return families
-
-    def _add_counts(self, families: MetricFamilies, listener: Listened) -> None:
-        robot, counts = listener.robot, asdict(listener.stats)
-        text = "Messages that could not be used."
-        for reason, count in counts.pop("refused").items():
-            families.count("zstate_listener_refused", text, count, robot=robot, reason=reason)
-        for name, count in counts.items():
-            text = f"Samples {name.replace('_', ' ')}, as TransformListener.stats counts them."
-            families.count(f"zstate_listener_{name}", text, count, robot=robot)
-        rate_hz = self._rates.update(id(listener), counts["received"])
-        families.gauge("zstate_listener_rate_hertz", "Samples received per second.", rate_hz, robot=robot)
 
 
 def _add_ages(families: MetricFamilies, listener: Listened) -> None:
@@ -217,15 +221,6 @@ def _add_ages(families: MetricFamilies, listener: Listened) -> None:
     for robot, stamp in sorted(newest.items())[:MAX_ROBOTS]:
         age_s = (buffer.clock.now() - stamp) * 1e-9
         families.gauge("zstate_listener_age_seconds", text, age_s, robot=robot)
-
-
-def _add_lookups(families: MetricFamilies, robot: str, buffer: InstrumentedBuffer) -> None:
-    text = "Time from a sample's stamp until it could be looked up."
-    families.histogram("zstate_listener_latency_seconds", text, buffer.latency_of(robot), robot=robot)
-    families.count("zstate_listener_lookups", "Lookups in the buffer.", buffer.lookups, robot=robot)
-    for kind, count in buffer.failures.items():
-        text = "Failed lookups by the kind of the error."
-        families.count("zstate_listener_lookup_errors", text, count, robot=robot, kind=kind)
 
 
 class WriterMetrics:

@@ -83,14 +83,11 @@ class MetricsEndpoint(Closeable):
             self._server = (_Server6 if ":" in host else _Server)((host, port), _Handler)
         except OSError as error:
             endpoint = f"{host}:{port}"
+            text = f"metrics cannot be served at {endpoint!r}:"
             if error.errno == errno.EADDRINUSE:
-                raise PortBusy(
-                    f"metrics cannot be served at {endpoint!r}: another program listens there; choose "
-                    "another port, or 0 for a free one",
-                    endpoint=endpoint,
-                ) from None
-            text = f"metrics cannot be served at {endpoint!r}: {error.strerror}; give an address of this host"
-            raise InvalidInput(text) from None
+                text = f"{text} another program listens there; choose another port, or 0 for a free one"
+                raise PortBusy(text, endpoint=endpoint) from None
+            raise InvalidInput(f"{text} {error.strerror}; give an address of this host") from None
         samplers = [getattr(collector, "sample", None) for collector in collectors]
         self._server.samplers = [sampler for sampler in samplers if sampler is not None]
         # The library's types leave out the arguments of the application.

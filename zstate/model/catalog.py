@@ -15,7 +15,7 @@ from functools import cache
 from importlib import metadata, util
 from pathlib import Path
 
-from zstate._util.suggestions import suggestion_text
+from zstate._util.format import suggestion_text
 from zstate.errors import UnknownModel
 from zstate.model.findings import quoted
 

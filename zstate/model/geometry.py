@@ -11,15 +11,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from zstate._util.suggestions import suggestion_text
+from zstate._util.format import suggestion_text
 from zstate.model.findings import Finding, Findings, quoted
-from zstate.model.robot import RobotModel
+from zstate.model.robot import Pose7, RobotModel, Vector3
 from zstate.model.xml import Element, NumberError, read_document, read_number, read_numbers
 from zstate.se3 import IDENTITY, quaternion_from_rpy
 
 Role = Literal["visual", "collision"]
 Color = tuple[float, float, float, float]
-Pose7 = tuple[float, float, float, float, float, float, float]
 
 _ROLES: tuple[Role, ...] = ("visual", "collision")
 _GEOMETRIES = ("box", "cylinder", "sphere", "mesh")
@@ -30,7 +29,7 @@ _SOME_GEOMETRY = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
 class Box:
     """A box about its centre; ``size`` along x, y, z [m]."""
 
-    size: tuple[float, float, float]
+    size: Vector3
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +52,7 @@ class MeshFile:
     """A mesh file, named as in the URDF; ``scale`` along x, y, z."""
 
     uri: str
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    scale: Vector3 = (1.0, 1.0, 1.0)
 
 
 Geometry: TypeAlias = Box | Cylinder | Sphere | MeshFile
@@ -79,13 +78,8 @@ class Shape:
     texture: str | None = None
 
 
-def parse_shapes(model: RobotModel) -> tuple[Shape, ...]:
-    """Every shape of the robot that can be drawn, in the order of the URDF."""
-    return read_shapes(model)[0]
-
-
 def read_shapes(model: RobotModel) -> tuple[tuple[Shape, ...], tuple[Finding, ...]]:
-    """The shapes that can be drawn, and the faults of the others by line."""
+    """The shapes that can be drawn, in the order of the URDF, and the faults of the others by line."""
     reader = _Reader(model)
     return tuple(reader.shapes()), reader.findings.sorted()
 
@@ -124,8 +118,8 @@ class _Reader:
         origin = IDENTITY
         try:
             for child in element.all("origin")[:1]:
-                x, y, z = _vector(child, "xyz", (0.0, 0.0, 0.0))
-                origin = (x, y, z, *quaternion_from_rpy(*_vector(child, "rpy", (0.0, 0.0, 0.0))))
+                x, y, z = _numbers(child, "xyz", 3, (0.0, 0.0, 0.0))
+                origin = (x, y, z, *quaternion_from_rpy(*_numbers(child, "rpy", 3, (0.0, 0.0, 0.0))))
             geometry = _geometry(element)
         except _ShapeError as fault:
             message = f"link {quoted(link)}: a <{role}> is not drawn: {fault}"
@@ -174,42 +168,39 @@ def _geometry(element: Element) -> Geometry:
         raise _ShapeError(element, "it has no <geometry> with something inside", _SOME_GEOMETRY)
     shape = shapes[0]
     if shape.tag == "box":
-        x, y, z = _vector(shape, "size")
-        return Box((_length(shape, x), _length(shape, y), _length(shape, z)))
+        x, y, z = _lengths(shape, "size", 3)
+        return Box((x, y, z))
     if shape.tag == "cylinder":
-        return Cylinder(_length(shape, _number(shape, "radius")), _length(shape, _number(shape, "length")))
+        return Cylinder(*_lengths(shape, "radius", 1), *_lengths(shape, "length", 1))
     if shape.tag == "sphere":
-        return Sphere(_length(shape, _number(shape, "radius")))
+        return Sphere(*_lengths(shape, "radius", 1))
     if shape.tag == "mesh":
         uri = shape.attributes.get("filename", "").strip()
         if not uri:
             fix = '<mesh filename="package://PACKAGE/meshes/FILE.stl"/>'
             raise _ShapeError(shape, "its <mesh> names no file", fix)
-        return MeshFile(uri, _vector(shape, "scale", (1.0, 1.0, 1.0)))
+        x, y, z = _numbers(shape, "scale", 3, (1.0, 1.0, 1.0))
+        return MeshFile(uri, (x, y, z))
     message = f"<{quoted(shape.tag)[1:-1]}> is none of {', '.join(_GEOMETRIES)}"
     raise _ShapeError(shape, message, _SOME_GEOMETRY)
 
 
-def _length(element: Element, length: float) -> float:
-    if length < 0.0:
-        raise _ShapeError(element, f"its <{element.tag}> has the negative length {length:g} m")
-    return length
+def _lengths(element: Element, name: str, count: int) -> tuple[float, ...]:
+    lengths = _numbers(element, name, count)
+    for length in lengths:
+        if length < 0.0:
+            raise _ShapeError(element, f"its <{element.tag}> has the negative length {length:g} m")
+    return lengths
 
 
-def _vector(
-    element: Element, name: str, default: tuple[float, float, float] | None = None
-) -> tuple[float, float, float]:
+def _numbers(
+    element: Element, name: str, count: int, default: tuple[float, ...] | None = None
+) -> tuple[float, ...]:
     if default is not None and name not in element.attributes:
         return default
+    text = element.attributes.get(name, "")
     try:
-        x, y, z = read_numbers(element.attributes.get(name, ""), 3)
+        return (read_number(text),) if count == 1 else read_numbers(text, count)
     except NumberError as fault:
-        raise _ShapeError(element, f"{element.tag} {name}: {fault}", f'{name}="0 0 0"') from None
-    return x, y, z
-
-
-def _number(element: Element, name: str) -> float:
-    try:
-        return read_number(element.attributes.get(name, ""))
-    except NumberError as fault:
-        raise _ShapeError(element, f"{element.tag} {name}: {fault}", f'{name}="0.1"') from None
+        fix = f'{name}="{"0.1" if count == 1 else "0 0 0"}"'
+        raise _ShapeError(element, f"{element.tag} {name}: {fault}", fix) from None

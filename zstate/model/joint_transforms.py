@@ -12,33 +12,24 @@ With ``x = scale * position + shift``,
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput
 from zstate.extension import kernel
-from zstate.model.robot import NORM_TOLERANCE, Joint, JointType, RobotModel
+from zstate.model.robot import NORM_TOLERANCE, Joint, Pose7, RobotModel, Vector3
 from zstate.se3 import SCALARS, multiply, normalize, rotate, to_matrix
 
 if TYPE_CHECKING or kernel == "c":
     from zstate import _kernel
 
 EdgeKind = Literal["fixed", "revolute", "prismatic", "planar", "floating"]
-Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Floats = NDArray[np.float64]
-
-_KINDS: dict[JointType, EdgeKind] = {
-    "fixed": "fixed",
-    "revolute": "revolute",
-    "continuous": "revolute",
-    "prismatic": "prismatic",
-    "planar": "planar",
-    "floating": "floating",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,15 +52,14 @@ class JointTransform:
     shift: float
     q_cos: Quaternion
     q_sin: Quaternion
-    t0: Vector
-    t1: Vector
-    origin: tuple[float, float, float, float, float, float, float]
-    axis: Vector
+    t0: Vector3
+    t1: Vector3
+    origin: Pose7
+    axis: Vector3
 
 
-def edge_forms(model: RobotModel) -> tuple[JointTransform, ...]:
-    """The closed form of every edge, fixed ones included, in the order of ``model.joints``."""
-    return tuple(_form(model, joint) for joint in model.joints)
+_Rows: TypeAlias = Sequence[tuple[int, JointTransform]]
+_Write: TypeAlias = Callable[[Floats, Floats], None]
 
 
 class JointTransforms:
@@ -81,9 +71,17 @@ class JointTransforms:
     def __init__(self, model: RobotModel) -> None:
         self.forms = edge_forms(model)
         self._rest = np.array([(*form.t0, *form.q_cos) for form in self.forms]).reshape(-1, 7)
-        self._floats = _FloatingBatch.build(self.forms)
-        batches = (_RevoluteBatch.build(self.forms), _PrismaticBatch.build(self.forms), self._floats)
-        self._batches = tuple(batch for batch in batches if batch is not None)
+        self._floats = [form for form in self.forms if form.kind == "floating"]
+        self._quaternions = np.array([range(form.column + 3, form.column + 7) for form in self._floats])
+        self._writes: list[_Write] = []
+        for make, kinds in (
+            (_rotations, ("revolute", "planar")),
+            (_translations, ("prismatic", "planar")),
+            (_floating_poses, ("floating",)),
+        ):
+            edges = [(row, form) for row, form in enumerate(self.forms) if form.kind in kinds]
+            if edges:
+                self._writes.append(make(edges))
         self._compiled = _compiled(model.position_count, self.forms) if kernel == "c" else None
 
     def poses(self, positions: Floats, out: Floats | None = None) -> Floats:
@@ -99,140 +97,99 @@ class JointTransforms:
             self._compiled.poses(positions, out)
             return out
         out[...] = self._rest
-        for batch in self._batches:
-            batch.write(positions, out)
+        for write in self._writes:
+            write(positions, out)
         return out
 
     @property
     def has_floats(self) -> bool:
         """Whether there are floating joints, whose quaternions need a check."""
-        return self._floats is not None
+        return bool(self._floats)
 
     def normalised(self, positions: Floats) -> Floats:
         """``positions`` with the quaternions of floating joints at unit length.
 
         Raises InvalidInput if a length is off by more than ``NORM_TOLERANCE``.
         """
-        return positions if self._floats is None else self._floats.normalised(positions)
-
-
-@dataclass(frozen=True, slots=True)
-class _RevoluteBatch:
-    """The edges that turn about an axis: revolute joints, and planar joints by their yaw."""
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    half_scale: Floats
-    half_shift: Floats
-    q_cos: Floats
-    q_sin: Floats
-
-    @classmethod
-    def build(cls, forms: tuple[JointTransform, ...]) -> _RevoluteBatch | None:
-        turning = [(row, form) for row, form in enumerate(forms) if form.kind in ("revolute", "planar")]
-        if not turning:
-            return None
-        return cls(
-            rows=np.array([row for row, _ in turning], dtype=np.intp),
-            columns=np.array([f.column + 2 * (f.kind == "planar") for _, f in turning], dtype=np.intp),
-            half_scale=np.array([0.5 * form.scale for _, form in turning]),
-            half_shift=np.array([0.5 * form.shift for _, form in turning]),
-            q_cos=np.array([form.q_cos for _, form in turning]),
-            q_sin=np.array([form.q_sin for _, form in turning]),
-        )
-
-    def write(self, positions: Floats, out: Floats) -> None:
-        half = positions.take(self.columns, axis=-1) * self.half_scale + self.half_shift
-        # One complex exponential is both cosine and sine, and accurate at any number of turns.
-        unit: NDArray[np.complex128] = np.exp(1j * half)
-        rotation = unit.real[..., None] * self.q_cos
-        rotation += unit.imag[..., None] * self.q_sin
-        out[..., self.rows, 3:] = rotation
-
-
-@dataclass(frozen=True, slots=True)
-class _PrismaticBatch:
-    """The edges that move along one axis (prismatic joints) or along two (planar joints)."""
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    offsets: Floats
-    steps: Floats
-
-    @classmethod
-    def build(cls, forms: tuple[JointTransform, ...]) -> _PrismaticBatch | None:
-        sliding = [(row, form) for row, form in enumerate(forms) if form.kind in ("prismatic", "planar")]
-        if not sliding:
-            return None
-        return cls(
-            rows=np.array([row for row, _ in sliding], dtype=np.intp),
-            columns=np.array([(form.column, form.column + (form.kind == "planar")) for _, form in sliding]),
-            offsets=np.array([np.array(form.t0) + np.array(form.t1) * form.shift for _, form in sliding]),
-            # The derivative of the translation by the joint's two numbers; a prismatic joint has one.
-            steps=np.array(
-                [
-                    to_matrix(form.origin)[:3, :2]
-                    if form.kind == "planar"
-                    else np.outer(form.t1, (form.scale, 0.0))
-                    for _, form in sliding
-                ]
-            ),
-        )
-
-    def write(self, positions: Floats, out: Floats) -> None:
-        travelled = self.steps @ positions.take(self.columns, axis=-1)[..., None]
-        out[..., self.rows, :3] = travelled[..., 0] + self.offsets
-
-
-@dataclass(frozen=True, slots=True)
-class _FloatingBatch:
-    """Floating joints, whose positions are a pose: the origin acts on it linearly, as a 7 x 7 matrix."""
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    offsets: Floats
-    origins: Floats
-    names: tuple[str, ...]
-
-    @classmethod
-    def build(cls, forms: tuple[JointTransform, ...]) -> _FloatingBatch | None:
-        floating = [(row, form) for row, form in enumerate(forms) if form.kind == "floating"]
-        if not floating:
-            return None
-        origins = np.zeros((len(floating), 7, 7))
-        for matrix, (_, form) in zip(origins, floating, strict=True):
-            matrix[:3, :3] = to_matrix(form.origin)[:3, :3]
-            matrix[3:, 3:] = np.transpose(
-                [multiply(form.q_cos, (x, y, z, w)) for x, y, z, w in np.eye(4).tolist()]
-            )
-        return cls(
-            rows=np.array([row for row, _ in floating], dtype=np.intp),
-            columns=np.array([np.arange(form.column, form.column + 7) for _, form in floating]),
-            offsets=np.array([(*form.t0, 0.0, 0.0, 0.0, 0.0) for _, form in floating]),
-            origins=origins,
-            names=tuple(f"{form.parent!r} -> {form.child!r}" for _, form in floating),
-        )
-
-    def normalised(self, positions: Floats) -> Floats:
-        quaternions = positions[..., self.columns[:, 3:]]
+        if not self._floats:
+            return positions
+        quaternions = positions[..., self._quaternions]
         norms: Floats = np.sqrt(np.square(quaternions).sum(axis=-1, keepdims=True))
         if not np.all(np.abs(norms - 1.0) <= NORM_TOLERANCE):
             worst = int(np.abs(norms - 1.0).argmax())
+            form = self._floats[worst % len(self._floats)]
             raise InvalidInput(
-                f"the floating joint of {self.names[worst % len(self.names)]} was given a quaternion of "
-                f"length {norms.item(worst):.6g}; its last four numbers are qx qy qz qw of length 1"
+                f"the floating joint of {form.parent!r} -> {form.child!r} was given a quaternion of length "
+                f"{norms.item(worst):.6g}; its last four numbers are qx qy qz qw of length 1"
             )
         unit = positions.copy()
-        unit[..., self.columns[:, 3:]] = quaternions / norms
+        unit[..., self._quaternions] = quaternions / norms
         return unit
 
-    def write(self, positions: Floats, out: Floats) -> None:
-        poses = self.origins @ positions.take(self.columns, axis=-1)[..., None]
-        out[..., self.rows, :] = poses[..., 0] + self.offsets
+
+def _rotations(edges: _Rows) -> _Write:
+    """The rotation of the edges that turn about an axis: revolute joints, and planar joints by their yaw."""
+    rows = np.array([row for row, _ in edges])
+    columns = np.array([form.column + 2 * (form.kind == "planar") for _, form in edges])
+    half_scale = np.array([0.5 * form.scale for _, form in edges])
+    half_shift = np.array([0.5 * form.shift for _, form in edges])
+    q_cos = np.array([form.q_cos for _, form in edges])
+    q_sin = np.array([form.q_sin for _, form in edges])
+
+    def write(positions: Floats, out: Floats) -> None:
+        half = positions.take(columns, axis=-1) * half_scale + half_shift
+        # One complex exponential is both cosine and sine, and accurate at any number of turns.
+        unit: NDArray[np.complex128] = np.exp(1j * half)
+        rotation = unit.real[..., None] * q_cos
+        rotation += unit.imag[..., None] * q_sin
+        out[..., rows, 3:] = rotation
+
+    return write
+
+
+def _translations(edges: _Rows) -> _Write:
+    """The translation of the edges that move along one axis (prismatic) or along two (planar)."""
+    columns = np.array([(form.column, form.column + (form.kind == "planar")) for _, form in edges])
+    offsets = np.array([np.array(form.t0) + np.array(form.t1) * form.shift for _, form in edges])
+    # The derivative of the translation by the joint's two numbers; a prismatic joint has one.
+    steps = [
+        to_matrix(form.origin)[:3, :2] if form.kind == "planar" else np.outer(form.t1, (form.scale, 0.0))
+        for _, form in edges
+    ]
+    return _linear(edges, columns, np.array(steps), offsets)
+
+
+def _floating_poses(edges: _Rows) -> _Write:
+    """The poses of floating joints: the origin acts on the joint's pose linearly, as a 7 x 7 matrix."""
+    columns = np.array([range(form.column, form.column + 7) for _, form in edges])
+    offsets = np.array([(*form.t0, 0.0, 0.0, 0.0, 0.0) for _, form in edges])
+    origins = np.zeros((len(edges), 7, 7))
+    for matrix, (_, form) in zip(origins, edges, strict=True):
+        matrix[:3, :3] = to_matrix(form.origin)[:3, :3]
+        matrix[3:, 3:] = np.transpose(
+            [multiply(form.q_cos, (x, y, z, w)) for x, y, z, w in np.eye(4).tolist()]
+        )
+    return _linear(edges, columns, origins, offsets)
+
+
+def _linear(edges: _Rows, columns: NDArray[np.intp], matrices: Floats, offsets: Floats) -> _Write:
+    """Writes ``matrices @ positions[columns] + offsets`` into the first numbers of the poses of ``edges``."""
+    rows, count = np.array([row for row, _ in edges]), offsets.shape[1]
+
+    def write(positions: Floats, out: Floats) -> None:
+        moved = matrices @ positions.take(columns, axis=-1)[..., None]
+        out[..., rows, :count] = moved[..., 0] + offsets
+
+    return write
+
+
+def edge_forms(model: RobotModel) -> tuple[JointTransform, ...]:
+    """The closed form of every edge, fixed ones included, in the order of ``model.joints``."""
+    return tuple(_form(model, joint) for joint in model.joints)
 
 
 def _form(model: RobotModel, joint: Joint) -> JointTransform:
-    kind = _KINDS[joint.type]
+    kind: EdgeKind = "revolute" if joint.type == "continuous" else joint.type
     axis = joint.axis
     if kind != "fixed":
         x, y, z = (0.0, 0.0, 1.0) if kind == "planar" else joint.axis

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate._util.fork_safe import fork_safe_lock
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.errors import InvalidInput, LibraryMissing
 from zstate.model.joint_transforms import Floats, JointTransform, JointTransforms
 from zstate.model.robot import RobotModel
@@ -106,18 +106,20 @@ class _Solver:
             ) from error
         self._pin: Any = pinocchio
         self._model: Any = self._pin.Model()
-        self._joint_ids: dict[JointTransform, int] = {}
-        self._add_links(model, forms)
+        rows = [
+            (form, self._model.idx_qs[joint_id], self._model.idx_vs[joint_id])
+            for form, joint_id in self._add_links(model, forms).items()
+        ]
         self._data: Any = self._model.createData()
-        single = [form for form in self._joint_ids if form.kind in ("revolute", "prismatic")]
-        self._q_rows = np.array([self._q_row(form) for form in single], dtype=np.intp)
-        self._v_rows = np.array([self._v_row(form) for form in single], dtype=np.intp)
-        self._columns = np.array([form.column for form in single], dtype=np.intp)
-        self._velocity_columns = np.array([form.velocity_column for form in single], dtype=np.intp)
-        self._scale = np.array([form.scale for form in single])
-        self._shift = np.array([form.shift for form in single])
-        self._planar = [form for form in self._joint_ids if form.kind == "planar"]
-        self._floating = [form for form in self._joint_ids if form.kind == "floating"]
+        single = [row for row in rows if row[0].kind in ("revolute", "prismatic")]
+        self._q_rows = np.array([q_row for _, q_row, _ in single], dtype=np.intp)
+        self._v_rows = np.array([v_row for _, _, v_row in single], dtype=np.intp)
+        self._columns = np.array([form.column for form, _, _ in single], dtype=np.intp)
+        self._velocity_columns = np.array([form.velocity_column for form, _, _ in single], dtype=np.intp)
+        self._scale = np.array([form.scale for form, _, _ in single])
+        self._shift = np.array([form.shift for form, _, _ in single])
+        self._planar = [row for row in rows if row[0].kind == "planar"]
+        self._floating = [row for row in rows if row[0].kind == "floating"]
         # A view of Pinocchio's placements, which are contiguous, twelve doubles each: the rotation by
         # columns, then the translation. Reading them one by one from Python costs more than ten times
         # what computing them does. The view keeps the workspace alive.
@@ -150,12 +152,10 @@ class _Solver:
     def _configuration(self, positions: Floats) -> Floats:
         q = np.empty(self._model.nq)
         q[self._q_rows] = positions[self._columns] * self._scale + self._shift
-        for form in self._planar:
+        for form, row, _ in self._planar:
             x, y, yaw = positions[form.column : form.column + 3].tolist()
-            row = self._q_row(form)
             q[row : row + 4] = x, y, np.cos(yaw), np.sin(yaw)
-        for form in self._floating:
-            row = self._q_row(form)
+        for form, row, _ in self._floating:
             q[row : row + 7] = positions[form.column : form.column + 7]
         return q
 
@@ -163,53 +163,45 @@ class _Solver:
         """Pinocchio's velocities: those of planar and floating joints are in the axes of the child."""
         v = np.empty(self._model.nv)
         v[self._v_rows] = velocities[self._velocity_columns] * self._scale
-        for form in self._planar:
+        for form, _, row in self._planar:
             x, y, yaw_rate = velocities[form.velocity_column : form.velocity_column + 3]
             yaw = positions[form.column + 2]
             cos, sin = np.cos(yaw), np.sin(yaw)
-            row = self._v_row(form)
             v[row : row + 3] = cos * x + sin * y, cos * y - sin * x, yaw_rate
-        for form in self._floating:
+        for form, _, row in self._floating:
             pose = self._pin.XYZQUATToSE3(positions[form.column : form.column + 7])
             rates = velocities[form.velocity_column : form.velocity_column + 6]
-            row = self._v_row(form)
             v[row : row + 6] = (rates.reshape(2, 3) @ pose.rotation).ravel()
         return v
 
-    def _add_links(self, model: RobotModel, forms: tuple[JointTransform, ...]) -> None:
+    def _add_links(self, model: RobotModel, forms: tuple[JointTransform, ...]) -> dict[JointTransform, int]:
+        """Add all joints and links to Pinocchio's model. Returns the ids of the joints that move."""
+        pin, joint_ids = self._pin, dict[JointTransform, int]()
         below: defaultdict[str, list[JointTransform]] = defaultdict(list)
         for form in forms:
             below[form.parent].append(form)
-        placed: dict[str, tuple[int, Any]] = {model.root: (0, self._pin.SE3.Identity())}
+        # For each link Pinocchio's joint that carries it, and the link's pose in that joint.
+        placed: dict[str, tuple[int, Any]] = {model.root: (0, pin.SE3.Identity())}
         waiting = below[model.root].copy()
         while waiting:
             form = waiting.pop()
-            placed[form.child] = self._place(form, *placed[form.parent])
             waiting += below[form.child]
+            joint_id, placement = placed[form.parent]
+            placement = placement * pin.XYZQUATToSE3(np.array(form.origin))
+            if form.kind != "fixed":
+                if form.kind == "revolute":
+                    joint = pin.JointModelRevoluteUnaligned(np.array(form.axis))
+                elif form.kind == "prismatic":
+                    joint = pin.JointModelPrismaticUnaligned(np.array(form.axis))
+                else:
+                    joint = pin.JointModelPlanar() if form.kind == "planar" else pin.JointModelFreeFlyer()
+                joint_id = self._model.addJoint(joint_id, joint, placement, f"j{len(joint_ids)}")
+                joint_ids[form], placement = joint_id, pin.SE3.Identity()
+            placed[form.child] = joint_id, placement
         for row, link in enumerate(model.links):
             joint_id, placement = placed[link]
-            self._model.addFrame(self._pin.Frame(f"l{row}", joint_id, 0, placement, self._pin.FrameType.BODY))
-
-    def _place(self, form: JointTransform, joint_id: int, placement: Any) -> tuple[int, Any]:
-        """Pinocchio's joint that carries the child of an edge, and the child's pose in it."""
-        joint_from_origin = placement * self._pin.XYZQUATToSE3(np.array(form.origin))
-        if form.kind == "fixed":
-            return joint_id, joint_from_origin
-        if form.kind == "revolute":
-            joint = self._pin.JointModelRevoluteUnaligned(np.array(form.axis))
-        elif form.kind == "prismatic":
-            joint = self._pin.JointModelPrismaticUnaligned(np.array(form.axis))
-        else:
-            joint = self._pin.JointModelPlanar() if form.kind == "planar" else self._pin.JointModelFreeFlyer()
-        added: int = self._model.addJoint(joint_id, joint, joint_from_origin, f"j{len(self._joint_ids)}")
-        self._joint_ids[form] = added
-        return added, self._pin.SE3.Identity()
-
-    def _q_row(self, form: JointTransform) -> int:
-        return self._model.idx_qs[self._joint_ids[form]]
-
-    def _v_row(self, form: JointTransform) -> int:
-        return self._model.idx_vs[self._joint_ids[form]]
+            self._model.addFrame(pin.Frame(f"l{row}", joint_id, 0, placement, pin.FrameType.BODY))
+        return joint_ids
 
 
 def _destination(out: Floats | None, rows: int) -> Floats:

@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.errors import InvalidInput
 from zstate.model.catalog import CatalogEntry, catalog, find_entry
 from zstate.model.findings import Finding, model_error

@@ -28,15 +28,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property
+from itertools import accumulate
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate._util.suggestions import suggestion_text
+from zstate._util.format import suggestion_text
 from zstate.checks import real_numbers
 from zstate.errors import FindingLike, InvalidInput
 
+Pose7 = tuple[float, float, float, float, float, float, float]
+Vector3 = tuple[float, float, float]
 JointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
 
 POSITION_COUNTS: dict[JointType, int] = {
@@ -90,8 +93,8 @@ class Joint:
     type: JointType
     parent: str
     child: str
-    origin: tuple[float, float, float, float, float, float, float]
-    axis: tuple[float, float, float]
+    origin: Pose7
+    axis: Vector3
     limits: Limits
     mimic: Mimic | None = None
     line: int | None = None
@@ -277,12 +280,8 @@ def _name_parts(name: str) -> tuple[str, ...]:
 
 
 def _offsets(joints: Sequence[Joint], counts: Mapping[JointType, int]) -> dict[str, int]:
-    starts: dict[str, int] = {}
-    total = 0
-    for joint in joints:
-        starts[joint.name] = total
-        total += counts[joint.type]
-    return starts
+    starts = accumulate((counts[joint.type] for joint in joints), initial=0)
+    return {joint.name: start for joint, start in zip(joints, starts, strict=False)}
 
 
 def coordinate_names(model: RobotModel) -> tuple[str, ...]:

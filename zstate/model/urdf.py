@@ -7,12 +7,13 @@ has one message for all faults. Limits: 16 MiB, 2000 links, 500 joints in a chai
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 
-from zstate._util.suggestions import suggestion_text
+from zstate._util.format import suggestion_text
 from zstate.model.findings import Findings, quoted, shortened
 from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, Joint, RobotModel
-from zstate.model.urdf_joint import JointReader
+from zstate.model.urdf_joint import read_joint
 from zstate.model.xml import Document, Element, NumberError, read_document, read_number
 
 MAX_LINKS = 2000
@@ -47,8 +48,7 @@ def parse_document(document: Document, source: str) -> RobotModel:
     _check_names(findings, robot)
     _check_nesting(findings, robot)
     links = _read_links(findings, robot)
-    reader = JointReader(findings, links)
-    joints = [reader.read(element) for element in robot.all("joint")]
+    joints = [read_joint(element, links, findings) for element in robot.all("joint")]
     root = _check_tree(findings, links, joints)
     _check_mimics(findings, joints)
     findings.raise_errors()
@@ -176,18 +176,20 @@ def _check_tree(findings: Findings, links: Mapping[str, int], joints: Sequence[J
             message = f"joint {quoted(joint.name)} joins link {quoted(joint.child)} to itself"
             findings.error(joint.line, message, '<child link="LINK"/> with another link')
     whole = [joint for joint in joints if joint.parent and joint.child and joint.parent != joint.child]
-    _check_pairs(findings, whole)
+    below: dict[str, list[Joint]] = defaultdict(list)
+    for joint in whole:
+        below[joint.parent].append(joint)
     _check_parents(findings, whole)
-    _check_cycles(findings, links, whole)
+    _check_cycles(findings, links, below)
     root = _check_roots(findings, links, joints)
-    _check_depth(findings, root, whole)
+    _check_depth(findings, root, below)
     return root
 
 
-def _check_pairs(findings: Findings, joints: Sequence[Joint]) -> None:
-    first: dict[tuple[str, str], Joint] = {}
+def _check_parents(findings: Findings, joints: Sequence[Joint]) -> None:
+    parents: dict[str, dict[str, Joint]] = defaultdict(dict)
     for joint in joints:
-        earlier = first.setdefault((joint.parent, joint.child), joint)
+        earlier = parents[joint.child].setdefault(joint.parent, joint)
         if earlier is not joint:
             findings.error(
                 joint.line,
@@ -195,12 +197,6 @@ def _check_pairs(findings: Findings, joints: Sequence[Joint]) -> None:
                 f"(line {joint.line}) join the same links {quoted(joint.parent)} and {quoted(joint.child)}",
                 "delete one of them, or put a link between two joints that both move",
             )
-
-
-def _check_parents(findings: Findings, joints: Sequence[Joint]) -> None:
-    parents: dict[str, dict[str, Joint]] = {}
-    for joint in joints:
-        parents.setdefault(joint.child, {}).setdefault(joint.parent, joint)
     for child, by_parent in parents.items():
         if len(by_parent) > 1:
             count = "two" if len(by_parent) == 2 else str(len(by_parent))
@@ -210,37 +206,25 @@ def _check_parents(findings: Findings, joints: Sequence[Joint]) -> None:
             findings.error(line, f"link {quoted(child)} has {count} parents: {_and(named)}", fix)
 
 
-def _check_cycles(findings: Findings, links: Mapping[str, int], joints: Sequence[Joint]) -> None:
-    below: dict[str, list[Joint]] = {}
-    for joint in joints:
-        below.setdefault(joint.parent, []).append(joint)
+def _check_cycles(findings: Findings, links: Iterable[str], below: Mapping[str, Sequence[Joint]]) -> None:
     done: set[str] = set()
-    for link in links:
-        for cycle, closing in _cycles_below(link, below, done):
-            named = " -> ".join(quoted(name) for name in _middle_cut([*cycle, cycle[0]]))
-            message = f"the links {named} form a cycle, closed by joint {quoted(closing.name)}"
-            fix = f"delete joint {quoted(closing.name)}, or give it another child"
-            findings.error(closing.line, message, fix)
-
-
-def _cycles_below(
-    start: str, below: Mapping[str, Sequence[Joint]], done: set[str]
-) -> list[tuple[list[str], Joint]]:
-    """The cycles on a walk down from ``start``, each with the joint that closes it."""
-    cycles: list[tuple[list[str], Joint]] = []
-    path = [] if start in done else [start]
-    open_joints = [iter(below.get(start, ()))]
-    while path:
-        joint = next(open_joints[-1], None)
-        if joint is None:
-            done.add(path.pop())
-            open_joints.pop()
-        elif joint.child in path:
-            cycles.append((path[path.index(joint.child) :], joint))
-        elif joint.child not in done:
-            path.append(joint.child)
-            open_joints.append(iter(below.get(joint.child, ())))
-    return cycles
+    for start in links:
+        path = [] if start in done else [start]
+        open_joints = [iter(below.get(start, ()))]
+        while path:
+            joint = next(open_joints[-1], None)
+            if joint is None:
+                done.add(path.pop())
+                open_joints.pop()
+            elif joint.child in path:
+                cycle = [*path[path.index(joint.child) :], joint.child]
+                named = " -> ".join(quoted(name) for name in _middle_cut(cycle))
+                message = f"the links {named} form a cycle, closed by joint {quoted(joint.name)}"
+                fix = f"delete joint {quoted(joint.name)}, or give it another child"
+                findings.error(joint.line, message, fix)
+            elif joint.child not in done:
+                path.append(joint.child)
+                open_joints.append(iter(below.get(joint.child, ())))
 
 
 def _check_roots(findings: Findings, links: Mapping[str, int], joints: Sequence[Joint]) -> str:
@@ -258,20 +242,19 @@ def _check_roots(findings: Findings, links: Mapping[str, int], joints: Sequence[
     return roots[0] if roots else ""
 
 
-def _check_depth(findings: Findings, root: str, joints: Sequence[Joint]) -> None:
-    below: dict[str, list[str]] = {}
-    for joint in joints:
-        below.setdefault(joint.parent, []).append(joint.child)
-    levels = [[root]]
-    seen = {root}
-    while levels[-1]:
-        children = dict.fromkeys(child for link in levels[-1] for child in below.get(link, ()))
-        levels.append([child for child in children if child not in seen])
-        seen.update(children)
-    depth = len(levels) - 2
-    if depth > MAX_DEPTH:
-        deepest = quoted(levels[depth][0])
-        message = f"link {deepest} lies {depth} joints below the root; the limit is {MAX_DEPTH}"
+def _check_depth(findings: Findings, root: str, below: Mapping[str, Sequence[Joint]]) -> None:
+    depths = {root: 0}
+    queue = [root]
+    for link in queue:
+        for joint in below.get(link, ()):
+            if joint.child not in depths:
+                depths[joint.child] = depths[link] + 1
+                queue.append(joint.child)
+    deepest = max(depths, key=depths.__getitem__)
+    if depths[deepest] > MAX_DEPTH:
+        message = (
+            f"link {quoted(deepest)} lies {depths[deepest]} joints below the root; the limit is {MAX_DEPTH}"
+        )
         findings.error(None, message, "merge links that fixed joints join")
 
 
@@ -289,28 +272,25 @@ def _check_mimics(findings: Findings, joints: Sequence[Joint]) -> None:
     """Each master exists and has one position; chains of mimics end and are at most 100 long."""
     by_name = {joint.name: joint for joint in joints}
     for joint in joints:
-        if joint.mimic is not None:
-            _check_master(findings, joint, joint.mimic.joint, by_name)
+        if joint.mimic is None:
+            continue
+        label, name = f"joint {quoted(joint.name)} mimics", joint.mimic.joint
+        master = by_name.get(name)
+        if master is None:
+            near = findings.did_you_mean(name, (other for other in by_name if other != joint.name))
+            fix = _FOLLOW if near is None else f'<mimic joint="{near}"/>'
+            message = f"{label} {quoted(name)}, which does not exist{suggestion_text(near)}"
+            findings.error(joint.line, message, fix)
+        elif master is joint:
+            findings.error(joint.line, f"{label} itself", _FOLLOW)
+        elif POSITION_COUNTS[master.type] != 1:
+            findings.error(
+                joint.line,
+                f"{label} {quoted(name)} (line {master.line}), which is {master.type}; a mimic follows a "
+                "revolute, continuous or prismatic joint",
+                _FOLLOW,
+            )
     _check_chains(findings, by_name)
-
-
-def _check_master(findings: Findings, joint: Joint, name: str, by_name: Mapping[str, Joint]) -> None:
-    label = f"joint {quoted(joint.name)} mimics"
-    master = by_name.get(name)
-    if master is None:
-        near = findings.did_you_mean(name, (other for other in by_name if other != joint.name))
-        fix = _FOLLOW if near is None else f'<mimic joint="{near}"/>'
-        message = f"{label} {quoted(name)}, which does not exist{suggestion_text(near)}"
-        findings.error(joint.line, message, fix)
-    elif master is joint:
-        findings.error(joint.line, f"{label} itself", _FOLLOW)
-    elif POSITION_COUNTS[master.type] != 1:
-        findings.error(
-            joint.line,
-            f"{label} {quoted(name)} (line {master.line}), which is {master.type}; a mimic follows a "
-            "revolute, continuous or prismatic joint",
-            _FOLLOW,
-        )
 
 
 def _check_chains(findings: Findings, by_name: Mapping[str, Joint]) -> None:

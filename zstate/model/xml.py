@@ -26,62 +26,6 @@ _BYTE_ORDER_MARKS = (
 _ENCODINGS = {"utf-8", "us-ascii", "ascii", "iso-8859-1", "latin-1", "iso-8859-15", "windows-1252", "cp1252"}
 _DECLARED = re.compile(rb"""\s*<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]*)["']""")
 
-
-class XmlError(ValueError):
-    """Unreadable text or XML, in ``line`` if known; ``fix`` is what to write instead."""
-
-    def __init__(self, message: str, line: int | None = None, fix: str = "") -> None:
-        super().__init__(message)
-        self.line = line
-        self.fix = fix
-
-
-def decode(data: str | bytes) -> str:
-    """The text of ``data`` without its byte order mark. Raises XmlError.
-
-    Encodings: UTF-8, UTF-16 with a byte order mark, and, if the XML declaration names them, US-ASCII,
-    ISO-8859-1, ISO-8859-15 and windows-1252.
-    """
-    text = data.removeprefix("\ufeff") if isinstance(data, str) else _decode_bytes(data)
-    try:
-        text.encode()
-    except UnicodeEncodeError as error:
-        line = text.count("\n", 0, error.start) + 1
-        raise XmlError(f"the character {text[error.start]!r} is half of a pair, not text", line) from None
-    return text
-
-
-def _decode_bytes(data: bytes) -> str:
-    for mark, encoding in _BYTE_ORDER_MARKS:
-        if data.startswith(mark):
-            return _decode_as(data[len(mark) :], encoding)
-    if b"\0" in data:
-        line, column = _place(data, data.index(b"\0"))
-        raise XmlError(f"column {column}: a zero byte; this is a binary file, not a URDF", line)
-    declared = _DECLARED.match(data[:1000])
-    encoding = "utf-8" if declared is None else declared[1].decode("latin-1")
-    if encoding.lower() not in _ENCODINGS:
-        raise XmlError(f"the declared encoding {encoding[:40]!r} is not read; save the file as UTF-8", 1)
-    return _decode_as(data, encoding)
-
-
-def _decode_as(data: bytes, encoding: str) -> str:
-    try:
-        return data.decode(encoding)
-    except UnicodeDecodeError as error:
-        line, column = _place(data, error.start)
-        raise XmlError(
-            f"column {column}: byte 0x{data[error.start]:02x} is not {encoding.upper()}; save the file as "
-            'UTF-8, or declare its encoding in line 1 (<?xml version="1.0" encoding="ISO-8859-1"?>)',
-            line,
-        ) from None
-
-
-def _place(data: bytes, offset: int) -> tuple[int, int]:
-    """Line and column of a byte, both counted from 1."""
-    return data.count(b"\n", 0, offset) + 1, offset - data.rfind(b"\n", 0, offset)
-
-
 MAX_BYTES = 16 * 1024 * 1024
 MAX_ELEMENTS = 200_000
 MAX_NESTING = 100
@@ -124,27 +68,60 @@ class Document:
 
 
 def read_document(data: str | bytes, source: str) -> Document:
-    """The element tree of ``data``. Raises ModelError if it is not XML, or not safe to read."""
-    try:
-        return _read(data)
-    except XmlError as fault:
-        raise model_error(source, str(fault), fault.line, fault.fix) from None
+    """The element tree of ``data``. Raises ModelError if it is not XML, or not safe to read.
 
-
-def _read(data: str | bytes) -> Document:
+    Encodings: UTF-8, UTF-16 with a byte order mark, and, if the XML declaration names them, US-ASCII,
+    ISO-8859-1, ISO-8859-15 and windows-1252.
+    """
     if len(data) > MAX_BYTES:
-        raise XmlError(f"the text has {len(data)} bytes; the limit is {MAX_BYTES}")
-    text = decode(data)
+        raise model_error(source, f"the text has {len(data)} bytes; the limit is {MAX_BYTES}")
+    text = data.removeprefix("\ufeff") if isinstance(data, str) else _decode(data, source)
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        line = text.count("\n", 0, error.start) + 1
+        message = f"the character {text[error.start]!r} is half of a pair, not text"
+        raise model_error(source, message, line) from None
     body = text.lstrip()
     if not body:
         whole = '<robot name="NAME"><link name="base_link"/></robot>'
-        raise XmlError('the text is empty; a URDF begins with <robot name="...">', fix=whole)
+        raise model_error(source, 'the text is empty; a URDF begins with <robot name="...">', fix=whole)
     lines_before = text.count("\n", 0, len(text) - len(body))
-    return Document(body, _Reader(body, lines_before).read())
+    return Document(body, _Reader(source, body, lines_before).read())
+
+
+def _decode(data: bytes, source: str) -> str:
+    mark, encoding = next((one for one in _BYTE_ORDER_MARKS if data.startswith(one[0])), (b"", ""))
+    data = data[len(mark) :]
+    if not encoding:
+        if b"\0" in data:
+            line, column = _place(data, data.index(b"\0"))
+            message = f"column {column}: a zero byte; this is a binary file, not a URDF"
+            raise model_error(source, message, line)
+        declared = _DECLARED.match(data[:1000])
+        encoding = "utf-8" if declared is None else declared[1].decode("latin-1")
+        if encoding.lower() not in _ENCODINGS:
+            message = f"the declared encoding {encoding[:40]!r} is not read; save the file as UTF-8"
+            raise model_error(source, message, 1)
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as error:
+        line, column = _place(data, error.start)
+        message = (
+            f"column {column}: byte 0x{data[error.start]:02x} is not {encoding.upper()}; save the file as "
+            'UTF-8, or declare its encoding in line 1 (<?xml version="1.0" encoding="ISO-8859-1"?>)'
+        )
+        raise model_error(source, message, line) from None
+
+
+def _place(data: bytes, offset: int) -> tuple[int, int]:
+    """Line and column of a byte, both counted from 1."""
+    return data.count(b"\n", 0, offset) + 1, offset - data.rfind(b"\n", 0, offset)
 
 
 class _Reader:
-    def __init__(self, text: str, lines_before: int) -> None:
+    def __init__(self, source: str, text: str, lines_before: int) -> None:
+        self._source = source
         self._text = text
         self._lines_before = lines_before
         self._open: list[Element] = []
@@ -161,7 +138,7 @@ class _Reader:
         except expat.ExpatError as error:
             line = error.lineno + self._lines_before
             cause, fix = self._cause(error)
-            raise XmlError(f"column {error.offset + 1}: {cause}", line, fix) from None
+            raise model_error(self._source, f"column {error.offset + 1}: {cause}", line, fix) from None
         assert self._root is not None, "expat accepts no document without an element"
         return self._root
 
@@ -172,9 +149,11 @@ class _Reader:
         element = Element(tag, attributes, self._line())
         self._count += 1
         if self._count > MAX_ELEMENTS:
-            raise XmlError(f"more than {MAX_ELEMENTS} elements, which is the limit", element.line)
+            message = f"more than {MAX_ELEMENTS} elements, which is the limit"
+            raise model_error(self._source, message, element.line)
         if len(self._open) == MAX_NESTING:
-            raise XmlError(f"<{_short(tag)}> is nested deeper than {MAX_NESTING} levels", element.line)
+            message = f"<{_short(tag)}> is nested deeper than {MAX_NESTING} levels"
+            raise model_error(self._source, message, element.line)
         if self._open:
             self._open[-1].children.append(element)
         else:
@@ -183,7 +162,8 @@ class _Reader:
 
     def _doctype(self, _name: str, system: str | None, public: str | None, has_declarations: int) -> None:
         if system or public or has_declarations:
-            raise XmlError(
+            raise model_error(
+                self._source,
                 "a DOCTYPE with declarations (entities) or a reference to a file is refused: it can make "
                 "a small file huge or read others; remove it",
                 self._line(),

@@ -27,7 +27,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from typing import Protocol
 
 import zenoh
@@ -80,67 +80,42 @@ class _Process:
         self.zenoh_started_in = zenoh_started_in
         self.sessions: weakref.WeakSet[Session] = weakref.WeakSet()
         self.threads: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
+        self.lock = fork_safe_lock()
         self.opening = 0
+        self.none_opening = threading.Event()
+        self.none_opening.set()
         self.is_ending = False
-        self._lock = fork_safe_lock()
-        self._closing: list[Callable[[], None]] = []
-        self._requested = threading.Event()
-        self._done = threading.Event()
-        self._none_opening = threading.Event()
-        self._none_opening.set()
-        self._thread: threading.Thread | None = None
+        self.closing: list[Callable[[], None]] = []
+        self.requested = threading.Event()
+        self.done = threading.Event()
+        self.exit_thread: threading.Thread | None = None
 
-    @contextmanager
-    def session_opening(self) -> Generator[None]:
-        with self._lock:
-            if self.is_ending:
-                raise Closed("no session can be opened any more: this process is ending")
-            if self.zenoh_started_in not in (None, os.getpid()):
-                fact = f"process {self.zenoh_started_in} used Zenoh before this one was forked from it"
-                raise Closed(forked_text(fact))
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name=THREAD_NAME, daemon=True)
-                self._thread.start()
-            self.zenoh_started_in = os.getpid()
-            self.opening += 1
-            self._none_opening.clear()
-        try:
-            yield
-        finally:
-            with self._lock:
-                self.opening -= 1
-                if not self.opening:
-                    self._none_opening.set()
-
-    def close_all(self, close: Callable[[], None] | None = None) -> None:
-        if close is not None:
-            self._closing.append(close)
-        self._requested.set()
-        if self._thread is not None:
-            self._done.wait(TIMEOUT_S)
-
-    def _run(self) -> None:
+    def run_exit_thread(self) -> None:
         threading.main_thread().join()
         self._hide_exit_errors()
         # Python waits for these threads itself, and they may use their sessions until they end.
-        while threads := [one for one in threading.enumerate() if one.is_alive() and _is_program_thread(one)]:
+        while threads := [
+            thread
+            for thread in threading.enumerate()
+            if thread.is_alive() and not thread.daemon and not _is_callback(thread)
+        ]:
             for thread in threads:
                 thread.join()
         if not any(_is_callback(thread) and not thread.daemon for thread in threading.enumerate()):
-            self._requested.wait()
-        with self._lock:
+            self.requested.wait()
+        with self.lock:
             self.is_ending = True
         deadline = time.monotonic() + TIMEOUT_S
-        for close in (*self._closing, *(session.close_blocking for session in tuple(self.sessions))):
+        for close in (*self.closing, *(session.close_blocking for session in tuple(self.sessions))):
             close()
-        self._none_opening.wait(max(0.0, deadline - time.monotonic()))
+        self.none_opening.wait(max(0.0, deadline - time.monotonic()))
         for session in tuple(self.sessions):  # the sessions that were being opened
             session.close_blocking()
         for thread in threading.enumerate():
             if thread in self.threads or _is_callback(thread):
                 thread.join(max(0.0, deadline - time.monotonic()))
         _join_users(min(deadline, time.monotonic() + _USERS_TIMEOUT_S))
-        self._done.set()
+        self.done.set()
 
     def _hide_exit_errors(self) -> None:
         """Do not report threads that find their session closed or cannot start threads any more."""
@@ -157,10 +132,6 @@ class _Process:
 
 def _is_callback(thread: threading.Thread) -> bool:
     return _CALLBACK_THREAD in thread.name
-
-
-def _is_program_thread(thread: threading.Thread) -> bool:
-    return not thread.daemon and not _is_callback(thread)
 
 
 def _join_users(deadline: float) -> None:
@@ -198,18 +169,44 @@ def join_at_exit(thread: threading.Thread) -> threading.Thread:
     return thread
 
 
-def session_opening() -> AbstractContextManager[None]:
+@contextmanager
+def session_opening() -> Generator[None]:
     """Context in which a session is opened.
 
     Raises Closed while the process ends, and in a process forked from one that has used Zenoh, even if all of
     its sessions are closed: Zenoh starts its threads once, and a session here would wait for the parent's.
     """
-    return _process.session_opening()
+    process = _process
+    with process.lock:
+        if process.is_ending:
+            raise Closed("no session can be opened any more: this process is ending")
+        if process.zenoh_started_in not in (None, os.getpid()):
+            fact = f"process {process.zenoh_started_in} used Zenoh before this one was forked from it"
+            raise Closed(forked_text(fact))
+        if process.exit_thread is None:
+            process.exit_thread = threading.Thread(
+                target=process.run_exit_thread, name=THREAD_NAME, daemon=True
+            )
+            process.exit_thread.start()
+        process.zenoh_started_in = os.getpid()
+        process.opening += 1
+        process.none_opening.clear()
+    try:
+        yield
+    finally:
+        with process.lock:
+            process.opening -= 1
+            if not process.opening:
+                process.none_opening.set()
 
 
 def end_sessions(close: Callable[[], None] | None = None) -> None:
     """End all sessions within ``TIMEOUT_S``, after ``close()``."""
-    _process.close_all(close)
+    if close is not None:
+        _process.closing.append(close)
+    _process.requested.set()
+    if _process.exit_thread is not None:
+        _process.done.wait(TIMEOUT_S)
 
 
 def _reset_after_fork() -> None:

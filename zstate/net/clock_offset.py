@@ -5,11 +5,9 @@ at some time during the round trip; with the middle of it the error is at most h
 shortest of several is used (as in NTP). Writers on simulated time do not reply: they share one clock.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Collection
@@ -36,7 +34,10 @@ REFRESH_S = 30.0
 _UNANSWERED_REFRESH_S = 5.0
 
 _TIMEOUTS_S = (0.1, 0.2, 0.5)
-"""Of three attempts, the later two after those of other robots; then none until the offset is read again."""
+"""Of three attempts, the later two after those of other robots; then none until the offset is read again.
+
+Longer if the writer did not reply before.
+"""
 
 _DISCOVERY_S = 0.05
 
@@ -89,7 +90,7 @@ def measure_offsets(
 def _measure(
     session: Session, expression: str, rounds: int, clock: Clock, timeout_s: float
 ) -> Collection[MeasuredOffset]:
-    best: dict[str, MeasuredOffset] = {}
+    best: dict[tuple[str, WriterId], MeasuredOffset] = {}
     deadline = time.monotonic() + timeout_s
     while rounds:
         has_reply = False
@@ -102,16 +103,11 @@ def _measure(
             consolidation=zenoh.ConsolidationMode.NONE,
         )
         for reply in replies:
-            round_trip_ns = time.monotonic_ns() - sent_ns
-            decoded = _decode_reply(reply)
-            if decoded is not None:
+            measured = _offset_in(reply, now, time.monotonic_ns() - sent_ns)
+            if measured is not None:
                 has_reply = True
-                robot, writer, stamp = decoded
-                half = round_trip_ns // 2
-                measured = MeasuredOffset(robot, writer, stamp - (now + half), half, round_trip_ns)
-                key = clock_key(robot, writer.identity)
-                if key not in best or round_trip_ns < best[key].round_trip_ns:
-                    best[key] = measured
+                key = measured.robot, measured.writer
+                best[key] = min(best.get(key, measured), measured, key=lambda one: one.round_trip_ns)
         if has_reply:
             rounds -= 1
         elif best or time.monotonic() > deadline:
@@ -121,8 +117,8 @@ def _measure(
     return best.values()
 
 
-def _decode_reply(reply: zenoh.Reply) -> tuple[str, WriterId, int] | None:
-    """Robot, writer and the time of its clock; None for other replies."""
+def _offset_in(reply: zenoh.Reply, sent: int, round_trip_ns: int) -> MeasuredOffset | None:
+    """The offset by the ``reply`` to a query sent at ``sent`` [ns] by the local clock; None for others."""
     if reply.ok is None:
         return None
     try:
@@ -131,7 +127,10 @@ def _decode_reply(reply: zenoh.Reply) -> tuple[str, WriterId, int] | None:
         message = decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), ClockMessage)
     except (InvalidInput, MessageError):
         return None
-    return (robot, writer, message.stamp) if message.session == writer.session else None
+    if message.session != writer.session:
+        return None
+    half = round_trip_ns // 2
+    return MeasuredOffset(robot, writer, message.stamp - (sent + half), half, round_trip_ns)
 
 
 class ClockOffsetMonitor(Closeable):
@@ -170,7 +169,6 @@ class ClockOffsetMonitor(Closeable):
                     self._is_open = False
 
     def close(self) -> None:
-        """Stop measuring. A second call does nothing."""
         with self._lock:
             self._is_open = False
             self._requests.clear()
@@ -182,39 +180,33 @@ class ClockOffsetMonitor(Closeable):
                 if offset is None:
                     self._is_running = False
                     return
+            timeout_s = _TIMEOUTS_S[min(offset.unanswered, len(_TIMEOUTS_S) - 1)]
             try:
-                if offset.update(_measure(self._session, offset.key, 8, self._clock, offset.timeout_s)):
-                    self.request(offset)
+                measured = _measure(self._session, offset.key, 8, self._clock, timeout_s)
             except (Closed, zenoh.ZError):
                 self.close()  # with the session
+                continue
+            for one in measured:
+                offset.known = ClockOffset(one.offset_ns, one.uncertainty_ns)
+            offset.unanswered = 0 if measured else offset.unanswered + 1
+            if 0 < offset.unanswered < len(_TIMEOUTS_S):
+                self.request(offset)
 
 
+@dataclass(eq=False)
 class _WriterOffset:
-    """The offset of one writer's clock, if it is known."""
+    """The offset of one writer's clock, if it is ``known``."""
 
-    def __init__(self, monitor: ClockOffsetMonitor, robot: str, key: str) -> None:
-        self.robot = robot
-        self.key = key
-        self.offset: ClockOffset | None = None
-        self._unanswered = 0
-        self._monitor = monitor
-        self._requested_s = -REFRESH_S
-
-    @property
-    def timeout_s(self) -> float:
-        """The time for the next reply: longer if the writer did not reply before."""
-        return _TIMEOUTS_S[min(self._unanswered, len(_TIMEOUTS_S) - 1)]
-
-    def update(self, measured: Collection[MeasuredOffset]) -> bool:
-        """Store a measurement. Returns whether to try again, without a reply."""
-        self._unanswered = 0 if measured else self._unanswered + 1
-        for one in measured:
-            self.offset = ClockOffset(one.offset_ns, one.uncertainty_ns)
-        return 0 < self._unanswered < len(_TIMEOUTS_S)
+    monitor: ClockOffsetMonitor
+    robot: str
+    key: str
+    known: ClockOffset | None = None
+    unanswered: int = 0
+    requested_s: float = -math.inf
 
     def __call__(self) -> ClockOffset | None:
         now_s = time.monotonic()
-        if now_s - self._requested_s >= (_UNANSWERED_REFRESH_S if self.offset is None else REFRESH_S):
-            self._requested_s = now_s
-            self._monitor.request(self)
-        return self.offset
+        if now_s - self.requested_s >= (_UNANSWERED_REFRESH_S if self.known is None else REFRESH_S):
+            self.requested_s = now_s
+            self.monitor.request(self)
+        return self.known

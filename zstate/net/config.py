@@ -1,8 +1,5 @@
 """Session settings: modes, checked endpoints, ``ZSTATE_*`` variables, and the zenoh.Config they make."""
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import ipaddress
@@ -11,7 +8,7 @@ import os
 import re
 import socket
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
@@ -76,20 +73,17 @@ _LOCAL = {"unixsock-stream", "unixpipe", "vsock", "serial"}
 
 def endpoint_list(endpoints: str | Sequence[str]) -> tuple[str, ...]:
     """Checked endpoints, from one or several. Raises InvalidInput with the correct form."""
-    return tuple(map(_check_endpoint, [endpoints] if isinstance(endpoints, str) else endpoints))
-
-
-def _check_endpoint(endpoint: str) -> str:
-    protocol, slash, location = endpoint.partition("/")
-    if not slash or not protocol.isascii() or protocol not in _ADDRESSED | _LOCAL:
-        raise InvalidInput(f"{endpoint!r} is not an endpoint; {_advice(endpoint)}")
-    address = re.split(r"[?#]", location, maxsplit=1)[0]
-    if protocol in _ADDRESSED:
-        if parse_endpoint(endpoint) is None:
+    checked = (endpoints,) if isinstance(endpoints, str) else tuple(endpoints)
+    for endpoint in checked:
+        protocol, slash, location = endpoint.partition("/")
+        if not slash or protocol not in _ADDRESSED | _LOCAL:
+            raise InvalidInput(f"{endpoint!r} is not an endpoint; {_advice(endpoint)}")
+        address = re.split(r"[?#]", location, maxsplit=1)[0]
+        if protocol in _ADDRESSED and parse_endpoint(endpoint) is None:
             raise InvalidInput(f"{endpoint!r} has no host and port; {_advice(address, protocol)}")
-    elif not address:
-        raise InvalidInput(f"{endpoint!r} has no address after {protocol + '/'!r}")
-    return endpoint
+        if not address:
+            raise InvalidInput(f"{endpoint!r} has no address after {protocol + '/'!r}")
+    return checked
 
 
 def _advice(address: str, protocol: str = "tcp") -> str:
@@ -117,7 +111,7 @@ def default_config(
     settings["listen/endpoints"] = list(listen)
     settings["connect/timeout_ms"] = -1 if timeout_s is None else round(timeout_s * 1000)
     settings["connect/exit_on_failure"] = timeout_s is not None
-    return _apply(zenoh.Config(), settings)
+    return apply_settings(zenoh.Config(), settings)
 
 
 def user_config(
@@ -136,7 +130,7 @@ def user_config(
         settings["connect/endpoints"] = list(endpoints)
     if listen:
         settings["listen/endpoints"] = list(listen)
-    return _apply(_load(source), settings)
+    return apply_settings(_load(source), settings)
 
 
 def _mode_settings(mode: Mode) -> dict[str, object]:
@@ -150,7 +144,8 @@ def _mode_settings(mode: Mode) -> dict[str, object]:
     return {"mode": "peer" if mode == "loopback" else mode}
 
 
-def _apply(config: zenoh.Config, settings: Mapping[str, object]) -> zenoh.Config:
+def apply_settings(config: zenoh.Config, settings: Mapping[str, object]) -> zenoh.Config:
+    """``config``, changed by ``settings``, which are values by path."""
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
     return config
@@ -220,20 +215,16 @@ def listen_endpoints(mode: Mode, listen: Sequence[str], credentials: Credentials
 def check_loopback_only(endpoints: Iterable[str]) -> None:
     """Raise InvalidInput for an endpoint that is reachable from, or leads to, another host."""
     for endpoint in endpoints:
-        if not endpoint.startswith(("unixsock-stream/", "unixpipe/")) and not _is_loopback(endpoint):
+        parsed = parse_endpoint(endpoint)
+        is_local = endpoint.startswith(("unixsock-stream/", "unixpipe/"))
+        if parsed and not is_local:
+            with suppress(ValueError):  # a host name, which may get another address later
+                is_local = parsed.host == "localhost" or ipaddress.ip_address(parsed.host).is_loopback
+        if not is_local:
             raise InvalidInput(
                 f"{endpoint!r} leaves this host, which mode 'loopback' forbids; write an address in "
                 "127.0.0.0/8, '[::1]' or 'localhost', or choose mode 'peer', 'lan' or 'client'"
             )
-
-
-def _is_loopback(endpoint: str) -> bool:
-    parsed = parse_endpoint(endpoint)
-    host = parsed.host if parsed else ""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False  # a host name may get another address later
 
 
 def check_credentials(mode: Mode, credentials: Credentials | None, listen: Iterable[str]) -> None:

@@ -16,7 +16,7 @@ from zstate._util.closeable import Closeable
 from zstate.errors import NetworkError
 from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
-from zstate.net.status import watch_status
+from zstate.net.status import StatusSubscriber
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream
 from zstate.wire.messages import Status
@@ -152,7 +152,7 @@ class GraphMonitor(Closeable):
         self._used_at = -_IDLE_AFTER_S
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._status = watch_status(session, ANY, self._on_status)
+        self._status = StatusSubscriber(session, ANY, self._on_status)
         self._thread = threading.Thread(target=self._run, name="zstate graph", daemon=True)
         self._thread.start()
 
@@ -192,7 +192,6 @@ class GraphMonitor(Closeable):
                     del self._statuses[key]
 
     def close(self) -> None:
-        """Stop the thread. A second call does nothing."""
         self._stop.set()
         self._status.close()
         self._thread.join(_JOIN_TIMEOUT_S)

@@ -1,8 +1,5 @@
 """Latched values (ROS 1; transient local in DDS): late joiners receive the current value of each key."""
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownLambdaType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -62,7 +59,7 @@ class LatchedPublisher(Closeable):
         self._session.release(self._publisher)
 
 
-class LatchedSubscriber(Closeable):
+class LatchedSubscriber(Receiver[zenoh.Sample]):
     """Subscriber to the current value of every matching key, then to each change.
 
     ``on_value(sample)`` is called from one thread of this subscriber; the payload is empty if the value was
@@ -70,10 +67,7 @@ class LatchedSubscriber(Closeable):
     """
 
     def __init__(self, session: Session, keyexpr: str, on_value: Callable[[SerializedSample], None]) -> None:
-        def on_batch(batch: list[zenoh.Sample]) -> None:
-            # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
-            call_for_each(batch, lambda sample: on_value(to_serialized(sample)))
-
+        self._on_value = on_value
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
         subscriber = zenoh.ext.declare_advanced_subscriber(
             session.zenoh,
@@ -82,13 +76,8 @@ class LatchedSubscriber(Closeable):
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
             recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
-        self._receiver = Receiver(session, subscriber, on_batch, CAPACITY)
+        super().__init__(session, subscriber, CAPACITY)
 
-    @property
-    def failures(self) -> int:
-        """How often ``on_value`` raised."""
-        return self._receiver.failures
-
-    def close(self) -> None:
-        """Stop within a second, also from inside ``on_value``. A second call does nothing."""
-        self._receiver.close()
+    def _on_batch(self, batch: list[zenoh.Sample]) -> None:
+        # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
+        call_for_each(batch, lambda sample: self._on_value(to_serialized(sample)))

@@ -1,10 +1,7 @@
-"""Opening a Zenoh session: retried until a router or peer accepts it, or all of them refuse.
+"""Opening a Zenoh session: retried until a router or peer accepts it, or all of them deny it.
 
 Also sets Zenoh's thread-pool sizes: enough that closing dead links does not block reconnecting peers.
 """
-
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
 
 from __future__ import annotations
 
@@ -14,6 +11,7 @@ import os
 import re
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import zenoh
@@ -68,17 +66,17 @@ def open_with_retry(
     """A session with ``config``; if it gets no link, retried for ``timeout_s`` [s].
 
     Raises PortBusy, Unreachable, NetworkError; and AccessDenied, before the timeout, if all of ``endpoints``
-    refuse.
+    deny it.
     """
     deadline, next_check = time.monotonic() + timeout_s, 0.0
     while (session := _attempt(config)) is None:
         if time.monotonic() >= min(deadline, next_check):
-            from zstate.net.security.connection_check import check_endpoints  # noqa: PLC0415  # loads ssl
+            from zstate.net.security.connection_check import check_connections  # noqa: PLC0415  # loads ssl
 
-            results = check_endpoints(endpoints, credentials)
+            results = check_connections(endpoints, credentials)
             next_check = time.monotonic() + CHECK_PERIOD_S
-            if results.are_refusals or time.monotonic() >= deadline:
-                # A router that answers the check may have started after our attempt, and refuse nothing.
+            if results.is_denied or time.monotonic() >= deadline:
+                # A router that answers the check may have started after our attempt, and deny nothing.
                 session = _attempt(config) if isinstance(results.error, AccessDenied) else None
                 if session is None:
                     raise results.error
@@ -112,14 +110,34 @@ def connect_timeout(config: zenoh.Config) -> float:
     ``config`` describes no client, or does not retry.
     """
 
-    def client_value(value: Any) -> Any:
-        """The client's part of a setting that may have a value for each mode."""
+    def client_value(name: str) -> Any:
+        """A setting, or the client's part of it if it has a value for each mode."""
+        value: Any = json.loads(config.get_json(f"connect/{name}"))
         return cast("dict[str, Any]", value).get("client") if isinstance(value, dict) else value
 
-    settings: dict[str, Any] = json.loads(config.get_json("connect"))
-    timeout_ms, is_needed = (client_value(settings[name]) for name in ("timeout_ms", "exit_on_failure"))
+    timeout_ms, is_needed = client_value("timeout_ms"), client_value("exit_on_failure")
     is_client = json.loads(config.get_json("mode")) == "client"
     if not (is_client and endpoints_in(config) and timeout_ms) or is_needed is False:
         return 0.0
     config.insert_json5("connect/timeout_ms", "0")
     return math.inf if timeout_ms < 0 else timeout_ms / 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeSession:
+    """Configuration of a second client with the same ``identity``, which checks what a router forwards."""
+
+    config: zenoh.Config
+    identity: str
+
+    @classmethod
+    def for_config(cls, config: zenoh.Config, credentials: Credentials | None) -> ProbeSession | None:
+        """For the session that ``config`` opened; None unless it is a client with an identity."""
+        if credentials is None or not credentials.identity or json.loads(config.get_json("mode")) != "client":
+            return None
+        config.insert_json5("connect/timeout_ms", "0")  # each endpoint once
+        return cls(config, credentials.identity)
+
+    def open(self) -> zenoh.Session:
+        """Open it. Raises zenoh.ZError if no router answers."""
+        return open_zenoh(self.config)

@@ -5,9 +5,6 @@ they are published, because then their value shows them, moving ones as long as 
 Conflicting writers are found by their liveliness tokens and raise SecondWriter.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import time
@@ -15,6 +12,7 @@ import weakref
 from collections.abc import Container, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
+from itertools import islice
 from typing import NamedTuple, TypeAlias
 
 import zenoh
@@ -105,7 +103,7 @@ class WriterClaim(Closeable):
             wait_for_discovery(self._session)
             self._wait_for_expiry(raises_early=False)
         except BaseException:
-            self._release()
+            self.close()
             raise
 
     def confirm(self) -> None:
@@ -147,15 +145,12 @@ class WriterClaim(Closeable):
 
     def close(self) -> None:
         """Release the ownership. A second call does nothing."""
-        self._release()
+        with _CLAIMS_LOCK:
+            _CLAIMS[self._session].discard(self)
         if self._tokens is not None:
             self._session.release(self._tokens)
         while self._received:
             self._session.release(self._received.popitem()[1])
-
-    def _release(self) -> None:
-        with _CLAIMS_LOCK:
-            _CLAIMS[self._session].discard(self)
 
     def _wait_for_expiry(self, *, raises_early: bool) -> None:
         """Wait until there is no rival, for ``TOKEN_EXPIRY_S``. ``raises_early``: not if one is older."""
@@ -194,11 +189,7 @@ class WriterClaim(Closeable):
                 ring,
                 history=zenoh.ext.HistoryConfig(max_samples=1),
             )
-        handler = self._received[stream].handler
-        for _ in range(CAPACITY):
-            sample = handler.try_recv()
-            if sample is None:
-                break
+        for sample in islice(iter(self._received[stream].handler.try_recv, None), CAPACITY):
             with suppress(MessageError):  # withdrawn, or not of zstate
                 for message in _WIRE.decode(rival.stream, to_serialized(sample), rival.robot):
                     if isinstance(message, Sample | StaticTransforms | RobotDescription):

@@ -3,9 +3,6 @@
 Discovery queries the tokens; ``WriterWatch`` follows their changes. ``connections`` counts links.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import math
@@ -41,7 +38,7 @@ ROUND_S = 0.1
 
 _RECENT_S = 0.1
 _ROUTER_EVENT_S = 0.02
-_POLL_S = 0.002
+_POLL_S = 0.002  # Zenoh's channels have no receive with a timeout
 
 
 def local_writer(session: int, program: str = "") -> WriterId:
@@ -87,7 +84,6 @@ class LivelinessToken(Closeable):
         self._token = token
 
     def close(self) -> None:
-        """Undeclare the token. A second call does nothing."""
         self._session.release(self._token)
 
 
@@ -210,11 +206,10 @@ class RouterLossDetector(Closeable):
             time.sleep(_POLL_S)
 
     def close(self) -> None:
-        """Undeclare the listener. A second call does nothing."""
         self._session.release(self._events)
 
 
-class WriterWatch(Closeable):
+class WriterWatch(Receiver[zenoh.Sample]):
     """Watches the writers of ``robot`` ("*": of all robots), beginning with the current ones.
 
     ``callback(announced, alive)`` is called from one thread. The loss of a router removes every writer behind
@@ -231,27 +226,21 @@ class WriterWatch(Closeable):
         session: Session,
         robot: str,
         callback: Callable[[Announcement, bool], None],
-        wire: Wire,
+        wire: str = "native",
         on_cut_off: Callable[[Announcement], None] | None = None,
     ) -> None:
         self.foreign = 0
         self.ignored = 0
-        self._session = session
         self._known: dict[str, Announcement | None] = {}
         self._callback = callback
         self._on_cut_off = on_cut_off
         self._routers = None if on_cut_off is None else RouterLossDetector(session)
         self._robot = robot
-        self._wire = wire
+        self._wire = get_wire(wire)
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
-        self._expression = wire.writers_expression(robot)
+        self._expression = self._wire.writers_expression(robot)
         tokens = session.zenoh.liveliness().declare_subscriber(self._expression, ring, history=True)
-        self._receiver = Receiver(session, tokens, self._on_batch, CAPACITY)
-
-    @property
-    def failures(self) -> int:
-        """How often a callback raised, counted once for tokens that arrived together."""
-        return self._receiver.failures
+        super().__init__(session, tokens, CAPACITY)
 
     def _on_batch(self, batch: list[zenoh.Sample]) -> None:
         if len(batch) < CAPACITY:
@@ -284,21 +273,9 @@ class WriterWatch(Closeable):
             self._callback(announced, alive)
 
     def close(self) -> None:
-        """Stop within a second. A second call does nothing."""
-        self._receiver.close()  # first: its thread uses the detector
+        super().close()  # first: its thread uses the detector
         if self._routers is not None:
             self._routers.close()
-
-
-def watch(
-    session: Session,
-    robot: str,
-    callback: Callable[[Announcement, bool], None],
-    wire: str = "native",
-    on_cut_off: Callable[[Announcement], None] | None = None,
-) -> WriterWatch:
-    """Call ``callback(announced, alive)`` for each current writer and each change; see ``WriterWatch``."""
-    return WriterWatch(session, robot, callback, get_wire(wire), on_cut_off)
 
 
 class Connections(NamedTuple):

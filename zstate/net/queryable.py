@@ -7,9 +7,6 @@ while Zenoh holds its own: next to a computing thread, 8000 replies then take mo
 into a channel that is never full, and the limit is applied where they are read.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import logging
@@ -20,7 +17,6 @@ from typing import NamedTuple, TypeAlias
 
 import zenoh
 
-from zstate._util.closeable import Closeable
 from zstate.errors import InvalidInput, Unreachable, ZStateError
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, call_for_each
@@ -42,7 +38,6 @@ MAX_PAUSE_S = 0.2
 _LOG = logging.getLogger("zstate")
 
 _Channel: TypeAlias = "zenoh.handlers.FifoChannel[zenoh.Reply]"
-_Queries: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Query]"
 
 
 def query(
@@ -96,14 +91,13 @@ class Reply(NamedTuple):
     is_error: bool = False
 
 
-class Queryable(Closeable):
+class Queryable(Receiver[zenoh.Query]):
     """Replies to queries on ``key``, until it is closed.
 
     ``answer(parameters)`` is called from one thread of this queryable, for one query after the other; None
-    sends no reply. Its exceptions are counted in ``failures``, and the first goes to
-    ``threading.excepthook``. Neither a slow answer nor a flood of queries delays Zenoh or publishers: queries
-    beyond ``capacity`` are lost, and ``overflows`` counts how often that may have happened. After a full
-    batch the thread pauses, so that a flood takes no more than a quarter of one processor.
+    sends no reply. Neither a slow answer nor a flood of queries delays Zenoh or publishers: queries beyond
+    ``capacity`` are lost, and ``full_batches`` counts how often that may have happened. After a full batch
+    the thread pauses, so that a flood takes no more than a quarter of one processor.
     """
 
     def __init__(
@@ -116,27 +110,15 @@ class Queryable(Closeable):
         self.answered = 0
         self._key = key
         self._answer = answer
-        self._capacity = capacity
-        ring: _Queries = zenoh.handlers.RingChannel(capacity)
-        queryable = session.zenoh.declare_queryable(key, ring)
-        self._receiver = Receiver(session, queryable, self._on_queries, capacity)
+        ring: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(capacity)
+        super().__init__(session, session.zenoh.declare_queryable(key, ring), capacity)
 
-    @property
-    def overflows(self) -> int:
-        """How often the ring was full: some queries may have been lost there."""
-        return self._receiver.full_batches
-
-    @property
-    def failures(self) -> int:
-        """How often ``answer`` raised, counted once for queries that arrived together."""
-        return self._receiver.failures
-
-    def _on_queries(self, queries: list[zenoh.Query]) -> None:
+    def _on_batch(self, batch: list[zenoh.Query]) -> None:
         start = time.monotonic()
         try:
-            call_for_each(queries, self._on_query)
+            call_for_each(batch, self._on_query)
         finally:
-            if len(queries) >= self._capacity:
+            if len(batch) >= self._capacity:
                 time.sleep(min(3.0 * (time.monotonic() - start), MAX_PAUSE_S))
 
     def _on_query(self, received: zenoh.Query) -> None:
@@ -150,10 +132,6 @@ class Queryable(Closeable):
                 else:
                     received.reply(self._key, reply.payload, encoding=reply.encoding)
                 self.answered += 1
-
-    def close(self) -> None:
-        """Stop replying, within a second. A second call does nothing."""
-        self._receiver.close()
 
 
 def parse_parameters(text: str) -> dict[str, str]:

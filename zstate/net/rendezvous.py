@@ -11,9 +11,6 @@ second, sessions meet at the next address in the same way and keep checking the 
 register there, and so meet the process that was stopped.
 """
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import os
@@ -45,7 +42,7 @@ _REGISTRATION_POLL_S = 0.01
 PROBE_PERIOD_S = 0.2
 JOIN_WITHIN_S = 0.3
 _DISCOVERY_TIMEOUT_S = 3.0
-_DISCOVERY_POLL_S = 0.002
+_DISCOVERY_POLL_S = 0.002  # nothing reports a port that becomes free
 
 
 def rendezvous_key(number: int) -> str:
@@ -214,13 +211,11 @@ class _Address:
 
     @property
     def is_registered(self) -> bool:
-        """Whether the session sees a rendezvous peer there."""
         registration = self._registration
         return registration is not None and registration.is_registered
 
     @property
     def is_silent(self) -> bool:
-        """Whether no rendezvous peer answered there."""
         registration = self._registration
         return registration is not None and registration.is_silent
 
@@ -245,7 +240,7 @@ class _Address:
 
     def join(self, session: zenoh.Session, endpoint: str) -> RendezvousRegistration:
         """The registration of ``session`` there."""
-        registration = self._registration
+        registration = self._registration  # ``leave`` may clear it at the same time
         if registration is None:
             registration = RendezvousRegistration(session, endpoint, self.endpoint, self._key)
             self._registration = registration

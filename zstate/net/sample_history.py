@@ -15,9 +15,6 @@ announced writer may never reply: in the order of arrival a thousand silent writ
 those of another robot by minutes. So robots take turns.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import heapq
@@ -266,21 +263,18 @@ class HistoryReader(Closeable):
                     self._closed = True  # with the session
 
     def _on_event(self, request: _Request, has_ended: bool) -> None:
-        if not has_ended:
-            self._waiting.add(request.key, request)
-            return
-        self._in_flight -= 1
-        try:
-            due_s = (
-                self._retry_s(request) if request.reply is None else self._on_reply(request, request.reply)
-            )
-        except Exception:
-            self._failures += 1
-            if self._failures == 1:
-                threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
-        else:
-            if due_s is not None:
-                self._waiting.add(request.key, request, due_s)
+        due_s: float | None = 0.0
+        if has_ended:
+            self._in_flight -= 1
+            try:
+                due_s = self._on_reply(request)
+            except Exception:
+                due_s = None
+                self._failures += 1
+                if self._failures == 1:
+                    threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
+        if due_s is not None:
+            self._waiting.add(request.key, request, due_s)
 
     def _send(self, request: _Request) -> None:
         selector = f"{request.key}?session={request.writer}"
@@ -305,10 +299,17 @@ class HistoryReader(Closeable):
             congestion_control=zenoh.CongestionControl.DROP,
         )
 
-    def _on_reply(self, request: _Request, reply: zenoh.Sample) -> float | None:
-        """Deliver a page. Returns when [s] to request the next one; None for never."""
+    def _on_reply(self, request: _Request) -> float | None:
+        """Deliver the page, if there is a reply. Returns when [s] to request again; None for never."""
+        if request.reply is None:
+            # The token of a new writer may be known before its queryable; or a page was lost.
+            now_s = time.monotonic()
+            request.attempts += 1
+            request.timeouts += now_s - request.sent_s > 0.9 * TIMEOUTS_S[request.timeouts]
+            is_last = request.attempts >= MAX_ATTEMPTS or request.timeouts >= len(TIMEOUTS_S)
+            return None if is_last else now_s + RETRY_DELAY_S * 2**request.attempts
         request.attempts = request.timeouts = 0
-        received = to_serialized(reply, request.key)
+        received = to_serialized(request.reply, request.key)
         if len(received.payload) > MAX_PAGE_BYTES:
             text = f"a page of {len(received.payload)} bytes, more than {MAX_PAGE_BYTES}"
             self._on_error(received.key, MessageError(text, reason="too large"))
@@ -324,17 +325,6 @@ class HistoryReader(Closeable):
         goes_back = page.before is not None and (request.before is None or page.before < request.before)
         request.before = page.before
         return 0.0 if wants_more and goes_back and request.pages < _MAX_PAGES else None
-
-    @staticmethod
-    def _retry_s(request: _Request) -> float | None:
-        """When [s] to repeat a request without a reply; None for never."""
-        # The token of a new writer may be known before its queryable; or a page was lost.
-        now_s = time.monotonic()
-        request.attempts += 1
-        request.timeouts += now_s - request.sent_s > 0.9 * TIMEOUTS_S[request.timeouts]
-        if request.attempts >= MAX_ATTEMPTS or request.timeouts >= len(TIMEOUTS_S):
-            return None
-        return now_s + RETRY_DELAY_S * 2**request.attempts
 
     def close(self) -> None:
         """Stop the thread, within a second. A second call does nothing."""

@@ -1,8 +1,5 @@
 """Session: the connection to the network, opened by ``connect``."""
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import itertools
@@ -36,9 +33,9 @@ from zstate.net.config import (
     settings_from_environment,
     user_config,
 )
-from zstate.net.open import connect_timeout, open_with_retry
+from zstate.net.open import ProbeSession, connect_timeout, open_with_retry
 from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_addresses
-from zstate.net.security.connection_monitor import ConnectionMonitor, ProbeSession
+from zstate.net.security.connection_monitor import ConnectionMonitor
 from zstate.net.security.credentials import Credentials
 
 CLOSE_TIMEOUT_S = 0.8
@@ -49,22 +46,6 @@ class Undeclarable(Protocol):
     """An entity declared on a Zenoh session."""
 
     def undeclare(self) -> Any: ...
-
-
-def undeclare(entity: Undeclarable) -> None:
-    """Undeclare ``entity``, as soon as no other thread is using it, or give up after 0.5 s."""
-    deadline = time.monotonic() + _UNDECLARE_TIMEOUT_S
-    while True:
-        try:
-            entity.undeclare()
-        except RuntimeError as error:
-            if "borrowed" not in str(error):
-                raise
-        else:
-            return
-        if time.monotonic() >= deadline:
-            return
-        time.sleep(0.001)
 
 
 def connect(
@@ -107,8 +88,8 @@ def connect(
     started by `zstate up` join its network.
 
     Raises InvalidInput or ConfigError for unusable arguments; a client also raises Unreachable if no router
-    answers and AccessDenied if all that answer refuse; PortBusy, NetworkError. The other modes retry; a
-    refusal and its reason are logged as a warning.
+    answers and AccessDenied if all that answer deny it; PortBusy, NetworkError. The other modes retry; a
+    denial and its reason are logged as a warning.
     """
     if config is None and mode is None and not endpoints and not listen:
         settings = settings_from_environment()
@@ -246,12 +227,27 @@ class Session(Closeable):
             raise Closed(forked_text(f"this session belongs to process {self._pid}"))
 
     def release(self, entity: Undeclarable) -> None:
-        """Undeclare an entity of this session. Does nothing if the entity or the session is closed."""
+        """Undeclare an entity of this session. Does nothing if the entity or the session is closed.
+
+        Waits until no other thread is using the entity, or gives up after 0.5 s.
+        """
         if os.getpid() != self._pid:
             leak(entity)
-        elif not self._closed:
-            with suppress(zenoh.ZError):
-                undeclare(entity)
+            return
+        deadline = time.monotonic() + _UNDECLARE_TIMEOUT_S
+        while not self._closed:
+            try:
+                entity.undeclare()
+            except zenoh.ZError:
+                return
+            except RuntimeError as error:
+                if "borrowed" not in str(error):
+                    raise
+            else:
+                return
+            if time.monotonic() >= deadline:
+                return
+            time.sleep(0.001)
 
     def close(self) -> None:
         """Leave the network within a second. A second call does nothing."""

@@ -44,7 +44,6 @@ class StatusPublisher(Closeable):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop publishing. A second call does nothing."""
         self._stop.set()
         self._publisher.close()
         if threading.current_thread() is not self._thread:
@@ -64,27 +63,25 @@ class StatusPublisher(Closeable):
             due = max(due + PERIOD_S, time.monotonic())
 
 
-class StatusSubscriber(Closeable):
-    """Receives every status of ``robot`` ("*": of all robots); ``refused`` counts invalid ones by reason."""
+class StatusSubscriber(StreamSubscriber):
+    """Calls ``callback(robot, status)`` with the status of each publisher of ``robot`` ("*": of all robots).
+
+    Called once a second, from one thread, starting within a second. A process that is frozen or gone
+    publishes no status: check the age of its last one. ``refused`` counts invalid ones by reason.
+    """
 
     def __init__(self, session: Session, robot: str, callback: Callable[[str, Status], None]) -> None:
         self.refused: Counter[str] = Counter()
-        self._callback = callback
-        self._subscriber = StreamSubscriber(
-            session, status_expression(robot), lambda samples: call_for_each(samples, self._on_sample)
-        )
 
-    def _on_sample(self, sample: SerializedSample) -> None:
-        try:
-            robot, status = _decode_status(sample)
-        except (MessageError, InvalidInput) as error:
-            self.refused[getattr(error, "reason", "foreign")] += 1
-        else:
-            self._callback(robot, status)
+        def on_sample(sample: SerializedSample) -> None:
+            try:
+                name, status = _decode_status(sample)
+            except (MessageError, InvalidInput) as error:
+                self.refused[getattr(error, "reason", "foreign")] += 1
+            else:
+                callback(name, status)
 
-    def close(self) -> None:
-        """Stop within a second. A second call does nothing."""
-        self._subscriber.close()
+        super().__init__(session, status_expression(robot), lambda samples: call_for_each(samples, on_sample))
 
 
 def _decode_status(sample: SerializedSample) -> tuple[str, Status]:
@@ -99,12 +96,3 @@ def _decode_status(sample: SerializedSample) -> tuple[str, Status]:
     if not math.isfinite(status.rate_hz):
         raise MessageError(f"a Status with the rate {status.rate_hz}", reason="malformed")
     return robot, status
-
-
-def watch_status(session: Session, robot: str, callback: Callable[[str, Status], None]) -> StatusSubscriber:
-    """Call ``callback(robot, status)`` with the status of each publisher of ``robot``, once a second.
-
-    Starts within a second; called from one thread. A process that is frozen or gone publishes no status:
-    check the age of its last one.
-    """
-    return StatusSubscriber(session, robot, callback)

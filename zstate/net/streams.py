@@ -1,15 +1,13 @@
 """Sample streams (best effort, keep last): the newest sample replaces older ones, and writers never wait.
 
-A ``Receiver`` is one daemon thread that drains a Zenoh channel in batches.
+Subscribers and queryables are a ``Receiver``: one daemon thread that drains a Zenoh channel in batches.
 """
-
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
 
 from __future__ import annotations
 
 import sys
 import threading
+from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Generic, Protocol, TypeAlias, TypeVar
@@ -59,35 +57,31 @@ def call_for_each(batch: Iterable[T], function: Callable[[T], object]) -> None:
         raise failure
 
 
-class Receiver(Generic[T]):
-    """Calls ``on_batch`` with all waiting items, oldest first.
+class Receiver(Closeable, Generic[T]):
+    """Calls ``_on_batch`` with all waiting items, oldest first.
 
     The ring in between holds ``capacity`` items: if it is full the oldest are lost. A batch that fills it is
     counted in ``full_batches``, which distinguishes a gap before or in it from a loss in the network. An
-    exception of ``on_batch`` is counted in ``failures``, and the first goes to ``threading.excepthook``; the
-    thread continues.
+    exception of ``_on_batch`` is counted in ``failures``, once for items that arrived together, and the first
+    goes to ``threading.excepthook``; the thread continues.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        subscribed: Subscribed[T],
-        on_batch: Callable[[list[T]], None],
-        capacity: int,
-    ) -> None:
+    def __init__(self, session: Session, subscribed: Subscribed[T], capacity: int) -> None:
         self.full_batches = 0
         self.failures = 0
         self._session = session
         self._subscribed = subscribed
-        self._on_batch = on_batch
         self._capacity = capacity
         self._closed = False
         thread = threading.Thread(target=self._run, name="zstate receiver", daemon=True)
         self._thread = join_at_exit(thread)
         self._thread.start()
 
+    @abstractmethod
+    def _on_batch(self, batch: list[T]) -> None: ...
+
     def close(self) -> None:
-        """Stop within a second; ``on_batch``, from which this may be called, is not called afterwards."""
+        """Stop within a second, also from inside a callback, which is not called afterwards."""
         self._closed = True
         self._session.release(self._subscribed)
         if threading.current_thread() is not self._thread:
@@ -112,9 +106,6 @@ class Receiver(Generic[T]):
                 self.failures += 1
                 if self.failures == 1:
                     threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
-
-
-_Statuses: TypeAlias = "zenoh.handlers.Handler[zenoh.MatchingStatus]"
 
 
 def capacity_for(keyexpr: str) -> int:
@@ -149,7 +140,7 @@ class StreamPublisher(Closeable):
             express=False,
         )
         self._has_readers = False
-        self._changes: zenoh.MatchingListener[_Statuses] | None = None
+        self._changes: zenoh.MatchingListener[zenoh.handlers.Handler[zenoh.MatchingStatus]] | None = None
 
     @property
     def has_readers(self) -> bool:
@@ -172,16 +163,19 @@ class StreamPublisher(Closeable):
             raise Closed(f"the publisher of {self._key!r} is closed") from None
 
     def close(self) -> None:
-        """Undeclare the publisher. A second call does nothing."""
         if self._changes is not None:
             self._session.release(self._changes)
         self._session.release(self._publisher)
 
 
-class StreamSubscriber(Closeable):
+class StreamSubscriber(Receiver[zenoh.Sample]):
     """Subscriber to a key expression; ``on_samples`` is called with all waiting samples, oldest first.
 
     It is called from one thread of this subscriber. ``Receiver`` describes slow and failing callbacks.
+
+    The keys of received samples, up to 4096, are declared to Zenoh, which keeps the route of samples on
+    declared keys. On others it searches all declarations under them for each sample: with the tokens of 100
+    robots that is a quarter of what a reader's sample costs.
     """
 
     def __init__(
@@ -191,72 +185,35 @@ class StreamSubscriber(Closeable):
         on_samples: Callable[[list[SerializedSample]], None],
         capacity: int | None = None,
     ) -> None:
-        self._keys = keys = _DeclaredKeys(session)
-        key = "" if "*" in keyexpr else keyexpr
-
-        def on_batch(batch: list[zenoh.Sample]) -> None:
-            samples = [to_serialized(sample, key, 4 * SAMPLE_BYTES) for sample in batch]
-            if not all(sample.payload for sample in samples):
-                # A delete has no payload; reading the kind of every sample would cost as much as its key.
-                puts = zenoh.SampleKind.PUT
-                samples = [one for one, sample in zip(samples, batch, strict=True) if sample.kind == puts]
-            if not key:
-                keys.declare({sample.key for sample in samples})
-            on_samples(samples)
-
+        self._key = "" if "*" in keyexpr else keyexpr
+        self._declared: dict[str, _DeclaredKey] = {}
+        self._on_samples = on_samples
         capacity = capacity or capacity_for(keyexpr)
         ring: Ring = zenoh.handlers.RingChannel(capacity)
-        subscriber = session.zenoh.declare_subscriber(keyexpr, ring)
-        self._receiver = Receiver(session, subscriber, on_batch, capacity)
+        super().__init__(session, session.zenoh.declare_subscriber(keyexpr, ring), capacity)
 
-    @property
-    def full_batches(self) -> int:
-        """How often the ring was full: samples were lost in this process, not in the network."""
-        return self._receiver.full_batches
-
-    @property
-    def failures(self) -> int:
-        """How often ``on_samples`` raised."""
-        return self._receiver.failures
-
-    def close(self) -> None:
-        """Stop within a second, also from inside ``on_samples``. A second call does nothing."""
-        self._receiver.close()
-        self._keys.close()
-
-
-class _DeclaredKeys:
-    """Keys of received samples, declared to Zenoh.
-
-    Zenoh keeps the route of samples on declared keys. On others it searches all declarations under them for
-    each sample: with the tokens of 100 robots that is a quarter of what a reader's sample costs.
-    """
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self._keys: dict[str, _Key] = {}
-        self._max = _MAX_KEYS
-
-    def declare(self, keys: set[str]) -> None:
-        """Declare ``keys``, up to 4096 in all."""
-        if len(self._keys) < self._max:
-            for key in keys.difference(self._keys):
+    def _on_batch(self, batch: list[zenoh.Sample]) -> None:
+        samples = [to_serialized(sample, self._key, 4 * SAMPLE_BYTES) for sample in batch]
+        if not all(sample.payload for sample in samples):
+            # A delete has no payload; reading the kind of every sample would cost as much as its key.
+            puts = zenoh.SampleKind.PUT
+            samples = [one for one, sample in zip(samples, batch, strict=True) if sample.kind == puts]
+        if not self._key and len(self._declared) < _MAX_KEYS:
+            for key in {sample.key for sample in samples}.difference(self._declared):
                 with suppress(Closed, zenoh.ZError):  # closed at the same time: no more samples will arrive
-                    self._keys[key] = _Key(self._session, key)
+                    self._declared[key] = _DeclaredKey(self._session.zenoh, key)
+        self._on_samples(samples)
 
     def close(self) -> None:
-        """Undeclare them. A second call does nothing."""
-        self._max = 0
-        while self._keys:
-            self._session.release(self._keys.popitem()[1])
+        super().close()
+        while self._declared:
+            self._session.release(self._declared.popitem()[1])
 
 
-class _Key:
-    """A key expression that is declared to Zenoh."""
-
-    def __init__(self, session: Session, key: str) -> None:
-        self._session = session.zenoh
-        self._expression: zenoh.KeyExpr = self._session.declare_keyexpr(key)
+class _DeclaredKey:
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._session = session
+        self._expression: zenoh.KeyExpr = session.declare_keyexpr(key)
 
     def undeclare(self) -> None:
         self._session.undeclare(self._expression)

@@ -1,8 +1,8 @@
-"""Subscription to the decoded messages of one stream."""
+"""Decoding of received samples, and subscription to the messages of one stream."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from zstate.errors import InvalidInput, MessageError
@@ -13,8 +13,6 @@ from zstate.wire.keys import ANY, Stream, shortened
 from zstate.wire.messages import Message
 from zstate.wire.protocol import SerializedSample, Wire
 
-_LATCHED: frozenset[Stream] = frozenset({"robot_description", "tf_static"})
-
 
 class Received(NamedTuple):
     """A decoded message, with the robot and the key that it was published on."""
@@ -22,6 +20,28 @@ class Received(NamedTuple):
     robot: str
     key: str
     message: Message
+
+
+def decode_samples(
+    wire: Wire,
+    robot: str,
+    stream: Stream,
+    samples: Iterable[SerializedSample],
+    on_error: Callable[[str, str], object] | None = None,
+) -> Iterator[Received]:
+    """The messages of ``samples`` of ``robot``, or of the robot of each key with ``"*"``.
+
+    ``on_error(reason, text)`` is called for each payload that cannot be decoded.
+    """
+    for sample in samples:
+        try:
+            name = wire.robot_from_key(sample.key) if robot == ANY else robot
+            for message in wire.decode(stream, sample, name):
+                yield Received(name, sample.key, message)
+        except (MessageError, InvalidInput) as error:  # noqa: PERF203 - the other samples are still decoded
+            if on_error is not None:
+                reason = error.reason if isinstance(error, MessageError) else "foreign"
+                on_error(reason, f"{shortened(sample.key)}: {error}")
 
 
 def subscribe(
@@ -40,29 +60,19 @@ def subscribe(
     first; ``on_error(reason, text)`` for each payload that cannot be decoded; ``on_withdrawn(key)`` if a
     latched value is withdrawn.
     """
-    is_latched = stream in _LATCHED
 
-    def decode(samples: Iterable[SerializedSample]) -> Iterator[Received]:
-        for sample in samples:
-            # ROS cannot withdraw values: an empty payload there is a broken message.
-            if is_latched and not sample.payload and not wire.shared:
-                if on_withdrawn is not None:
-                    on_withdrawn(sample.key)
-                continue
-            try:
-                name = wire.robot_from_key(sample.key) if robot == ANY else robot
-                for message in wire.decode(stream, sample, name):
-                    yield Received(name, sample.key, message)
-            except (MessageError, InvalidInput) as error:
-                if on_error is not None:
-                    reason = error.reason if isinstance(error, MessageError) else "foreign"
-                    on_error(reason, f"{shortened(sample.key)}: {error}")
-
-    def on_samples(samples: Iterable[SerializedSample]) -> None:
-        if messages := list(decode(samples)):
+    def on_samples(samples: Sequence[SerializedSample]) -> None:
+        if messages := list(decode_samples(wire, robot, stream, samples, on_error)):
             on_messages(messages)
 
+    def on_value(sample: SerializedSample) -> None:
+        # ROS cannot withdraw values: an empty payload there is a broken message.
+        if sample.payload or wire.shared:
+            on_samples((sample,))
+        elif on_withdrawn is not None:
+            on_withdrawn(sample.key)
+
     key = wire.expression(robot, stream)
-    if is_latched:
-        return LatchedSubscriber(session, key, lambda sample: on_samples((sample,)))
+    if stream in ("robot_description", "tf_static"):
+        return LatchedSubscriber(session, key, on_value)
     return StreamSubscriber(session, key, on_samples)

@@ -10,19 +10,19 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
+from contextlib import ExitStack
 from functools import cached_property
 from itertools import pairwise
 from statistics import median, pstdev
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.clock import Clock, SystemClock
-from zstate.errors import InvalidInput, MessageError
 from zstate.ingest.deadline import Deadline
 from zstate.net.streams import StreamSubscriber
+from zstate.net.subscription import decode_samples
 from zstate.wire.keys import ANY, Stream
 from zstate.wire.messages import Sample
 
@@ -178,19 +178,12 @@ class WriterKey(NamedTuple):
     session: int
 
 
-Sources = Callable[[str, Stream, Sample], Iterator[Hashable]]
-"""The keys under which a sample of a robot's stream is counted."""
-
-
-def by_writer(robot: str, stream: Stream, sample: Sample) -> Iterator[WriterKey]:
-    """Each writer of a stream is a source."""
-    yield WriterKey(robot, stream, sample.session)
-
-
 class TopicStatistics(Closeable):
     """Statistics of subscribed streams by source; messages that cannot be decoded are skipped.
 
-    ``clock`` is that of the stamps. ``on_sample`` is called with each sample, in the subscriber's thread.
+    ``sources(robot, stream, sample)`` are the keys under which a sample is counted, by default the
+    ``WriterKey`` of its writer. ``clock`` is that of the stamps. ``on_sample`` is called with each sample, in
+    the subscriber's thread.
     """
 
     def __init__(
@@ -198,13 +191,14 @@ class TopicStatistics(Closeable):
         session: Session,
         wire: Wire,
         *,
-        sources: Sources = by_writer,
+        sources: Callable[[str, Stream, Sample], Iterable[Hashable]] | None = None,
         clock: Clock | None = None,
         window: int = WINDOW,
         on_sample: Callable[[Stream, Sample], None] | None = None,
     ) -> None:
         self.gaps = SequenceGaps()
-        self._session, self._wire, self._sources = session, wire, sources
+        self._session, self._wire = session, wire
+        self._sources = sources or (lambda name, stream, one: (WriterKey(name, stream, one.session),))
         self._clock = clock or SystemClock()
         self._on_sample, self._window = on_sample, window
         self._statistics: BoundedDict[Hashable, IntervalStatistics] = BoundedDict()
@@ -214,15 +208,12 @@ class TopicStatistics(Closeable):
     def subscribe(self, stream: Stream, robot: str = ANY) -> None:
         """Count ``stream`` of ``robot``, or of all robots, from now on."""
 
-        def on_samples(received: list[SerializedSample]) -> None:
+        def on_samples(samples: list[SerializedSample]) -> None:
             at, now = time.monotonic_ns(), self._clock.now()
             with self._arrived:
-                for serialized in received:
-                    with suppress(InvalidInput, MessageError):
-                        name = self._wire.robot_from_key(serialized.key) if robot == ANY else robot
-                        for sample in self._wire.decode(stream, serialized, name):
-                            if isinstance(sample, Sample):
-                                self.add(name, stream, sample, at, now)
+                for name, _, message in decode_samples(self._wire, robot, stream, samples):
+                    if isinstance(message, Sample):
+                        self.add(name, stream, message, at, now)
                 self._arrived.notify_all()
 
         key = self._wire.expression(robot, stream)
@@ -259,5 +250,4 @@ class TopicStatistics(Closeable):
             self._arrived.wait_for(lambda: all(map(is_measurable, sources)), timeout_s)
 
     def close(self) -> None:
-        """Unsubscribe. A second call does nothing."""
         self._subscriptions.close()

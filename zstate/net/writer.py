@@ -1,23 +1,34 @@
-"""Writers of one robot on one wire: publishers that own their encoder, announced by liveliness tokens."""
+"""Writers of one robot on one wire: publishers that own their encoder, announced by liveliness tokens.
+
+``check_may_write`` detects writes that the access control of a router drops.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack, suppress
+from typing import TypeVar
+
+import zenoh
 
 from zstate._util.closeable import Closeable
-from zstate.errors import Closed
+from zstate.errors import AccessDenied, Closed
 from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import announce
-from zstate.net.security.write_permission import check_may_write
+from zstate.net.queryable import query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.wire.identity import WriterId
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import Message
-from zstate.wire.protocol import EntityId, StreamEncoder, Wire
+from zstate.wire.protocol import StreamEncoder, Wire, WriterNode
+
+_PERMISSION_TIMEOUT_S = 1.0
+_PERMISSION_ROUND_S = 0.02
+
+W = TypeVar("W", "SampleWriter", "LatchedWriter")
 
 
 class SampleWriter(StreamPublisher):
@@ -79,50 +90,72 @@ class WireWriter(Closeable):
     ) -> None:
         self._session = session
         self._wire = wire
-        self._robot = robot
-        self._writer = writer
-        self._sample_names = sample_names or SampleLayout()
-        self._node = EntityId(session.zid, session.next_number())
+        names = sample_names or SampleLayout()
+        self._node = WriterNode(robot, writer, session.zid, session.next_number(), names)
         self._is_permitted = wire.name == "ros2dds"  # the permissions of these are the bridges' own
         self._opened = ExitStack()
-        token = wire.node_token(robot, writer, self._node)
+        token = wire.node_token(self._node)
         if token is not None:
             self._opened.enter_context(announce(session, token))
 
     def open_stream(self, stream: Stream, name: str = "") -> SampleWriter:
         """Open and announce ``stream``; edges under ``name``. Raises AccessDenied if the router drops it."""
-        writer = SampleWriter(self._session, self._encoder(stream, name))
-        self._announce(writer)
-        return writer
+        return self._announced(SampleWriter(self._session, self._encoder(stream, name)))
 
     def open_latched(self, stream: Stream, name: str = "") -> LatchedWriter:
         """Open and announce ``stream`` for a latched value; static edges under ``name``. Raises as above."""
-        writer = LatchedWriter(self._session, self._encoder(stream, name))
-        self._announce(writer)
-        return writer
+        return self._announced(LatchedWriter(self._session, self._encoder(stream, name)))
 
     def _encoder(self, stream: Stream, name: str = "") -> StreamEncoder:
-        return self._wire.stream_encoder(
-            self._robot,
-            self._writer,
-            stream,
-            node=self._node,
-            number=self._session.next_number(),
-            sample_names=self._sample_names,
-            name=name,
-        )
+        return self._wire.stream_encoder(self._node, stream, self._session.next_number(), name)
 
-    def _announce(self, writer: SampleWriter | LatchedWriter) -> None:
+    def _announced(self, writer: W) -> W:
         self._opened.enter_context(writer)
         token = writer.encoder.token
-        if token is None:
-            return
-        self._opened.enter_context(announce(self._session, token))
-        if not self._is_permitted:
-            # One check is enough: all streams of a robot have the same permissions.
-            check_may_write(self._session, self._robot, token)
-            self._is_permitted = True
+        if token is not None:
+            self._opened.enter_context(announce(self._session, token))
+            if not self._is_permitted:
+                # One check is enough: all streams of a robot have the same permissions.
+                check_may_write(self._session, self._node.robot, token)
+                self._is_permitted = True
+        return writer
 
     def close(self) -> None:
         """Close all streams and withdraw their tokens. A second call does nothing."""
         self._opened.close()
+
+
+def check_may_write(session: Session, robot: str, token: str) -> None:
+    """Raise AccessDenied if the router of ``session`` drops what it writes of ``robot``.
+
+    Zenoh gives no error for that. ``token`` is a liveliness token that the session keeps among the robot's
+    keys. A second session of the same identity, open for milliseconds, queries the router for it. Without
+    credentials, in modes other than client, and while the router changes, nothing is checked.
+    """
+    probe = session.probe
+    if probe is None or not _routers(session.zenoh):
+        return
+    try:
+        other = probe.open()
+    except zenoh.ZError:
+        return
+    with other:
+        if _routers(other) != _routers(session.zenoh):
+            return
+        deadline = time.monotonic() + _PERMISSION_TIMEOUT_S
+        while time.monotonic() < deadline:
+            if any(query_tokens(other, token, _PERMISSION_TIMEOUT_S)):
+                return
+            time.sleep(_PERMISSION_ROUND_S)
+    raise AccessDenied(
+        f"the router does not let {probe.identity} write as robot {robot!r}: it drops {token!r}, and would "
+        "drop samples without an error. Is this the identity of that robot? If so, the "
+        f"access control of the router lacks the rules '{robot} writes' and '{robot} reads', which "
+        f"`zstate acl --robot {robot}` prints, with --wire for those of ROS; routers read it when they start",
+        reason="not allowed to write",
+        endpoint=token,
+    )
+
+
+def _routers(session: zenoh.Session) -> set[str]:
+    return {str(zid) for zid in session.info.routers_zid()}

@@ -6,11 +6,12 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
+from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, check_stamp, wait_interruptible
 from zstate.errors import Closed, MessageError, NoClock, format_duration
 from zstate.net.presence import local_writer
@@ -86,7 +87,6 @@ class SimulatedClock(Closeable):
         self.timeout_s = timeout_s
         self.epoch = 0
         """How often the time went back."""
-        self.refused: dict[str, int] = {}
         self._wire = get_wire(wire)
         self._now: int | None = None
         self._session: int | None = None
@@ -98,6 +98,8 @@ class SimulatedClock(Closeable):
         self._is_open = True
         self.key = self._wire.expression(SHARED, "clock")
         """The key that it subscribes to."""
+        self._refusals = Refusals(self.key)
+        self.refused: Mapping[str, int] = self._refusals.counts
         self._subscriber = StreamSubscriber(session, self.key, self._on_samples)
 
     def now(self) -> int:
@@ -147,14 +149,14 @@ class SimulatedClock(Closeable):
             try:
                 (message,) = self._wire.decode("clock", arrival, SHARED)
             except MessageError as error:
-                self._refuse(error.reason, str(error))
+                self._refusals.count(error.reason, error)
                 continue
             assert isinstance(message, ClockMessage)
             if self._follows(message.session):
                 self._set(message.stamp)
             else:
                 text = f"another publisher of the time is active: {message.session:08x}"
-                self._refuse("second clock", text)
+                self._refusals.count("second clock", text)
 
     def _follows(self, session: int) -> bool:
         """Whether ``session`` is the one to follow: the newest to appear, while it is active."""
@@ -189,8 +191,3 @@ class SimulatedClock(Closeable):
                 wait[1].set()
             else:
                 self._waits.append(wait)
-
-    def _refuse(self, reason: str, text: str) -> None:
-        self.refused[reason] = self.refused.get(reason, 0) + 1
-        if self.refused[reason] == 1:
-            _LOG.warning("%s refused (%s): %s; further ones are only counted", self.key, reason, text)

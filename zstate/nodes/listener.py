@@ -23,7 +23,7 @@ from zstate.ingest.stamp_checks import StampCheck
 from zstate.ingest.transforms import StaticTransformIngest, TransformIngest
 from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import announce_reader, watch
+from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
@@ -128,10 +128,11 @@ class TransformListener(Closeable):
         with ExitStack() as opening:
             opening.enter_context(self._events)
             expression = self._wire.expression
-            key = expression(robot, "robot_description")
-            opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_description)))
-            key = expression(robot, "tf_static")
-            opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_statics)))
+            on_description = self._observed(self._on_description)
+            on_statics = self._observed(self._on_statics)
+            description, statics = expression(robot, "robot_description"), expression(robot, "tf_static")
+            opening.enter_context(LatchedSubscriber(session, description, on_description))
+            opening.enter_context(LatchedSubscriber(session, statics, on_statics))
             for samples in self._sample_streams.values():
                 key = expression(robot, samples.stream)
                 samples.capacity = capacity_for(key)
@@ -145,7 +146,7 @@ class TransformListener(Closeable):
                 self._clock_offsets = opening.enter_context(_WriterClockOffsets(session, self.buffer))
             # History is requested from each writer found: after subscribing, so that no sample falls between.
             on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
-            opening.enter_context(watch(session, robot, on_writer, wire, on_cut_off))
+            opening.enter_context(WriterWatch(session, robot, on_writer, wire, on_cut_off))
             for announcement in announce_reader(session, self._wire, robot, streams):
                 opening.enter_context(announcement)
             self._opened = opening.pop_all()

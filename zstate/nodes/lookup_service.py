@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
@@ -13,6 +12,7 @@ from zstate.model.robot import RobotModel
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.sample_history import SampleCache
 from zstate.net.session import Session
+from zstate.transform import Transform
 from zstate.wire.keys import full_name, lookup_key
 from zstate.wire.lookup_request import LookupRequest, error_to_json, to_json
 from zstate.wire.messages import JointState, from_block
@@ -20,7 +20,7 @@ from zstate.wire.messages import JointState, from_block
 _JSON = "application/json"
 
 
-class LookupService(Closeable):
+class LookupService(Queryable):
     """Answers ``zstate/<robot>/lookup?target=..;source=..;at=..`` with one transform in JSON.
 
     Without ``at`` [ns] the newest instant is used. Ambiguous bare frame names are those of ``robot``.
@@ -31,35 +31,21 @@ class LookupService(Closeable):
     def __init__(
         self, session: Session, buffer: TransformBuffer | Callable[[], TransformBuffer], robot: str
     ) -> None:
-        self._get_buffer = (lambda: buffer) if isinstance(buffer, TransformBuffer) else buffer
-        self._robot = robot
-        self._service = Queryable(session, lookup_key(robot), self._answer)
-
-    @property
-    def answered(self) -> int:
-        """The number of replies, errors included."""
-        return self._service.answered
-
-    @property
-    def overflows(self) -> int:
-        """How often the queue of queries was full, so that some may have been lost."""
-        return self._service.overflows
-
-    def _answer(self, parameters: Mapping[str, str]) -> Reply:
-        try:
-            request, buffer = LookupRequest.parse(parameters), self._get_buffer()
+        def lookup(request: LookupRequest) -> Transform:
+            current = buffer if isinstance(buffer, TransformBuffer) else buffer()
             try:
-                transform = buffer.lookup(request.target, request.source, request.at)
+                return current.lookup(request.target, request.source, request.at)
             except AmbiguousFrame:
-                target, source = (full_name(self._robot, name) for name in (request.target, request.source))
-                transform = buffer.lookup(target, source, request.at)
-            return Reply(to_json(transform), _JSON)
-        except ZStateError as error:
-            return Reply(error_to_json(error), _JSON, is_error=True)
+                target, source = (full_name(robot, name) for name in (request.target, request.source))
+                return current.lookup(target, source, request.at)
 
-    def close(self) -> None:
-        """Stop answering. A second call does nothing."""
-        self._service.close()
+        def answer(parameters: Mapping[str, str]) -> Reply:
+            try:
+                return Reply(to_json(lookup(LookupRequest.parse(parameters))), _JSON)
+            except ZStateError as error:
+                return Reply(error_to_json(error), _JSON, is_error=True)
+
+        super().__init__(session, lookup_key(robot), answer)
 
 
 class RecentBuffer:

@@ -210,31 +210,20 @@ class StatePublisher(Closeable):
         numbers = self.model.position_count + 2 * self.model.velocity_count
         cache: SampleCache[JointState] = SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
         if cache_s:
-            encoders = {key: writer.encoder for key, writer in self._writers.items()}
-            joints, transforms = encoders.get(("native", "joint_states")), encoders.get(("native", "tf"))
-            if joints is not None:
-                opening.enter_context(
-                    serve_history(session, self.robot, "joint_states", cache, joints.encode)
-                )
-            if transforms is not None:
-                robot, encode = self._encoder, transforms.encode
-                service = serve_history(
-                    session, self.robot, "tf", cache, lambda state: encode(robot.transform_sample(state))
-                )
+            robot, writers = self.robot, self._writers
+            if joints := writers.get(("native", "joint_states")):
+                encode = joints.encoder.encode
+                opening.enter_context(serve_history(session, robot, "joint_states", cache, encode))
+            if transforms := writers.get(("native", "tf")):
+                sample, encode_tf = self._encoder.transform_sample, transforms.encoder.encode
+                service = serve_history(session, robot, "tf", cache, lambda state: encode_tf(sample(state)))
                 opening.enter_context(service)
         return cache
 
     def description(self) -> RobotDescription:
         """The robot's model and conventions, latched for listeners."""
-        model = self.model
-        return RobotDescription(
-            self._session_id,
-            model.urdf,
-            model.digest,
-            model.joint_names,
-            self._encoder.names,
-            self._clock.domain,
-        )
+        model, names, domain = self.model, self._encoder.names, self._clock.domain
+        return RobotDescription(self._session_id, model.urdf, model.digest, model.joint_names, names, domain)
 
     def statics(self) -> StaticTransforms:
         """The robot's fixed edges, latched for listeners without its model."""
@@ -248,11 +237,8 @@ class StatePublisher(Closeable):
             for stream, writer in self._writers.items()
         }
         rate = None if self._rate is None else self._rate.report()
-        counts = (self._seq, self._refused, self._last_refusal, streams, rate)
-        limits = self._limits
-        return (
-            PublisherStats(*counts) if limits is None else PublisherStats(*counts, limits.count, limits.last)
-        )
+        outside, excess = (0, "") if self._limits is None else (self._limits.count, self._limits.last)
+        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate, outside, excess)
 
     def publish(
         self,

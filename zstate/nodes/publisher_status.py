@@ -73,11 +73,9 @@ class LimitWatch:
     def add(self, stamp: int, block: bytes) -> None:
         """Count the sample with ``stamp`` [ns] and the positions ``block``, now or with its group."""
         self._blocks.append(block)
-        if not self._began <= stamp < self._due or len(self._blocks) >= _CHECKED_AT_ONCE:
-            self._check()
-            self._began, self._due = stamp, stamp + _CHECKED_EVERY_NS
-
-    def _check(self) -> None:
+        if self._began <= stamp < self._due and len(self._blocks) < _CHECKED_AT_ONCE:
+            return
+        self._began, self._due = stamp, stamp + _CHECKED_EVERY_NS
         positions = np.frombuffer(b"".join(self._blocks), "<f8").reshape(len(self._blocks), -1)
         self._blocks.clear()
         # Usually nothing is outside, and these two rows are sufficient to show it.
@@ -85,11 +83,10 @@ class LimitWatch:
         if not self._limits.are_exceeded(extremes).any():
             return
         are_exceeded = self._limits.are_exceeded(positions)
-        is_first = not self.count
         self.last = self._limits.explanation(positions[are_exceeded][-1:])
-        self.count += int(are_exceeded.sum())
-        if is_first:
+        if not self.count:
             _LOG.warning("%s: %s; further samples outside limits are only counted", self._robot, self.last)
+        self.count += int(are_exceeded.sum())
 
 
 class Health(NamedTuple):
@@ -116,9 +113,16 @@ class StatusReporter:
         rate_hz = (now.sent - before.sent) * 1e9 / max(at_ns - self._at_ns, 1)
         level, text = assess_health(before, now, quiet_ns=at_ns - self._sent_at_ns)
         self._stats, self._at_ns = now, at_ns
+        values = {"refused": str(now.refused)}
+        if now.outside_limits:
+            values["outside limits"] = f"{now.outside_limits} samples, {now.last_excess}"
+        if now.rate is not None:
+            values |= {"commanded": f"{now.rate.commanded_hz:g} Hz", "skipped": str(now.rate.skipped)}
+        for (wire, stream), counts in now.streams.items():
+            values[f"{wire} {stream}"] = f"{counts.samples} samples, {counts.bytes} bytes"
         writer, late = self._writer, now.rate.late if now.rate else 0
         head = (time.time_ns(), writer.session, level, writer.program, writer.host, writer.pid)
-        return Status(*head, rate_hz, now.sent, late, text, _values(now))
+        return Status(*head, rate_hz, now.sent, late, text, values)
 
 
 def assess_health(before: PublisherStats, now: PublisherStats, *, quiet_ns: int) -> Health:
@@ -134,28 +138,13 @@ def assess_health(before: PublisherStats, now: PublisherStats, *, quiet_ns: int)
     outside = now.outside_limits - before.outside_limits
     if outside:
         return Health("warn", f"{outside} {ARE_OUTSIDE}: {now.last_excess}")
-    return _punctuality(before.rate, now.rate)
-
-
-def _punctuality(before: RateReport | None, now: RateReport | None) -> Health:
-    if now is None:
-        return Health("ok")
-    late = now.late - (before.late if before else 0)
-    skipped = now.skipped - (before.skipped if before else 0)
-    if late <= 0 and skipped <= 0:
-        return Health("ok")
-    text = (
-        f"{late} ticks late and {skipped} skipped: {now.commanded_hz:g} Hz are more than this process keeps"
-    )
-    return Health("warn", f"{text}; its source or its machine is slow")
-
-
-def _values(stats: PublisherStats) -> dict[str, str]:
-    values = {"refused": str(stats.refused)}
-    if stats.outside_limits:
-        values["outside limits"] = f"{stats.outside_limits} samples, {stats.last_excess}"
-    if stats.rate is not None:
-        values |= {"commanded": f"{stats.rate.commanded_hz:g} Hz", "skipped": str(stats.rate.skipped)}
-    for (wire, stream), counts in stats.streams.items():
-        values[f"{wire} {stream}"] = f"{counts.samples} samples, {counts.bytes} bytes"
-    return values
+    if now.rate is not None:
+        late = now.rate.late - (before.rate.late if before.rate else 0)
+        skipped = now.rate.skipped - (before.rate.skipped if before.rate else 0)
+        if late > 0 or skipped > 0:
+            text = (
+                f"{late} ticks late and {skipped} skipped: {now.rate.commanded_hz:g} Hz are more than this "
+                "process keeps; its source or its machine is slow"
+            )
+            return Health("warn", text)
+    return Health("ok")

@@ -9,13 +9,13 @@ from hashlib import blake2b
 from itertools import islice
 from typing import NamedTuple
 
-from zstate.errors import MessageError, ModelError
-from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.errors import InvalidInput, MessageError, ModelError
+from zstate.ingest.joint_states import joint_order
+from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.recording.encode import StaticAccumulator
 from zstate.recording.reader import RecordingReader
-from zstate.recording.storage import ROBOT, Channel, Record
-from zstate.wire.joint_order import JointOrder
+from zstate.recording.storage import ROBOT, Channel
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms
 from zstate.wire.ros2.decoder import RosDecoder
@@ -129,11 +129,6 @@ class DecodedRecording:
             or (writer.foreign and writer.robot == SHARED and writer.stream in ("tf", "tf_static"))
         }
 
-    @property
-    def span(self) -> tuple[int, int] | None:
-        """The first and the last log time [ns] of the whole recording; None when it is empty."""
-        return self._reader.span
-
     def messages(
         self,
         robots: Collection[str] | None = None,
@@ -148,20 +143,20 @@ class DecodedRecording:
         # Without topics there is nothing to read, while None would mean all.
         for record in self._reader.records(topics, begin, end) if topics else ():
             decoder = self._decoder(record.channel)
-            if decoder is not None and decoder.writer in selected:
-                counts[decoder.writer] += 1
-                yield from self._decode(record, decoder, counts[decoder.writer])
-
-    def _decode(self, record: Record, decoder: _ChannelDecoder, count: int) -> Iterator[DecodedMessage]:
-        writer = decoder.writer
-        seq = count if writer.foreign else record.sequence
-        try:
-            messages = decoder.ros.messages(writer.stream, record.payload, writer.session, seq, decoder.names)
-        except MessageError as error:
-            self._refuse(error.reason, f"{record.topic}: {error}")
-            return
-        for message in messages:
-            yield DecodedMessage(writer, message, record.log_time)
+            if decoder is None or decoder.writer not in selected:
+                continue
+            writer = decoder.writer
+            counts[writer] += 1
+            seq = counts[writer] if writer.foreign else record.sequence
+            try:
+                messages = decoder.ros.messages(
+                    writer.stream, record.payload, writer.session, seq, decoder.names
+                )
+            except MessageError as error:
+                self._refuse(error.reason, f"{record.topic}: {error}")
+                continue
+            for message in messages:
+                yield DecodedMessage(writer, message, record.log_time)
 
     def _decoder(self, channel: Channel) -> _ChannelDecoder | None:
         if channel not in self._known:
@@ -186,14 +181,10 @@ class LatchedState:
     """The robot descriptions and static edges in effect at one point of a recording."""
 
     def __init__(self) -> None:
-        self._descriptions: dict[str, DecodedMessage] = {}
+        self.descriptions: dict[str, DecodedMessage] = {}
+        """By robot."""
         self._statics: dict[tuple[str, str], DecodedMessage] = {}
         self._accumulated: dict[RecordedWriter, StaticAccumulator] = {}
-
-    @property
-    def descriptions(self) -> dict[str, DecodedMessage]:
-        """By robot."""
-        return dict(self._descriptions)
 
     @property
     def statics(self) -> tuple[DecodedMessage, ...]:
@@ -207,24 +198,27 @@ class LatchedState:
         """
         writer, message, _ = decoded
         if isinstance(message, RobotDescription):
-            before = self._descriptions.get(writer.robot)
-            self._descriptions[writer.robot] = decoded
-            if before is not None and isinstance(before.message, RobotDescription):
-                return None if before.message.urdf == message.urdf else decoded
-            return decoded
-        if not isinstance(message, StaticTransforms):
+            before = self.descriptions.get(writer.robot)
+            self.descriptions[writer.robot] = decoded
+        elif isinstance(message, StaticTransforms):
+            if writer.static_writer is None:
+                edges = self._accumulated.setdefault(writer, StaticAccumulator(writer.session))
+                decoded = decoded._replace(message=edges.with_edges(message))
+            key = static_key(writer)
+            before = self._statics.get(key)
+            self._statics[key] = decoded
+        else:
             return None
-        if writer.static_writer is None:
-            edges = self._accumulated.setdefault(writer, StaticAccumulator(writer.session))
-            message = edges.with_edges(message)
-            decoded = decoded._replace(message=message)
-        key = static_key(writer)
-        before = self._statics.get(key)
-        self._statics[key] = decoded
-        if before is None or not isinstance(before.message, StaticTransforms):
-            return decoded
-        is_same = (before.message.edges, before.message.poses) == (message.edges, message.poses)
+        is_same = before is not None and _latched_value(before.message) == _latched_value(decoded.message)
         return None if is_same else decoded
+
+
+def _latched_value(message: Message) -> object:
+    """What a latched message states, whatever session repeats it."""
+    if isinstance(message, RobotDescription):
+        return message.urdf
+    assert isinstance(message, StaticTransforms)
+    return message.edges, message.poses
 
 
 def static_key(writer: RecordedWriter) -> tuple[str, str]:
@@ -232,17 +226,20 @@ def static_key(writer: RecordedWriter) -> tuple[str, str]:
     return writer.robot, writer.static_writer or "recorded"
 
 
-def joint_order(model: RobotModel) -> JointOrder:
-    """Reader of the joint states of a robot with this model."""
-    return JointOrder(model.joint_names, coordinate_names(model), velocity_columns_by_position(model))
+def check_has_robot(recording: DecodedRecording, robot: str) -> str:
+    """``robot``, if the recording has it. Raises InvalidInput, which names the robots it has."""
+    if robot not in recording.robots:
+        names = ", ".join(map(repr, recording.robots)) or "none"
+        raise InvalidInput(f"the recording has no robot {robot!r}; its robots: {names}")
+    return robot
 
 
 def first_descriptions(
     recording: DecodedRecording, robots: Collection[str] | None = None
 ) -> dict[str, DecodedMessage]:
     """The first description of each robot."""
-    described = [writer.robot for writer in recording.writers if writer.stream == "robot_description"]
-    missing = {robot for robot in described if robots is None or robot in robots}
+    described = {writer.robot for writer in recording.writers if writer.stream == "robot_description"}
+    missing = described if robots is None else described.intersection(robots)
     found: dict[str, DecodedMessage] = {}
     for decoded in recording.messages(missing, ("robot_description",)):
         found.setdefault(decoded.writer.robot, decoded)

@@ -7,7 +7,7 @@ from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
 
-from zstate._util.bounded_queue import BoundedQueue
+from zstate._util.bounded import BoundedQueue
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.robot import coordinate_names, velocity_columns_by_position
@@ -28,7 +28,7 @@ from zstate.wire.messages import (
     order_digest,
 )
 from zstate.wire.ros2.cdr import to_time
-from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
+from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
@@ -55,7 +55,6 @@ _STREAMS: dict[type[Message], Stream] = {
     RobotDescription: "robot_description",
     ClockMessage: "clock",
 }
-_NO_ADDRESS = TopicAddress("", "", None)
 _NAMED = SampleLayout()
 
 
@@ -65,11 +64,12 @@ class RecordingEncoder:
     Samples are written from one thread, latched messages from the same or from one other thread: large ones
     take long to encode, and do not block samples.
 
-    ``alone`` is the robot in the root of ROS's names (see ``RosNamespaces``). ``refuse(reason, text)`` is
-    called for each message that cannot be written: CDR cannot represent it ("no stamp", "stamp outside 1901
-    to 2038", "not sayable"), its model is unusable ("unusable model"), or its robot has opened too many
-    channels ("too many writers", see ``OpenChannels``). ``programs`` maps sessions to program names, as far
-    as known when the first message of a session is written.
+    The robot ``alone`` and what belongs to no robot are in the root of ROS's names, with unchanged frame
+    names, where every ROS tool finds them; any other robot has a namespace and a frame prefix of its own.
+    ``refuse(reason, text)`` is called for each message that cannot be written: CDR cannot represent it ("no
+    stamp", "stamp outside 1901 to 2038", "not sayable"), its model is unusable ("unusable model"), or its
+    robot has opened too many channels ("too many writers", see ``OpenChannels``). ``programs`` maps sessions
+    to program names, as far as known when the first message of a session is written.
     """
 
     def __init__(
@@ -82,11 +82,12 @@ class RecordingEncoder:
     ) -> None:
         self._writer = writer
         self._refuse = refuse
-        self._namespaces = RosNamespaces(alone)
+        self._root = {SHARED, alone}
+        self._namespaces: dict[str, str] = {}
         self._programs = programs
         self._lock = fork_safe_lock()
         self._channels: defaultdict[str, OpenChannels] = defaultdict(OpenChannels)
-        self._latched: dict[str, dict[str, ChannelWriter]] = {}
+        self._latched: dict[str, dict[str, ChannelEncoder]] = {}
         self._statics: dict[tuple[str, int], StaticAccumulator] = {}
         self._orders: dict[str, OrderRegistry] = {}
         self._pending = PendingSamples()
@@ -141,8 +142,9 @@ class RecordingEncoder:
             key = f"{robot}/{static_writer}"
             channel = self._latched.get(robot, {}).pop(key, None)
             if channel is not None:
-                channel.latch(key, channel.encode(StaticTransforms(0, (), b"")), log_time)
-                channel.unlatch(key)
+                payload = channel.encode(StaticTransforms(0, (), b""))
+                self._writer.latch(channel.number, key, payload, log_time, log_time)
+                self._writer.unlatch(channel.number, key)
                 self._counts[robot, "tf_static"] += 1
 
     def _write_sample(self, robot: str, message: Sample | ClockMessage, log_time: int) -> None:
@@ -151,7 +153,11 @@ class RecordingEncoder:
             self._pending.append(robot, message, log_time)
             return
         stream = _STREAMS[type(message)]
-        self._channel(robot, stream, message.session, log_time).write(message, sample_names, log_time)
+        channel = self._channel(robot, stream, message.session, log_time)
+        payload = channel.encode(message, sample_names)
+        # MCAP begins in 1970; the payload keeps an earlier stamp.
+        publish_time = max(message.stamp, 0)
+        self._writer.write(channel.number, payload, log_time, publish_time, sequence=message.seq)
         self._counts[robot, stream] += 1
 
     def _write_description(self, robot: str, description: RobotDescription, log_time: int) -> None:
@@ -183,10 +189,10 @@ class RecordingEncoder:
             channel = self._channel(robot, stream, message.session, log_time, static_writer)
         payload = channel.encode(message)
         with self._lock:
-            channel.latch(key, payload, log_time)
+            self._writer.latch(channel.number, key, payload, log_time, log_time)
             before = latched.get(key, channel)
             if before is not channel:
-                before.unlatch(key)
+                self._writer.unlatch(before.number, key)
             latched[key] = channel
             self._counts[robot, stream] += 1
 
@@ -196,7 +202,7 @@ class RecordingEncoder:
 
     def _channel(
         self, robot: str, stream: Stream, session: int, log_time: int, static_writer: str = ""
-    ) -> ChannelWriter:
+    ) -> ChannelEncoder:
         key = (stream, session, static_writer)
         opened = self._channels[robot]
         channel = opened.find(key)
@@ -204,7 +210,7 @@ class RecordingEncoder:
             return channel
         if not opened.allow(log_time):
             raise _TooManyWriters("its writers start too often, each with channels of its own")
-        options = self._namespaces.options(robot)
+        options = self._options(robot)
         metadata = {"zstate.session": str(session)}
         if stream != "clock":
             metadata |= {ROBOT: robot, "zstate.frame_prefix": options.frame_prefix}
@@ -214,48 +220,42 @@ class RecordingEncoder:
             metadata["zstate.program"] = self._programs[session]
         topic = RmwKeys(options).topic(robot, stream)
         number = self._writer.channel(topic, ros_type(stream), STREAM_QOS[stream], metadata)
-        channel = ChannelWriter(self._writer, number, stream, FrameNames(options, robot))
-        opened.add(key, channel, self._latched.get(robot, {}).values())
+        channel = ChannelEncoder(number, stream, FrameNames(options, robot))
+        for unused in opened.add(key, channel, self._latched.get(robot, {}).values()):
+            self._writer.release(unused.number)
         return channel
 
+    def _options(self, robot: str) -> Ros2Options:
+        """The namespace and the frame prefix of a robot. Raises InvalidInput for an invalid name."""
+        if robot in self._root:
+            return Ros2Options()
+        if robot not in self._namespaces:
+            # "arm-1" and "arm.1" are valid robots for zstate, but not valid names in ROS.
+            name = re.sub(r"\W|^(?=\d)", "_", robot, flags=re.ASCII)
+            while name in self._namespaces.values():
+                name += "_"
+            self._namespaces[robot] = name
+        return Ros2Options(namespace=self._namespaces[robot], frame_prefix=f"{robot}/")
 
-class ChannelWriter:
-    """Encodes and writes the messages of one writer on ``stream``. Raises InvalidInput if CDR cannot."""
 
-    def __init__(
-        self, writer: RecordingWriter, channel: ChannelId, stream: Stream, names: FrameNames
-    ) -> None:
-        self._writer = writer
-        self._channel = channel
+class ChannelEncoder:
+    """Encodes the messages of one writer on ``stream``, for the channel ``number`` of the file."""
+
+    def __init__(self, number: ChannelId, stream: Stream, names: FrameNames) -> None:
+        self.number = number
         self._stream: Stream = stream
         self._names = names
         self._sample_names = _NAMED
-        self._encoder = RosStreamEncoder(stream, _NO_ADDRESS, names, _NAMED)
-
-    def write(self, message: Sample | ClockMessage, sample_names: SampleLayout, log_time: int) -> None:
-        """Write one sample; ``sample_names`` names its numbers."""
-        payload = self.encode(message, sample_names)
-        # MCAP begins in 1970; the payload keeps an earlier stamp.
-        publish_time = max(message.stamp, 0)
-        self._writer.write(self._channel, payload, log_time, publish_time, sequence=message.seq)
-
-    def latch(self, key: str, payload: bytes, log_time: int) -> None:
-        """Write a payload that is latched until the next of this ``key``."""
-        self._writer.latch(self._channel, key, payload, log_time, log_time)
-
-    def unlatch(self, key: str) -> None:
-        """Stop repeating the payload of ``key``: another channel has a newer one."""
-        self._writer.unlatch(self._channel, key)
-
-    def release(self) -> None:
-        """Leave the channel out of the files that follow."""
-        self._writer.release(self._channel)
+        self._encoder = RosStreamEncoder(names, _NAMED)
 
     def encode(self, message: Message, sample_names: SampleLayout = _NAMED) -> bytes:
-        """The payload of ``message``; slow for a large latched one."""
+        """The payload of ``message``; slow for a large latched one. ``sample_names`` names its numbers.
+
+        Raises InvalidInput if CDR cannot represent it.
+        """
         if sample_names is not self._sample_names:
             self._sample_names = sample_names
-            self._encoder = RosStreamEncoder(self._stream, _NO_ADDRESS, self._names, sample_names)
+            self._encoder = RosStreamEncoder(self._names, sample_names)
         return self._encoder.encode(message)
 
 
@@ -267,23 +267,26 @@ class OpenChannels:
     """
 
     def __init__(self) -> None:
-        self._channels: OrderedDict[Hashable, ChannelWriter] = OrderedDict()
+        self._channels: OrderedDict[Hashable, ChannelEncoder] = OrderedDict()
         self._allowed = float(CHANNEL_BURST)
         self._filled_at = 0
 
-    def find(self, key: Hashable) -> ChannelWriter | None:
+    def find(self, key: Hashable) -> ChannelEncoder | None:
         """The channel of ``key``, if it is open."""
         channel = self._channels.get(key)
         if channel is not None:
             self._channels.move_to_end(key)
         return channel
 
-    def add(self, key: Hashable, channel: ChannelWriter, kept: Collection[ChannelWriter]) -> None:
-        """Add a channel; beyond the maximum, release the least recently used one that is not ``kept``."""
+    def add(
+        self, key: Hashable, channel: ChannelEncoder, kept: Collection[ChannelEncoder]
+    ) -> tuple[ChannelEncoder, ...]:
+        """Add a channel; beyond the maximum, remove and return the least recently used not ``kept`` one."""
         self._channels[key] = channel
-        if len(self._channels) > MAX_OPEN_CHANNELS:
-            unused = next(other for other, channel in self._channels.items() if channel not in kept)
-            self._channels.pop(unused).release()
+        if len(self._channels) <= MAX_OPEN_CHANNELS:
+            return ()
+        unused = next(other for other, channel in self._channels.items() if channel not in kept)
+        return (self._channels.pop(unused),)
 
     def allow(self, log_time: int) -> bool:
         """Whether another channel may be opened now, which counts as opening it."""
@@ -349,30 +352,6 @@ class PendingSamples:
     def pop(self, robot: str) -> Iterable[tuple[Sample | ClockMessage, int]]:
         """Remove the samples of ``robot``, and return them with their log times."""
         return self._robots.pop(robot, ())
-
-
-class RosNamespaces:
-    """The ROS namespace and the frame prefix of each robot in one recording.
-
-    ``alone`` and what belongs to no robot are in the root, with unchanged frame names, where every ROS tool
-    finds them. Any other robot has a namespace and a frame prefix of its own.
-    """
-
-    def __init__(self, alone: str | None = None) -> None:
-        self._root = {SHARED, alone}
-        self._namespaces: dict[str, str] = {}
-
-    def options(self, robot: str) -> Ros2Options:
-        """Raises InvalidInput for an invalid robot name."""
-        if robot in self._root:
-            return Ros2Options()
-        if robot not in self._namespaces:
-            # "arm-1" and "arm.1" are valid robots for zstate, but not valid names in ROS.
-            name = re.sub(r"\W|^(?=\d)", "_", robot, flags=re.ASCII)
-            while name in self._namespaces.values():
-                name += "_"
-            self._namespaces[robot] = name
-        return Ros2Options(namespace=self._namespaces[robot], frame_prefix=f"{robot}/")
 
 
 class StaticAccumulator:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import secrets
 from collections import Counter
-from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack
+from typing import NamedTuple
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, ManualClock
 from zstate.errors import InvalidInput, MessageError, ModelError
+from zstate.ingest.joint_states import joint_order
 from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -19,11 +21,14 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
-from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, joint_order, static_key
+from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
 from zstate.wire.identity import Announcement
+from zstate.wire.joint_order import JointOrder
 from zstate.wire.keys import MODEL_WRITER, Stream
 from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample
 from zstate.wire.registry import get_wire
+
+_SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
 
 
 class PlaybackPublishers(Closeable):
@@ -56,10 +61,15 @@ class PlaybackPublishers(Closeable):
         self._robots: dict[str, _RobotPublisher] = {}
         self._others: dict[str, PassthroughPublisher] = {}
         with ExitStack() as opening:
-            opening.callback(lambda: [robot.close() for robot in self._robots.values()])
+            opening.callback(lambda: [robot.publisher.close() for robot in self._robots.values()])
             for robot, model in models.items():
-                self._robots[robot] = self._open(robot, model, _is_computed(robot, writers))
-            for robot, streams in self._other_streams(writers).items():
+                self._open(robot, model, _is_computed(robot, writers))
+            recorded = {(writer.robot, writer.stream) for writer in writers}
+            for robot in {robot for robot, _ in recorded if robot}:
+                own = self._robots[robot].streams if robot in self._robots else ()
+                streams: list[Stream] = [
+                    one for one in _SAMPLES if (robot, one) in recorded and one not in own
+                ]
                 self._others[robot] = PassthroughPublisher(
                     session, wires, robot, streams, sessions=self._sessions, takeover=takeover
                 )
@@ -68,24 +78,25 @@ class PlaybackPublishers(Closeable):
                 self._publish_counted(decoded)
             self._opened = opening.pop_all()
 
-    def _open(self, robot: str, model: RobotModel, is_computed: bool) -> _RobotPublisher:
+    def _open(self, robot: str, model: RobotModel, is_computed: bool) -> None:
+        """Open the publisher of a robot with a known model."""
+        streams: tuple[Stream, ...] = ("joint_states", "tf_static", "robot_description")
         self._modelled.set_model(robot, model)
         if is_computed:
             self._computed.set_model(robot, model)
-        opened = _RobotPublisher(self._session, self._wires, robot, model, is_computed, self._takeover)
-        self._sessions.add(opened.session_id)
-        return opened
-
-    def _other_streams(self, writers: Iterable[RecordedWriter]) -> dict[str, list[Stream]]:
-        streams: dict[str, list[Stream]] = {}
-        for writer in writers:
-            if writer.robot:
-                found = streams.setdefault(writer.robot, [])
-                robot = self._robots.get(writer.robot)
-                own: Collection[Stream] = () if robot is None else robot.streams
-                if writer.stream in ("joint_states", "tf") and writer.stream not in (*own, *found):
-                    found.append(writer.stream)
-        return streams
+            streams += ("tf",)
+        publisher = StatePublisher(
+            self._session,
+            model,
+            robot,
+            self._wires,
+            streams=streams,
+            # Every sample has its own stamp; the clock only marks them as simulated time.
+            clock=ManualClock(domain=SIMULATED),
+            takeover=self._takeover,
+        )
+        self._robots[robot] = _RobotPublisher(publisher, joint_order(model), streams)
+        self._sessions.add(publisher.description().session)
 
     def publish(self, decoded: DecodedMessage) -> bool:
         """Publish it; False for a repetition and for what cannot be published."""
@@ -113,15 +124,16 @@ class PlaybackPublishers(Closeable):
             edges = self._modelled.filter_statics(writer.robot, message)
             self._others[writer.robot].set_statics(edges, static_key(writer)[1])
         elif isinstance(message, RobotDescription) and robot is None:
-            self._others[writer.robot].describe(message, MODEL_WRITER)
+            self._others[writer.robot].describe(message)
         elif isinstance(message, RobotDescription):
             assert robot is not None
-            if robot.model.urdf != message.urdf:
+            if robot.publisher.model.urdf != message.urdf:
                 model = parse_urdf(message.urdf, f"the URDF of {writer.robot!r}")
-                robot.close()
-                self._robots[writer.robot] = self._open(writer.robot, model, "tf" in robot.streams)
+                robot.publisher.close()
+                self._open(writer.robot, model, "tf" in robot.streams)
         elif isinstance(message, JointState) and robot is not None:
-            robot.publish(message)
+            positions, velocities, efforts = robot.order.read(message)
+            robot.publisher.publish(positions, velocities, efforts, message.stamp)
         elif isinstance(message, TransformSample):
             rest = self._computed.filter_sample(writer.robot, message)
             if rest is None or (robot is not None and "tf" in robot.streams):
@@ -136,46 +148,12 @@ class PlaybackPublishers(Closeable):
         self._opened.close()
 
 
-class _RobotPublisher(Closeable):
-    """StatePublisher of a robot with a known model."""
+class _RobotPublisher(NamedTuple):
+    """The publisher of a robot with a known model, and the reader of its recorded joint states."""
 
-    def __init__(  # noqa: PLR0917 - one use, just above
-        self,
-        session: Session,
-        wires: Sequence[str],
-        robot: str,
-        model: RobotModel,
-        is_computed: bool,
-        takeover: bool,
-    ) -> None:
-        self.model = model
-        self.streams: tuple[Stream, ...] = ("joint_states", "tf_static", "robot_description")
-        if is_computed:
-            self.streams += ("tf",)
-        self._order = joint_order(model)
-        self._publisher = StatePublisher(
-            session,
-            model,
-            robot,
-            wires,
-            streams=self.streams,
-            # Every sample has its own stamp; the clock only marks them as simulated time.
-            clock=ManualClock(domain=SIMULATED),
-            takeover=takeover,
-        )
-
-    @property
-    def session_id(self) -> int:
-        """The session id in its messages."""
-        return self._publisher.description().session
-
-    def publish(self, state: JointState) -> None:
-        """Raises MessageError and InvalidInput for a state that cannot be published."""
-        positions, velocities, efforts = self._order.read(state)
-        self._publisher.publish(positions, velocities, efforts, state.stamp)
-
-    def close(self) -> None:
-        self._publisher.close()
+    publisher: StatePublisher
+    order: JointOrder
+    streams: tuple[Stream, ...]
 
 
 class PassthroughPublisher(Closeable):
@@ -231,23 +209,28 @@ class PassthroughPublisher(Closeable):
         write_all(self._streams[stream], sample)
         self._seqs[stream] += 1
 
-    def describe(self, description: RobotDescription, writer: str) -> None:
+    def describe(self, description: RobotDescription) -> None:
         """Publish the robot's description (latched)."""
         orders = (description.joint_names, description.moving_edges)
         message = RobotDescription(self._session_id, description.urdf, description.digest, *orders, SIMULATED)
-        write_all(self._latch("robot_description", writer), message)
+        write_all(self._latch("robot_description", MODEL_WRITER), message)
 
     def set_statics(self, statics: StaticTransforms, writer: str) -> None:
         """Publish all static edges of one ``writer``; an empty set withdraws the previous ones."""
-        key: tuple[Stream, str] = ("tf_static", writer)
-        if statics.edges:
-            writers = self._latch(*key)
-            with self._placing(statics, writer):
-                write_all(writers, StaticTransforms(self._session_id, statics.edges, statics.poses))
-        else:
-            for latched in self._latched.get(key, ()):
+        if not statics.edges:
+            for latched in self._latched.get(("tf_static", writer), ()):
                 latched.withdraw()
             self._placed.pop(writer, None)
+            return
+        writers = self._latch("tf_static", writer)
+        edges = set(named_edges(self._robot, statics.edges))
+        new = sorted(edges - self._placed.get(writer, set())) if self._is_alone else []
+        with ExitStack() as placing:
+            if new:  # owned during their publication
+                announced = self._announced("tf_static", writer)
+                placing.enter_context(claim_edges(self._session, announced, new, allowed=self._sessions))
+            write_all(writers, StaticTransforms(self._session_id, statics.edges, statics.poses))
+        self._placed[writer] = edges
 
     def _latch(self, stream: Stream, writer: str) -> list[LatchedWriter]:
         if (stream, writer) not in self._latched:
@@ -269,18 +252,6 @@ class PassthroughPublisher(Closeable):
             return None
         return opening.enter_context(WriterClaim(self._session, streams))
 
-    @contextmanager
-    def _placing(self, statics: StaticTransforms, writer: str) -> Generator[None]:
-        """Own new edges of ``writer`` during their publication."""
-        edges = set(named_edges(self._robot, statics.edges))
-        new = sorted(edges - self._placed.get(writer, set())) if self._is_alone else []
-        with ExitStack() as placed:
-            if new:
-                announced = self._announced("tf_static", writer)
-                placed.enter_context(claim_edges(self._session, announced, new, allowed=self._sessions))
-            yield
-        self._placed[writer] = edges
-
     def close(self) -> None:
         """Stop; readers keep the latched values. A second call does nothing."""
         self._opened.close()
@@ -291,8 +262,8 @@ def _is_computed(robot: str, writers: Collection[RecordedWriter]) -> bool:
 
     That is the case without recorded transforms, or if the writer of the joint states wrote them too.
     """
-    sessions: dict[Stream, set[int]] = {"tf": set(), "joint_states": set()}
-    for writer in writers:
-        if writer.robot == robot and writer.stream in sessions:
-            sessions[writer.stream].add(writer.session)
-    return sessions["tf"] <= sessions["joint_states"]
+
+    def sessions(stream: Stream) -> set[int]:
+        return {writer.session for writer in writers if (writer.robot, writer.stream) == (robot, stream)}
+
+    return sessions("tf") <= sessions("joint_states")

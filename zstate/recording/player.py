@@ -19,10 +19,10 @@ from zstate.recording.decode import (
     LATCHED,
     DecodedRecording,
     LatchedState,
+    check_has_robot,
     first_descriptions,
     recorded_model,
 )
-from zstate.recording.load import check_has_robot
 from zstate.recording.playback_publishers import PlaybackPublishers
 from zstate.recording.player_clock import Lateness, PlayerClock
 from zstate.recording.reader import RecordingReader
@@ -112,7 +112,7 @@ class Player(Closeable):
         self._position = self._begin
 
     def _bounds(self, path: str | Path, start_s: float, duration_s: float | None) -> tuple[int, int]:
-        span = self._recording.span
+        span = self._reader.span
         if span is None or not self.robots:
             raise InvalidInput(f"there is nothing in {str(path)!r} to replay")
         length_s = (span[1] - span[0]) / 1e9
@@ -238,7 +238,7 @@ class Player(Closeable):
                 self._player_clock.pause()
                 while not self._wake.wait(1.0 / CLOCK_HZ):
                     if ticks is not None:
-                        ticks.repeat(self._position)
+                        ticks.clock.publish(self._position)
                 self._player_clock.start(self._position)
             elif self._player_clock.wait(log_time, self._wake):
                 self._position = log_time
@@ -250,7 +250,7 @@ class _ClockTicks:
 
     def __init__(self, clock: ClockPublisher, begin: int, rate: float) -> None:
         self.next = begin
-        self._clock = clock
+        self.clock = clock
         self._is_paced = math.isfinite(rate)
         self._step = round(1e9 / CLOCK_HZ * (rate if self._is_paced else 1.0)) or 1
 
@@ -258,9 +258,5 @@ class _ClockTicks:
         """Publish ``next``; no message is published before ``ahead``."""
         # At an infinite rate nothing waits through a gap.
         now = self.next if self._is_paced else ahead
-        self._clock.publish(now)
+        self.clock.publish(now)
         self.next = now + self._step
-
-    def repeat(self, log_time: int) -> None:
-        """Publish ``log_time`` again."""
-        self._clock.publish(log_time)

@@ -1,4 +1,4 @@
-"""Reads the records of a recording in the order of their log times.
+"""Reads the records of a recording, in MCAP files or a ROS 2 bag, in the order of their log times.
 
 The folder of a rosbag2 recording lists its files in metadata.yaml. Only that list is read from the YAML
 (https://github.com/ros2/rosbag2, versions 1 to 9 of the format); the rest is in the files. Written by
@@ -11,20 +11,25 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Collection, Iterator
+import sqlite3
+from collections.abc import Collection, Generator, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import quote
 
 from zstate._util.closeable import Closeable
 from zstate.errors import RecordingError
 from zstate.recording.mcap.file import McapFile, explain_unreadable, open_errors, split_files
 from zstate.recording.mcap.records import MAGIC
-from zstate.recording.sqlite_file import SqliteFile
 from zstate.recording.storage import (
     CDR,
     Channel,
     Format,
     ReadFilter,
     Record,
+    SortedPart,
     Storage,
     merge_by_log_time,
     merge_channels,
@@ -38,7 +43,13 @@ _KEY = re.compile(r"( *)([A-Za-z_]\w*):(?: +(.*?))? *$")
 _ITEM = re.compile(r" *- +(.*?) *$")
 _PLAIN = re.compile(r"[^\s\"'\[\]{}&*!|>%@`#,?:-](?:[^:#]|:(?! )|(?<! )#)*")
 _NEWEST = 9
+
 _SQLITE_MAGIC = b"SQLite format 3\0"
+_OPTIONAL = {"offered_qos_profiles": "offered_qos_profiles", "type_description_hash": "topic_type_hash"}
+# A row takes more than four bytes and less than fifty steps of SQLite's virtual machine.
+_STEPS, _STEPS_PER_BYTE = 100_000_000, 16
+_STEPS_BETWEEN = 100_000
+_STAMPS = (-(1 << 63), (1 << 63) - 1)
 
 
 class RecordingReader(Closeable):
@@ -91,14 +102,13 @@ class RecordingReader(Closeable):
         Records of one instant are in the order of writing. Only chunks that may contain some are read, one
         after the other.
         """
-        default = ReadFilter()
-        read_filter = ReadFilter(
-            None if topics is None else frozenset(topics),
-            default.begin if begin is None else begin,
-            default.end if end is None else end,
-        )
         if not self._is_open:
             raise RecordingError(f"the recording {str(self.path)!r} is closed", path=str(self.path))
+        read_filter = ReadFilter(
+            None if topics is None else frozenset(topics),
+            -(1 << 63) if begin is None else begin,
+            1 << 64 if end is None else end,
+        )
         return merge_by_log_time([part for storage in self.storages for part in storage.parts(read_filter)])
 
     def close(self) -> None:
@@ -117,16 +127,121 @@ def _open_storage(path: Path) -> Storage:
     raise RecordingError(explain_unreadable(path, beginning), path=str(path))
 
 
+class SqliteFile:
+    """A .db3 file, opened read-only; log and publish times are the same."""
+
+    format: Format = "sqlite3"
+    profile = "ros2"
+    library = ""
+    complete = True
+    compressions: tuple[str, ...] = ()
+    losses: tuple[str, ...] = ()
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = self._steps = self._max_steps = 0
+        with self._errors():
+            self.size = path.stat().st_size
+            self._max_steps = _STEPS + _STEPS_PER_BYTE * self.size
+            uri = f"file:{quote(str(path.resolve()))}?mode=ro"
+            journals = [path.with_name(path.name + ending) for ending in ("-wal", "-journal")]
+            if not any(journal.exists() for journal in journals):
+                # SQLite then creates no files of its own, which would need a writable folder. It would also
+                # ignore the journal in which a killed recorder left the newest messages.
+                uri += "&immutable=1"
+            self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            self._database.set_progress_handler(self._is_over_limit, _STEPS_BETWEEN)
+        try:
+            with self._errors():
+                found = self._rows(
+                    "SELECT name, type, rootpage FROM sqlite_master WHERE name IN ('topics', 'messages')"
+                )
+                for name, kind, page in found:  # views may have rows without end
+                    if kind != "table" or not page:
+                        found_kind = kind if page else "view or virtual table"
+                        raise ValueError(f"{name!r} is a {found_kind}, not a table")
+                self._channels = dict(self._read_channels())
+                ((first, last),) = self._rows("SELECT min(timestamp), max(timestamp) FROM messages")
+                self.span = None if first is None else (int(first), int(last))
+        except RecordingError:
+            self.close()
+            raise
+        self.channels = tuple(self._channels.values())
+
+    @contextmanager
+    def _errors(self) -> Generator[None, None, None]:
+        try:
+            yield
+        except (sqlite3.Error, OSError, ValueError, TypeError, OverflowError) as error:
+            reason = str(error)
+            if self._steps > self._max_steps:
+                reason = f"a query took more than {self._max_steps} steps, too many for {self.size} bytes"
+            elif isinstance(error, sqlite3.OperationalError) and "interrupted" in reason:
+                raise KeyboardInterrupt from None  # SQLite drops exceptions that signals raise in the handler
+            text = (
+                f"{str(self.path)!r} cannot be read as a rosbag2 database: {reason}; if it is damaged, "
+                "`sqlite3 FILE .recover` may save a part of it"
+            )
+            raise RecordingError(text, path=str(self.path)) from error
+
+    def _is_over_limit(self) -> bool:
+        self._steps += _STEPS_BETWEEN
+        return self._steps > self._max_steps
+
+    def _read_channels(self) -> Iterator[tuple[int, Channel]]:
+        counts = dict(self._rows("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+        known = {str(name) for _, name, *_ in self._rows("PRAGMA table_info(topics)")}
+        extra = [column for column in _OPTIONAL if column in known]
+        columns = ", ".join(["id", "name", "type", "serialization_format", *extra])
+        for number, *texts in self._rows(f"SELECT {columns} FROM topics ORDER BY id"):
+            if not isinstance(number, int) or not all(isinstance(text, str) for text in texts):
+                raise TypeError(f"the topic {number!r} is described by {texts!r}")
+            topic, type_name, encoding, *rest = texts
+            metadata = {_OPTIONAL[key]: text for key, text in zip(extra, rest, strict=True) if text}
+            yield number, Channel(topic, type_name, encoding, metadata, int(counts.get(number, 0)))
+
+    def _rows(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[Any]:
+        self._steps = 0
+        return self._database.execute(query, values)
+
+    def parts(self, read_filter: ReadFilter) -> list[SortedPart]:
+        if self.span is None:
+            return []
+        return [SortedPart(self.span[0], partial(self._records, read_filter))]
+
+    def _records(self, read_filter: ReadFilter) -> Iterator[Record]:
+        selected = {
+            number: channel for number, channel in self._channels.items() if read_filter.accepts(channel)
+        }
+        query = (
+            "SELECT topic_id, timestamp, data FROM messages WHERE timestamp BETWEEN ? AND ? "
+            f"AND topic_id IN ({', '.join(map(str, selected))}) ORDER BY timestamp, id"
+        )
+        first, last = _STAMPS
+        limits = max(read_filter.begin, first), min(read_filter.end - 1, last)
+        with self._errors():
+            for number, stamp, data in self._rows(query, limits):
+                if not isinstance(stamp, int) or not isinstance(data, bytes):
+                    raise TypeError(f"a message at {stamp!r} is {type(data).__name__}")
+                yield Record(selected[number], data, stamp, stamp, 0)
+
+    def close(self) -> None:
+        self._database.close()
+
+
 def bag_files(folder: Path) -> list[Path]:
     """The files of a bag, ordered by its metadata.yaml, or by their numbers if it has none."""
     metadata = folder / METADATA
     if not metadata.exists():
         return _numbered_files(folder)
     try:
-        text = metadata.read_text("utf-8")
+        names = _listed_files(metadata.read_text("utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{str(metadata)!r} cannot be read: {error}", path=str(metadata)) from error
-    files = [folder / PurePosixPath(name).name for name in _Metadata(metadata, text).names]
+    except ValueError as error:
+        text = f"the bag of {str(metadata)!r} cannot be read: {error}"
+        raise RecordingError(text, path=str(metadata)) from error
+    files = [folder / PurePosixPath(name).name for name in names]
     if missing := [str(file) for file in files if not file.exists()]:
         text = f"{str(metadata)!r} names files that are not there: {', '.join(missing)}"
         raise RecordingError(text, path=str(metadata))
@@ -149,71 +264,67 @@ def _numbered_files(folder: Path) -> list[Path]:
     raise RecordingError(text, path=str(folder))
 
 
-class _Metadata:
-    """The list of files in a metadata.yaml. Raises RecordingError for a form that is not supported."""
+def _listed_files(text: str) -> list[str]:
+    """The files that a metadata.yaml lists. Raises ValueError for a form that is not supported."""
+    keys = _metadata_keys(text)
 
-    def __init__(self, path: Path, text: str) -> None:
-        self._path = path
-        self._keys = self._read_keys(text)
-        version, storage = self._word("version"), self._word("storage_identifier")
-        if not version.isdecimal() or not 1 <= int(version) <= _NEWEST:
-            raise self._error(f"its version is {version!r}, and 1 to {_NEWEST} are known")
-        if storage not in FORMATS.values():
-            raise self._error(f"its storage is {storage!r}, and 'mcap' and 'sqlite3' are known")
-        mode = self._word("compression_mode").lower() if "compression_mode" in self._keys else ""
-        if mode not in {"", "none"}:
-            raise self._error(
-                f"it is compressed by {mode}, on top of its storage; `ros2 bag convert` writes it "
-                "without (a .zstd file alone: `zstd -d`)"
-            )
-        value, *lines = self._keys.get("relative_file_paths", ("",))
-        names: list[str] = []
-        for line in lines:
-            match = _ITEM.match(line)
-            if not match:
-                raise self._error(f"{line.strip()!r} is YAML that is not supported here")
-            names.append(self._scalar(match[1]))
-        self.names = tuple(names)
-        if value or not names:
-            raise self._error("it does not list 'relative_file_paths', one a line")
-
-    def _error(self, reason: str) -> RecordingError:
-        text = f"the bag of {str(self._path)!r} cannot be read: {reason}"
-        return RecordingError(text, path=str(self._path))
-
-    def _read_keys(self, text: str) -> dict[str, list[str]]:
-        """Each key, with the rest of its line and the lines below it."""
-        keys: dict[str, list[str]] = {}
-        lines = [line.rstrip() for line in text.splitlines() if line.strip() not in {"", "---"}]
-        if not lines or lines[0] != _TOP:
-            raise self._error(f"it does not begin with {_TOP!r}")
-        step, current = "", []
-        for line in lines[1:]:
-            match = _KEY.match(line)
-            step = step or (match[1] if match else "")
-            if not match or match[1] != step or not step:
-                current.append(line)
-            elif match[2] in keys:
-                raise self._error(f"it has the key {match[2]!r} twice")
-            else:
-                current = keys[match[2]] = [match[3] or ""]
-        return keys
-
-    def _word(self, key: str) -> str:
-        value, *rest = self._keys.get(key, ("", "?"))
+    def word(key: str) -> str:
+        value, *rest = keys.get(key, ("", "?"))
         if rest:
-            raise self._error(f"its {key!r} is not one word")
-        return self._scalar(value)
+            raise ValueError(f"its {key!r} is not one word")
+        return _scalar(value)
 
-    def _scalar(self, text: str) -> str:
-        try:
-            value = json.loads(text) if text.startswith('"') else None
-        except ValueError:
-            value = None
-        if isinstance(value, str):
-            return value
-        if len(text) > 1 and text[0] == text[-1] == "'":
-            return text[1:-1].replace("''", "'")
-        if not _PLAIN.fullmatch(text):
-            raise self._error(f"{text!r} is YAML that is not supported here")
-        return text
+    version, storage = word("version"), word("storage_identifier")
+    if not version.isdecimal() or not 1 <= int(version) <= _NEWEST:
+        raise ValueError(f"its version is {version!r}, and 1 to {_NEWEST} are known")
+    if storage not in FORMATS.values():
+        raise ValueError(f"its storage is {storage!r}, and 'mcap' and 'sqlite3' are known")
+    mode = word("compression_mode").lower() if "compression_mode" in keys else ""
+    if mode not in {"", "none"}:
+        raise ValueError(
+            f"it is compressed by {mode}, on top of its storage; `ros2 bag convert` writes it "
+            "without (a .zstd file alone: `zstd -d`)"
+        )
+    value, *lines = keys.get("relative_file_paths", ("",))
+    names: list[str] = []
+    for line in lines:
+        match = _ITEM.match(line)
+        if not match:
+            raise ValueError(f"{line.strip()!r} is YAML that is not supported here")
+        names.append(_scalar(match[1]))
+    if value or not names:
+        raise ValueError("it does not list 'relative_file_paths', one a line")
+    return names
+
+
+def _metadata_keys(text: str) -> dict[str, list[str]]:
+    """Each key, with the rest of its line and the lines below it."""
+    keys: dict[str, list[str]] = {}
+    lines = [line.rstrip() for line in text.splitlines() if line.strip() not in {"", "---"}]
+    if not lines or lines[0] != _TOP:
+        raise ValueError(f"it does not begin with {_TOP!r}")
+    step, current = "", []
+    for line in lines[1:]:
+        match = _KEY.match(line)
+        step = step or (match[1] if match else "")
+        if not match or match[1] != step or not step:
+            current.append(line)
+        elif match[2] in keys:
+            raise ValueError(f"it has the key {match[2]!r} twice")
+        else:
+            current = keys[match[2]] = [match[3] or ""]
+    return keys
+
+
+def _scalar(text: str) -> str:
+    try:
+        value = json.loads(text) if text.startswith('"') else None
+    except ValueError:
+        value = None
+    if isinstance(value, str):
+        return value
+    if len(text) > 1 and text[0] == text[-1] == "'":
+        return text[1:-1].replace("''", "'")
+    if not _PLAIN.fullmatch(text):
+        raise ValueError(f"{text!r} is YAML that is not supported here")
+    return text

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.clock import SystemClock, wait_interruptible
@@ -22,10 +22,11 @@ from zstate.errors import Closed, InvalidInput, MessageError, RecordingError
 from zstate.ingest.counters import Counters, GapCounter
 from zstate.net.at_exit import forked_text
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import announce_reader, watch
+from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.rate import Rate
+from zstate.recording.decode import LATCHED
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.wire.identity import Announcement
@@ -53,7 +54,6 @@ _DISCOVERY_NS = 300_000_000
 _DRAIN_S = 0.5
 _JOIN_WITHIN_S = 0.9
 
-_LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
 _SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
 
 
@@ -83,21 +83,26 @@ class MessageQueue(Closeable):
         self._opened = ExitStack()
 
     def subscribe(self, stream: Stream, expression: str, robot: str | None) -> None:
-        """Subscribe to samples."""
+        """Subscribe to a stream; an empty payload of a latched one is a withdrawn value."""
         capacity = capacity_for(expression)
 
         def put(arrivals: list[SerializedSample]) -> None:
-            self._put(Batch(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity))
+            batch = Batch(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity)
+            with self._has_room:
+                # A slow reader must not fill the memory: the subscription's ring drops samples, and counts
+                # them.
+                while self._is_open and (self._waiting >= QUEUE_LENGTH or self._bytes >= QUEUE_BYTES):
+                    self._has_room.wait()
+                if self._is_open:
+                    self._batches.append(batch)
+                    self._waiting += len(arrivals)
+                    self._bytes += sum(len(arrival.payload) for arrival in arrivals)
 
-        self._opened.enter_context(StreamSubscriber(self._session, expression, put))
-
-    def subscribe_latched(self, stream: Stream, expression: str, robot: str | None) -> None:
-        """Subscribe to latched values; an empty payload is a withdrawn one."""
-
-        def put(arrival: SerializedSample) -> None:
-            self._put(Batch(stream, robot, [arrival], time.time_ns(), overflowed=False))
-
-        self._opened.enter_context(LatchedSubscriber(self._session, expression, put))
+        if stream in LATCHED:
+            subscriber = LatchedSubscriber(self._session, expression, lambda arrival: put([arrival]))
+        else:
+            subscriber = StreamSubscriber(self._session, expression, put)
+        self._opened.enter_context(subscriber)
 
     def pop_all(self) -> list[Batch]:
         """Remove and return all batches, in the order of reception."""
@@ -113,16 +118,6 @@ class MessageQueue(Closeable):
             self._is_open = False
             self._has_room.notify_all()
         self._opened.close()
-
-    def _put(self, batch: Batch) -> None:
-        with self._has_room:
-            # A slow reader must not fill the memory: the subscription's ring drops samples, and counts them.
-            while self._is_open and (self._waiting >= QUEUE_LENGTH or self._bytes >= QUEUE_BYTES):
-                self._has_room.wait()
-            if self._is_open:
-                self._batches.append(batch)
-                self._waiting += len(batch.arrivals)
-                self._bytes += sum(len(arrival.payload) for arrival in batch.arrivals)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,10 +181,10 @@ class Recorder(Closeable):
         with ExitStack() as opening:
             self._queue = opening.enter_context(MessageQueue(session))
             robot = self._selected[0] if len(self._selected) == 1 else ANY
-            opening.enter_context(watch(session, robot, self._on_writer, wire))
+            opening.enter_context(WriterWatch(session, robot, self._on_writer, wire))
             self._subscribe()
             for robot in self._selected or (ANY,):
-                for announcement in announce_reader(session, self._wire, robot, (*_LATCHED, *_SAMPLES)):
+                for announcement in announce_reader(session, self._wire, robot, (*LATCHED, *_SAMPLES)):
                     opening.enter_context(announcement)
             self._writer = RecordingWriter(
                 path, max_bytes=max_bytes, max_seconds=max_seconds, overwrite=overwrite
@@ -203,13 +198,13 @@ class Recorder(Closeable):
 
     def _subscribe(self) -> None:
         """Subscribe to every stream; if two robots share an expression, keys distinguish them."""
-        for stream in (*_LATCHED, *_SAMPLES):
+        for stream in (*LATCHED, *_SAMPLES):
             robots: dict[str, set[str]] = {}
             for robot in self._selected or (ANY,):
                 robots.setdefault(self._wire.expression(robot, stream), set()).add(robot)
-            subscribe = self._queue.subscribe_latched if stream in _LATCHED else self._queue.subscribe
             for expression, named in robots.items():
-                subscribe(stream, expression, named.pop() if self._selected and len(named) == 1 else None)
+                robot = named.pop() if self._selected and len(named) == 1 else None
+                self._queue.subscribe(stream, expression, robot)
         clock = self._wire.expression(self._selected[0] if self._selected else ANY, "clock")
         self._queue.subscribe("clock", clock, SHARED)
 
@@ -284,7 +279,18 @@ class Recorder(Closeable):
         if self._encoder is None:
             return
         for batch in self._pending:
-            self._write(batch)
+            self._gaps.start_batch(overflowed=batch.overflowed)
+            for arrival in batch.arrivals:
+                if time.monotonic() > self._ends_at:
+                    self._counters.count("dropped")
+                    continue
+                robot = self._robot(batch, arrival)
+                if robot is None:
+                    continue
+                if batch.stream in LATCHED and self._large.accepts(robot, len(arrival.payload)):
+                    self._large.put(robot, batch, arrival)
+                else:
+                    self._write_arrival(robot, batch, arrival)
         self._pending = []
 
     def _new_encoder(self) -> RecordingEncoder | None:
@@ -307,25 +313,11 @@ class Recorder(Closeable):
             self._writer, self._counters.count_refusal, alone=alone, programs=self._programs
         )
 
-    def _write(self, batch: Batch) -> None:
-        self._gaps.start_batch(overflowed=batch.overflowed)
-        for arrival in batch.arrivals:
-            if time.monotonic() > self._ends_at:
-                self._counters.count("dropped")
-                continue
-            robot = self._robot(batch, arrival)
-            if robot is None:
-                continue
-            if batch.stream in _LATCHED and self._large.accepts(robot, len(arrival.payload)):
-                self._large.put(robot, batch, arrival)
-            else:
-                self._write_arrival(robot, batch, arrival)
-
     def _write_arrival(self, robot: str, batch: Batch, arrival: SerializedSample) -> None:
         encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
         assert encoder is not None
         static_writer = self._wire.static_writer_name(arrival.key) if stream == "tf_static" else None
-        if not arrival.payload and stream in _LATCHED:
+        if not arrival.payload and stream in LATCHED:
             if static_writer is not None:
                 encoder.withdraw(robot, static_writer, stamp)
             return

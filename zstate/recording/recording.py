@@ -1,7 +1,23 @@
-"""Recording: lookups in a recorded file."""
+"""Recording: lookups in a recorded file, which is loaded into a transform buffer.
+
+For a single writer this gives the same buffer as listening live. A listener drops the history of a writer
+that is replaced; a recording keeps it:
+
+==========================================  ============================================================
+the recording holds                         the buffer gets
+==========================================  ============================================================
+a writer ends, a new one continues later    one history, interpolated between the two as elsewhere
+a new writer with an earlier clock          a new history, which begins with this writer
+two samples in a row more than 0.1 s back   a new history: the clock was set back
+another model (URDF) of a robot             a new history of the robot
+a withdrawn static edge                     the edge, until another writer places the frame
+==========================================  ============================================================
+"""
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +27,41 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import check_stamps
-from zstate.recording.decode import DecodedRecording
+from zstate.errors import InvalidInput
+from zstate.ingest.base import StreamIngest
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.joint_states import JointStateIngest
+from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest, TransformIngest
+from zstate.model.robot import RobotModel
+from zstate.recording.decode import (
+    DecodedMessage,
+    DecodedRecording,
+    RecordedWriter,
+    check_has_robot,
+    first_descriptions,
+    recorded_model,
+)
 from zstate.recording.info import RecordingInfo, read_info
-from zstate.recording.load import HISTORY_S, check_has_robot, load_into
 from zstate.recording.reader import RecordingReader
+from zstate.wire.keys import MODEL_WRITER, full_name
+from zstate.wire.messages import (
+    Edges,
+    JointState,
+    RobotDescription,
+    Sample,
+    StaticTransforms,
+    TransformSample,
+    poses_from_block,
+)
+
+# A buffer that keeps a whole recording: 28 years, on any clock.
+_HISTORY_S = 9e8
+# The buffer drops unneeded samples after every so many messages, at least.
+_BATCH = 4096
+# A sample may be this late and still belong to its epoch, as with the history of a listener.
+_DELAYED_NS = 10_000_000_000
+_UNNAMED = "a ROS node"
 
 
 class Recording(Closeable):
@@ -43,9 +90,7 @@ class Recording(Closeable):
 
     def buffer(self) -> TransformBuffer:
         """A buffer with all of the recording, or with all of ``robot``."""
-        buffer = TransformBuffer(HISTORY_S)
-        load_into(buffer, self._reader, self.robot)
-        return buffer
+        return self._load()
 
     def lookup_many(
         self, target: str, source: str, stamps: ArrayLike
@@ -57,10 +102,230 @@ class Recording(Closeable):
         Raises UnknownFrame, AmbiguousFrame and Disconnected.
         """
         instants = check_stamps(stamps)
-        buffer = TransformBuffer(HISTORY_S)
-        load_into(buffer, self._reader, self.robot, around=instants)
-        return buffer.lookup_many(target, source, instants)
+        return self._load(instants).lookup_many(target, source, instants)
+
+    def _load(self, around: NDArray[np.int64] | None = None) -> TransformBuffer:
+        """A buffer with everything, or with what lookups at the stamps ``around`` [ns] need."""
+        buffer, counters = TransformBuffer(_HISTORY_S), Counters()
+        buffer.is_recording = True
+        recording = DecodedRecording(self._reader, counters.count_refusal)
+        robots = None if self.robot is None else (self.robot,)
+        shares_frames = any(
+            writer.foreign or (writer.stream == "tf_static" and writer.static_writer is None)  # of ROS
+            for writer in recording.writers
+        )
+        loader = RecordingLoader(buffer, counters, () if shares_frames else recording.robots)
+        for description in first_descriptions(recording, robots).values():
+            model = recorded_model(recording, description, counters.count_refusal)
+            if model is not None:
+                loader.add_model(description, model)
+        stamps = None if around is None else np.unique(around)
+        batch = _BATCH if stamps is None else max(_BATCH, len(stamps))
+        for count, decoded in enumerate(recording.messages(robots), 1):
+            loader.insert(decoded)
+            if stamps is not None and not count % batch:
+                buffer.keep_only_around(stamps)
+        return buffer
 
     def close(self) -> None:
         """Close the file. A second call does nothing."""
         self._reader.close()
+
+
+class RecordingLoader:
+    """Inserts recorded messages into ``buffer``, in the order of the recording.
+
+    Frames of ``robots`` are owned as in a listener, see ``FrameOwnership``; without any, all writers share
+    all frames.
+    """
+
+    def __init__(self, buffer: TransformBuffer, counters: Counters, robots: Collection[str]) -> None:
+        self._counters = counters
+        self._ownership = FrameOwnership(buffer, counters, is_shared=not robots)
+        for robot in robots:
+            self._ownership.add_robot(robot)
+        self._joints: dict[str, RecordedJointStateIngest] = {}
+        self._transforms: dict[tuple[str, int], RecordedTransformIngest] = {}
+        self._statics: dict[tuple[str, str | int], StaticTransformIngest] = {}
+        self._static_messages: dict[tuple[str, str | int], StaticTransforms] = {}
+        self._withdrawn: set[str] = set()
+        self._named: set[RecordedWriter] = set()
+        self._filter = ModelEdgeFilter()
+        self._epochs = EdgeEpochs()
+
+    def add_model(self, description: DecodedMessage, model: RobotModel) -> None:
+        """Insert the joint states of a robot with this ``model``. Call it before the first ``insert``."""
+        robot = description.writer.robot
+        self._filter.set_model(robot, model)
+        self._joints[robot] = RecordedJointStateIngest(robot, self._ownership, self._filter)
+        self.insert(description)
+
+    def insert(self, decoded: DecodedMessage) -> None:
+        """Insert the next message."""
+        writer, message, _ = decoded
+        if isinstance(message, JointState):
+            ingest = self._joints.get(writer.robot)
+            if ingest is None:
+                text = f"{writer.robot!r}: no robot_description fits its joint states"
+                self._counters.count_refusal("no description", text)
+            else:
+                self._set_name(ingest, writer)
+                ingest.insert_sample(message, overflowed=False)
+        elif isinstance(message, TransformSample):
+            self._insert_transforms(writer, message)
+        elif isinstance(message, StaticTransforms):
+            self._insert_statics(writer, message)
+        elif isinstance(message, RobotDescription) and writer.robot in self._joints:
+            self._set_name(self._joints[writer.robot], writer)
+            self._joints[writer.robot].describe(message)
+
+    def _insert_transforms(self, writer: RecordedWriter, sample: TransformSample) -> None:
+        rest = self._filter.filter_sample(writer.robot, sample)
+        if rest is None or rest.edges is None:
+            return
+        self._remove_withdrawn(writer.robot, rest.edges)
+        key = writer.robot, writer.session
+        ingest = self._transforms.get(key)
+        if ingest is None:
+            ingest = RecordedTransformIngest(writer.robot, self._ownership, self._epochs)
+            self._transforms[key] = ingest
+        self._set_name(ingest, writer)
+        ingest.insert_sample(rest, overflowed=False)
+
+    def _insert_statics(self, writer: RecordedWriter, statics: StaticTransforms) -> None:
+        robot, static_writer = writer.robot, writer.static_writer
+        if static_writer == MODEL_WRITER and robot in self._joints:
+            return  # the model has the same edges
+        key = robot, writer.session if static_writer is None else static_writer
+        before = self._static_messages.get(key)
+        if before is not None and (before.edges, before.poses) == (statics.edges, statics.poses):
+            return  # repeated for readers that start in the middle
+        self._static_messages[key] = statics
+        rest = self._filter.filter_statics(robot, statics)
+        self._remove_withdrawn(robot, rest.edges)
+        if before is not None and static_writer is not None:
+            self._withdrawn |= _children(robot, before.edges) - _children(robot, statics.edges)
+        name = static_writer or writer.program or _UNNAMED
+        ingest = StaticTransformIngest(robot, name, self._ownership)
+        self._statics.setdefault(key, ingest).add(rest)
+
+    def _set_name(self, ingest: StreamIngest, writer: RecordedWriter) -> None:
+        if writer not in self._named and writer.program is not None:
+            ingest.name_writer(writer.session, writer.program)
+            self._named.add(writer)
+
+    def _remove_withdrawn(self, robot: str, edges: Edges) -> None:
+        """Remove withdrawn edges whose child is placed again."""
+        if self._withdrawn:
+            for child in self._withdrawn & _children(robot, edges):
+                self._withdrawn.discard(child)
+                self._ownership.remove_child(child)
+
+
+def _children(robot: str, edges: Edges) -> set[str]:
+    children: set[str] = set()
+    for _, child in edges:
+        with suppress(InvalidInput):  # refused and counted when it is inserted
+            children.add(full_name(robot, child))
+    return children
+
+
+class RecordedJointStateIngest(JointStateIngest):
+    """Keeps the samples of earlier writers while stamps increase."""
+
+    def __init__(self, robot: str, ownership: FrameOwnership, model_filter: ModelEdgeFilter) -> None:
+        super().__init__(robot, ownership)
+        self._filter = model_filter
+
+    def _replace_model(self, model: RobotModel) -> None:
+        super()._replace_model(model)
+        self._filter.set_model(self.robot, model)
+
+    def _insert(self, sample: Sample) -> bool | None:
+        is_described = self._track is not None
+        if is_described and self._newest is not None and sample.stamp < self._newest - _DELAYED_NS:
+            return False
+        return super()._insert(sample)
+
+    def _replace_session(self, sample: Sample) -> None:
+        if self._newest is not None and sample.stamp <= self._newest:
+            self._drop_history()
+
+
+class RecordedTransformIngest(TransformIngest):
+    """Inserts the edges of one writer, or of all writers of a shared topic; each edge has its own epochs."""
+
+    def __init__(self, robot: str, ownership: FrameOwnership, epochs: EdgeEpochs) -> None:
+        super().__init__(robot, ownership)
+        self._epochs = epochs
+        self._children: set[str] = set()
+
+    def _insert(self, sample: Sample) -> bool | None:
+        assert isinstance(sample, TransformSample)
+        assert sample.edges is not None
+        edges = self._named(sample.edges)
+        children = [child for _, child in edges]
+        if self._epochs.is_delayed(sample, children):
+            return False
+        self._children.update(children)
+        if self._epochs.is_new_epoch(sample, children):
+            self._drop_edges(set(children))
+        poses = poses_from_block(sample.poses)
+        inserted = self._buffer.insert_many(edges, sample.stamp, poses, writer=self.writer)
+        self._epochs.add(sample, children)
+        return inserted
+
+    def _drop_edges(self, children: set[str]) -> None:
+        for frame in self._buffer.frames():
+            if frame.kind == "pose" and frame.name in children:
+                self._buffer.withdraw(frame.name)
+        self._epochs.remove(children)
+        text = f"the clock of {sorted(children)[0]!r} went back: its history restarts"
+        self._counters.warn_once(f"{self.robot} back", text)
+
+    def _drop_history(self) -> None:
+        self._drop_edges(self._children)
+        self._newest_by_order.clear()
+
+
+class EdgeEpochs:
+    """The newest stamp of each edge, by its child, and the sessions that published it."""
+
+    def __init__(self) -> None:
+        self._newest: dict[str, int] = {}
+        self._delayed: dict[str, int] = {}
+        self._sessions: set[tuple[int, str]] = set()
+
+    def is_delayed(self, sample: Sample, children: list[str]) -> bool:
+        """Whether it is a single old sample, after which stamps may continue as before."""
+        limit = sample.stamp + _DELAYED_NS
+        if not any(limit < self._newest.get(child, limit) for child in children):
+            self._delayed.pop(children[0], None)
+            return False
+        before = self._delayed.pop(children[0], None)
+        if before is not None and before < sample.stamp:
+            return False
+        self._delayed[children[0]] = sample.stamp
+        return True
+
+    def is_new_epoch(self, sample: Sample, children: list[str]) -> bool:
+        """Whether the clock went back: with a second old sample, or with another writer."""
+        for child in children:
+            newest = self._newest.get(child)
+            if newest is not None and sample.stamp <= newest:
+                is_new_writer = (sample.session, child) not in self._sessions
+                if is_new_writer or sample.stamp < newest - _DELAYED_NS:
+                    return True
+        return False
+
+    def add(self, sample: Sample, children: list[str]) -> None:
+        """Add an inserted sample."""
+        for child in children:
+            if sample.stamp > self._newest.get(child, sample.stamp - 1):
+                self._newest[child] = sample.stamp
+            self._sessions.add((sample.session, child))
+
+    def remove(self, children: set[str]) -> None:
+        """Remove edges whose history restarts."""
+        for child in children:
+            self._newest.pop(child, None)

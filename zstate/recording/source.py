@@ -40,7 +40,7 @@ class RecordedSource(Closeable):
         except BaseException:
             self.close()
             raise
-        first, last = recording.span or (0, 0)
+        first, last = self._reader.span or (0, 0)
         self.duration_s = (last - first) / 1e9
         """Length of the recording [s]: by then everything is due."""
         self._messages = recording.messages((self.robot,), ("joint_states",))

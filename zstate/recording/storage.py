@@ -61,9 +61,9 @@ class Record(NamedTuple):
 class ReadFilter(NamedTuple):
     """Selects records of these topics (None: all) with log times in [begin, end)."""
 
-    topics: frozenset[str] | None = None
-    begin: int = -(1 << 63)
-    end: int = 1 << 64
+    topics: frozenset[str] | None
+    begin: int
+    end: int
 
     def accepts(self, channel: Channel) -> bool:
         """Whether records of ``channel`` are read at all: only CDR is."""
@@ -120,18 +120,18 @@ def merge_by_log_time(parts: Sequence[SortedPart]) -> Iterator[Record]:
 
     A part is opened when the stream reaches its start, so a long recording is never in memory as a whole.
     """
-    later = sorted(enumerate(parts), key=lambda item: item[1].start, reverse=True)
-    heads: list[tuple[int, int, Record, Iterator[Record]]] = []
-    while later or heads:
-        while later and (not heads or later[-1][1].start <= heads[0][0]):
-            number, part = later.pop()
-            records = part.records()
-            if (record := next(records, None)) is not None:
-                heapq.heappush(heads, (record.log_time, number, record, records))
-        if heads:
-            _, number, record, records = heads[0]
+    # Start or next log time, whether the part is open, its number, its next record, and the rest.
+    heads: list[tuple[int, bool, int, Record | None, Iterator[Record]]] = [
+        (part.start, False, number, None, iter(())) for number, part in enumerate(parts)
+    ]
+    heapq.heapify(heads)
+    while heads:
+        _, _, number, record, records = heads[0]
+        if record is None:
+            records = parts[number].records()
+        else:
             yield record
-            if (following := next(records, None)) is None:
-                heapq.heappop(heads)
-            else:
-                heapq.heapreplace(heads, (following.log_time, number, following, records))
+        if (following := next(records, None)) is None:
+            heapq.heappop(heads)
+        else:
+            heapq.heapreplace(heads, (following.log_time, True, number, following, records))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ipaddress
 import secrets
+from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
@@ -58,26 +59,23 @@ class AccessCheck:
         """Why a request for ``path``, query included, is refused; None if it is answered."""
         repeated = [name for name in _UNIQUE if len(headers.get_all(name)) > 1]
         if repeated:
-            return AccessDeniedResponse(
-                HTTPStatus.BAD_REQUEST, f"a request has at most one {repeated[0]} header"
-            )
+            text = f"a request has at most one {repeated[0]} header"
+            return AccessDeniedResponse(HTTPStatus.BAD_REQUEST, text)
         host = headers.get("Host", "")
         name, port = _name_and_port(host)
         if is_loopback(self.host) and not (is_loopback(name) and port == self.port):
-            return AccessDeniedResponse(
-                HTTPStatus.FORBIDDEN,
+            text = (
                 f"this view is for this machine only, at port {self.port}, and was requested as {host!r}; "
                 f"forward the same port (ssh -L {self.port}:127.0.0.1:{self.port} HOST), or open the view to "
-                "others with `zstate view --host`",
+                "others with `zstate view --host`"
             )
+            return AccessDeniedResponse(HTTPStatus.FORBIDDEN, text)
         origin = headers.get("Origin")
         if is_websocket(headers) and origin is not None and not _is_same_host(origin, host):
             return AccessDeniedResponse(HTTPStatus.FORBIDDEN, f"a page of {origin!r} may not use this view")
         if not self._has_token(path, headers):
-            return AccessDeniedResponse(
-                HTTPStatus.UNAUTHORIZED,
-                "this view asks for its token; open the address that `zstate view` printed",
-            )
+            text = "this view asks for its token; open the address that `zstate view` printed"
+            return AccessDeniedResponse(HTTPStatus.UNAUTHORIZED, text)
         return None
 
     def headers(self) -> dict[str, str]:
@@ -131,8 +129,6 @@ def _name_and_port(host: str) -> tuple[str, int]:
 
 def _is_same_host(origin: str, host: str) -> bool:
     """Whether an Origin header names the same host and port as a Host header."""
-    try:
-        netloc = urlsplit(origin).netloc.lower()
-    except ValueError:
-        return False
-    return netloc != "" and netloc == host.lower()
+    with suppress(ValueError):
+        return urlsplit(origin).netloc.lower() == host.lower() != ""
+    return False

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.buffer.snapshot import FramePoses, Mask, Poses
+from zstate.buffer.snapshot import FramePoses, Poses
 
 FIELD_OF_VIEW = math.radians(45.0)
 """Vertical field of view of the camera [rad]."""
@@ -84,28 +84,19 @@ def fit_camera(
     return CameraPose(_point(middle + _ROOM * away * _DIRECTION), _point(middle), floor, reach)
 
 
-def in_picture(camera: CameraPose, points: NDArray[np.float64], aspect: float) -> Mask:
-    """Which of the points (N, 3) in the fixed frame are in the picture; never a NaN."""
-    position = np.array(camera.position)
-    ahead, right, up = ((points - position) @ _axes(np.subtract(camera.look_at, position))).T
-    half = ahead * math.tan(0.5 * FIELD_OF_VIEW)
-    with np.errstate(invalid="ignore"):
-        return (ahead > 0.0) & (np.abs(up) <= half) & (np.abs(right) <= half * aspect)
-
-
 def robot_visibility(
     snapshot: FramePoses, poses: Poses, camera: CameraPose, aspect: float, robots: Iterable[str]
 ) -> Iterator[Visibility]:
     """Whether each robot is in the picture, which it is if one of its frames is."""
     tree = snapshot.tree
-    seen = in_picture(camera, poses[:, :3], aspect)
-    rows: dict[str, list[int]] = {}
-    for row, name in enumerate(tree.names):
-        if "/" in name:
-            rows.setdefault(name.partition("/")[0], []).append(row)
+    position = np.array(camera.position)
+    ahead, right, up = ((poses[:, :3] - position) @ _axes(np.subtract(camera.look_at, position))).T
+    half = ahead * math.tan(0.5 * FIELD_OF_VIEW)
+    with np.errstate(invalid="ignore"):  # frames without a pose, which are not seen
+        seen = (ahead > 0.0) & (np.abs(up) <= half) & (np.abs(right) <= half * aspect)
     for robot in robots:
-        links = rows.get(robot)
-        if links is None:
+        links = [row for row, name in enumerate(tree.names) if name.startswith(f"{robot}/")]
+        if not links:
             yield Visibility(robot, False, "its description has not been received")
             continue
         is_visible = bool(seen[links].any())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -48,11 +49,9 @@ class ViewSource(Closeable):
             self.listener = TransformListener(session, robot, self.buffer, wire)
         self._selected = frozenset(robots)
         self._version = 0
-        self._models: Mapping[str, RobotModel] = {}
         # By robot: its newest stamp [ns], and when that was first seen, by time.monotonic [s].
         self._newest: dict[str, tuple[int, float]] = {}
-        self._table: FrameTable = FrameTable((), np.empty(0, np.intp), (), ())
-        self._refresh()
+        self._table = self.buffer.frame_table(self._selected)
 
     @classmethod
     def from_recording(cls, path: str | Path) -> ViewSource:
@@ -68,14 +67,14 @@ class ViewSource(Closeable):
     @property
     def version(self) -> int:
         """Grows when a robot, a model, a frame or the writer of an edge changes."""
-        self._refresh()
+        self._set_table(self.buffer.frame_table(self._selected))
         return self._version
 
     @property
     def models(self) -> Mapping[str, RobotModel]:
         """The robots with a known model."""
-        self._refresh()
-        return self._models
+        robots = self.buffer.frame_table(self._selected).robots
+        return {name: track.model for name, track in robots.items()}
 
     def robots(self) -> tuple[str, ...]:
         """Every robot received or with a known model, sorted by name."""
@@ -108,33 +107,19 @@ class ViewSource(Closeable):
         known = self._newest.get(robot)
         return None if known is None or self.session is None else time.monotonic() - known[1]
 
-    def _refresh(self) -> None:
-        self._set_table(self.buffer.frame_table(self._selected))
-
     def _set_table(self, table: FrameTable) -> None:
-        if table is not self._table:
-            self._table = table
-            self._models = {name: track.model for name, track in table.robots.items()}
-            self._version += 1
+        self._version += table is not self._table
+        self._table = table
 
 
+@dataclass
 class FixedFrame:
     """The fixed frame, as in rviz: the ``requested`` one if it exists, else the root of the largest tree."""
 
-    def __init__(self, requested: str = "") -> None:
-        self.requested = requested
-        self._tree: FrameTable | None = None
-        self._default = ""
+    requested: str = ""
 
     def resolve(self, tree: FrameTable) -> str:
-        """Its name; empty if there is no frame."""
-        if tree is not self._tree:
-            self._tree, self._default = tree, default_fixed_frame(tree)
-        return self.requested if self.requested in tree.index else self._default
-
-
-def default_fixed_frame(tree: FrameTable) -> str:
-    """The root of the most frames, the first of equal ones; empty if there is no frame."""
-    if not tree.names:
-        return ""
-    return tree.names[int(np.bincount(tree.roots).argmax())]
+        """Its name; of equally large trees, the first root. Empty if there is no frame."""
+        if self.requested in tree.index:
+            return self.requested
+        return tree.names[int(np.bincount(tree.roots).argmax())] if tree.names else ""

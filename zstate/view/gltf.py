@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -28,17 +27,6 @@ _VERTICES, _INDICES = 34962, 34963
 _PNG = b"\x89PNG"
 _ROUGHNESS = 0.65
 
-_PLAIN = Material(GREY)
-Corner = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class MaterialOverride:
-    """The material of meshes without one (``missing``), or one colour for all (``over``)."""
-
-    missing: Material = _PLAIN
-    over: Color | None = None
-
 
 class Glb:
     """Meshes packed once, for files in several colours; meshes with the same material are joined."""
@@ -49,22 +37,15 @@ class Glb:
         self._accessors: list[dict[str, Any]] = []
         self._views: list[dict[str, Any]] = []
         self._binary = bytearray()
-        self._corner_count = 0
+        self.triangle_count = 0
         for mesh in _joined(meshes):
             self._add(mesh)
 
     @property
-    def triangle_count(self) -> int:
-        """Number of triangles."""
-        return self._corner_count // 3
-
-    @property
-    def bounds(self) -> tuple[Corner, Corner]:
-        """The lowest and the highest coordinates of its points [m]; needs at least one point."""
+    def bounds(self) -> NDArray[np.float64]:
+        """The lowest and the highest coordinates of its points: (2, 3) [m]; needs at least one point."""
         boxes = [one for one in self._accessors if "min" in one]
-        low = np.min([one["min"] for one in boxes], axis=0).tolist()
-        high = np.max([one["max"] for one in boxes], axis=0).tolist()
-        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+        return np.array([np.min([one["min"] for one in boxes], 0), np.max([one["max"] for one in boxes], 0)])
 
     @property
     def byte_count(self) -> int:
@@ -72,14 +53,14 @@ class Glb:
         images = {material.image for material, _ in self._materials if material and material.image}
         return len(self._binary) + sum(map(len, images))
 
-    def to_bytes(self, override: MaterialOverride) -> bytes:
-        """The glTF file."""
+    def to_bytes(self, missing: Material, over: Color | None) -> bytes:
+        """The glTF file; meshes without a material have ``missing``, or all have the colour ``over``."""
         materials: list[Material] = []
         for own, has_uv in self._materials:
-            material = override.missing if own is None else own
-            if override.over is not None:
-                material = Material(override.over)
-            materials.append(material if has_uv and override.over is None else Material(material.color))
+            material = missing if own is None else own
+            if over is not None or not has_uv:
+                material = Material(over or material.color)
+            materials.append(material)
         images = list(dict.fromkeys(material.image for material in materials if material.image is not None))
         binary, views = bytearray(self._binary), list(self._views)
         for image in images:
@@ -121,7 +102,7 @@ class Glb:
             colors = mesh.colors / 255.0
             colors[:, :3] = _linear(colors[:, :3])
             attributes["COLOR_0"] = self._array(colors.astype(np.float32), _VERTICES)
-        self._corner_count += mesh.triangles.size
+        self.triangle_count += len(mesh.triangles)
         # The largest index of a type means primitive restart.
         narrow = np.uint16 if len(mesh.points) < 0xFFFF else np.uint32
         rows = self._array(mesh.triangles.reshape(-1, 1).astype(narrow), _INDICES)
@@ -157,22 +138,24 @@ def _joined(meshes: Iterable[Mesh]) -> list[Mesh]:
     every = [mesh for group in by_material.values() for mesh in group]
     has_uv = any(one.uv is not None for one in every)
     has_colors = any(one.colors is not None for one in every)
-    return [_join(group, has_uv, has_colors) for group in by_material.values()]
-
-
-def _join(group: list[Mesh], has_uv: bool, has_colors: bool) -> Mesh:
-    starts = np.cumsum([0, *(len(one.points) for one in group[:-1])])
-    rows = [one.triangles + np.uint32(start) for one, start in zip(group, starts, strict=True)]
-    uv = [np.zeros((len(one.points), 2), np.float32) if one.uv is None else one.uv for one in group]
-    white = np.full(4, 255, dtype=np.uint8)
-    colors = [np.tile(white, (len(one.points), 1)) if one.colors is None else one.colors for one in group]
-    return Mesh(
-        np.concatenate([one.points for one in group]),
-        np.concatenate(rows).astype(np.uint32),
-        group[0].material,
-        np.concatenate(uv) if has_uv else None,
-        np.concatenate(colors) if has_colors else None,
-    )
+    joined: list[Mesh] = []
+    for material, group in by_material.items():
+        counts = [len(one.points) for one in group]
+        starts = np.cumsum([0, *counts[:-1]])
+        rows = [one.triangles + np.uint32(start) for one, start in zip(group, starts, strict=True)]
+        uv = [np.zeros((len(one.points), 2), np.float32) if one.uv is None else one.uv for one in group]
+        white = [np.full((count, 4), 255, dtype=np.uint8) for count in counts]
+        colors = [hue if one.colors is None else one.colors for one, hue in zip(group, white, strict=True)]
+        joined.append(
+            Mesh(
+                np.concatenate([one.points for one in group]),
+                np.concatenate(rows).astype(np.uint32),
+                material,
+                np.concatenate(uv) if has_uv else None,
+                np.concatenate(colors) if has_colors else None,
+            )
+        )
+    return joined
 
 
 def _material(material: Material, images: list[bytes]) -> dict[str, Any]:

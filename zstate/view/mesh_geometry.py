@@ -51,12 +51,10 @@ class Mesh:
 
     def normals(self) -> NDArray[np.float32]:
         """The normal of each point: the mean of its triangles, weighted by area."""
-        corners = self.points[self.triangles].astype(np.float64)
-        facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        rows = self.triangles.ravel()
+        rows, areas = self.triangles.ravel(), _areas(self.points.astype(np.float64), self.triangles)
         sums = np.zeros((len(self.points), 3))
         for k in range(3):
-            sums[:, k] = np.bincount(rows, np.repeat(facing[:, k], 3), len(self.points))
+            sums[:, k] = np.bincount(rows, areas[:, k], len(self.points))
         return directions(sums).astype(np.float32)
 
 
@@ -108,7 +106,7 @@ def smooth_normals(
     )
 
 
-def _areas(points: Corners, triangles: NDArray[np.intp]) -> Corners:
+def _areas(points: Corners, triangles: NDArray[np.integer[Any]]) -> Corners:
     """Twice the area of each corner's triangle (3 F, 3), along its normal."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     return np.repeat(np.cross(b - a, c - a), 3, axis=0)
@@ -148,7 +146,7 @@ def _groups(features: list[NDArray[Any]]) -> tuple[NDArray[np.intp], NDArray[np.
     return first, kinds
 
 
-def primitive(shape: Box | Cylinder | Sphere, *, textured: bool = False) -> Mesh:
+def primitive(shape: Box | Cylinder | Sphere, textured: bool) -> Mesh:
     """The mesh of a shape, with texture coordinates if ``textured``.
 
     The image covers each side of a box; it goes once around a cylinder or a sphere, from the lower end

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -43,9 +42,6 @@ class MissingFile:
         """The reason, and the folders that were searched."""
         return f"{self.reason}; searched in {', '.join(self.searched)}" if self.searched else self.reason
 
-    def __str__(self) -> str:
-        return f"{self.uri}: {self.why}"
-
 
 class MeshPaths:
     """Finds the files that a URDF names.
@@ -59,6 +55,11 @@ class MeshPaths:
 
     def __init__(self, base: Path | None = None) -> None:
         self._base = None if base is None else _absolute(base)
+        self._ancestors = () if self._base is None else (self._base, *self._base.parents)
+        # Folders with packages directly in them.
+        self._shares = [prefix / "share" for prefix in _path_list("AMENT_PREFIX_PATH")]
+        # Folders that are a package, or have packages somewhere below them.
+        self._search_roots = [*_path_list("ROS_PACKAGE_PATH"), *package_folders()]
 
     def find(self, uri: str) -> Path | MissingFile:
         """The file of that name, or why there is none."""
@@ -75,23 +76,26 @@ class MeshPaths:
         """A plain path; from a received description only if it could be written as package://."""
         if self._base is not None:
             found = self._base / path
-            return found if _is_file(found) else MissingFile(uri, _NO_FILE, (str(found.parent),))
+            return found if _succeeds(found.is_file) else MissingFile(uri, _NO_FILE, (str(found.parent),))
         if not path.is_absolute():
             reason = "a relative path means nothing without the folder of its URDF; write package://NAME/PATH"
             return MissingFile(uri, reason)
         for folder in (*self._shares, *self._search_roots):
             if folder in path.parents and _is_within(path, folder, path.parts[len(folder.parts)]):
-                return path if _is_file(path) else MissingFile(uri, _NO_FILE, (str(path.parent),))
+                return path if _succeeds(path.is_file) else MissingFile(uri, _NO_FILE, (str(path.parent),))
         return MissingFile(uri, _ONLY_PACKAGES)
 
     def _find_in_package(self, uri: str, path: str) -> Path | MissingFile:
         package, _, rest = path.partition("/")
         if package in ("", ".", ".."):
             return MissingFile(uri, f"{package!r} is not a package name")
-        folders = list(dict.fromkeys(self._packages(package)))
+        found = [folder for folder in self._ancestors if folder.name == package]
+        inside = [folder / package for folder in (*self._ancestors, *self._shares)]
+        found += [folder for folder in inside if _succeeds(folder.is_dir)]
+        folders = list(dict.fromkeys(found + self._folders_by_name.get(package, [])))
         allowed = [one for one in folders if self._base or _is_within(one / rest, one, package)]
         for folder in allowed:
-            if _is_file(folder / rest):
+            if _succeeds((folder / rest).is_file):
                 return folder / rest
         if allowed:
             return MissingFile(uri, f"the package {package!r} has no such file", tuple(map(str, allowed)))
@@ -102,30 +106,6 @@ class MeshPaths:
             f"there is no package {package!r}; put the folder of the package into ROS_PACKAGE_PATH",
             tuple(str(folder) for folder in (*self._ancestors, *self._shares, *self._search_roots)),
         )
-
-    def _packages(self, name: str) -> Iterator[Path]:
-        """The folders of packages of that name."""
-        yield from (folder for folder in self._ancestors if folder.name == name)
-        for folder in (*self._ancestors, *self._shares):
-            with suppress(OSError, ValueError):
-                if (folder / name).is_dir():
-                    yield folder / name
-        yield from self._folders_by_name.get(name, ())
-
-    @cached_property
-    def _ancestors(self) -> Sequence[Path]:
-        """``base`` and the folders above it."""
-        return () if self._base is None else (self._base, *self._base.parents)
-
-    @cached_property
-    def _shares(self) -> Sequence[Path]:
-        """Folders with packages directly in them."""
-        return [prefix / "share" for prefix in _path_list("AMENT_PREFIX_PATH")]
-
-    @cached_property
-    def _search_roots(self) -> Sequence[Path]:
-        """Folders that are a package, or have packages somewhere below them."""
-        return [*_path_list("ROS_PACKAGE_PATH"), *package_folders()]
 
     @cached_property
     def _folders_by_name(self) -> dict[str, list[Path]]:
@@ -185,8 +165,9 @@ def _package_name(folder: Path) -> str | None:
     return None if found is None else found[1].decode(errors="replace").strip()
 
 
-def _is_file(path: Path) -> bool:
+def _succeeds(check: Callable[[], bool]) -> bool:
+    """Whether a check of a path is true; False if the path is invalid or cannot be reached."""
     try:
-        return path.is_file()
+        return check()
     except (OSError, ValueError):
         return False

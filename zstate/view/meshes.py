@@ -1,10 +1,14 @@
-"""Meshes of shapes as binary glTF, from files or primitives. The one module that uses trimesh and Pillow."""
+"""Meshes of shapes as binary glTF, from files or primitives, loaded on a background thread.
+
+The one module that uses trimesh and Pillow.
+"""
 
 from __future__ import annotations
 
 import io
+import threading
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,7 +24,7 @@ from trimesh.resolvers import FilePathResolver
 from trimesh.units import unit_conversion
 
 from zstate.model.geometry import Box, Color, Cylinder, MeshFile, Shape, Sphere
-from zstate.view.gltf import GREY, Corner, Glb, MaterialOverride
+from zstate.view.gltf import GREY, Glb
 from zstate.view.mesh_geometry import Material, Mesh, primitive, smooth_normals
 from zstate.view.mesh_paths import MeshPaths, MissingFile
 
@@ -43,14 +47,10 @@ _COPIED_BYTES = 512 * 1024 * 1024
 
 @dataclass(frozen=True, eq=False)
 class Copy:
-    """A mesh in one colour, as binary glTF, with its bounds [m].
-
-    It is kept while an asset uses it.
-    """
+    """A mesh in one colour, as binary glTF, with its bounds [m]; kept while an asset uses it."""
 
     glb: bytes
-    low: Corner
-    high: Corner
+    bounds: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class MeshAsset:
 
     def corners(self) -> NDArray[np.float64]:
         """The corners of its bounding box, scaled: (8, 3) [m]."""
-        ends = np.array([self.copy.low, self.copy.high]) * self.scale
+        ends = self.copy.bounds * self.scale
         return np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
 
     @property
@@ -89,7 +89,9 @@ class Meshes:
         self._packed: OrderedDict[_Source, Glb] = OrderedDict()
         self.kept_byte_count = 0
         """Size of the geometry in memory [bytes]."""
-        self._copies: WeakValueDictionary[tuple[_Source, MaterialOverride], Copy] = WeakValueDictionary()
+        self._copies: WeakValueDictionary[tuple[_Source, Material, Color | None], Copy] = (
+            WeakValueDictionary()
+        )
         self._firsts: WeakValueDictionary[_Source, Copy] = WeakValueDictionary()
         self._copied_bytes = 0
         # Sizes of copies that are no longer used; appended by any thread.
@@ -103,16 +105,16 @@ class Meshes:
         ``base`` is the folder of a URDF file that the user named, see MeshPaths.
         """
         geometry = shape.geometry
-        if not isinstance(geometry, MeshFile):
-            source = (geometry, shape.texture is not None)
-            name = f"<{type(geometry).__name__.lower()}> of link {shape.link!r}"
-            if self._pack(source).triangle_count:
-                return self._colored(source, shape, over, base, name)
-            return MissingFile(name, "nothing can be drawn: its size is zero, or not finite")
-        uri, scale = geometry.uri, geometry.scale
-        return self._read(
-            uri, base, lambda path: replace(self._colored(path, shape, over, base, uri), scale=scale)
-        )
+        if isinstance(geometry, MeshFile):
+            uri, scale = geometry.uri, geometry.scale
+            return self._read(
+                uri, base, lambda path: replace(self._colored(path, shape, over, base, uri), scale=scale)
+            )
+        source = (geometry, shape.texture is not None)
+        name = f"<{type(geometry).__name__.lower()}> of link {shape.link!r}"
+        if self._pack(source).triangle_count:
+            return self._colored(source, shape, over, base, name)
+        return MissingFile(name, "nothing can be drawn: its size is zero, or not finite")
 
     def missing_texture(self, shape: Shape, base: Path | None = None) -> MissingFile | None:
         """Why the texture of the shape cannot be loaded; None if it can, or if there is none."""
@@ -122,15 +124,12 @@ class Meshes:
     def _colored(
         self, source: _Source, shape: Shape, over: Color | None, base: Path | None, name: str
     ) -> MeshAsset:
-        if over is not None:
-            override = MaterialOverride(over=over)
+        image = self._texture(shape, base) if over is None else None
+        if isinstance(image, bytes):
+            missing = Material(shape.color or (1.0, 1.0, 1.0, 1.0), image)
         else:
-            image = self._texture(shape, base)
-            if isinstance(image, bytes):
-                override = MaterialOverride(Material(shape.color or (1.0, 1.0, 1.0, 1.0), image))
-            else:
-                override = MaterialOverride(Material(shape.color or GREY))
-        done = self._copies.get((source, override))
+            missing = Material(GREY if shape.color is None or over is not None else shape.color)
+        done = self._copies.get((source, missing, over))
         if done is not None:
             return MeshAsset(done)
         packed = self._pack(source)
@@ -141,7 +140,7 @@ class Meshes:
             limit = f"{self._max_copied_bytes / 1e6:.0f} MB"
             reason = f"drawn in another colour: the meshes on the page have reached the limit of {limit}"
             return MeshAsset(another, defect=MissingFile(name, reason))
-        done = self._copies[source, override] = Copy(packed.to_bytes(override), *packed.bounds)
+        done = self._copies[source, missing, over] = Copy(packed.to_bytes(missing, over), packed.bounds)
         if another is None:
             self._firsts[source] = done
         self._copied_bytes += len(done.glb)
@@ -151,10 +150,7 @@ class Meshes:
     def _pack(self, source: _Source) -> Glb:
         done = self._packed.pop(source, None)
         if done is None:
-            meshes = (
-                read_mesh(source) if isinstance(source, Path) else [primitive(source[0], textured=source[1])]
-            )
-            done = Glb(meshes)
+            done = Glb(read_mesh(source) if isinstance(source, Path) else [primitive(*source)])
             self.kept_byte_count += done.byte_count
         self._packed[source] = done
         while self.kept_byte_count > self._kept_bytes and len(self._packed) > 1:
@@ -176,6 +172,66 @@ class Meshes:
             return read(path)
         except (OSError, UnreadableFile) as error:
             return MissingFile(uri, str(error), (str(path.parent),))
+
+
+@dataclass(eq=False)
+class MeshRequest:
+    """A shape to load; ``over`` and ``base`` as for ``Meshes.load``. Requests compare by identity.
+
+    When it ``is_loaded``, ``asset`` is None if it cannot be drawn, and ``missing`` are the files that it
+    lacks: its own, its texture or a copy in its colour.
+    """
+
+    shape: Shape
+    over: Color | None
+    base: Path | None
+    asset: MeshAsset | None = None
+    missing: tuple[MissingFile, ...] = ()
+    is_loaded: bool = False
+
+
+class MeshLoader:
+    """Loads meshes on a background thread that exits when its queue is empty: files do not delay pictures."""
+
+    def __init__(self, meshes: Meshes) -> None:
+        self._meshes = meshes
+        self._lock = threading.Lock()
+        self._queue: list[MeshRequest] = []
+        self._running = False
+
+    def request(self, requests: Sequence[MeshRequest]) -> None:
+        """Queue requests."""
+        with self._lock:
+            self._queue += requests
+            if self._queue and not self._running:
+                self._running = True
+                threading.Thread(target=self._run, name="zstate-meshes", daemon=True).start()
+
+    def cancel(self, requests: Sequence[MeshRequest]) -> None:
+        """Drop requests that are still queued."""
+        with self._lock:
+            self._queue = [request for request in self._queue if request not in requests]
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                if not self._queue:
+                    self._running = False
+                    return
+                request = self._queue.pop(0)
+            texture = None
+            try:
+                asset = self._meshes.load(request.shape, request.over, request.base)
+                if request.over is None:
+                    texture = self._meshes.missing_texture(request.shape, request.base)
+            except Exception as error:  # one unforeseen file must not stop the others
+                asset = MissingFile(str(request.shape.geometry), f"{type(error).__name__}: {error}")
+            if isinstance(asset, MeshAsset):
+                request.asset, lacks = asset, (texture, asset.defect)
+            else:
+                lacks = (asset, texture)
+            request.missing = tuple(one for one in lacks if one is not None)
+            request.is_loaded = True
 
 
 class UnreadableFile(ValueError):
@@ -224,35 +280,33 @@ def _loaded(path: Path, data: Path | io.BytesIO) -> tuple[Mesh, ...]:
     scene: Any = _load(data, file_type=kind, resolver=resolver, process=kind == "stl")
     meshes: list[Mesh] = []
     for node in scene.graph.nodes_geometry:
-        matrix, name = scene.graph[node]
+        transform, name = scene.graph[node]
         mesh = scene.geometry[name]
         if len(getattr(mesh, "faces", ())):
             scale = 1.0 if mesh.units is None else unit_conversion(mesh.units, "meters")
-            metres = np.asarray(matrix, dtype=np.float64) * [[scale], [scale], [scale], [1.0]]
-            meshes.append(_mesh(mesh, metres))
+            matrix = np.asarray(transform, dtype=np.float64)[:3] * scale
+            points = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:, :3].T + matrix[:, 3]
+            # From the cache: the property would compute normals if the file has none.
+            own: Any = mesh._cache.cache.get("vertex_normals")
+            normals = (
+                None if own is None else np.asarray(own, dtype=np.float64) @ np.linalg.inv(matrix[:, :3])
+            )
+            material, uv, colors = _visual(mesh.visual)
+            faces = np.asarray(mesh.faces)
+            meshes.append(smooth_normals(points, faces, material, normals=normals, uv=uv, colors=colors))
     return tuple(meshes)
-
-
-def _mesh(mesh: Any, matrix: NDArray[np.float64]) -> Mesh:
-    points = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    # From the cache: the property would compute normals if the file has none.
-    own: Any = mesh._cache.cache.get("vertex_normals")
-    normals = None if own is None else np.asarray(own, dtype=np.float64) @ np.linalg.inv(matrix[:3, :3])
-    material, uv, colors = _visual(mesh.visual)
-    return smooth_normals(points, np.asarray(mesh.faces), material, normals=normals, uv=uv, colors=colors)
 
 
 def _visual(visual: Any) -> tuple[Material | None, NDArray[np.float64] | None, NDArray[np.uint8] | None]:
     """Material, texture coordinates and point colours."""
     if visual.kind in {"vertex", "face"}:
         return Material((1.0, 1.0, 1.0, 1.0)), None, np.asarray(visual.vertex_colors, dtype=np.uint8)
-    material = getattr(visual, "material", None)
-    if material is None:
+    if getattr(visual, "material", None) is None:
         return None, None, None
-    own = _material(material)
+    material = _material(visual.material)
     # Without a material of its own, the URDF may have a texture for it.
-    is_covered = visual.uv is not None and (own is None or own.image is not None)
-    return own, np.asarray(visual.uv, dtype=np.float64) if is_covered else None, None
+    is_covered = visual.uv is not None and (material is None or material.image is not None)
+    return material, np.asarray(visual.uv, dtype=np.float64) if is_covered else None, None
 
 
 def _material(material: Any) -> Material | None:
@@ -262,17 +316,16 @@ def _material(material: Any) -> Material | None:
         return None  # trimesh adds a material to an OBJ file with texture coordinates and no material
     else:
         factor, image = material.diffuse, material.image
-    given = (1.0,) * 4 if factor is None else (np.asarray(factor, dtype=np.float64) / 255.0).tolist()
-    red, green, blue, opacity = given
+    own = (1.0,) * 4 if factor is None else (np.asarray(factor, dtype=np.float64) / 255.0).tolist()
+    red, green, blue, opacity = own
     color = (red, green, blue, opacity if opacity > _INVISIBLE else 1.0)
     return Material(color, None if image is None else _encoded(image))
 
 
 def _encoded(image: Any) -> bytes:
     image.thumbnail((_WIDEST_IMAGE, _WIDEST_IMAGE))
-    has_opacity = image.mode in {"RGBA", "LA", "PA"} or "transparency" in image.info
     buffer = io.BytesIO()
-    if has_opacity:
+    if image.mode in {"RGBA", "LA", "PA"} or "transparency" in image.info:
         image.convert("RGBA").save(buffer, "PNG", compress_level=3)
     else:
         image.convert("RGB").save(buffer, "JPEG", quality=88)

@@ -7,16 +7,16 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 
 import imageio.v3
 import numpy as np
+import viser
 from numpy.typing import NDArray
 
-from zstate._util.closeable import Closeable
 from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, LibraryMissing, ZStateError
 from zstate.view.server import ViewServer
@@ -47,7 +47,8 @@ _FLAGS = (
 _EXIT_TIMEOUT_S = 3.0
 _OPEN_TIMEOUT_S = 30.0
 _DRAW_TIMEOUT_S = 30.0
-# A browser unpacks meshes one after the other: a picture is complete when it hardly changes any more.
+# A browser unpacks meshes one after the other and reports none of them: a picture is complete when it hardly
+# changes any more.
 _UNPACK_PERIOD_S = 0.5
 _MAX_CHANGED = 0.004  # share of pixels
 _MAX_ATTEMPTS = 6
@@ -59,72 +60,61 @@ class ScreenshotFailed(ZStateError):
     """The browser did not open or draw the page."""
 
 
-class HeadlessBrowser(Closeable):
-    """Shows ``url`` in a window of ``width`` by ``height`` pixels that is on no screen.
+@contextmanager
+def _headless_browser(url: str, width: int, height: int) -> Generator[subprocess.Popen[bytes]]:
+    """A browser that shows ``url`` in a window of ``width`` by ``height`` pixels that is on no screen.
 
     Raises LibraryMissing if no Chromium-based browser is installed.
     """
-
-    def __init__(self, url: str, width: int, height: int) -> None:
-        program = next(filter(None, map(shutil.which, _PROGRAMS)), None)
-        if program is None:
-            raise LibraryMissing(
-                "a picture needs a Chromium-based browser, and none is installed: apt-get install chromium"
-            )
-        self._profile = tempfile.TemporaryDirectory(prefix="zstate-view-", ignore_cleanup_errors=True)
-        window = (f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}")
-        command = [program, *_FLAGS, *window]
+    program = next(filter(None, map(shutil.which, _PROGRAMS)), None)
+    if program is None:
+        raise LibraryMissing(
+            "a picture needs a Chromium-based browser, and none is installed: apt-get install chromium"
+        )
+    with tempfile.TemporaryDirectory(prefix="zstate-view-", ignore_cleanup_errors=True) as profile:
+        command = [program, *_FLAGS, f"--user-data-dir={profile}", f"--window-size={width},{height}"]
         if os.geteuid() == 0:
             command.append("--no-sandbox")  # root has none
         silent = subprocess.DEVNULL
-        self._process = subprocess.Popen(
+        process = subprocess.Popen(
             [*command, url], stdin=silent, stdout=silent, stderr=silent, start_new_session=True
         )
-
-    @property
-    def has_exited(self) -> bool:
-        """Whether the browser has exited by itself, which it never should."""
-        return self._process.poll() is not None
-
-    def close(self) -> None:
-        """Stop the browser and remove its profile. A second call does nothing."""
-        self._process.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_EXIT_TIMEOUT_S)
-        self._process.kill()
-        self._process.wait()
-        self._profile.cleanup()
+        try:
+            yield process
+        finally:
+            process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_EXIT_TIMEOUT_S)
+            process.kill()
+            process.wait()
 
 
 def save_screenshot(
-    page: ViewServer, path: Path, *, width: int = 1280, height: int = 800, hold: Callable[[float], bool]
+    page: ViewServer, path: Path, *, width: int, height: int, hold: Callable[[float], bool]
 ) -> None:
     """Write what ``page`` shows, without its panels, to ``path``.
 
     The view must be running in another thread; ``hold`` is its method. Raises LibraryMissing if no browser is
     installed, ScreenshotFailed if it does not draw in time, InvalidInput if the file cannot be written.
     """
-    with HeadlessBrowser(page.url, width, height) as browser:
+    with _headless_browser(page.url, width, height) as browser:
         deadline = time.monotonic() + _OPEN_TIMEOUT_S
         while not wait_interruptible(page.connected, 0.2):
-            if browser.has_exited or time.monotonic() > deadline:
+            if browser.poll() is not None or time.monotonic() > deadline:
                 raise ScreenshotFailed(
                     "the browser did not open the page; does it start by itself, without a screen?"
                 )
         client = next(iter(page.server.get_clients().values()))
         if not hold(_DRAW_TIMEOUT_S):
             raise ScreenshotFailed(f"no robot had a pose to be drawn within {_DRAW_TIMEOUT_S:g} s")
-
-        def draw() -> Pixels:
-            try:
-                pixels: Pixels = client.get_render(
-                    height, width, transport_format="png", timeout=_DRAW_TIMEOUT_S
-                )
-            except (RuntimeError, TimeoutError) as error:
-                raise ScreenshotFailed(f"the browser draws nothing: {error}") from None
-            return _on_white(pixels)
-
-        pixels = _until_stable(draw)
+        pixels = _render(client, width, height)
+        for _ in range(_MAX_ATTEMPTS):
+            time.sleep(_UNPACK_PERIOD_S)
+            before, pixels = pixels, _render(client, width, height)
+            if before.shape == pixels.shape:
+                difference = np.abs(before.astype(np.int16) - pixels.astype(np.int16)).max(axis=2)
+                if float((difference > 16).mean()) < _MAX_CHANGED:
+                    break
     try:
         out = BytesIO()
         imageio.v3.imwrite(out, pixels, extension=".png")  # pyright: ignore[reportUnknownMemberType]
@@ -133,22 +123,13 @@ def save_screenshot(
         raise InvalidInput(f"the picture cannot be written: {error}") from None
 
 
-def _on_white(pixels: Pixels) -> Pixels:
-    """(H, W, 4) with opacity, on a white background (H, W, 3)."""
+def _render(client: viser.ClientHandle, width: int, height: int) -> Pixels:
+    """The picture of a browser on a white background (H, W, 3)."""
+    try:
+        pixels: Pixels = client.get_render(height, width, transport_format="png", timeout=_DRAW_TIMEOUT_S)
+    except (RuntimeError, TimeoutError) as error:
+        raise ScreenshotFailed(f"the browser draws nothing: {error}") from None
     if pixels.shape[2] == 3:
         return pixels
     opacity = pixels[:, :, 3:].astype(np.float64) / 255.0
     return np.round(pixels[:, :, :3] * opacity + 255.0 * (1.0 - opacity)).astype(np.uint8)
-
-
-def _until_stable(draw: Callable[[], Pixels]) -> Pixels:
-    """The first picture that hardly differs from the one before, or the last attempt."""
-    last = draw()
-    for _ in range(_MAX_ATTEMPTS):
-        time.sleep(_UNPACK_PERIOD_S)
-        before, last = last, draw()
-        if before.shape == last.shape:
-            difference = np.abs(before.astype(np.int16) - last.astype(np.int16)).max(axis=2)
-            if float((difference > 16).mean()) < _MAX_CHANGED:
-                break
-    return last

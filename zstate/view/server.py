@@ -42,7 +42,7 @@ class ViewServer(Closeable):
     that is needed beyond loopback. Raises InvalidInput if ``host`` or ``port`` cannot be used.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int | None = None, *, title: str = "zstate") -> None:
+    def __init__(self, host: str = "127.0.0.1", port: int | None = None) -> None:
         self.host = host
         self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]
@@ -51,7 +51,7 @@ class ViewServer(Closeable):
         """Set while at least one browser shows the page."""
         try:
             with _opening, _no_output(), self._guarded_serve() as opened:
-                self.server = _Server(host, self.port, title, verbose=False)
+                self.server = _Server(host, self.port, "zstate", verbose=False)
         except BaseException:
             self._socket.close()
             raise
@@ -116,12 +116,11 @@ class ViewServer(Closeable):
     ) -> Response | None:
         denied = self.access.check(request.path, request.headers)
         if denied is not None:
-            response = connection.respond(denied.status, denied.text + "\n")
-        elif is_websocket(request.headers):
+            return connection.respond(denied.status, denied.text + "\n")
+        if is_websocket(request.headers):
             return None
-        else:
-            response = viser_process_request(connection, request)
-            response.headers.update(self.access.headers())
+        response = viser_process_request(connection, request)
+        response.headers.update(self.access.headers())
         return response
 
 
@@ -154,8 +153,6 @@ def _bind(host: str, port: int) -> socket.socket | None:
         raise InvalidInput(f"cannot listen at {host!r}, port {port}: {error}") from None
 
 
-@contextlib.contextmanager
-def _no_output() -> Generator[None]:
+def _no_output() -> contextlib.redirect_stdout[io.StringIO]:
     """Hides what viser prints: addresses that are not the ones to open."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield
+    return contextlib.redirect_stdout(io.StringIO())

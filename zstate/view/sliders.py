@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.clock import Clock
 from zstate.errors import InvalidInput, SecondWriter
 from zstate.model.robot import Joint, RobotModel
@@ -22,14 +22,14 @@ from zstate.net.session import Session
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.rate import check_rate
 from zstate.se3 import quaternion_from_rpy, rpy_from_quaternion
-from zstate.sources.joint_source import JointReading
-from zstate.sources.sine import SineSource
+from zstate.sources.joint_source import JointReading, SineSource
 
 Unit = Literal["rad", "m"]
 Values = NDArray[np.float64]
 
 _REACH_M = 2.0
 """Range of a coordinate without limits, each way."""
+_JOIN_TIMEOUT_S = 1.0
 
 _FLOATING: tuple[tuple[str, Unit, float], ...] = (
     ("x", "m", _REACH_M),
@@ -94,11 +94,10 @@ class SliderMapping:
         return values
 
 
-def _slider_specs(joint: Joint) -> Iterator[SliderSpec]:
-    if joint.type in ("planar", "floating"):
-        for part, unit, reach in _PLANAR if joint.type == "planar" else _FLOATING:
-            yield SliderSpec(f"{joint.name}.{part}", unit, -reach, reach)
-        return
+def _slider_specs(joint: Joint) -> list[SliderSpec]:
+    parts = {"planar": _PLANAR, "floating": _FLOATING}.get(joint.type)
+    if parts is not None:
+        return [SliderSpec(f"{joint.name}.{part}", unit, -reach, reach) for part, unit, reach in parts]
     unit: Unit = "m" if joint.type == "prismatic" else "rad"
     reach = _REACH_M if unit == "m" else math.pi
     lower, upper = joint.limits.lower, joint.limits.upper
@@ -106,10 +105,7 @@ def _slider_specs(joint: Joint) -> Iterator[SliderSpec]:
         lower, upper = -math.inf, math.inf
     if not math.isfinite(lower):
         lower = -reach if not math.isfinite(upper) else upper - 2.0 * reach
-    yield SliderSpec(joint.name, unit, lower, upper if math.isfinite(upper) else lower + 2.0 * reach)
-
-
-_JOIN_TIMEOUT_S = 1.0
+    return [SliderSpec(joint.name, unit, lower, upper if math.isfinite(upper) else lower + 2.0 * reach)]
 
 
 class SliderPublisher(Closeable):
@@ -133,14 +129,15 @@ class SliderPublisher(Closeable):
         self.model = model
         self.robot = robot or model.name
         self.mapping = SliderMapping(model)
+        self.values = self.mapping.values(model.neutral)
+        """The slider values, [rad] or [m], in the order of ``mapping.specs``; replaced when they change."""
         self.conflict = ""
         """Why nothing is published; empty while it is."""
         self._session = session
         self._wires = wires
         self._clock = clock
-        self._rate_hz = check_rate(rate_hz)
+        self._rate_hz = self._kept_hz = check_rate(rate_hz)
         self._lock = fork_safe_lock()
-        self._values = self.mapping.values(model.neutral)
         self._sine: SineSource | None = None
         self._publisher: StatePublisher | None = None
         self._thread: threading.Thread | None = None
@@ -153,13 +150,13 @@ class SliderPublisher(Closeable):
             if self._closed or self._publisher is not None:
                 return self._publisher is not None
             try:
-                self._publisher = self._open_publisher()
+                publisher = self._publisher = self._open_publisher()
             except SecondWriter as error:
                 self.conflict = _conflict_text(error)
                 return False
             self.conflict = ""
             self._thread = threading.Thread(
-                target=self._run, args=(self._publisher,), name="zstate sliders", daemon=True
+                target=self._run, args=(publisher,), name="zstate sliders", daemon=True
             )
             self._thread.start()
             return True
@@ -177,8 +174,9 @@ class SliderPublisher(Closeable):
     def _run(self, publisher: StatePublisher) -> None:
         conflict = ""
         while True:
+            self._kept_hz = self._rate_hz
             try:
-                publisher.run(_RateChecked(self, self._rate_hz), self._rate_hz)
+                publisher.run(self, self._kept_hz)
             except _RateChanged:
                 continue
             except SecondWriter as error:
@@ -206,14 +204,9 @@ class SliderPublisher(Closeable):
         return None if report is None else report.rate_hz
 
     @property
-    def values(self) -> Values:
-        """The slider values, [rad] or [m], in the order of ``mapping.specs``."""
-        return self._values.copy()
-
-    @property
     def positions(self) -> Values:
         """The joint positions, in the order of the model's ``joint_names``."""
-        return self.mapping.positions(self._values)
+        return self.mapping.positions(self.values)
 
     @property
     def mimics(self) -> dict[str, float]:
@@ -241,9 +234,9 @@ class SliderPublisher(Closeable):
                 f"{name!r} takes {spec.lower:.6g} to {spec.upper:.6g} {spec.unit}, not {value:.6g}"
             )
         with self._lock:
-            values = self._values.copy()
+            values = self.values.copy()
             values[names.index(name)] = value
-            self._values, self._sine = values, None
+            self.values, self._sine = values, None
 
     def home(self) -> None:
         """Set all joints to zero, or to the middle of their limits if zero is outside."""
@@ -260,7 +253,7 @@ class SliderPublisher(Closeable):
 
     def _set_all(self, values: Values) -> None:
         with self._lock:
-            self._values, self._sine = values, None
+            self.values, self._sine = values, None
 
     @property
     def sine_enabled(self) -> bool:
@@ -275,11 +268,13 @@ class SliderPublisher(Closeable):
 
     def read(self, stamp: int) -> JointReading:
         """The joint positions to publish at ``stamp`` [ns]."""
+        if self._rate_hz != self._kept_hz:
+            raise _RateChanged
         with self._lock:
             if self._sine is None:
-                return JointReading(self.mapping.positions(self._values))
+                return JointReading(self.positions)
             reading = self._sine.read(stamp)
-            self._values = self.mapping.values(reading.positions)
+            self.values = self.mapping.values(reading.positions)
             return reading
 
     def close(self) -> None:
@@ -294,20 +289,7 @@ class SliderPublisher(Closeable):
 
 
 class _RateChanged(Exception):
-    """The rate was changed."""
-
-
-class _RateChecked:
-    """Joint source that ends with _RateChanged when the rate of the sliders has changed."""
-
-    def __init__(self, sliders: SliderPublisher, rate_hz: float) -> None:
-        self._sliders = sliders
-        self._rate_hz = rate_hz
-
-    def read(self, stamp: int) -> JointReading:
-        if self._sliders.rate_hz != self._rate_hz:
-            raise _RateChanged
-        return self._sliders.read(stamp)
+    """Ends the loop of the publisher, to start it with another rate."""
 
 
 def _conflict_text(error: SecondWriter) -> str:

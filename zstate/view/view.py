@@ -1,4 +1,4 @@
-"""View: the draw loop of the page."""
+"""View: the page's panels and its draw loop."""
 
 from __future__ import annotations
 
@@ -7,18 +7,30 @@ import threading
 import time
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
+import viser
 
 from zstate._util.closeable import Closeable
 from zstate.buffer.snapshot import FramePoses, Poses
 from zstate.clock import SystemClock, wait_interruptible
 from zstate.model.robot import RobotModel
+from zstate.net.graph import GraphMonitor
 from zstate.rate import Rate
 from zstate.view.camera import FIELD_OF_VIEW, Camera, CameraPose, Visibility, fit_camera, robot_visibility
-from zstate.view.data_source import ViewSource
-from zstate.view.panels.layout import PanelLayout
+from zstate.view.data_source import FixedFrame, ViewSource
+from zstate.view.panels import html
+from zstate.view.panels.control_panels import PlotsPanel, SlidersPanel, TimeCursor, TimePanel
+from zstate.view.panels.display_panels import (
+    DisplayPanel,
+    FramesPanel,
+    GraphPanel,
+    RobotsPanel,
+    TransformPanel,
+)
+from zstate.view.panels.panel import Panel, PanelContext
 from zstate.view.scene.scene import Scene
 from zstate.view.server import ViewServer
 from zstate.view.sliders import SliderPublisher
@@ -56,9 +68,9 @@ class View(Closeable):
         self._source = source
         self._page = page
         self._rate_hz = rate_hz
-        self._folders = dict(folders or {})
+        self._folders = folders or {}
         self.scene = Scene(page.server)
-        self._layout = PanelLayout(page.server, source, self.scene, sliders, fixed_frame)
+        self.layout = PanelLayout(page.server, source, self.scene, sliders, fixed_frame)
         self._camera = camera
         self._aspect = aspect
         self._version = -1
@@ -104,6 +116,22 @@ class View(Closeable):
                 if not self._page.connected.is_set():
                     break
 
+    def _try_to_draw(self) -> None:
+        """Draw, or show the error on the page and log it once for each line of code that raises it."""
+        try:
+            self.draw()
+        except Exception as error:  # the next picture may succeed, and the other robots are still moving
+            fault = f"{type(error).__name__}: {error}"
+            self.layout.show_fault(fault)
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{Path(frame.filename).name}, line {frame.lineno}"
+            if where not in self._logged:
+                self._logged.add(where)
+                text = "the view failed to draw a picture (%s, in %s); it continues and tries again"
+                _LOG.warning(text, fault, where)
+        else:
+            self.layout.show_fault("")
+
     def draw(self) -> FramePoses:
         """Draw the newest snapshot, or the one at the stamp selected on the page."""
         snapshot = self._held
@@ -112,10 +140,10 @@ class View(Closeable):
             if self._version != version:
                 self._update_robots()
                 self._version = version
-            snapshot = self._source.snapshot(self._layout.stamp)
+            snapshot = self._source.snapshot(self.layout.stamp)
             if self._hold_requested:
                 self._held, self._fitted_to = snapshot, None
-        fixed = self._layout.fixed_frame(snapshot)
+        fixed = self.layout.fixed.resolve(snapshot.tree)
         with self._page.server.atomic():
             try:
                 if fixed:
@@ -128,48 +156,9 @@ class View(Closeable):
             finally:
                 # Panels mark robots that have become stale since: wrong in a picture of an earlier instant.
                 if self._held is None and time.monotonic() >= self._panels_due_s:
-                    self._layout.update(snapshot)
+                    self.layout.update(snapshot)
                     self._panels_due_s = time.monotonic() + _PANELS_PERIOD_S
         return snapshot
-
-    def hold(self, timeout_s: float) -> bool:
-        """Draw only the current snapshot from now on, with the camera fitted to it.
-
-        Returns when it is drawn completely, or after ``timeout_s``; False if nothing is drawn.
-        """
-        self._hold_requested = True
-        return wait_interruptible(self._hold_complete, timeout_s) or self._held_poses is not None
-
-    def visibility(self) -> tuple[Visibility, ...]:
-        """Which robots are in the held picture, and why others are not."""
-        robots = self._source.robots()
-        if self._held is None or self._held_poses is None or self._camera_pose is None:
-            return tuple(Visibility(robot, False, "no robot has a pose yet") for robot in robots)
-        return tuple(robot_visibility(self._held, self._held_poses, self._camera_pose, self._aspect, robots))
-
-    @property
-    def fault(self) -> str:
-        """Why the last picture could not be drawn; empty if it was drawn."""
-        return self._layout.fault
-
-    def close(self) -> None:
-        """Close the panels. A second call does nothing."""
-        self._layout.close()
-
-    def _try_to_draw(self) -> None:
-        """Draw, or show the error on the page and log it once for each line of code that raises it."""
-        try:
-            self.draw()
-        except Exception as error:  # the next picture may succeed, and the other robots are still moving
-            fault = self._layout.fault = f"{type(error).__name__}: {error}"
-            frame = traceback.extract_tb(error.__traceback__)[-1]
-            where = f"{Path(frame.filename).name}, line {frame.lineno}"
-            if where not in self._logged:
-                self._logged.add(where)
-                text = "the view failed to draw a picture (%s, in %s); it continues and tries again"
-                _LOG.warning(text, fault, where)
-        else:
-            self._layout.fault = ""
 
     def _update_robots(self) -> None:
         models = self._source.models
@@ -184,7 +173,7 @@ class View(Closeable):
 
     def _fit_camera(self, snapshot: FramePoses, fixed: str, poses: Poses) -> None:
         """Fit camera and floor to all robots if robots, fixed frame, poses or meshes have been added."""
-        subject = fixed, tuple(self._drawn), self.scene.layout_version
+        subject = fixed, tuple(self._drawn), self.scene.layout.version
         unknown = int(np.count_nonzero(~snapshot.known))
         has_more = unknown < self._fitted_unknown or (self._fitted_busy and not self.scene.busy)
         if not self._drawn or (subject == self._fitted_to and not has_more):
@@ -203,6 +192,97 @@ class View(Closeable):
         self._floor.width = self._floor.height = 2.0 * pose.reach
         if moves:
             server = self._page.server
-            cameras = [server.initial_camera, *(client.camera for client in server.get_clients().values())]
-            for camera in cameras:
-                camera.position, camera.look_at = pose.position, pose.look_at
+            for one in (server.initial_camera, *(client.camera for client in server.get_clients().values())):
+                one.position, one.look_at = pose.position, pose.look_at
+
+    def hold(self, timeout_s: float) -> bool:
+        """Draw only the current snapshot from now on, with the camera fitted to it.
+
+        Returns when it is drawn completely, or after ``timeout_s``; False if nothing is drawn.
+        """
+        self._hold_requested = True
+        return wait_interruptible(self._hold_complete, timeout_s) or self._held_poses is not None
+
+    def visibility(self) -> tuple[Visibility, ...]:
+        """Which robots are in the held picture, and why others are not."""
+        robots = self._source.robots()
+        if self._held is None or self._held_poses is None or self._camera_pose is None:
+            return tuple(Visibility(robot, False, "no robot has a pose yet") for robot in robots)
+        return tuple(robot_visibility(self._held, self._held_poses, self._camera_pose, self._aspect, robots))
+
+    def close(self) -> None:
+        """Close the panels. A second call does nothing."""
+        self.layout.close()
+
+
+class PanelLayout(Closeable):
+    """Adds the panels to the page of ``server``; ``sliders`` belong to the robots that are moved from it.
+
+    ``fixed_frame`` is selected at first. The drawing thread reads ``stamp`` and ``fixed`` for each picture,
+    and calls ``update`` with the snapshot on display a few times a second. ``fault`` is why the last picture
+    could not be drawn; empty if it was drawn.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        source: ViewSource,
+        scene: Scene,
+        sliders: Sequence[SliderPublisher] = (),
+        fixed_frame: str = "",
+    ) -> None:
+        gui = server.gui
+        self._source = source
+        self.fixed = FixedFrame(fixed_frame)
+        self._resources = ExitStack()
+        self.cursor = TimeCursor(live=source.session is not None)
+        self.fault = ""
+        self._fault_html = gui.add_html("")
+        tabs = gui.add_tab_group()
+        # The display panel is first: a fixed frame selected there applies to the other panels.
+        with tabs.add_tab("View"):
+            self._panels: list[Panel] = [
+                DisplayPanel(gui, scene, self.fixed),
+                RobotsPanel(gui, source, scene),
+            ]
+        with tabs.add_tab("Frames"):
+            self._panels.append(FramesPanel(gui, scene))
+            with gui.add_folder("Between two frames"):
+                self._panels.append(TransformPanel(gui))
+        with tabs.add_tab("Joints"):
+            for publisher in sliders:
+                with gui.add_folder(f"Move {publisher.robot}"):
+                    self._panels.append(SlidersPanel(gui, publisher))
+            with gui.add_folder("Plot"):
+                self._panels.append(PlotsPanel(gui, source))
+        with tabs.add_tab("Time"):
+            self._panels.append(TimePanel(gui, self.cursor))
+        if source.session is not None:
+            with tabs.add_tab("Graph"):
+                monitor = self._resources.enter_context(GraphMonitor(source.session))
+                self._panels.append(GraphPanel(gui, monitor))
+
+    @property
+    def stamp(self) -> int | None:
+        """The stamp to show [ns]; None for the newest samples."""
+        return self.cursor.stamp(self._source.buffer.span())
+
+    def update(self, snapshot: FramePoses) -> None:
+        """Apply the user's input, and show what has changed."""
+        buffer, is_live = self._source.buffer, self.cursor.is_live
+        domain = buffer.domain.name
+        now = buffer.clock.now() if is_live and domain in (None, buffer.clock.domain) else None
+        for panel in self._panels:
+            fixed = self.fixed.resolve(snapshot.tree)
+            panel.update(PanelContext(snapshot, fixed, buffer, is_live, now, domain))
+
+    def show_fault(self, fault: str) -> None:
+        """Show why the last picture could not be drawn; nothing if it was drawn."""
+        if fault != self.fault:
+            self.fault = fault
+            text = f"The last picture could not be drawn; an older one is shown: {fault}"
+            self._fault_html.content = html.paragraph(text, color=html.ALARM) if fault else ""
+
+    def close(self) -> None:
+        """Stop monitoring the graph. A second call does nothing."""
+        self._resources.close()

@@ -13,6 +13,7 @@ from zstate.errors import MessageError
 from zstate.wire.messages import Edges, JointState, from_block, order_digest
 
 Floats = NDArray[np.float64]
+_Indices = NDArray[np.intp]
 
 
 class JointNumbers(NamedTuple):
@@ -21,13 +22,6 @@ class JointNumbers(NamedTuple):
     positions: Floats
     velocities: Floats | None
     efforts: Floats | None
-
-
-class JointColumns(NamedTuple):
-    """The index in a writer's order of each number in the reader's; velocities and efforts share theirs."""
-
-    positions: NDArray[np.intp]
-    velocities: NDArray[np.intp]
 
 
 class JointOrder:
@@ -45,9 +39,8 @@ class JointOrder:
         self.digest = order_digest(tuple(names))
         self._coordinates = tuple(coordinates or names)
         self._slots = np.array(velocity_slots or range(len(self._coordinates)), dtype=np.intp)
-        count = len(self._coordinates)
-        self._plain = JointColumns(np.arange(count), np.arange(len(self._slots)))
-        self._permutations: dict[tuple[str, ...], JointColumns] = {}
+        self._plain = np.arange(len(self._coordinates)), np.arange(len(self._slots))
+        self._permutations: dict[tuple[str, ...], tuple[_Indices, _Indices]] = {}
 
     def is_plain(self, state: JointState) -> bool:
         """Whether ``state`` has only positions, in the reader's order: the usual case."""
@@ -59,16 +52,19 @@ class JointOrder:
         velocities = None if state.velocities is None else from_block(state.velocities)
         efforts = None if state.efforts is None else from_block(state.efforts)
         if state.order != self.digest:
-            order = self.columns(state)
-            positions = positions[order.positions]
-            velocities = None if velocities is None else velocities[order.velocities]
-            efforts = None if efforts is None else efforts[order.velocities]
+            order, rate_order = self.columns(state)
+            positions = positions[order]
+            velocities = None if velocities is None else velocities[rate_order]
+            efforts = None if efforts is None else efforts[rate_order]
         if state.names is not None:
             velocities, efforts = _none_if_nan(velocities), _none_if_nan(efforts)
         return JointNumbers(positions, velocities, efforts)
 
-    def columns(self, state: JointState) -> JointColumns:
-        """The index in ``state`` of each number. Raises MessageError if any is missing."""
+    def columns(self, state: JointState) -> tuple[_Indices, _Indices]:
+        """The index in ``state`` of each position, and of each velocity or effort, of the reader's.
+
+        Raises MessageError if any is missing.
+        """
         if state.order == self.digest:
             return self._plain
         names = state.names
@@ -86,7 +82,7 @@ class JointOrder:
                 )
             # One order per writer is usual; a writer that shuffles must not fill the memory.
             positions = np.array([names.index(name) for name in self._coordinates], dtype=np.intp)
-            found = JointColumns(positions, positions[self._slots])
+            found = positions, positions[self._slots]
             self._permutations = {names: found}
         return found
 

@@ -44,6 +44,9 @@ NAMED_STREAMS: frozenset[Stream] = frozenset({"tf_static", "transforms"})
 READERS = "zstate/@reader/*/*/*"
 """The key expression of the tokens of all readers."""
 
+VERBATIM_CHUNKS = ("@writer", "@clock", "@edge", "@reader")
+"""The chunks of tokens and clocks: ``*`` and ``**`` do not match them (Zenoh: verbatim chunks)."""
+
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""
 
@@ -58,17 +61,13 @@ _STREAMS: dict[str, Stream] = {stream: stream for stream in get_args(Stream)}
 _RESERVED = frozenset("/*$?#")
 
 
-def check_robot(name: str) -> str:
-    """``name`` if it can be one chunk of a key. Raises InvalidInput with the reason otherwise."""
-    return _check_chunk("robot", name)
-
-
 def check_writer(name: str) -> str:
-    """The same for the name under which a writer publishes edges."""
-    return _check_chunk("writer", name)
+    """``check_robot`` for the name under which a writer publishes edges."""
+    return check_robot(name, "writer")
 
 
-def _check_chunk(what: str, name: str) -> str:
+def check_robot(name: str, what: str = "robot") -> str:
+    """``name`` if it can be one chunk of a key. Raises InvalidInput with the reason otherwise."""
     problem = _chunk_problem(name)
     if problem:
         raise InvalidInput(

@@ -10,20 +10,9 @@ from typing import TypeVar
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
+from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import (
-    NAMED_STREAMS,
-    Stream,
-    check_writer,
-    parse_writer_key,
-    reader_key,
-    robot_from_key,
-    stream_expression,
-    stream_key,
-    writer_expression,
-    writer_key,
-)
+from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     LATCHED_BYTES,
     SAMPLE_BYTES,
@@ -39,7 +28,7 @@ from zstate.wire.messages import (
     check_edges,
     check_size,
 )
-from zstate.wire.protocol import EntityId, SerializedSample
+from zstate.wire.protocol import SerializedSample, WriterNode
 
 VERSION = 1
 
@@ -108,10 +97,10 @@ class NativeStreamEncoder:
     can_withdraw = True
 
     def __init__(self, robot: str, writer: WriterId, stream: Stream, name: str) -> None:
-        self.key = stream_key(robot, stream, name)
+        self.key = keys.stream_key(robot, stream, name)
         self.encoding = ENCODINGS[STREAM_TYPES[stream]]
-        identity = Announcement(robot, stream, writer, name if stream in NAMED_STREAMS else "").identity
-        self.token = None if stream == "clock" else writer_key(robot, stream, identity)
+        identity = Announcement(robot, stream, writer, name if stream in keys.NAMED_STREAMS else "").identity
+        self.token = None if stream == "clock" else keys.writer_key(robot, stream, identity)
 
     def encode(self, message: Message) -> bytes:
         return _ENCODER.encode(message)
@@ -127,32 +116,24 @@ class NativeWire:
     shared: frozenset[Stream] = frozenset()
     transforms: Stream = "transforms"
 
-    def node_token(self, robot: str, writer: WriterId, node: EntityId) -> None:
+    def node_token(self, node: WriterNode) -> None:
         return None
 
     def stream_encoder(
-        self,
-        robot: str,
-        writer: WriterId,
-        stream: Stream,
-        *,
-        node: EntityId,
-        number: int,
-        sample_names: SampleLayout,
-        name: str = "",
+        self, node: WriterNode, stream: Stream, number: int, name: str = ""
     ) -> NativeStreamEncoder:
-        return NativeStreamEncoder(robot, writer, stream, name)
+        return NativeStreamEncoder(node.robot, node.writer, stream, name)
 
     def reader_tokens(
         self, robot: str, streams: Sequence[Stream], reader: WriterId, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         identity = replace(reader, session=number()).identity
-        return tuple(reader_key(robot, stream, identity) for stream in streams)
+        return tuple(keys.reader_key(robot, stream, identity) for stream in streams)
 
     def expression(self, robot: str, stream: Stream) -> str:
-        return stream_expression(robot, stream)
+        return keys.stream_expression(robot, stream)
 
-    robot_from_key = staticmethod(robot_from_key)
+    robot_from_key = staticmethod(keys.robot_from_key)
 
     def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         if arrival.size or len(arrival.payload) > _MIN_LIMIT_BYTES:
@@ -163,15 +144,15 @@ class NativeWire:
         return (message,)
 
     def static_writer_name(self, key: str) -> str:
-        robot_from_key(key)
-        return check_writer(key.rpartition("/")[2])
+        keys.robot_from_key(key)
+        return keys.check_writer(key.rpartition("/")[2])
 
     def writers_expression(self, robot: str) -> str:
-        return writer_expression(robot)
+        return keys.writer_expression(robot)
 
     def parse_token(self, token: str, robot: str) -> Announcement | None:
         try:
-            return Announcement.parse(*parse_writer_key(token))
+            return Announcement.parse(*keys.parse_writer_key(token))
         except InvalidInput:
             return None
 

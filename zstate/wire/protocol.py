@@ -27,11 +27,17 @@ class SerializedSample(Struct, frozen=True, gc=False):
     size: int = 0
 
 
-class EntityId(NamedTuple):
-    """Identifies a writer on the network: its Zenoh session, and its number within that session."""
+class WriterNode(NamedTuple):
+    """``writer`` of ``robot`` on the network: its Zenoh session, and its number within that session.
 
+    ``sample_names`` are the names behind the numbers of its samples.
+    """
+
+    robot: str
+    writer: WriterId
     zid: str
     number: int
+    sample_names: SampleLayout = SampleLayout()
 
 
 class StreamEncoder(Protocol):
@@ -75,25 +81,15 @@ class Wire(Protocol):
     transforms: Stream
     """The stream that carries the edges of a ``TransformPublisher``."""
 
-    def node_token(self, robot: str, writer: WriterId, node: EntityId) -> str | None:
-        """The liveliness token of ``writer`` as a node of the ROS graph; None if there is no such graph."""
+    def node_token(self, node: WriterNode) -> str | None:
+        """The liveliness token of a writer as a node of the ROS graph; None if there is no such graph."""
         ...
 
-    def stream_encoder(
-        self,
-        robot: str,
-        writer: WriterId,
-        stream: Stream,
-        *,
-        node: EntityId,
-        number: int,
-        sample_names: SampleLayout,
-        name: str = "",
-    ) -> StreamEncoder:
-        """The encoder of ``stream`` of ``robot`` for ``writer``.
+    def stream_encoder(self, node: WriterNode, stream: Stream, number: int, name: str = "") -> StreamEncoder:
+        """The encoder of ``stream`` for the writer ``node``.
 
-        ``node`` identifies the writer, ``number`` this stream within the session; ``name`` is the one under
-        which the writer publishes edges. Raises InvalidInput for names that cannot be in a key.
+        ``number`` identifies the stream within the session; ``name`` is the one under which the writer
+        publishes edges. Raises InvalidInput for names that cannot be in a key.
         """
         ...
 

@@ -23,7 +23,7 @@ IN_DEBIAN = "import os, sys; os.execv(sys.argv[1], [sys.argv[1], '-u', '-c', *sy
 
 @pytest.fixture(scope="module")
 def roscore(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """The environment in which a master is found."""
+    """The environment variables that lead to a master."""
     environment = ros_environment(tmp_path_factory.mktemp("ros"))
     core = Roscore(environment)
     yield environment
@@ -34,7 +34,7 @@ def roscore(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]
 def namespace(
     roscore: dict[str, str], monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> str:
-    """The name space that processes started from here on have to themselves in the ROS of this file."""
+    """The namespace, one for each test, of processes started in this test."""
     for name, value in roscore.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("ROS_NAMESPACE", f"/{request.node.name}")
@@ -42,7 +42,7 @@ def namespace(
 
 
 def ready(spawn: Spawn, code: str, *arguments: str) -> Child:
-    """A node that runs ``code`` with Debian's Python, once it is ready."""
+    """A ready node that runs ``code`` with Debian's Python."""
     child = spawn(IN_DEBIAN, DEBIAN_PYTHON, textwrap.dedent(code), *arguments)
     assert child.line() == "ready", child.stderr
     return child
@@ -50,25 +50,25 @@ def ready(spawn: Spawn, code: str, *arguments: str) -> Child:
 
 @pytest.fixture
 def peer(namespace: str, spawn: Spawn) -> Callable[..., RosPeer]:
-    """``peer()`` is a publisher node, ``peer("hear")`` also subscribes."""
+    """``peer()`` is a publisher node, ``peer("subscribe")`` also subscribes."""
     return lambda *arguments: RosPeer(ready(spawn, ROS_PEER, *arguments))
 
 
 @pytest.fixture
 def tf2_listener(namespace: str, spawn: Spawn) -> Callable[[], RosPeer]:
-    """``tf2_listener().ask(target, source, stamp, wait_s)`` asks the real tf2_ros."""
+    """``tf2_listener().query(target, source, stamp, wait_s)`` looks up with the real tf2_ros."""
     return lambda: RosPeer(ready(spawn, TF2_LISTENER))
 
 
 @pytest.fixture
 def program(namespace: str, spawn: Spawn) -> Callable[..., Child]:
-    """``program(path, *arguments)`` runs a program of ROS."""
+    """``program(path, *arguments)`` starts a program of ROS."""
     return lambda *command: spawn("import os, sys; os.execv(sys.argv[1], sys.argv[1:])", *command)
 
 
 @pytest.fixture
 def bridge(namespace: str, spawn: Spawn) -> Callable[..., Child]:
-    """``bridge(*arguments)`` is ``zstate ros1 rrbot ...``, running."""
+    """``bridge(*arguments)`` starts ``zstate ros1 rrbot ...`` and waits until it bridges."""
 
     def start(*arguments: str) -> Child:
         child = spawn(BRIDGE, "ros1", "rrbot", *arguments)

@@ -150,7 +150,7 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_does(
     assert carrying.stderr.count("odom") == 1
 
 
-def test_carried_messages_do_not_come_back(bridge: Bridge, peer: Callable[..., RosPeer]):
+def test_carried_messages_are_not_carried_back(bridge: Bridge, peer: Callable[..., RosPeer]):
     listening, talker = peer("subscribe"), peer()
     carrying = bridge("--to-ros", "--from-ros")
     in_zstate: Counter[int] = Counter()
@@ -275,7 +275,7 @@ def test_a_killed_node_ends_the_bridge_with_an_error(namespace: str, spawn: Spaw
     assert "zstate: ROS has ended the node" in carrying.stderr
 
 
-def test_rospy_leaves_the_logging_of_others_alone(namespace: str, spawn: Spawn):
+def test_rospy_does_not_change_other_loggers(namespace: str, spawn: Spawn):
     child = spawn(
         f"""
         import logging, sys

@@ -41,7 +41,7 @@ ROS = RospyModules(None, lambda name: SimpleNamespace(header=header(), name=name
 
 
 @given(st.integers(1, 2**32 * 10**9 - 1))
-def test_a_stamp_goes_to_ros_and_back_to_the_nanosecond(stamp: int):
+def test_stamp_round_trips_through_ros_to_the_nanosecond(stamp: int):
     there = header()
     set_stamp(there, stamp)
     assert there.stamp.nsecs < 10**9
@@ -62,7 +62,7 @@ def test_a_zero_stamp_of_ros_is_none():
 
 
 @given(BARE, st.sampled_from(["", "left_", "tf/"]))
-def test_a_frame_name_comes_back_from_ros(bare: str, prefix: str):
+def test_frame_name_round_trips_through_ros(bare: str, prefix: str):
     names = Ros1FrameNames("rrbot", prefix)
     for frame in (bare, f"rrbot/{bare}"):
         if frame == bare and "/" in bare:
@@ -76,7 +76,7 @@ def test_old_programs_put_a_slash_before_a_frame_name():
     assert Ros1FrameNames("rrbot", "left_").in_zstate("/left_tool", frozenset()) == "tool"
 
 
-def test_a_link_with_a_slash_in_its_name_is_the_robots_own():
+def test_link_with_a_slash_in_its_name_belongs_to_the_robot():
     names = Ros1FrameNames("rrbot")
     assert names.in_zstate("camera/lens", frozenset({"camera/lens"})) == "rrbot/camera/lens"
     assert names.in_zstate("fleet/map", frozenset({"camera/lens"})) == "fleet/map"

@@ -52,7 +52,7 @@ def test_other_user_cannot_write_the_robot_and_the_error_names_the_reason(router
     assert received == []
 
 
-def test_the_names_are_checked():
+def test_invalid_names_are_refused():
     assert "cannot be the name of an identity" in failure("acl", "--robot", "a/b")
     assert "give at least one of --robot NAME" in failure("acl", code=2)
 
@@ -64,7 +64,7 @@ def test_a_placer_writes_static_edges_under_its_own_name():
     assert '"zstate/site/**"' not in printed
 
 
-def test_a_file_without_access_control_is_not_taken_for_one(tmp_path: Path):
+def test_a_file_without_access_control_is_refused(tmp_path: Path):
     file = tmp_path / "acl.json5"
     file.write_text("{}")
     assert "has no access_control" in failure("router", "--acl", str(file))

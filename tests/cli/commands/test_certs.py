@@ -32,7 +32,7 @@ def test_certs_prints_its_files_and_a_warning(tmp_path: Path):
     assert "In production keep it off every robot" in done.stderr.decode()
 
 
-def test_it_adds_and_never_overwrites(tmp_path: Path):
+def test_certs_adds_identities_and_never_overwrites(tmp_path: Path):
     assert zstate("certs", str(tmp_path), "--identity", "router").returncode == 0
     assert zstate("certs", str(tmp_path), "--identity", "r1").returncode == 0
     assert "nothing is overwritten" in failure("certs", str(tmp_path), "--identity", "r1")
@@ -40,7 +40,7 @@ def test_it_adds_and_never_overwrites(tmp_path: Path):
     assert "--days" in failure("certs", str(tmp_path), "--identity", "r2", "--days", "0", code=2)
 
 
-def test_commands_with_identities_meet_at_a_router_that_asks_for_them(
+def test_commands_with_identities_connect_through_a_router_that_requires_them(
     spawn: Spawn, tmp_path: Path, free_port: int
 ):
     folder = str(tmp_path)

@@ -37,7 +37,7 @@ def test_a_sound_model_is_drawn_as_a_tree():
     assert len(lines) == 7
 
 
-def test_each_error_stands_with_its_line():
+def test_each_error_has_its_line():
     ended = zstate("check", "-", stdin=WITHOUT_LIMIT.encode())
     headline, finding = ended.stdout.decode().splitlines()
     assert ended.returncode == 1
@@ -74,7 +74,7 @@ def test_a_name_of_the_catalog_is_checked_too():
     assert zstate("check", "rrbot").stdout.decode().startswith("rrbot: robot 'rrbot'")
 
 
-def test_a_name_that_nothing_has_is_met_with_near_misses():
+def test_unknown_name_is_reported_with_near_misses():
     assert "rrbot" in failure("check", "rrbt")
 
 
@@ -100,14 +100,14 @@ def test_garbage_fails_without_a_traceback(garbage: bytes):
     assert b"Traceback" not in ended.stderr
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path):
+def test_missing_file_is_named(tmp_path: Path):
     missing = str(tmp_path / "arm.urdf")
     ended = zstate("check", missing)
     assert ended.returncode == 1
     assert "no such file" in ended.stdout.decode()
 
 
-def test_the_deepest_chain_that_is_allowed_is_drawn():
+def test_the_deepest_allowed_chain_is_drawn():
     ended = zstate("check", "-", stdin=deep(500).encode())
     assert ended.returncode == 0
     assert len(ended.stdout.decode().splitlines()) == 502

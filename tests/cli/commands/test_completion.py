@@ -46,7 +46,7 @@ def test_completion_offers_models_by_name_and_files():
     assert offered("check", "./models/rr") == ["file,./models/rr"]
 
 
-def test_robots_are_offered_that_are_announced():
+def test_announced_robots_are_offered():
     with published_robot("left"), published_robot("right"):
         assert offered("tree", "le") == ["plain,left"]
         assert offered("snapshot", "save", "a.toml", "r") == ["plain,right"]

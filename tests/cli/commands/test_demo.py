@@ -86,7 +86,7 @@ def test_a_publisher_does_not_outlive_a_demo_that_is_killed(spawn: Spawn):
     until(lambda: is_gone(publisher))
 
 
-def test_it_is_alone_with_its_publisher_wherever_the_user_is(monkeypatch: pytest.MonkeyPatch):
+def test_demo_is_isolated_with_its_publisher_in_any_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZENOH_CONFIG", "/nowhere.json5")
     monkeypatch.setenv("ZSTATE_MODE", "client")
     assert zstate("demo", RRBOT, "--seconds", "0.5").returncode == 0

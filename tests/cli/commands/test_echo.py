@@ -106,7 +106,7 @@ def test_by_accepts_only_larger_differences():
 
 
 @pytest.mark.parametrize("amount", ["-1", "nan"])
-def test_an_amount_that_is_none_is_wrong_usage(amount: str):
+def test_invalid_amount_is_wrong_usage(amount: str):
     assert "an amount is finite and at least 0" in failure(
         "echo", "rrbot", "--changed", "--by", amount, code=2
     )
@@ -130,7 +130,7 @@ def test_a_floating_joint_has_its_seven_numbers_together(tmp_path: Path):
     assert document["velocities"] == {"flight": list(rates), "swing": 0.7}
 
 
-def test_without_a_description_the_numbers_come_without_names():
+def test_numbers_without_a_description_have_no_names():
     with published_robot(streams=("joint_states",)):
         ended = zstate("echo", "rrbot", "--once", "--json")
     assert json.loads(ended.stdout)["positions"] == [SHOULDER, ELBOW]
@@ -191,7 +191,7 @@ def test_a_name_that_no_robot_can_have_is_refused():
     assert "'a/b'" in failure("echo", "a/b")
 
 
-def test_the_robot_may_be_left_out_while_there_is_only_one():
+def test_robot_may_be_omitted_if_there_is_only_one():
     with published_robot():
         assert b"elbow" in zstate("echo", "--once").stdout
         assert zstate("hz", "--once").stdout.startswith(b"average rate: ")

@@ -66,7 +66,7 @@ def test_writers_and_readers_of_a_robot_are_seen_with_rates():
 
 
 @pytest.mark.processes
-def test_a_stream_that_is_read_and_not_written_stands_out(spawn: Spawn):
+def test_stream_with_readers_but_no_writer_is_marked(spawn: Spawn):
     started(spawn, "publish", RRBOT).line()
     with connect() as session:
         until(lambda: discover(session))

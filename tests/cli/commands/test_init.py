@@ -20,7 +20,7 @@ def test_up_runs_the_file_that_init_writes(spawn: Spawn, tmp_path: Path):
     interrupted(child)
 
 
-def test_every_example_in_it_counts_once_its_sign_is_taken_away(tmp_path: Path):
+def test_every_example_is_valid_once_uncommented(tmp_path: Path):
     file = tmp_path / "cell.toml"
     zstate("init", "rrbot", "-o", str(file))
     file.write_text(re.sub(r"^#(?! )", "", file.read_text(), flags=re.MULTILINE))
@@ -37,7 +37,7 @@ def test_every_example_in_it_counts_once_its_sign_is_taken_away(tmp_path: Path):
     ], shown.stderr
 
 
-def test_the_model_is_found_from_where_the_file_is(tmp_path: Path):
+def test_the_model_path_is_relative_to_the_file(tmp_path: Path):
     (tmp_path / "urdf").mkdir()
     shutil.copy(RRBOT, tmp_path / "urdf" / "my arm.urdf")
     file = tmp_path / "cell.toml"

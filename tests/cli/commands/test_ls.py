@@ -18,7 +18,7 @@ from zstate.wire.registry import get_wire
 pytestmark = pytest.mark.processes
 
 
-def test_each_stream_stands_with_its_writer():
+def test_each_stream_is_listed_with_its_writer():
     with published_robot():
         robot, *streams = zstate("ls").stdout.decode().splitlines()
     assert robot == "rrbot"
@@ -36,7 +36,7 @@ def test_json_names_robots_and_writers():
     assert (writer["stream"], writer["pid"]) == ("joint_states", os.getpid())
 
 
-def test_static_edges_stand_with_the_name_under_which_they_are_written():
+def test_static_edges_are_listed_with_the_name_of_their_writer():
     with connect() as session, StaticPublisher(session, "arm", "mount"):
         lines = zstate("ls").stdout.decode().splitlines()
         (robot,) = json.loads(zstate("ls", "--json").stdout)
@@ -52,7 +52,7 @@ def test_empty_network_is_no_error():
     assert json.loads(zstate("ls", "--json").stdout) == []
 
 
-def test_an_endpoint_that_cannot_be_is_named():
+def test_invalid_endpoint_is_named():
     assert "nonsense" in failure("ls", "--connect", "nonsense")
 
 
@@ -77,7 +77,7 @@ def test_watch_prints_the_list_again_after_each_change(spawn: Spawn):
     interrupted(command)
 
 
-def test_watched_as_json_it_is_a_document_a_second(spawn: Spawn):
+def test_watch_as_json_prints_a_document_a_second(spawn: Spawn):
     with published_robot():
         command = started(spawn, "ls", "--watch", "--json")
         documents = [json.loads(command.line()) for _ in range(2)]
@@ -85,7 +85,7 @@ def test_watched_as_json_it_is_a_document_a_second(spawn: Spawn):
     interrupted(command)
 
 
-def test_a_narrow_terminal_has_less_of_when_and_of_age():
+def test_narrow_terminal_abbreviates_start_times_and_ages():
     writer = WriterId("driver", "jetson", 412, 0, 7)
     robots = (RobotInfo("arm", (("joint_states", writer),)),)
     with connect() as session, TopicStatistics(session, get_wire("native")) as statistics:

@@ -9,7 +9,7 @@ from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, connect, load_model
 from zstate.buffer.frame_tree import FrameInfo
-from zstate.cli.monitor import EdgeMeasure, EdgeRow, EdgeStatistics, overview_text, path_text
+from zstate.cli.edge_statistics import EdgeMeasure, EdgeRow, EdgeStatistics, overview_text, path_text
 from zstate.clock import ClockOffset, ManualClock
 from zstate.net.streams import StreamPublisher
 from zstate.wire.messages import JointState, order_digest, to_block

@@ -36,7 +36,7 @@ def test_publish_follows_joint_states_and_writes_the_rest(spawn: Spawn):
     assert streams_of("rrbot") == DERIVED
 
 
-def test_with_a_source_of_its_own_publish_writes_joint_states_too(spawn: Spawn):
+def test_publish_with_its_own_source_writes_joint_states_too(spawn: Spawn):
     started(spawn, "publish", RRBOT, "--source", "sine").line()
     assert streams_of("rrbot") == DERIVED | {"joint_states"}
 
@@ -107,7 +107,7 @@ def test_publish_at_a_rate_reports_the_achieved_rate():
     assert "; commanded 50 Hz, achieved " in output.splitlines()[-1]
 
 
-def test_joint_states_that_never_come_are_a_failure_with_a_hint():
+def test_missing_joint_states_are_a_failure_with_a_hint():
     message = failure("publish", RRBOT, "--seconds", "0.3")
     assert "waiting for zstate/rrbot/joint_states" in message
     assert "received nothing on zstate/rrbot/joint_states in 0.3 s; `zstate ls`" in message
@@ -132,11 +132,11 @@ def test_unknown_wire_error_lists_known_wires():
     assert "'native'" in message
 
 
-def test_a_recording_is_published_as_if_it_were_now(spawn: Spawn, tmp_path: Path):
-    with RecordingBuilder(tmp_path / "run.mcap", "arm") as tale:
-        tale.describe("arm")
+def test_a_recording_is_published_with_present_stamps(spawn: Spawn, tmp_path: Path):
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(100):
-            tale.joints("arm", START + n * 10 * MS, swing_positions(n))
+            builder.joints("arm", START + n * 10 * MS, swing_positions(n))
     with connect() as session, TransformListener(session, "rrbot") as listener:
         before = time.time_ns()
         child = started(spawn, "publish", RRBOT, "--source", str(tmp_path / "run.mcap"), "--rate", "200")
@@ -148,7 +148,7 @@ def test_a_recording_is_published_as_if_it_were_now(spawn: Spawn, tmp_path: Path
         assert child.wait() == 0
 
 
-def test_a_source_that_is_no_recording_is_wrong_usage():
+def test_source_file_that_is_not_a_recording_is_wrong_usage():
     assert "neither 'joints' nor 'sine' nor a recording" in failure(
         "publish", RRBOT, "--source", "nope.mcap", code=2
     )

@@ -101,7 +101,7 @@ def test_ros_robot_is_recorded_over_its_wire(tmp_path: Path):
     assert "no wire 'nonsense'" in failure("record", "x", "--wire", "nonsense", code=2)
 
 
-def test_limits_and_names_that_cannot_be_are_refused(tmp_path: Path):
+def test_invalid_limits_and_names_are_refused(tmp_path: Path):
     path = str(tmp_path / "run.mcap")
     for option in ("--duration", "--split-size", "--split-seconds"):
         for value in ("0", "-1", "nan", "inf"):

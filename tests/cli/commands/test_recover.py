@@ -33,7 +33,7 @@ def test_recover_reports_savings_and_losses_and_keeps_the_original(cut: Path):
     assert cut.read_bytes() == before
 
 
-def test_a_target_may_be_named_and_one_that_exists_is_kept(cut: Path, tmp_path: Path):
+def test_target_may_be_named_and_an_existing_file_is_kept(cut: Path, tmp_path: Path):
     target = tmp_path / "saved.mcap"
     assert zstate("recover", str(cut), str(target)).returncode == 0
     before = target.read_bytes()
@@ -50,7 +50,7 @@ def test_complete_file_is_copied_and_reported_as_complete(tmp_path: Path):
     assert "was complete: nothing to recover" in output
 
 
-def test_a_file_that_lacks_its_end_only_has_lost_nothing(tmp_path: Path):
+def test_file_without_its_end_has_lost_nothing(tmp_path: Path):
     path = tmp_path / "run.mcap"
     write_run(path, joint_states(10), flush_every=10)
     path.write_bytes(path.read_bytes()[:-8])

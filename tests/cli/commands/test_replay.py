@@ -15,10 +15,10 @@ pytestmark = pytest.mark.processes
 @pytest.fixture
 def file(tmp_path: Path) -> str:
     """Half a second of an arm."""
-    with RecordingBuilder(tmp_path / "run.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(51):
-            tale.joints("arm", START + n * 10 * MS, swing_positions(n / 50))
+            builder.joints("arm", START + n * 10 * MS, swing_positions(n / 50))
     return str(tmp_path / "run.mcap")
 
 

@@ -13,7 +13,7 @@ from zstate.wire.ros2.types import STRING, TF_MESSAGE
 pytestmark = pytest.mark.processes
 
 
-def test_each_topic_stands_with_its_publishers_and_their_qos(ros_router: str):
+def test_each_topic_is_listed_with_its_publishers_and_their_qos(ros_router: str):
     with published_robot(wire="ros2:node=driver", router=ros_router):
         lines = zstate("ls").stdout.decode().splitlines()
     assert lines[:2] == ["1 node in domain 0", "  /driver"]
@@ -34,7 +34,7 @@ def test_subscribers_and_nodes_of_others_are_listed_too(ros_router: str):
     with connect(mode="client", endpoints=ros_router) as session:
         node = NodeToken(0, session.zid, 0, "/", "/cell", "rviz")
         ends = [
-            EndpointToken(0, session.zid, 0, 1, "MS", "/", "/cell", "rviz", topic, kind.dds, kind.hash, qos)
+            EndpointToken(node, 1, "MS", topic, kind.dds, kind.hash, qos)
             for topic, kind in (("/tf", TF_MESSAGE), ("/chatter", STRING))
         ]
         liveliness = session.zenoh.liveliness()
@@ -50,7 +50,7 @@ def test_subscribers_and_nodes_of_others_are_listed_too(ros_router: str):
     assert (subscriber["reliability"], subscriber["history"]) == ("best_effort", "keep_all")
 
 
-def test_robots_in_namespaces_come_with_how_to_call_for_them(ros_router: str):
+def test_robots_in_namespaces_are_listed_with_the_option_that_selects_them(ros_router: str):
     with published_robot("r1", wire="ros2:namespace=*,hash=humble", router=ros_router):
         ended = zstate("ls")
         called = zstate("ls", "--wire", "ros2:namespace=r1")

@@ -132,7 +132,9 @@ def test_a_file_is_the_whole_configuration(tmp_path):
         assert "exclude each other" in message
 
 
-def test_peers_are_not_introduced_past_its_access_control(spawn: Spawn, free_port: int, tmp_path: Path):
+def test_router_with_access_control_does_not_connect_peers_to_each_other(
+    spawn: Spawn, free_port: int, tmp_path: Path
+):
     """Over a direct link a robot could write another robot's keys."""
     pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
     certs, acl, endpoint = str(tmp_path / "pki"), tmp_path / "acl.json5", f"tls/127.0.0.1:{free_port}"

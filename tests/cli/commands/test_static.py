@@ -8,14 +8,14 @@ from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect
 from zstate.cli.frame_checks import unknown_target_warnings
-from zstate.cli.up.schema import StaticSection
+from zstate.cli.up.cell import StaticSection
 
 pytestmark = pytest.mark.processes
 
 POSE = ("--xyz", "0.1", "0", "-0.2", "--rpy-deg", "0", "0", "90")
 
 
-def test_an_edge_is_there_until_ctrl_c_and_withdrawn_then(spawn: Spawn):
+def test_edge_is_published_until_ctrl_c_and_then_withdrawn(spawn: Spawn):
     with published_robot(), connect() as session, TransformListener(session, "rrbot") as listener:
         child = started(spawn, "static", "lower", "flange", *POSE)
         sentence = child.line()
@@ -63,7 +63,7 @@ def test_a_file_places_all_its_edges(spawn: Spawn, tmp_path: Path):
     assert lens.translation.tolist() == [1.0, 0.0, 2.0]
 
 
-def test_with_a_robot_that_is_named_the_edge_is_that_robots(spawn: Spawn):
+def test_edge_belongs_to_the_selected_robot(spawn: Spawn):
     with published_robot(), connect() as session, TransformListener(session, placers=["site"]) as listener:
         child = started(spawn, "static", "site/map", "rrbot/world", "--xyz", "1", "0", "0", "--robot", "site")
         assert "(robot 'site'" in child.line()
@@ -74,12 +74,12 @@ def test_with_a_robot_that_is_named_the_edge_is_that_robots(spawn: Spawn):
         assert "would close the loop" in failure("static", *edge)
 
 
-def test_without_a_robot_to_belong_to_it_asks_which():
+def test_edge_without_a_known_robot_is_refused_with_the_robot_option():
     message = failure("static", "a", "b", *POSE)
     assert "--robot NAME (no robot is announced" in message
 
 
-def test_with_two_robots_it_asks_which_and_names_them():
+def test_edge_with_two_candidate_robots_is_refused_with_their_names():
     with published_robot("left"), published_robot("right"):
         message = failure("static", "lower", "flange", *POSE)
     assert "--robot NAME (announced: 'left', 'right')" in message
@@ -93,7 +93,7 @@ def test_invalid_pose_error_names_the_reason():
     assert "itself" in failure("static", "r/a", "r/a", *POSE)
 
 
-def test_a_rotation_left_out_is_none_and_so_is_a_translation(spawn: Spawn):
+def test_omitted_rotation_or_translation_is_zero(spawn: Spawn):
     placed, turned = "r/a", "r/b"
     sentence = started(spawn, "static", "r/base", placed, "--xyz", "1", "2", "3").line()
     assert "xyz [1, 2, 3] m, rpy [0, 0, 0] deg" in sentence
@@ -122,7 +122,7 @@ def test_edge_of_a_file_is_published_on_each_of_its_wires(spawn: Spawn, ros_rout
                 assert listener.buffer.wait("tool", "camera", timeout_s=10.0).translation[2] == 2.5
 
 
-def test_a_target_that_is_nearly_a_frame_of_the_robot_is_warned_about(spawn: Spawn):
+def test_target_similar_to_a_frame_of_the_robot_gets_a_warning(spawn: Spawn):
     with published_robot():
         child = started(spawn, "static", "lowr", "flange", *POSE)
         child.line()
@@ -131,7 +131,7 @@ def test_a_target_that_is_nearly_a_frame_of_the_robot_is_warned_about(spawn: Spa
     assert "'rrbot' has no frame 'lowr'; did you mean 'lower'" in child.stderr
 
 
-def test_a_new_target_above_the_robot_leads_to_the_frame_that_robots_share(spawn: Spawn):
+def test_new_target_above_the_robot_is_advised_to_be_a_shared_frame(spawn: Spawn):
     with published_robot():
         child = started(spawn, "static", "map", "world", *POSE)
         child.line()

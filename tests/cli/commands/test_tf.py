@@ -20,7 +20,7 @@ BASE_FROM_LOWER = (0.7 * math.sin(SHOULDER), 0.1 + 0.07, 1.05 + 0.7 * math.cos(S
 PITCH = SHOULDER + ELBOW
 
 
-def test_it_looks_as_tf2_echo_does():
+def test_output_has_the_format_of_tf2_echo():
     with published_robot():
         lines = zstate("tf", "base", "lower", "--once").stdout.decode().splitlines()
     c, s = math.cos(PITCH), math.sin(PITCH)
@@ -66,7 +66,7 @@ def test_twist_of_a_static_edge_is_zero():
     ]
 
 
-def test_the_precision_is_that_of_every_number():
+def test_precision_applies_to_every_number():
     lines = transform_text(Transform("a", "b", (1 / 3, 0.0, -2.0), (0.0, 0.0, 0.0, 1.0), 5), 5).splitlines()
     assert lines[1] == "- Translation: [0.33333, 0.00000, -2.00000]"
     assert lines[6] == "  1.00000  0.00000  0.00000  0.33333"
@@ -89,7 +89,7 @@ def test_json_is_one_object_for_a_program():
     assert 0.0 <= answer["age_s"] < 10.0
 
 
-def test_fixed_frames_answer_although_nothing_moves():
+def test_fixed_frames_are_found_without_moving_joints():
     with connect() as session, StaticPublisher(session, "cell") as statics:
         statics.set(Transform("floor", "table", (0.0, 0.0, 0.8), (0.0, 0.0, 0.0, 1.0)))
         lines = zstate("tf", "floor", "table", "--once").stdout.decode().splitlines()
@@ -125,14 +125,14 @@ def test_once_gives_up_with_the_reason():
     assert "zstate: gave up after 1 s: the frame 'lowr' is unknown; did you mean 'lower'" in message
 
 
-def test_a_robot_that_is_not_there_is_met_with_those_that_are():
+def test_missing_robot_is_reported_with_the_announced_ones():
     with published_robot():
         message = failure("tf", "base", "lower", "--once", "--timeout", "1", "--robot", "rrbt")
     assert "'rrbt'" in message
     assert "did you mean 'rrbot'?" in message
 
 
-def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
+def test_future_instant_is_waited_for_and_past_one_is_refused():
     with published_robot():
         soon = time.time_ns() + 6_000_000_000  # a busy machine takes its time to start a command
         as_printed = f"{soon // 10**9}.{soon % 10**9:09d}"
@@ -163,7 +163,7 @@ def test_invalid_stamp_is_wrong_usage(stamp: str):
 
 
 @pytest.mark.parametrize(("option", "value"), [("--rate", "0"), ("--rate", "nan"), ("--timeout", "-1")])
-def test_numbers_that_cannot_be_are_wrong_usage(option: str, value: str):
+def test_invalid_numbers_are_wrong_usage(option: str, value: str):
     assert option in failure("tf", "a", "b", option, value, code=2)
 
 

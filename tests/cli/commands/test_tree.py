@@ -45,7 +45,7 @@ def test_guides_show_parents_and_children():
     assert lines[7].startswith("            └── tool ")
 
 
-def test_static_edges_of_others_stand_in_the_tree():
+def test_static_edges_of_other_writers_are_in_the_tree():
     with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
         statics.set(Transform("tool", "gauge", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
         gauge = next(line for line in drawn() if "gauge" in line)
@@ -61,7 +61,7 @@ def test_json_has_every_frame():
     assert frames["rrbot/world"]["parent"] is None
 
 
-def test_dot_and_mermaid_have_an_edge_for_each_frame_but_the_root():
+def test_dot_and_mermaid_have_an_edge_for_each_frame_except_the_root():
     with published_robot():
         dot, mermaid = drawn("--dot"), drawn("--mermaid")
     assert dot[0] == "digraph frames {"
@@ -83,7 +83,7 @@ def test_the_picture_is_svg_with_every_frame_and_writer():
     assert sum(text.startswith("joint · ") and "Hz" in text for text in texts) == 2
 
 
-def test_a_robot_that_is_not_there_is_an_error_that_lists_the_others():
+def test_missing_robot_error_lists_the_others():
     with published_robot():
         message = failure("tree", "rrbt")
     assert "did you mean 'rrbot'?" in message

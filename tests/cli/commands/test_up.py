@@ -68,7 +68,7 @@ def test_robots_and_statics_of_one_file_run_until_ctrl_c(up):
     interrupted(child)
 
 
-def test_a_program_of_plain_python_comes_to_the_router_of_the_file(up, free_port: int):
+def test_plain_python_program_connects_to_the_router_of_the_file(up, free_port: int):
     program = "\n".join(
         [
             "import zstate",
@@ -102,7 +102,7 @@ def test_a_loop_starts_a_robot_for_each_name_with_its_own_static_edges(up):
     interrupted(child)
 
 
-def test_with_a_router_everything_meets_at_it(up, free_port: int):
+def test_all_parts_connect_to_the_router_of_the_file(up, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = up(f'[router]\nlisten = ["{endpoint}"]\n' + robot())
     lines_until(child, "listens at", "publishing 'rrbot'")
@@ -111,7 +111,7 @@ def test_with_a_router_everything_meets_at_it(up, free_port: int):
     interrupted(child)
 
 
-def test_certificates_of_the_file_encrypt_what_meets_at_its_router(up, free_port: int, tmp_path: Path):
+def test_certificates_of_the_file_encrypt_connections_to_its_router(up, free_port: int, tmp_path: Path):
     assert (
         zstate("certs", str(tmp_path / "fleet"), "--identity", "router", "--identity", "rrbot").returncode
         == 0
@@ -137,7 +137,7 @@ def test_a_part_that_dies_ends_all_with_its_last_error(up):
     assert not is_alive(pids["one"])
 
 
-def test_a_part_that_may_starts_again_and_the_others_live_on(up):
+def test_part_with_restarts_is_restarted_and_the_others_continue(up):
     child = up(
         table("program", name="shell", run=["sh", "-c", "echo at $$; exec sleep 60"], restart="on-failure")
     )
@@ -163,7 +163,7 @@ def test_error_of_several_lines_is_reported_in_full(up):
     assert "'driver' ended with exit code 3: Bad: a file line 3  it has no end\n" in child.stderr
 
 
-def test_a_program_starts_when_what_it_is_after_is_ready(up):
+def test_program_starts_when_its_dependency_is_ready(up):
     child = up(
         table("program", name="late", run=["echo", "now"], after=["slow", "rrbot"])
         + table(
@@ -180,7 +180,7 @@ def test_a_program_starts_when_what_it_is_after_is_ready(up):
     interrupted(child)
 
 
-def test_all_is_well_when_every_part_has_done_its_work(up):
+def test_up_succeeds_when_every_part_has_finished(up):
     child = up(table("program", run=["sh", "-c", "exit 0"]) + table("program", run="zstate check rrbot"))
     assert child.wait() == 0
 
@@ -198,14 +198,14 @@ def test_processes_end_before_the_ones_they_need(up):
     assert [line.split("| ")[1] for line in (child.line(), child.line())] == ["top ends", "base ends"]
 
 
-def test_programs_end_with_it_however_it_ends(up):
+def test_programs_end_with_up_however_it_ends(up):
     child = up(table("program", run=["sh", "-c", "echo at $$; exec sleep 60"]))
     pid = printed_pid(child, "at")
     child.kill()
     until(lambda: not is_alive(pid))
 
 
-def test_what_a_program_left_behind_and_what_ignores_signals_ends_when_it_is_killed(up):
+def test_leftover_children_and_programs_that_ignore_signals_are_killed(up):
     """Else a second driver would come to the same arm when it is started again."""
     deaf = "trap '' INT TERM; sleep 60 & echo at $!; echo at $$; sleep 60"
     child = up(table("program", run=["sh", "-c", deaf]))

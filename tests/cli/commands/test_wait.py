@@ -32,7 +32,7 @@ def await_text(child: Child, text: str) -> None:
     until(lambda: text in child.stderr)
 
 
-def test_a_robot_that_is_there_is_not_waited_for():
+def test_available_robot_is_ready_at_once():
     with published_robot():
         ended = zstate("wait", "robot", "rrbot")
     assert (ended.returncode, ended.stdout.decode()) == (0, "ready: 'rrbot' (7 frames)\n")
@@ -50,7 +50,7 @@ def test_a_robot_is_ready_when_it_moves_and_not_before(spawn: Spawn):
             assert child.wait() == 0
 
 
-def test_every_robot_that_is_named_has_to_be_there():
+def test_every_named_robot_is_waited_for():
     with published_robot("left"):
         outcome = waited("robot", "left", "right", "--timeout", "1", code=1)
     assert outcome["ready"] is False
@@ -85,7 +85,7 @@ def test_a_router_may_come_late(spawn: Spawn, free_port: int):
     assert child.wait() == 0
 
 
-def test_a_robot_behind_a_router_that_comes_late_is_waited_for_as_well(spawn: Spawn, free_port: int):
+def test_robot_behind_a_late_router_is_waited_for(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = started(spawn, "wait", "robot", "rrbot", "--connect", endpoint)
     started(spawn, "router", "--listen", endpoint).line()
@@ -93,7 +93,7 @@ def test_a_robot_behind_a_router_that_comes_late_is_waited_for_as_well(spawn: Sp
         assert child.line() == "ready: 'rrbot' (7 frames)"
 
 
-def test_a_router_that_never_comes_ends_the_wait_in_time(free_port: int):
+def test_missing_router_ends_the_wait_in_time(free_port: int):
     began = time.monotonic()
     outcome = waited("router", f"tcp/127.0.0.1:{free_port}", "--timeout", "1", code=1)
     assert "nothing answers" in str(outcome["reason"])

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from helpers.cli_runner import RRBOT, published_robot, zstate
 
-from zstate.cli.doctor.diagnosis import effective_network, with_same_options
+from zstate.cli.doctor.diagnosis import with_same_options
 from zstate.cli.session import SessionOptions
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import Stream
@@ -130,9 +130,9 @@ def test_without_nodes_the_domain_is_reported(ros_router: str):
 
 def test_ros_wire_without_options_joins_the_router_of_the_host(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ZENOH_CONFIG", raising=False)
-    assert effective_network(SessionOptions(), "ros2") == SessionOptions("client", (ROUTER_ENDPOINT,))
-    assert effective_network(SessionOptions(), "native") == SessionOptions()
-    assert effective_network(SessionOptions("lan"), "ros2") == SessionOptions("lan")
+    assert SessionOptions().for_wires(("ros2",)) == SessionOptions("client", (ROUTER_ENDPOINT,))
+    assert SessionOptions().for_wires(("native",)) == SessionOptions()
+    assert SessionOptions("lan").for_wires(("ros2",)) == SessionOptions("lan")
 
 
 def test_next_command_has_the_endpoints_and_wire_of_doctor():

@@ -63,7 +63,7 @@ def test_a_command_prints_foreign_names_without_acting_on_them(stranger: None, c
     assert not any(line.startswith("ok       robots        all is well") for line in printed.splitlines())
 
 
-def test_escapes_are_shown_as_text_and_our_own_colours_stay_where_there_are_any():
+def test_escapes_are_shown_as_text_and_own_colours_are_kept():
     assert without_controls("plain \t text\n") == "plain \t text\n"
     assert without_controls("\x1b[31mred\x1b[0m") == r"\x1b[31mred\x1b[0m"
     assert without_controls("\x1b[31mred\x1b[0m\x1b[2J", colors=True) == "\x1b[31mred\x1b[0m" + r"\x1b[2J"

@@ -46,7 +46,7 @@ def test_a_failure_is_a_json_line_with_time_level_event_and_text():
     assert "no robot is called 'no_such_robot'" in str(entry["text"])
 
 
-def test_the_format_is_also_read_from_the_environment_and_the_option_goes_before(
+def test_format_is_read_from_the_environment_and_the_option_precedes_it(
     monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setenv("ZSTATE_LOG_FORMAT", "json")

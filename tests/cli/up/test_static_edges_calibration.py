@@ -55,7 +55,7 @@ def test_calibration_has_the_pose_of_the_camera(tmp_path: Path, text: str, targe
     assert edge.pose7 == pytest.approx((0.1, 0.2, -0.3, *TURN_ABOUT_Z))
 
 
-def test_json_is_read_as_well_and_may_hold_several(tmp_path: Path):
+def test_json_is_read_as_well_and_may_contain_several(tmp_path: Path):
     edges = read_calibration(file_of(tmp_path, f"[{OURS}, {OURS}]", "eyes.json"))
     assert len(edges) == 2
 
@@ -67,7 +67,7 @@ def test_frames_can_be_renamed(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "holds no transform"),
         ("just words", "holds no transform"),
@@ -81,10 +81,10 @@ def test_frames_can_be_renamed(tmp_path: Path):
         ("target: a\nsource: b\nxyz: [1, 2]\n", "takes a translation x y z"),
     ],
 )
-def test_a_file_without_one_is_refused_with_what_it_lacks(tmp_path: Path, text: str, told: str):
+def test_a_file_without_one_is_refused_with_the_missing_key(tmp_path: Path, text: str, message: str):
     with pytest.raises(ConfigError, match=r"eye\.yaml") as refusal:
         read_calibration(file_of(tmp_path, text))
-    assert told in str(refusal.value)
+    assert message in str(refusal.value)
 
 
 @pytest.mark.processes

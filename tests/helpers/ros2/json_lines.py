@@ -1,6 +1,10 @@
-"""How the programs beside this file are talked to: a line of JSON in, a line of JSON out.
+"""Protocol of this folder's programs: JSON lines, requests on standard input, replies on standard output.
 
-They are run by interpreters that do not have zstate, so this needs nothing but the standard library.
+A request is ``{"do": NAME, ...}``; its reply is ``{"did": NAME, "answer": ...}`` or
+``{"failed": NAME, "why": ...}``.
+Between replies a program prints ``{"received": TOPIC, "message": ...}`` for every message that it receives.
+
+Their interpreters have no zstate, so this module imports only the standard library.
 """
 
 from __future__ import annotations
@@ -14,24 +18,24 @@ from typing import Any
 _LOCK = threading.Lock()
 
 
-def say(**facts: Any) -> None:
-    """One line, whole, from any thread."""
+def print_line(**values: Any) -> None:
+    """Prints one complete line; callable from any thread."""
     with _LOCK:
-        sys.stdout.write(json.dumps(facts) + "\n")
+        sys.stdout.write(json.dumps(values) + "\n")
         sys.stdout.flush()
 
 
-def heard(topic: str, message: Any) -> None:
-    """Tell that ``message`` arrived on ``topic``."""
-    say(heard=topic, message=message)
+def report_message(topic: str, message: Any) -> None:
+    """Prints ``message``, which was received on ``topic``."""
+    print_line(received=topic, message=message)
 
 
 def serve(commands: Mapping[str, Callable[..., Any]]) -> None:
-    """Answer ``{"do": NAME, ...}`` lines with what ``commands[NAME](...)`` returns, until the input ends.
+    """Replies to ``{"do": NAME, ...}`` with the result of ``commands[NAME](...)``, until the input ends.
 
-    "sync" does nothing: what was heard before it was told before its answer.
+    "sync" does nothing; messages received before it are printed before its reply.
     """
-    say(did="start", answer=None)
+    print_line(did="start", answer=None)
     commands = {"sync": lambda: None, **commands}
     for line in sys.stdin:
         arguments = json.loads(line)
@@ -39,6 +43,6 @@ def serve(commands: Mapping[str, Callable[..., Any]]) -> None:
         try:
             answer = commands[name](**arguments)
         except Exception as error:
-            say(failed=name, why=f"{type(error).__name__}: {error}")
+            print_line(failed=name, why=f"{type(error).__name__}: {error}")
         else:
-            say(did=name, answer=answer)
+            print_line(did=name, answer=answer)

@@ -1,4 +1,4 @@
-"""The definitions of the messages that zstate speaks, for oracles that must be given them."""
+"""Definitions of the ROS 2 messages that zstate uses, for oracles that do not have them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FIELDS = {
 
 
 def write_messages(folder: Path, *names: str) -> None:
-    """Write ``<folder>/<package>/msg/<Type>.msg`` for each of ``names``, or for all."""
+    """Writes ``<folder>/<package>/msg/<Type>.msg`` for each of ``names``; default: all."""
     for name in names or FIELDS:
         path = folder / f"{name}.msg"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,14 +1,14 @@
-"""The programs of others that zstate's ros2 wire is judged by, each with an interpreter of its own.
+"""Other implementations that the tests compare zstate's ros2 wire with, each with its own interpreter.
 
-``python oracles.py NAME FOLDER`` makes the environment of one of them in FOLDER and prints the path of its
-interpreter, for the variable that the tests look at:
+``python oracles.py NAME FOLDER`` creates the environment of one of them in FOLDER and prints the path of its
+interpreter, which is the value of the environment variable that the tests read:
 
 =========  ==========================  ============================================================
-NAME       variable                    what it is
+NAME       variable                    implementation
 =========  ==========================  ============================================================
 sdk        ZSTATE_ROS2_SDK_PYTHON      zenoh-ros2-sdk
-pyzeros    ZSTATE_PYZEROS_PYTHON       pyzeros; compiles once, for 20 s or more
-kilted     ZSTATE_KILTED_PYTHON        ROS 2 Kilted itself, on Fast DDS; needs g++
+pyzeros    ZSTATE_PYZEROS_PYTHON       pyzeros; compiles for 20 s or more, once
+kilted     ZSTATE_KILTED_PYTHON        genuine ROS 2 Kilted, on Fast DDS; needs g++
 =========  ==========================  ============================================================
 """
 
@@ -29,14 +29,14 @@ HERE = Path(__file__).parent
 
 
 class Oracle(NamedTuple):
-    """An environment: where its interpreter is named, and what is installed into it."""
+    """An environment: the variable with the path of its interpreter, and its packages."""
 
     variable: str
     packages: tuple[str, ...]
 
     @property
     def reason(self) -> str:
-        """Why a test that needs it is skipped."""
+        """The reason for skipping a test that needs it."""
         name = next(name for name, oracle in ORACLES.items() if oracle == self)
         made_by = f"`python tests/helpers/ros2/oracles.py {name} FOLDER`"
         return f"{self.variable} is not set; {made_by} prints it (pip install {' '.join(self.packages)})"
@@ -44,7 +44,7 @@ class Oracle(NamedTuple):
 
 _ZENOH = "eclipse-zenoh>=1.10.2,<1.11"
 _KILTED = ("rclpy[fastrtps]", "sensor-msgs", "geometry-msgs", "std-msgs", "rosgraph-msgs")
-# What generates and builds tf2_msgs, of which there is no wheel.
+# Generators and build tools for tf2_msgs, which has no wheel.
 _AMENT = (
     "ament-package",
     "ament-cmake",
@@ -86,7 +86,7 @@ _PACKAGE = """\
 
 
 def make(name: str, folder: Path) -> Path:
-    """The interpreter of a new environment in ``folder``."""
+    """Creates the environment ``name`` in ``folder``; returns its interpreter."""
     subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
     python = folder / "bin" / "python"
     pip = [str(python), "-m", "pip", "install", "-q", "--disable-pip-version-check"]
@@ -98,12 +98,12 @@ def make(name: str, folder: Path) -> Path:
 
 
 def _compile_attachment(_folder: Path, python: Path) -> None:
-    """Once, here, rather than in the first test."""
+    """Compiles here, once, so that the first test does not have to."""
     subprocess.run([str(python), str(HERE / "pyzeros_peer.py")], check=True, stdout=sys.stderr)
 
 
 def _build_tf2_msgs(folder: Path, python: Path) -> None:
-    """Generate tf2_msgs/msg/TFMessage with the generators of ROS 2, and install it beside the others."""
+    """Generates tf2_msgs/msg/TFMessage with the generators of ROS 2, and installs it in ``folder``."""
     _mend_exports(folder, python)
     with tempfile.TemporaryDirectory() as temporary:
         source, build = Path(temporary, "tf2_msgs"), Path(temporary, "build")
@@ -122,7 +122,7 @@ def _build_tf2_msgs(folder: Path, python: Path) -> None:
 
 
 def _mend_exports(folder: Path, python: Path) -> None:
-    """The wheels name the include folders of the machine that they were built on."""
+    """Corrects include folders: the wheels have those of the machine that they were built on."""
     ask = [str(python), "-c", "import numpy; print(numpy.get_include())"]
     numpy = subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip()
     for file in folder.glob("share/*/cmake/*.cmake"):

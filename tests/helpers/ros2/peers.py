@@ -1,4 +1,4 @@
-"""Other implementations of ROS 2 over Zenoh, each a process that the tests talk to."""
+"""Peers in tests: other implementations of ROS 2 over Zenoh, each in its own process."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ Spawn = Callable[..., Child]
 
 
 def interpreter(oracle: str) -> str:
-    """Where the environment of ``oracle`` is; a test that needs one that is not there is skipped."""
+    """The interpreter of ``oracle``; skips the test if it is not installed."""
     found = os.environ.get(ORACLES[oracle].variable)
     if not found:
         pytest.skip(ORACLES[oracle].reason)
     return found
 
 
-def repeat_until(say: Callable[[], object], condition: Callable[[], object]) -> None:
-    """Say it again and again until ``condition()``: who has just come is not heard by everybody yet."""
+def repeat_until(publish: Callable[[], object], condition: Callable[[], object]) -> None:
+    """Calls ``publish`` until ``condition()`` is true; first samples may be lost before discovery."""
 
-    def said() -> object:
-        say()
+    def is_done() -> object:
+        publish()
         return condition()
 
-    until(said)
+    until(is_done)
 
 
 class Program:
-    """One of the programs beside this file, in the environment of ``oracle``; lines.py has the rules."""
+    """A program of this folder, in the environment of ``oracle``; json_lines.py describes its protocol."""
 
     def __init__(self, spawn: Spawn, oracle: str, file: str, *arguments: object) -> None:
         self._child = spawn(RUN, interpreter(oracle), str(HERE / file), *map(str, arguments))
-        self._heard: list[tuple[str, Message]] = []
+        self._received: list[tuple[str, Message]] = []
         self._answer("start")
 
     def ask(self, do: str, **arguments: Any) -> Any:
@@ -55,25 +55,25 @@ class Program:
             line = json.loads(self._child.line(DEADLINE_S))
             if line.get("did") == did:
                 return line["answer"]
-            assert "heard" in line, (line, self._child.stderr)
-            self._heard.append((line["heard"], line["message"]))
+            assert "received" in line, (line, self._child.stderr)
+            self._received.append((line["received"], line["message"]))
 
-    def hears(self, topic: str, repeat: Callable[[], object] = lambda: None) -> Message:
-        """The first message on ``topic`` since it was last asked for; ``repeat`` is done until it comes."""
+    def receive(self, topic: str, publish: Callable[[], object] = lambda: None) -> Message:
+        """The first message on ``topic`` since the last call; calls ``publish`` until one arrives."""
         found: list[Message] = []
 
-        def looked() -> bool:
+        def has_arrived() -> bool:
             self.ask("sync")
-            found.extend(message for heard, message in self._heard if heard == topic)
-            self._heard = [(heard, message) for heard, message in self._heard if heard != topic]
+            found.extend(message for name, message in self._received if name == topic)
+            self._received = [(name, message) for name, message in self._received if name != topic]
             return bool(found)
 
-        repeat_until(repeat, looked)
+        repeat_until(publish, has_arrived)
         return found[0]
 
 
 class Peer(Program):
-    """Somebody who publishes and subscribes topics under the keys of rmw_zenoh_cpp."""
+    """A node that publishes and subscribes topics under the keys of rmw_zenoh_cpp."""
 
     can_latch = True
     node = "sdk_peer"
@@ -89,14 +89,14 @@ class Peer(Program):
 
 
 class PyzerosPeer(Peer):
-    """It has no durability but volatile."""
+    """A peer on pyzeros, which supports only volatile durability."""
 
     can_latch = False
     node = "pyzeros_peer"
 
 
 class BridgedPeer(Peer):
-    """An rclpy node on DDS, behind a bridge that carries its bytes as they are."""
+    """An rclpy node on DDS, behind a bridge that forwards its bytes unchanged."""
 
     node = "dds_bridge"
 
@@ -114,9 +114,9 @@ class BridgedPeer(Peer):
 
 
 def start_peer(oracle: str, spawn: Spawn, endpoint: str) -> Peer:
-    """A peer on ``oracle``, attached to the router at ``endpoint``."""
+    """A peer on ``oracle``, connected to the router at ``endpoint``."""
     if oracle == "kilted":
-        # A DDS domain that no other run of the tests on this host is likely to use.
+        # A DDS domain that other test runs on this host are unlikely to use.
         return BridgedPeer(spawn, endpoint, 1 + os.getpid() % 100)
     kind = PyzerosPeer if oracle == "pyzeros" else Peer
     return kind(spawn, oracle, f"{oracle}_peer.py", endpoint, DOMAIN)

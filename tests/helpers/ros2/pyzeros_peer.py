@@ -1,9 +1,9 @@
-"""A peer on pyzeros: ``pyzeros_peer.py ENDPOINT DOMAIN``, with the interpreter that has it.
+"""A peer on pyzeros: ``pyzeros_peer.py ENDPOINT DOMAIN``, run by the interpreter of that oracle.
 
-Without arguments it compiles what the others need, and ends.
+Without arguments it compiles the message classes into the cache and exits.
 
-Told in lines of JSON (lines.py) to subscribe, advertise, publish, and to say how it would write the
-token and the gid of an endpoint. It has no durability but volatile, and no view of the graph.
+Requests (json_lines.py): subscribe, advertise, publish, and the token and gid that it would generate for an
+endpoint. It supports only volatile durability, and has no view of the graph.
 """
 
 import asyncio
@@ -15,9 +15,9 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import zenoh
-from json_lines import heard, serve
+from json_lines import report_message, serve
 
-os.environ["CYDR_CACHE_DIR"] = f"{sys.prefix}/cydr_cache"  # else it is the working directory
+os.environ["CYDR_CACHE_DIR"] = f"{sys.prefix}/cydr_cache"  # default: the working directory
 from pyzeros import pub, sub
 from pyzeros.builtin_msgs import Attachment
 from pyzeros.node import Node
@@ -40,7 +40,7 @@ NODE = "pyzeros_peer"
 Json = dict[str, Any]
 
 
-# Its fields' annotations are looked at, so they must not be postponed.
+# IdlStruct reads the annotations of its fields, so this module must not postpone them.
 @dataclass
 class TFMessage(IdlStruct, typename="tf2_msgs/msg/TFMessage"):
     transforms: types.sequence[TransformStamped] = field(default_factory=list)
@@ -81,7 +81,7 @@ class PyzerosPeer:
         kind, _ = KINDS[type]
 
         def on_sample(sample: zenoh.Sample) -> None:
-            heard(topic, asdict(kind.deserialize(sample.payload.to_bytes())))
+            report_message(topic, asdict(kind.deserialize(sample.payload.to_bytes())))
 
         subscriber = sub.RawSub(kind, topic, on_sample, _qos(latched), self._node, scope=None)
         self._opened.append(subscriber)
@@ -98,17 +98,17 @@ class PyzerosPeer:
         publisher.publish(build(message))
 
     def node_token(self, domain: int, zid: str, node_id: int, **described: Any) -> str:
-        """The token of somebody else's node: ``name``, ``namespace``."""
+        """The token of a given node: ``name``, ``namespace``."""
         ids = {"_zenoh_id": zid, "_node_id": node_id, "_entity_id": node_id}
         return node_token(session=self._node.session, domain_id=domain, **ids, **described)
 
     def endpoint_token(self, kind: str, domain: int, zid: str, ids: tuple[int, int], **described: Any) -> str:
-        """The token of somebody else's publisher (MP) or subscription (MS)."""
-        write = {"MP": pub.token_keyexpr, "MS": sub.token_keyexpr}[kind]
+        """The token of a given publisher (MP) or subscription (MS)."""
+        keyexpr = {"MP": pub.token_keyexpr, "MS": sub.token_keyexpr}[kind]
         durability = "transient_local" if described.pop("latched") else "volatile"
         qos = QosProfile(depth=described.pop("depth"), durability=durability)
         identity = {"domain_id": domain, "_zenoh_id": zid, "_node_id": ids[0], "_entity_id": ids[1]}
-        return write(session=self._node.session, qos_profile=qos, **identity, **described)
+        return keyexpr(session=self._node.session, qos_profile=qos, **identity, **described)
 
 
 def _qos(latched: bool) -> QosProfile:

@@ -1,8 +1,8 @@
-"""Carries bytes between rmw_zenoh keys and Fast DDS: ``rclpy_bridge.py ENDPOINT DOMAIN ROS_DOMAIN``.
+"""Bridge between rmw_zenoh keys and Fast DDS: ``rclpy_bridge.py ENDPOINT DOMAIN ROS_DOMAIN``.
 
-There is no wheel of rmw_zenoh_cpp, so this stands between a genuine ROS 2 on DDS and zstate: on the
-Zenoh side it declares, checks and sends what rmw_zenoh_cpp does; on the DDS side the same bytes, as they
-are, come from and go to rclpy. Told in lines of JSON which topics to carry which way.
+There is no wheel of rmw_zenoh_cpp, so this bridge connects a genuine ROS 2 on DDS with zstate. On the
+Zenoh side it declares, checks and sends what rmw_zenoh_cpp does; on the DDS side rclpy receives and sends
+the same bytes, unchanged. Requests (json_lines.py) name the topics to forward and their direction.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import sys
 import time
 from typing import Any
 
-import xxhash  # noqa: F401 - missed here, with a name, rather than in a callback
+import xxhash  # noqa: F401 - fails here, by name, if it is missing, instead of in a callback
 import zenoh
-from json_lines import say, serve
+from json_lines import print_line, serve
 from rclpy_local import qos, spinning_node
 from rclpy_messages import message_class, type_hash
 from rmw_format import QOS, Attachment, data_key, dds_name, endpoint_token, gid, node_token
@@ -24,7 +24,7 @@ NODE = "dds_bridge"
 
 
 class Bridge:
-    """One node here, and the same node there."""
+    """A node on DDS, and the same node on Zenoh."""
 
     def __init__(self, node: Any, session: zenoh.Session, domain: int) -> None:
         self.node = node
@@ -35,14 +35,14 @@ class Bridge:
         self._node_token = self._token(node_token(domain, str(session.zid()), 0, "/", NODE))
 
     def to_ros(self, topic: str, type: str, latched: bool = False) -> str:
-        """What is put on the topic's key, with any type hash, is published on DDS."""
+        """Publishes on DDS the samples of the topic's key, with any type hash."""
         publisher = self.node.create_publisher(message_class(type), topic, qos(latched))
 
         def on_sample(sample: zenoh.Sample) -> None:
             try:
                 Attachment.parse(sample.attachment.to_bytes() if sample.attachment else b"")
             except ValueError as error:
-                say(refused=topic, why=str(error))
+                print_line(refused=topic, why=str(error))
             else:
                 publisher.publish(sample.payload.to_bytes())
 
@@ -51,7 +51,7 @@ class Bridge:
         return self._endpoint("MS", topic, type, latched)
 
     def to_zenoh(self, topic: str, type: str, latched: bool = False) -> str:
-        """What is published on DDS is put on the topic's key."""
+        """Puts messages that are published on DDS on the topic's key."""
         key = data_key(self._domain, topic, type, type_hash(type))
         publisher = self._publisher(key, latched)
         token = self._endpoint("MP", topic, type, latched)
@@ -92,7 +92,7 @@ class Bridge:
 
 
 def session_config(endpoint: str) -> zenoh.Config:
-    """As rmw_zenoh_cpp configures a node: a peer that knows its router."""
+    """The configuration that rmw_zenoh_cpp gives a node: a peer that connects to its router."""
     config = zenoh.Config()
     for path, value in {
         "mode": "peer",

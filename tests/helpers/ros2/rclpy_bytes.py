@@ -1,4 +1,4 @@
-"""A genuine ROS 2 says how messages are serialised and what their types hash to; told in lines of JSON."""
+"""Serialization and type hashes of a genuine ROS 2, by request (json_lines.py)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rclpy_messages import build, message_class, plain, type_hash
 
 
 def serialize(type: str, message: dict[str, Any]) -> str:
-    """The bytes, in hexadecimal. Padding in them, and up to 8 bytes after the end, are left as they were."""
+    """The bytes, in hexadecimal. Their padding, and up to 8 bytes after the end, are uninitialised."""
     return serialize_message(build(message_class(type), message)).hex()
 
 

@@ -1,4 +1,4 @@
-"""rclpy on Fast DDS that hears this host only, and is spun by a thread of its own."""
+"""An rclpy node on Fast DDS that discovers this host only, spun by its own thread."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def spinning_node(name: str, domain: int) -> Iterator[Any]:
 
 
 def qos(latched: bool) -> QoSProfile:
-    """What ROS 2 uses for /tf_static and /robot_description, and by default."""
+    """The QoS of /tf_static and /robot_description if ``latched``, otherwise ROS 2's default."""
     if not latched:
         return QoSProfile(depth=10)
     return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -1,4 +1,4 @@
-"""Between JSON and the message classes of a genuine ROS 2: what the rclpy programs share."""
+"""Conversion between JSON and the message classes of a genuine ROS 2, for the rclpy programs."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any
 
 @cache
 def message_class(type_name: str) -> type:
-    """The class of ``sensor_msgs/msg/JointState``, or of ``sensor_msgs/JointState``."""
+    """The class of ``sensor_msgs/msg/JointState`` or ``sensor_msgs/JointState``."""
     parts = type_name.split("/")
     return getattr(import_module(f"{parts[0]}.msg"), parts[-1])
 
 
 @cache
 def type_hash(type_name: str) -> str:
-    """RIHS01 as the generators of ROS 2 wrote it beside the message."""
+    """The RIHS01 hash in the JSON file that the generators of ROS 2 install for each message."""
     package, _, name = type_name.split("/")
     description = json.loads(Path(sys.prefix, "share", package, "msg", f"{name}.json").read_text())
     return next(row["hash_string"] for row in description["type_hashes"] if row["type_name"] == type_name)

@@ -1,6 +1,6 @@
 """An ordinary rclpy node on Fast DDS, on this host only: ``rclpy_peer.py ROS_DOMAIN``.
 
-Told in lines of JSON (lines.py) to subscribe, advertise, publish, and say what graph it sees.
+Requests (json_lines.py): subscribe, advertise, publish, and the graph that it sees.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from json_lines import heard, serve
+from json_lines import report_message, serve
 from rclpy_local import qos, spinning_node
 from rclpy_messages import build, message_class, plain
 
@@ -20,7 +20,7 @@ class RclpyPeer:
 
     def subscribe(self, topic: str, type: str, latched: bool = False) -> None:
         def on_message(message: Any) -> None:
-            heard(topic, plain(message))
+            report_message(topic, plain(message))
 
         self.node.create_subscription(message_class(type), topic, on_message, qos(latched))
 

@@ -1,6 +1,6 @@
-"""What rmw_zenoh_cpp puts on the network, said once more and apart from zstate: the judge in these tests.
+"""The wire format of rmw_zenoh_cpp, implemented independently of zstate, as the reference of these tests.
 
-Needs nothing but the standard library and xxhash, and runs with and without zstate.
+Imports only the standard library and xxhash, so that it runs with and without zstate.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ QOS = {"volatile": "::,10:,:,:,,", "latched": ":1:,1:,:,:,,"}
 
 
 class Attachment(NamedTuple):
-    """What travels beside each message."""
+    """The attachment of each message: sequence number, stamp and gid of its publisher."""
 
     seq: int
     stamp: int
@@ -23,12 +23,12 @@ class Attachment(NamedTuple):
 
     @classmethod
     def parse(cls, raw: bytes) -> Attachment:
-        """ValueError for what makes an rmw_zenoh_cpp node drop the message, or abort."""
+        """Raises ValueError for bytes that make an rmw_zenoh_cpp node drop the message, or abort."""
         if len(raw) != ATTACHMENT.size:
             raise ValueError(f"the attachment has {len(raw)} bytes, not {ATTACHMENT.size}")
         seq, stamp, length, gid = ATTACHMENT.unpack(raw)
         if length != 16:
-            raise ValueError(f"the attachment says that its gid has {length} bytes, not 16")
+            raise ValueError(f"the gid in the attachment has {length} bytes, not 16")
         return cls(seq, stamp, gid)
 
     def pack(self) -> bytes:
@@ -42,7 +42,7 @@ def gid(token: str) -> bytes:
 
 
 def dds_name(type_name: str) -> str:
-    """``sensor_msgs/msg/JointState`` as it stands in keys."""
+    """The form of ``sensor_msgs/msg/JointState`` in keys."""
     package, kind, name = type_name.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 

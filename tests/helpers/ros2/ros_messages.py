@@ -1,4 +1,4 @@
-"""ROS messages as the peers tell them: dictionaries with the names of the .msg files."""
+"""ROS messages in the JSON of the peers: dictionaries with the field names of the .msg files."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A peer on zenoh-ros2-sdk: ``sdk_peer.py ENDPOINT DOMAIN``, with the interpreter that has it.
+"""A peer on zenoh-ros2-sdk: ``sdk_peer.py ENDPOINT DOMAIN``, run by the interpreter of that oracle.
 
-Told in lines of JSON (lines.py) to subscribe, advertise, publish, and say what graph it sees.
+Requests (json_lines.py): subscribe, advertise, publish, and the graph that it sees.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from json_lines import heard, serve
+from json_lines import report_message, serve
 from message_texts import write_messages
 
 os.environ.pop("ZENOH_SESSION_CONFIG_URI", None)
@@ -32,7 +32,7 @@ NODE = "sdk_peer"
 
 
 class Messages:
-    """Between JSON and the classes that the store makes of message definitions."""
+    """Conversion between JSON and the classes that the store generates from message definitions."""
 
     def __init__(self, store: Any) -> None:
         self._store = store
@@ -78,7 +78,7 @@ class SdkPeer:
 
     def subscribe(self, topic: str, type: str, latched: bool = False) -> str:
         def on_message(message: Any) -> None:
-            heard(topic, self._messages.plain(type, message))
+            report_message(topic, self._messages.plain(type, message))
 
         options = {"node_name": NODE, "qos": _qos(latched), **self._where}
         subscriber = ROS2Subscriber(topic, type, on_message, **options)
@@ -95,7 +95,7 @@ class SdkPeer:
         publisher.publish(**self._messages.fields(publisher.msg_type, message))
 
     def graph(self) -> dict[str, Any]:
-        """Topics with their types, and who publishes and subscribes each."""
+        """Topics with their types, publishers and subscribers."""
         topics = get_topic_names_and_types(**self._where)
         return {topic: {"types": types, **self._endpoints(topic)} for topic, types in topics}
 

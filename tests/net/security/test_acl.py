@@ -11,13 +11,20 @@ from typing import Any
 
 import pytest
 import zenoh
+from helpers.access_routers import (
+    assert_only_allowed_writes_arrive,
+    publish_and_check,
+    replies,
+    router_with_users,
+)
 from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import InvalidInput
 from zstate.net.presence import announce, discover_readers
-from zstate.net.security.acl import AclRoles, access_control, access_text
+from zstate.net.security.acl import AclRoles, access_control
+from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import STREAMS
@@ -30,40 +37,28 @@ USERS = (*FLEET.identities, "stranger")
 
 
 class Site:
-    """A router with users, and sessions of its clients."""
+    """Sessions of clients of a router with users."""
 
-    def __init__(self, folder: Any, fleet: AclRoles) -> None:
-        self.endpoint = f"tcp/127.0.0.1:{find_free_port()}"
-        users = folder / "users.txt"
-        users.write_text("".join(f"{name}:secret\n" for name in USERS))
-        self.opened = ExitStack()
-        self.settings = {
-            "mode": "router",
-            "listen": {"endpoints": [self.endpoint]},
-            "scouting": {"multicast": {"enabled": False}},
-            "timestamping": {"enabled": False},
-            "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
-            "access_control": access_control(fleet),
-        }
-        self.opened.enter_context(connect(self.settings))
+    def __init__(self, endpoint: str, opened: ExitStack) -> None:
+        self._endpoint = endpoint
+        self._opened = opened
 
     def join(self, user: str, **more: object) -> Session:
         """A client with the identity ``user``."""
         settings = {
             "mode": "client",
-            "connect": {"endpoints": [self.endpoint], "timeout_ms": 5000},
+            "connect": {"endpoints": [self._endpoint], "timeout_ms": 5000},
             "scouting": {"multicast": {"enabled": False}},
             "transport": {"auth": {"usrpwd": {"user": user, "password": "secret"}}},
             **more,
         }
-        return self.opened.enter_context(connect(settings))
+        return self._opened.enter_context(connect(settings))
 
 
 @contextmanager
 def a_site(folder: Any, fleet: AclRoles) -> Iterator[Site]:
-    site = Site(folder, fleet)
-    with site.opened:
-        yield site
+    with router_with_users(folder, fleet, USERS) as endpoint, ExitStack() as opened:
+        yield Site(endpoint, opened)
 
 
 @pytest.fixture
@@ -95,20 +90,8 @@ WRITES = [
 
 
 def test_each_role_can_write_only_its_own_keys(site: Site):
-    tap = SampleCollector(site.join("desk"), "zstate/**")
     writers = {user: site.join(user) for user in USERS}
-    allowed = {(user.encode(), key) for user, key, is_allowed in WRITES if is_allowed}
-
-    def received() -> set[tuple[bytes, str]]:
-        return {(arrival.payload, arrival.key) for arrival in tap.arrivals}
-
-    def publish_until_received() -> bool:
-        for user, key, _ in WRITES:
-            writers[user].zenoh.put(key, user.encode())
-        return received() >= allowed and len(tap.arrivals) >= 10 * len(allowed)
-
-    until(publish_until_received)
-    assert received() == allowed
+    assert_only_allowed_writes_arrive(WRITES, writers, site.join("desk"), "zstate/**")
 
 
 def test_late_viewer_receives_all_streams(site: Site):
@@ -125,12 +108,7 @@ def test_late_viewer_receives_all_streams(site: Site):
         with TransformListener(viewer, "*") as model, TransformListener(viewer, "r1", follow="tf") as poses:
             for listener in (model, poses):
                 assert listener.buffer.wait("base", "camera", timeout_s=5.0).kind == "static"
-                until(lambda reader=listener: publish_and_look(publisher, reader))
-
-
-def publish_and_look(publisher: StatePublisher, listener: TransformListener) -> bool:
-    publisher.publish([0.1, 0.2])
-    return listener.buffer.can_lookup("base", "lower")
+                until(lambda reader=listener: publish_and_check(publisher, reader))
 
 
 def test_robot_receives_only_the_clock_of_others(site: Site):
@@ -176,7 +154,7 @@ def test_named_placer_places_robot_roots_and_robots_only_their_own(site: Site):
         with StaticPublisher(robot, "r1", "mount") as mount:
             mount.set(Transform("base", "camera", (2.0, 0.0, 0.0), UPRIGHT))
             for reader in (listener, poses):
-                until(lambda reader=reader: publish_and_look(publisher, reader))
+                until(lambda reader=reader: publish_and_check(publisher, reader))
                 reader.buffer.wait("site/map", "r1/camera", timeout_s=5.0)
                 assert {frame.writer for frame in reader.buffer.frames(("r1/camera",))} == {"mount"}
                 assert "not among the placers ('site')" in reader.refusals["foreign frame"]
@@ -190,7 +168,7 @@ def test_robot_announced_as_another_takes_over_no_edges(site: Site):
         TransformListener(site.join("desk"), "*", follow="tf") as listener,
         StreamPublisher(thief, "zstate/r2/tf", ENCODINGS[TransformSample]) as stream,
     ):
-        until(lambda: publish_and_look(publisher, listener))
+        until(lambda: publish_and_check(publisher, listener))
         (info,) = discover(site.join("desk"))
         (theirs,) = {writer for stream_of, writer in info.writers if stream_of == "tf"}
 
@@ -236,7 +214,7 @@ def test_a_robot_that_is_a_viewer_too_sees_the_others_move(tmp_path):
         StatePublisher(site.join("r1"), RRBOT, "r1") as publisher,
         TransformListener(site.join("r2"), "r1") as listener,
     ):
-        until(lambda: publish_and_look(publisher, listener))
+        until(lambda: publish_and_check(publisher, listener))
 
 
 def test_viewers_query_lookup_services_under_their_own_robot(site: Site):
@@ -248,12 +226,8 @@ def test_viewers_query_lookup_services_under_their_own_robot(site: Site):
     robot.zenoh.declare_queryable("zstate/r1/lookup", answer)
     other.zenoh.declare_queryable("zstate/$*1/lookup", answer)
 
-    def answers() -> list[str]:
-        replies = viewer.zenoh.get("zstate/r1/lookup", target=zenoh.QueryTarget.ALL, timeout=1.0)
-        return [reply.ok.payload.to_string() for reply in replies if reply.ok]
-
-    until(answers)
-    assert answers() == ["here"]
+    until(lambda: replies(viewer, "zstate/r1/lookup"))
+    assert replies(viewer, "zstate/r1/lookup") == ["here"]
 
 
 def test_namespace_prefixes_every_key(tmp_path):
@@ -262,7 +236,7 @@ def test_namespace_prefixes_every_key(tmp_path):
         StatePublisher(site.join("r1", namespace="hall/east"), RRBOT, "r1") as publisher,
         TransformListener(site.join("desk", namespace="hall/east"), "r1") as listener,
     ):
-        until(lambda: publish_and_look(publisher, listener))
+        until(lambda: publish_and_check(publisher, listener))
         assert discover(site.join("desk"), 0.2) == ()  # without any robot
 
 
@@ -300,19 +274,19 @@ def test_zenoh_parses_the_text_to_the_same_rules():
     assert (parsed["enabled"], parsed["default_permission"]) == (True, "deny")
 
 
-def test_rules_without_a_role_are_left_out():
+def test_rules_without_a_role_are_omitted():
     rules = [rule["id"] for rule in access_control(AclRoles(viewers=("desk", "desk")))["rules"]]
     assert rules == ["viewers read", "viewers are given", "readers are known"]
 
 
 @pytest.mark.parametrize("name", ["", "*", "a/b", "two words", "@r1", "r1:x", "x" * 65, "röbi"])
-def test_a_name_that_cannot_be_one_is_refused(name: str):
+def test_invalid_identity_name_is_refused(name: str):
     with pytest.raises(InvalidInput, match="cannot be the name of an identity"):
         AclRoles((name,))
 
 
 @pytest.mark.parametrize("namespace", ["/hall", "hall/", "a//b", "h*", "@x"])
-def test_namespace_that_is_no_key_prefix_is_refused(namespace: str):
+def test_invalid_namespace_is_refused(namespace: str):
     with pytest.raises(InvalidInput, match="is not made of chunks"):
         AclRoles(("r1",), namespace=namespace)
 

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from helpers import access_routers
+from helpers.access_routers import assert_only_allowed_writes_arrive, publish_and_check, replies
 from helpers.processes import Child, until
-from helpers.robots import RRBOT, UPRIGHT, SampleCollector
+from helpers.robots import RRBOT, UPRIGHT
 
-from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
+from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, discover
 from zstate.errors import AccessDenied, InvalidInput
 from zstate.net.presence import current_tokens
-from zstate.net.security.acl import AclRoles, access_control, access_text
-from zstate.net.security.credentials import Credentials
+from zstate.net.security.acl import AclRoles, access_control
+from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
 
 WIRE = "ros2:domain=7,namespace=*"
@@ -30,20 +32,13 @@ Join = Callable[[str], Session]
 @pytest.fixture
 def join(tmp_path: Path, spawn: Callable[..., Child], free_port: int) -> Iterator[Join]:
     """``join(user)``: a client of the router with that identity."""
-    users, acl = tmp_path / "users.txt", tmp_path / "acl.json5"
-    users.touch(0o600)
-    users.write_text("".join(f"{name}:secret\n" for name in USERS))
+    users, acl = access_routers.write_users(tmp_path, USERS), tmp_path / "acl.json5"
     acl.write_text(access_text(FLEET))
     endpoint = f"tcp/127.0.0.1:{free_port}"
     arguments = ("router", "--listen", endpoint, "--users", str(users), "--acl", str(acl))
     spawn("from zstate.cli.main import main; main()", *arguments).line()
     with ExitStack() as opened:
-
-        def enter(user: str) -> Session:
-            credentials = Credentials(user=user, password="secret")
-            return opened.enter_context(connect(mode="client", endpoints=endpoint, credentials=credentials))
-
-        yield enter
+        yield lambda user: opened.enter_context(access_routers.join(endpoint, user))
 
 
 WRITES = [
@@ -69,21 +64,8 @@ WRITES = [
 
 
 def test_each_role_can_write_only_its_own_topics(join: Join):
-    viewer = join("desk")
-    taps = [SampleCollector(viewer, key) for key in ("7/**", "5/**", "zstate/**")]
     writers = {user: join(user) for user in USERS}
-    allowed = {(user.encode(), key) for user, key, is_allowed in WRITES if is_allowed}
-
-    def received() -> list[tuple[bytes, str]]:
-        return [(arrival.payload, arrival.key) for tap in taps for arrival in tap.arrivals]
-
-    def publish_until_received() -> bool:
-        for user, key, _ in WRITES:
-            writers[user].zenoh.put(key, user.encode())
-        return set(received()) >= allowed and len(received()) >= 10 * len(allowed)
-
-    until(publish_until_received)
-    assert set(received()) == allowed
+    assert_only_allowed_writes_arrive(WRITES, writers, join("desk"), "7/**", "5/**", "zstate/**")
 
 
 TOKENS = [
@@ -129,12 +111,7 @@ def test_late_viewer_receives_all_streams_of_a_robot(join: Join):
         assert [info.name for info in discover(viewer, wire=WIRE) if info.name == "r1"] == ["r1"]
         with TransformListener(viewer, "r1", wire=WIRE) as listener:
             listener.buffer.wait("base", "camera", timeout_s=5.0)
-
-            def moves() -> bool:
-                publisher.publish([0.1, 0.2])
-                return listener.buffer.can_lookup("base", "lower")
-
-            until(moves)
+            until(lambda: publish_and_check(publisher, listener))
 
 
 @pytest.mark.parametrize("user", ["r2", "desk", "hand"])
@@ -153,14 +130,10 @@ def test_only_operators_call_services_and_only_their_robot_replies(join: Join):
     robot.zenoh.declare_queryable(service, answer)
     other.zenoh.declare_queryable(service, lambda query: query.reply(service, b"never"))
 
-    def answers(session: Session) -> list[str]:
-        replies = session.zenoh.get(service, target=zenoh.QueryTarget.ALL, timeout=1.0)
-        return [reply.ok.payload.to_string() for reply in replies if reply.ok]
-
     hand = join("hand")
-    until(lambda: answers(hand))
-    assert answers(hand) == ["stopped"]
-    assert answers(join("desk")) == []
+    until(lambda: replies(hand, service))
+    assert replies(hand, service) == ["stopped"]
+    assert replies(join("desk"), service) == []
 
 
 def test_rules_of_several_wires_are_combined():

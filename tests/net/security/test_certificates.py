@@ -44,7 +44,7 @@ def test_identities_of_one_folder_trust_each_other_by_name_and_at_this_host(tmp_
         assert handshake(tmp_path, "router", "r1", host) == "r1"
 
 
-def test_an_identity_is_good_for_the_hosts_that_were_given_and_for_no_other(tmp_path: Path):
+def test_certificate_is_valid_for_the_given_hosts_only(tmp_path: Path):
     issue_identities(tmp_path, ["router", "r1"], hosts=["10.0.0.7", "fleet.example"])
     for host in ("10.0.0.7", "fleet.example"):
         assert handshake(tmp_path, "router", "r1", host) == "r1"
@@ -80,7 +80,7 @@ def test_refused_call_overwrites_and_creates_no_file(tmp_path: Path):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_certificate_is_valid_for_the_days_that_were_asked_for(tmp_path: Path):
+def test_certificate_is_valid_for_the_requested_days(tmp_path: Path):
     start = datetime(2026, 3, 1, tzinfo=timezone.utc)
     files = issue_identities(tmp_path, ["r1"], days=30, valid_from=start)["r1"]
     certificate = read(files.certificate)

@@ -1,4 +1,4 @@
-"""Reasons of refused connections, with real routers in a process of their own."""
+"""Reasons of denied connections, with real routers in a process of their own."""
 
 from __future__ import annotations
 
@@ -164,7 +164,9 @@ def test_listener_without_replies_is_not_reported_as_one_without_tls(fleet: Acce
             assert caught.value.endpoints == (endpoint,)
 
 
-def test_router_busy_with_failed_handshakes_is_no_refusal(fleet: AccessRouters, spawn, free_port: int):
+def test_router_busy_with_failed_handshakes_is_not_reported_as_denial(
+    fleet: AccessRouters, spawn, free_port: int
+):
     """Zenoh pauses its accepting for 0.1 s after each handshake that failed."""
     endpoint = f"tls/127.0.0.1:{free_port}"
     assert spawn(ROUTERS_PROGRAM, str(fleet.folder), endpoint).line() == "ready"

@@ -1,4 +1,4 @@
-"""Connection monitor: refusals that are logged while sessions keep trying."""
+"""Connection monitor: denials that are logged while sessions keep trying."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection_monitor, "PERIOD_S", 0.1)
 
 
-def refusals(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
+def denials(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
     """The reasons and texts that were logged."""
     records = [record for record in caplog.records if record.name == "zstate"]
     assert {record.levelno for record in records} <= {logging.WARNING}
@@ -61,8 +61,8 @@ def test_refused_session_that_keeps_trying_logs_the_reason(
     endpoint, credentials = (choose(fleet) for choose in CASES[reason])
     where = free_endpoint(credentials)
     with connect(mode=mode, endpoints=endpoint, listen=where, credentials=credentials):
-        until(lambda: refusals(caplog))
-    ((logged, text),) = refusals(caplog)
+        until(lambda: denials(caplog))
+    ((logged, text),) = denials(caplog)
     assert logged == reason
     assert text.startswith(f"{endpoint!r} answers and does not let this session in: ")
     assert text.endswith("; still trying")
@@ -77,8 +77,8 @@ def test_session_of_a_zenoh_configuration_logs_the_reason(
         "listen": {"endpoints": [free_endpoint(None)]},
     }
     with connect(config):
-        until(lambda: refusals(caplog))
-    assert refusals(caplog)[0][0] == "user demanded"
+        until(lambda: denials(caplog))
+    assert denials(caplog)[0][0] == "user demanded"
 
 
 def test_only_refusing_endpoints_are_logged_and_once(fleet: AccessRouters, caplog: pytest.LogCaptureFixture):
@@ -88,10 +88,10 @@ def test_only_refusing_endpoints_are_logged_and_once(fleet: AccessRouters, caplo
     settings = {"endpoints": [unused, second, fleet.tcp("open"), refusing], "listen": first}
     with connect(endpoints=first, listen=second), connect(**settings) as session:
         until(lambda: len(session.zenoh.info.transports()) >= 2)
-        until(lambda: refusals(caplog))
+        until(lambda: denials(caplog))
         with connect(endpoints=fleet.tcp("users"), listen=free_endpoint(None)):
-            until(lambda: len(refusals(caplog)) == 2)
-    assert {text.partition(" ")[0] for _, text in refusals(caplog)} == {repr(refusing)}
+            until(lambda: len(denials(caplog)) == 2)
+    assert {text.partition(" ")[0] for _, text in denials(caplog)} == {repr(refusing)}
 
 
 ROUTER = """
@@ -130,8 +130,8 @@ def test_client_logs_a_refusing_router_that_replaced_its_own(
     with connect(mode="client", endpoints=endpoint, credentials=ALICE):
         own.kill()
         routers(endpoint, "eve")
-        until(lambda: refusals(caplog))
-    assert [reason for reason, _ in refusals(caplog)] == ["user or password"]
+        until(lambda: denials(caplog))
+    assert [reason for reason, _ in denials(caplog)] == ["user or password"]
 
 
 def test_refusal_is_logged_again_after_a_link(
@@ -140,16 +140,16 @@ def test_refusal_is_logged_again_after_a_link(
     endpoint, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{find_free_port()}"
     stranger = routers(endpoint, "eve")
     with connect(endpoints=[endpoint, other], listen=free_endpoint(None), credentials=ALICE) as session:
-        until(lambda: len(refusals(caplog)) == 1)
+        until(lambda: len(denials(caplog)) == 1)
         stranger.kill()
         own = routers(endpoint, "alice")
         until(session.zenoh.info.routers_zid)
         routers(other, "eve")
-        until(lambda: len(refusals(caplog)) == 2)  # it has checked while there was a link
+        until(lambda: len(denials(caplog)) == 2)  # it has checked while there was a link
         own.kill()
         routers(endpoint, "eve")
-        until(lambda: len(refusals(caplog)) == 3)
-    assert [text.partition(" ")[0] for _, text in refusals(caplog)] == [
+        until(lambda: len(denials(caplog)) == 3)
+    assert [text.partition(" ")[0] for _, text in denials(caplog)] == [
         repr(e) for e in (endpoint, other, endpoint)
     ]
 

@@ -81,7 +81,7 @@ def test_rendezvous_of_one_host_needs_no_credentials():
         assert "endpoints=" in refusal(Credentials(user="a", password="b"), mode=mode, endpoints=())
 
 
-def test_files_that_are_missing_are_named(fleet: Path):
+def test_missing_files_are_named(fleet: Path):
     for part in ("ca", "certificate", "key"):
         files = {"ca": fleet / "ca.pem", "certificate": fleet / "r1.pem", "key": fleet / "r1.key"}
         text = refusal(Credentials(**{**files, part: fleet / "nothing"}))
@@ -135,7 +135,7 @@ def test_unreadable_file_is_named(fleet: Path, tmp_path: Path):
     ("lines", "text"),
     [
         ("alice\n", "line 1: write user:password"),
-        ("alice:wonder\n# nobody\n", "line 2: write user:password; comments"),
+        ("alice:wonder\n# viewer\n", "line 2: write user:password; comments"),
         ("alice:\n", "line 1: write user:password"),
         (":wonder\n", "line 1: write user:password"),
         ("alice:a\n\nbob:b\nalice:c\n", "line 4: the user 'alice' is already in line 1"),

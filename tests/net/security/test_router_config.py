@@ -12,9 +12,9 @@ from helpers.robots import RRBOT, SampleCollector
 from zstate import StatePublisher, connect
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import default_config
-from zstate.net.security.acl import AclRoles, access_control, access_text, read_access_control
+from zstate.net.security.acl import AclRoles, access_control, read_access_control
 from zstate.net.security.credentials import Credentials
-from zstate.net.security.router_config import Downsampling, RouterConfig
+from zstate.net.security.router_config import Downsampling, RouterConfig, access_text
 
 FILES = Credentials(ca="/certs/ca.pem", certificate="/certs/r1.pem", key="/certs/r1.key")
 CONFIGURATIONS = {

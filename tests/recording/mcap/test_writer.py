@@ -39,7 +39,7 @@ def in_file_order(path: Path) -> list[tuple[str, bytes]]:
         try:
             for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
                 messages.append((channel.topic, message.data))
-        except Exception:  # what mcap says at the end of a cut file
+        except Exception:  # the error of mcap at the end of a cut file
             pass
     return messages
 
@@ -375,7 +375,7 @@ def test_file_with_the_maximum_of_channels_is_followed_by_another(
     assert topics == [f"/topic_{number}" for number in range(25)]
 
 
-def test_released_channel_is_left_out_of_the_next_file_unless_declared_again(tmp_path: Path):
+def test_released_channel_is_not_in_the_next_file_unless_redeclared(tmp_path: Path):
     with RecordingWriter(tmp_path / "run.mcap", max_seconds=1.0) as writer:
         one, other, third = (writer.channel(f"/{name}", STRING, Qos()) for name in ("one", "other", "third"))
         writer.write(one, DESCRIPTION, START, START)

@@ -21,13 +21,13 @@ pytestmark = [
 RATE_HZ = 100.0
 BOUND_S = 1.0
 CUT_READERS = ("swallowed5", "swallowed15", "unplugged5", "unplugged15")
-"""How a host is cut off, and for how many seconds."""
+"""Hosts of readers, named for the kind of their cut and its length [s]."""
 
 
 class Watched(NamedTuple):
-    """Who looks at which robot across a cut, and how that cut is made and mended."""
+    """A reader that monitors ``robot`` across a cut, and the functions that make and end the cut."""
 
-    party: FaultProcess
+    process: FaultProcess
     robot: str
     cut: Callable[[], None]
     heal: Callable[[], None]
@@ -57,10 +57,10 @@ def test_recovery_from_cuts_of_5_and_15_s_within_a_second_without_old_samples_as
         way = swallowing(hosts, name) if name.startswith("swallowed") else unplugging(hosts, name)
         watching[name] = Watched(reader, "r1", *way, 15.0 if name.endswith("15") else 5.0)
     for one in watching.values():
-        assert one.party.query("after", "r1", 0)
-        assert one.party.query("after", "r2", 0)
-        one.party.query("watch", one.robot)
-    before = [one.party.query("census") for one in watching.values()], router.query("census")
+        assert one.process.query("after", "r1", 0)
+        assert one.process.query("after", "r2", 0)
+        one.process.query("watch", one.robot)
+    before = [one.process.query("census") for one in watching.values()], router.query("census")
 
     began = time.monotonic()
     for one in watching.values():
@@ -72,15 +72,15 @@ def test_recovery_from_cuts_of_5_and_15_s_within_a_second_without_old_samples_as
         until(lambda one=one: time.monotonic() >= began + one.seconds, timeout_s=20.0)
         one.heal()
         healed[name] = time.time_ns()
-        one.party.send("after", one.robot, healed[name])
-        one.party.send("mark", one.robot, 1.0)
+        one.process.send("after", one.robot, healed[name])
+        one.process.send("mark", one.robot, 1.0)
 
     for name, one in watching.items():
         check_recovery(name, one, healed[name])
     stats = witness.query("stats")
     assert stats["refused"] == {}
     for was, one in zip(before[0], watching.values(), strict=True):
-        assert_no_growth(was, one.party.query("census"))
+        assert_no_growth(was, one.process.query("census"))
     assert_no_growth(before[1], router.query("census"))
 
 
@@ -93,20 +93,20 @@ def unplugging(hosts: NamespaceHosts, name: str) -> tuple[Callable[[], None], Ca
 
 
 def check_recovery(name: str, one: Watched, healed_at: int) -> None:
-    heard_at, latched_at = one.party.receive(), one.party.receive()
-    assert heard_at, name
+    received_at, latched_at = one.process.receive(), one.process.receive()
+    assert received_at, name
     assert latched_at, name
-    one.party.query("after", one.robot, heard_at)  # so that the watch has seen the end of the gap, too
-    watched, stats = one.party.query("watched", one.robot), one.party.query("stats")
-    heard_s, latched_s = ((at - healed_at) * 1e-9 for at in (heard_at, latched_at))
+    one.process.query("after", one.robot, received_at)  # the monitor sees the end of the gap
+    watched, stats = one.process.query("watched", one.robot), one.process.query("stats")
+    received_s, latched_s = ((at - healed_at) * 1e-9 for at in (received_at, latched_at))
     print(
-        f"{name}: answers again {heard_s:.3f} s after the heal, latched value after {latched_s:.3f} s; "
-        f"missed {stats['missed']}, late {stats['late']}, looks found stale {watched['stale']}"
+        f"{name}: answers again {received_s:.3f} s after the heal, latched value after {latched_s:.3f} s; "
+        f"missed {stats['missed']}, late {stats['late']}, stale lookups {watched['stale']}"
     )
     assert (watched["went_back"], watched["old_as_fresh"]) == (0, 0), name
     assert watched["gap_ns"] > (one.seconds - MAX_AGE_S) * 1e9, name
     assert watched["stale"] > 0, name
-    # What was lost is counted: all that was said while nothing came through, but for what waited.
+    # Lost samples are counted: all that were published during the cut, except for queued ones.
     assert stats["missed"] > (one.seconds - 4.0) * RATE_HZ / 2, name
-    assert heard_s < BOUND_S * SLACK, name
+    assert received_s < BOUND_S * SLACK, name
     assert latched_s < BOUND_S * SLACK, name

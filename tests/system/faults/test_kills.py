@@ -15,15 +15,15 @@ RATE_HZ = 200.0
 BOUND_S = 1.0
 
 
-def since(party: FaultProcess, heard_at: int | None) -> float:
+def since(process: FaultProcess, received_at: int | None) -> float:
     """Seconds from the readiness of a process to the first lookup of the reader."""
-    assert heard_at is not None
-    return max(0.0, (heard_at - party.ready_at) * 1e-9)
+    assert received_at is not None
+    return max(0.0, (received_at - process.ready_at) * 1e-9)
 
 
-def killed(party: FaultProcess) -> int:
-    """When that was [ns]."""
-    party.kill()
+def killed(process: FaultProcess) -> int:
+    """Kills the process; returns the time [ns]."""
+    process.kill()
     return time.time_ns()
 
 
@@ -47,8 +47,8 @@ def test_publisher_killed_twenty_times_is_received_again_within_a_second(start: 
         latched.append(since(publishing, reader.query("mark", "r1", mark)))
         if mark == 2:
             before = [reader.query("census"), router.query("census")]
-    for was, party in zip(before, (reader, router), strict=True):
-        assert_no_growth(was, party.query("census"))
+    for was, process in zip(before, (reader, router), strict=True):
+        assert_no_growth(was, process.query("census"))
     print_figures("publisher killed: silent, with the time to start another", silent)
     print_figures("publisher killed: answers again after the new one is ready", answered)
     print_figures("publisher killed: new latched value after", latched)
@@ -74,13 +74,13 @@ def test_router_killed_twenty_times_loses_no_latched_value_changed_during_the_ou
         latched.append(since(router, reader.query("mark", "r1", mark)))
         if mark == 2:
             before = [reader.query("census"), publisher.query("census")]
-    for was, party in zip(before, (reader, publisher), strict=True):
-        assert_no_growth(was, party.query("census"))
+    for was, process in zip(before, (reader, publisher), strict=True):
+        assert_no_growth(was, process.query("census"))
     late = start("reader", session=client(endpoint))
     assert late.query("after", "r1", late.ready_at) and late.query("mark", "r1", ROUNDS)
     print_figures("router killed: silent, with the time to start another", silent)
     print_figures("router killed: answers again after the new one is ready", answered)
-    print_figures("router killed: latched value changed meanwhile after", latched)
+    print_figures("router killed: latched value changed during the outage after", latched)
     assert max(answered) < BOUND_S * SLACK
     assert max(latched) < BOUND_S * SLACK
 
@@ -96,9 +96,9 @@ def test_listener_killed_twenty_times_has_all_data_within_a_second(start: Start,
         latched.append(since(reader, reader.query("mark", "r1", 7.0)))
         reader.kill()
         if number == 2:
-            before = [party.query("census") for party in (publisher, router, witness)]
-    for was, party in zip(before, (publisher, router, witness), strict=True):
-        assert_no_growth(was, party.query("census"))
+            before = [process.query("census") for process in (publisher, router, witness)]
+    for was, process in zip(before, (publisher, router, witness), strict=True):
+        assert_no_growth(was, process.query("census"))
     stats = witness.query("stats")
     assert (stats["missed"], stats["dropped"], stats["refused"]) == (0, 0, {})
     print_figures("listener killed: answers again after", answered)

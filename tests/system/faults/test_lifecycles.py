@@ -36,24 +36,24 @@ FORKING = """
                 return "fork" in str(closed) and "connect()" in str(closed)
             return False
 
-        def waits_in_vain():
-            began, said = time.monotonic(), []
+        def waits_fail():
+            began, errors = time.monotonic(), []
             far = buffer.latest("world", "tool") + 10**12
-            for ask in (buffer.lookup, buffer.wait):
+            for lookup in (buffer.lookup, buffer.wait):
                 for frames in (("world", "tool"), ("world", "nowhere")):
                     try:
-                        ask(*frames, far, timeout_s=60.0)
+                        lookup(*frames, far, timeout_s=60.0)
                     except LookupFailed as failed:
-                        said.append(str(failed))
+                        errors.append(str(failed))
             return (
-                len(said) == 4
+                len(errors) == 4
                 and time.monotonic() - began < 30.0
-                and all(f"belongs to process {os.getppid()} and does not run after" in one for one in said)
-                and not any("wait for it" in one for one in said)
+                and all(f"belongs to process {os.getppid()} and does not run after" in one for one in errors)
+                and not any("wait for it" in one for one in errors)
             )
 
-        def in_child(told):
-            sure = [
+        def in_child(write_fd):
+            results = [
                 refused(lambda: session.zenoh),
                 refused(lambda: publisher.publish([0.0, 0.0])),
                 refused(lambda: StatePublisher(session, model, "r2")),
@@ -62,12 +62,12 @@ FORKING = """
                 refused(lambda: discover(session)),
                 refused(lambda: buffer.watch("world", "tool", print)),
                 refused(lambda: Recorder(session, "never.mcap")),
-                waits_in_vain(),
+                waits_fail(),
                 buffer.lookup("world", "tool").stamp > 0,
             ]
             for one in (listener, publisher, session):
                 one.close()
-            os.write(told, (json.dumps(sure) + "\\n").encode())
+            os.write(write_fd, (json.dumps(results) + "\\n").encode())
 
         def ends_by_itself(pid):
             ended, _, _ = select.select([os.pidfd_open(pid)], [], [], 10.0)
@@ -76,25 +76,25 @@ FORKING = """
             status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
             return status if ended else "hangs"
 
-        def goes_on():
+        def receives_samples():
             return buffer.wait("world", "tool", buffer.latest("world", "tool") + 1, timeout_s=5.0).stamp > 0
 
         for way in ["os.fork", "multiprocessing"] * 5:
-            ear, mouth = os.pipe()
+            read_fd, write_fd = os.pipe()
             if way == "multiprocessing":
-                child = multiprocessing.get_context("fork").Process(target=in_child, args=(mouth,))
+                child = multiprocessing.get_context("fork").Process(target=in_child, args=(write_fd,))
                 child.start()
                 child.join(10.0)
                 code = "hangs" if child.exitcode is None else child.exitcode
             else:
                 pid = os.fork()
                 if pid == 0:
-                    in_child(mouth)
+                    in_child(write_fd)
                     sys.exit(0)
                 code = ends_by_itself(pid)
-            os.close(mouth)
-            said = json.loads(os.read(ear, 1000) or b"null")
-            print(json.dumps([way, said, code, goes_on()]))
+            os.close(write_fd)
+            results = json.loads(os.read(read_fd, 1000) or b"null")
+            print(json.dumps([way, results, code, receives_samples()]))
     print("closed")
 """
 
@@ -131,8 +131,8 @@ def test_forked_child_gets_an_error_naming_connect_and_affects_no_other_process(
     start("router", listen=endpoint)
     child = spawn(FORKING, json.dumps(client(endpoint) if mode == "client" else {}))
     for _ in range(10):
-        way, refusals, code, goes_on = json.loads(child.line(30.0))
-        assert (refusals, code, goes_on) == ([True] * 10, 0, True), way
+        way, refusals, code, receives_samples = json.loads(child.line(30.0))
+        assert (refusals, code, receives_samples) == ([True] * 10, 0, True), way
     assert child.line() == "closed"
     assert child.wait() == 0
     assert not re.search("Traceback|panicked", child.stderr)

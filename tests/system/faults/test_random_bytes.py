@@ -1,6 +1,6 @@
 """Random bytes on every key: no crash, and every unusable payload is counted.
 
-ZSTATE_LONG=1 makes a minute of it.
+ZSTATE_LONG=1 runs it for a minute.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from zstate.wire.native import ENCODINGS
 from zstate.wire.registry import get_wire
 
 SECONDS = 60.0 if os.environ.get("ZSTATE_LONG") else 5.0
-BATCH = 150  # all four together fit into every ring: what a full one loses is another test's matter
+BATCH = 150  # the batches of all four targets fit into every ring, so that none overflows
 FOLLOWS: tuple[Follow, ...] = ("joint_states", "tf")
 ENCODED = (*ENCODINGS.values(), "", "text/plain", "zenoh/bytes", "application/cdr")
 NAMES = ("r1", "r2", "\u0440\u043e\u0431\u043e\u0442", "a" * 200, "%", "r 3", "-", "1")
@@ -65,14 +65,14 @@ def ros_keys(follow: Follow) -> tuple[str, ...]:
 
 
 def put(session: Session, key: str, dice: random.Random) -> None:
-    payload = dice.randbytes(dice.choice((1, 2, 8, 60, 110, 1000, 20_000)))  # none is empty: a withdrawal
+    payload = dice.randbytes(dice.choice((1, 2, 8, 60, 110, 1000, 20_000)))  # an empty one is a withdrawal
     attachment = dice.choice((None, b"", dice.randbytes(33)))
     session.zenoh.put(
         key,
         payload,
         encoding=dice.choice(ENCODED),
         attachment=attachment,
-        congestion_control=zenoh.CongestionControl.BLOCK,  # so that what was put does arrive
+        congestion_control=zenoh.CongestionControl.BLOCK,  # no payload is dropped
     )
 
 
@@ -108,8 +108,8 @@ def test_random_bytes_on_every_key_are_each_counted_and_stop_no_listener(monkeyp
             for key in UNREAD:
                 put(writer, key, dice)
             for target in targets:
-                wanted = sum(sent[key] for key in target.keys)
-                until(lambda target=target, wanted=wanted: crashes or target.counted() >= wanted)
+                expected = sum(sent[key] for key in target.keys)
+                until(lambda target=target, expected=expected: crashes or target.counted() >= expected)
         for target in targets:
             assert target.counted() == sum(sent[key] for key in target.keys), target.listener.stats
         print(f"{sent.total()} random payloads on {len(sent)} keys; refused: ")

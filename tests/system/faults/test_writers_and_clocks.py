@@ -39,12 +39,12 @@ def test_newer_of_two_conflicting_writers_is_used_and_samples_of_the_other_are_c
     reader.query("after", "r1", time.time_ns() + 1_000_000_000)
     watched = reader.query("watched", "r1")
     stats = reader.query("stats")
-    print(f"two writers fight for a second: {stats}, newest went back {watched['went_back']} times")
+    print(f"two conflicting writers for a second: {stats}, newest went back {watched['went_back']} times")
     assert (watched["went_back"], watched["old_as_fresh"], watched["stale"]) == (0, 0, 0)
     assert stats["missed"] == 0
     assert stats["refused"]["second writer"] > 50
     second.kill()
-    assert reader.query("after", "r1", time.time_ns())  # the first is there again
+    assert reader.query("after", "r1", time.time_ns())  # the first is received again
 
 
 @pytest.mark.parametrize("step", [HOUR, -HOUR, 85_000, -85_000], ids=["+1h", "-1h", "+85us", "-85us"])
@@ -53,7 +53,7 @@ def test_writer_with_a_clock_step_is_received_again_within_a_second_also_after_t
 ):
     start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint))
-    start("publisher", robot="r2", session=client(endpoint))  # whose clock is right all the time
+    start("publisher", robot="r2", session=client(endpoint))  # its clock is correct throughout
     reader = start("reader", session=client(endpoint))
     for robot in ("r1", "r2"):
         assert reader.query("after", robot, 0)

@@ -62,7 +62,7 @@ def test_trees_are_ordered_by_the_numbers_in_their_names(scene):
 
 def test_trees_keep_their_places_while_robots_move_and_samples_are_missing(scene):
     before = middles(scene.show(snapshot(BOTS, REACH), "bot1/base"))
-    version = scene.layout_version
+    version = scene.layout.version
     moved = REACH | {"bot7/tool": at(9.0)}
     for shown in (
         snapshot(BOTS, moved),
@@ -81,10 +81,10 @@ def test_trees_keep_their_places_while_robots_move_and_samples_are_missing(scene
         assert {name: place.tolist() for name, place in after.items()} == {
             name: place.tolist() for name, place in before.items()
         }
-    assert scene.layout_version == version
+    assert scene.layout.version == version
 
 
-def test_trees_stand_on_the_floor_of_the_fixed_frame(scene):
+def test_every_tree_is_drawn_on_the_floor_of_the_fixed_frame(scene):
     """A walker with its root at the hip next to an arm with its root at the floor."""
     two = tree({"arm/base": None, "arm/tip": "arm/base", "walker/hip": None, "walker/foot": "walker/hip"})
     shown = snapshot(two, {"arm/tip": at(z=1.0), "walker/foot": at(z=-0.9)})

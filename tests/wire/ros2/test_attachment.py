@@ -50,7 +50,7 @@ def test_bytes_of_another_shape_are_foreign(wrong: bytes):
 
 
 @given(data=st.binary(max_size=80))
-def test_no_bytes_raise_anything_else(data: bytes):
+def test_any_bytes_parse_or_raise_message_error(data: bytes):
     try:
         assert pack(*unpack(data)) == data
     except MessageError as error:

@@ -17,14 +17,14 @@ def reader(payload: bytes) -> CdrReader:
     return CdrReader(payload, "test/msg/Thing")
 
 
-def test_a_string_counts_its_nul_and_the_next_count_stands_at_a_multiple_of_four():
+def test_string_length_includes_its_nul_and_the_next_count_is_aligned_to_four():
     writer = CdrWriter()
     writer.text("ab")
     writer.count(9)
     assert writer.payload() == LITTLE + struct.pack("<I3sxI", 3, b"ab\0", 9)
 
 
-def test_doubles_stand_at_a_multiple_of_eight_from_the_fifth_byte():
+def test_doubles_are_aligned_to_eight_from_the_fifth_byte():
     writer = CdrWriter()
     writer.sequence(to_block([0.5]))
     assert writer.payload() == LITTLE + struct.pack("<I4xd", 1, 0.5)
@@ -46,7 +46,7 @@ VALUES = st.one_of(
 
 
 @given(st.lists(VALUES, max_size=8), st.binary(max_size=9))
-def test_whatever_is_written_is_read_again_and_what_follows_is_passed_over(
+def test_written_values_are_read_back_and_trailing_bytes_ignored(
     values: list[tuple[str, object]], trailing: bytes
 ):
     writer = CdrWriter()
@@ -76,7 +76,7 @@ def read_all(payload: bytes, kinds: list[str]) -> None:
         getattr(again, kind)()
 
 
-def test_big_endian_values_are_turned_around():
+def test_big_endian_values_are_byte_swapped():
     # the count ends at 8 + 8 + 4 bytes, so four are skipped before the doubles
     body = struct.pack(">iII3sxI4x2d", -1, 5, 3, b"ab\0", 2, 0.5, -2.0)
     again = reader(BIG + body)
@@ -109,7 +109,7 @@ def test_the_options_of_the_header_do_not_matter(options: bytes):
     [b"", b"ab", b"a\0b\0", b"ab\0\0", b"\xff\xfe\0", b"\xed\xa0\x80\0"],
     ids=["no NUL", "no NUL behind text", "NUL in the midst", "two NULs", "not UTF-8", "a lone surrogate"],
 )
-def test_a_string_that_is_not_one_is_malformed(data: bytes):
+def test_invalid_string_is_malformed(data: bytes):
     with pytest.raises(MessageError, match="string") as caught:
         reader(LITTLE + struct.pack("<I", len(data)) + data).text()
     assert caught.value.reason == "malformed"

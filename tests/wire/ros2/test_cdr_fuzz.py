@@ -20,7 +20,7 @@ def agree(data: bytes) -> None:
         assert decode_outcome(NEW[kind](), data) == decode_outcome(old, data)
 
 
-def test_a_run_of_hostile_bytes_finds_nothing_and_reaches_every_outcome():
+def test_fuzzed_bytes_raise_only_message_errors_and_reach_every_outcome():
     old = long_lived()
     outcomes = sum((Fuzz(seed, old).run(150) for seed in range(20)), start=Fuzz(0, old).run(0))
     assert {"read", "truncated", "malformed", "no positions"} == {key.split(" ", 1)[1] for key in outcomes}
@@ -30,18 +30,18 @@ def test_a_run_of_hostile_bytes_finds_nothing_and_reaches_every_outcome():
 
 
 @given(st.binary(max_size=200), st.sampled_from([b"", b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"]))
-def test_arbitrary_bytes_raise_nothing_but_a_message_error(data: bytes, head: bytes):
+def test_arbitrary_bytes_raise_only_message_error(data: bytes, head: bytes):
     agree(head + data)
 
 
 @given(st.sampled_from(WHOLE), st.integers(0, 10_000), st.binary(min_size=1, max_size=8))
-def test_changed_bytes_raise_nothing_but_a_message_error(whole: bytes, at: int, change: bytes):
+def test_changed_bytes_raise_only_message_error(whole: bytes, at: int, change: bytes):
     at %= len(whole)
     agree(whole[:at] + change + whole[at + len(change) :])
 
 
 @given(st.sampled_from(WHOLE), st.integers(0, 10_000), st.binary(max_size=12))
-def test_bytes_cut_off_or_added_raise_nothing_but_a_message_error(whole: bytes, end: int, more: bytes):
+def test_truncated_or_longer_bytes_raise_only_message_error(whole: bytes, end: int, more: bytes):
     agree(whole[: end % (len(whole) + 1)] + more)
 
 

@@ -37,12 +37,12 @@ def test_a_clock_is_that_of_rosbags(stamp: int):
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0")))
-def test_a_text_comes_back(text: str):
+def test_text_round_trips(text: str):
     assert decode_string(encode_string(text)) == text
 
 
 @given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
-def test_a_stamp_comes_back(stamp: int):
+def test_stamp_round_trips(stamp: int):
     assert decode_clock(encode_clock(stamp)) == stamp
 
 

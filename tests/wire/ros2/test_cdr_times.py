@@ -30,12 +30,12 @@ def test_a_stamp_is_whole_seconds_and_the_nanoseconds_that_follow_them(stamp: in
 
 
 @given(st.lists(st.integers(FIRST, LAST), max_size=5))
-def test_stamps_come_back_from_their_bytes(stamps: list[int]):
+def test_stamps_round_trip_through_their_bytes(stamps: list[int]):
     assert unpack_stamps(b"".join(pack_stamp(stamp) for stamp in stamps)) == tuple(stamps)
 
 
 @pytest.mark.parametrize("stamp", [FIRST - 1, LAST + 1, 2**63 - 1, -(2**63)])
-def test_a_stamp_that_ros_2_has_no_seconds_for_is_refused_by_name(stamp: int):
+def test_stamp_outside_the_seconds_of_ros_2_is_refused_by_name(stamp: int):
     for convert in (to_time, pack_stamp):
         with pytest.raises(InvalidInput, match=f"{stamp}.*1901.*2038"):
             convert(stamp)

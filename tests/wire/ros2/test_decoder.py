@@ -90,7 +90,7 @@ def test_a_description_is_known_by_its_text():
     assert other.digest != one.digest
 
 
-def test_a_clock_may_stand_at_zero():
+def test_clock_may_be_zero():
     assert decoded("clock", rosbags_cdr("rosgraph_msgs/msg/Clock", rosbags_time(0))) == (
         ClockMessage(0, 5, 77),
     )

@@ -19,14 +19,9 @@ ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
 JOINT_STATE_HASH = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
 NODE = NodeToken(0, ZID, 0, "/", "/", "zstate")
 PUBLISHER = EndpointToken(
-    domain=5,
-    zid=ZID,
-    nid=0,
+    NodeToken(5, ZID, 0, "/", "/fleet/r1", "zstate"),
     eid=10,
     kind="MP",
-    enclave="/",
-    namespace="/fleet/r1",
-    node="zstate",
     topic="/fleet/r1/joint_states",
     dds_type="sensor_msgs::msg::dds_::JointState_",
     hash=JOINT_STATE_HASH,
@@ -43,19 +38,7 @@ NUMBERS = st.integers(0, 10**9)
 QOS = st.sampled_from([*STREAM_QOS.values(), Qos("best_effort", depth=5), Qos(history="keep_all", depth=0)])
 NODES = st.builds(NodeToken, NUMBERS, WORDS, NUMBERS, PATHS, PATHS, WORDS)
 ENDPOINTS = st.builds(
-    EndpointToken,
-    NUMBERS,
-    WORDS,
-    NUMBERS,
-    NUMBERS,
-    st.sampled_from(["MP", "MS", "SS", "SC"]),
-    PATHS,
-    PATHS,
-    WORDS,
-    PATHS,
-    WORDS,
-    WORDS,
-    QOS,
+    EndpointToken, NODES, NUMBERS, st.sampled_from(["MP", "MS", "SS", "SC"]), PATHS, WORDS, WORDS, QOS
 )
 
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import to_block
-from zstate.wire.ros2.joint_state import JointStateDecoder, JointStateEncoder, RosJointState
+from zstate.wire.ros2.decoder import JointStateDecoder, RosJointState
+from zstate.wire.ros2.encoder import JointStateEncoder
 
 STAMP = 1_700_000_000_123_456_789
 STAMPS = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
@@ -89,7 +90,7 @@ def test_the_bytes_are_those_of_rosbags(count: int, has_velocities: bool, has_ef
     st.sampled_from(PRESENT),
     st.randoms(use_true_random=False),
 )
-def test_a_joint_state_comes_back_as_it_was_and_as_rosbags_reads_it(
+def test_joint_state_round_trips_and_equals_the_reading_of_rosbags(
     stamp: int, frame_id: str, names: list[str], present: tuple[bool, bool], dice: random.Random
 ):
     rows = [[dice.uniform(-1e3, 1e3) for _ in names] for _ in range(3)]

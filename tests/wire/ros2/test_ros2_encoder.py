@@ -25,7 +25,7 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
-from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
+from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
 
@@ -42,7 +42,7 @@ GID = bytes(range(16))
 
 def encoder(sample_names: SampleLayout = ARM, gid: bytes | None = GID, prefix: str = "") -> RosStreamEncoder:
     names = FrameNames(Ros2Options(frame_prefix=prefix), "r1")
-    return RosStreamEncoder("joint_states", TopicAddress("key", "token", gid), names, sample_names)
+    return RosStreamEncoder(names, sample_names, "key", "token", gid)
 
 
 def state(*blocks, names=None, stamp: int = STAMP) -> JointState:

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import to_block
-from zstate.wire.ros2.tf_message import RosTransforms, TfMessageDecoder, TfMessageEncoder
+from zstate.wire.ros2.decoder import RosTransforms, TfMessageDecoder
+from zstate.wire.ros2.encoder import TfMessageEncoder
 
 STAMP = 1_700_000_000_123_456_789
 STAMPS = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
@@ -60,7 +61,7 @@ def test_the_bytes_are_those_of_rosbags(count: int):
 
 
 @given(STAMPS, st.lists(st.tuples(TEXTS, TEXTS), max_size=5), st.randoms(use_true_random=False))
-def test_transforms_come_back_as_they_were_and_as_rosbags_reads_them(
+def test_transforms_round_trip_and_equal_the_reading_of_rosbags(
     stamp: int, edges: list[tuple[str, str]], dice: random.Random
 ):
     poses = [[dice.uniform(-1e3, 1e3) for _ in range(7)] for _ in edges]

@@ -105,7 +105,7 @@ def test_ros_has_no_topic_for_joint_commands(layout):
 
 
 @pytest.mark.parametrize("layout", [RmwKeys, DdsKeys])
-def test_a_robot_whose_name_is_no_ros_name_is_refused_only_where_it_would_be_one(layout):
+def test_robot_name_that_is_invalid_in_ros_is_refused_only_as_a_namespace(layout):
     assert layout(Ros2Options(namespace="r1")).topic("arm-2", "joint_states") == "/r1/joint_states"
     with pytest.raises(InvalidInput, match="'arm_2'"):
         layout(Ros2Options(namespace="*")).key("arm-2", "joint_states")

@@ -77,7 +77,7 @@ def test_mcap_ros2_support_decodes_by_the_definitions():
 
 
 @EACH
-def test_parts_stand_behind_a_line_of_80_equals_signs_and_their_name(kind: RosType):
+def test_parts_follow_a_line_of_80_equals_signs_and_their_name(kind: RosType):
     _, *parts = kind.definition.split("=" * 80 + "\n")
     assert all(part.startswith("MSG: ") for part in parts)
     assert len({part.split("\n")[0] for part in parts}) == len(parts)

@@ -20,9 +20,8 @@ from hypothesis import strategies as st
 
 from zstate.errors import MessageError
 from zstate.wire.identity import WriterId
-from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
-from zstate.wire.protocol import EntityId, SerializedSample, StreamEncoder
+from zstate.wire.protocol import SerializedSample, StreamEncoder, WriterNode
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
 
@@ -31,6 +30,7 @@ GOOD = rosbags_joint_state(STAMP, "", ("a",), [1.0], [], [])
 GID = bytes(range(16))
 ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
 WRITER = WriterId("arm driver", "host", 4, 5, 6)
+NODE = WriterNode("r1", WRITER, ZID, 3)
 DDS_TOPICS = {
     "joint_states": "sensor_msgs§msg§JointState",
     "tf": "tf2_msgs§msg§TFMessage",
@@ -56,15 +56,12 @@ def arrival(
 
 
 def encoder_of(wire: Ros2Wire, stream: Stream, number: int) -> StreamEncoder:
-    node = EntityId(ZID, 3)
-    return wire.stream_encoder("r1", WRITER, stream, node=node, number=number, sample_names=SampleLayout())
+    return wire.stream_encoder(NODE, stream, number)
 
 
 def test_a_writer_is_a_node_with_an_endpoint_for_each_stream():
     there = wire(namespace="fleet/r1", domain=5)
-    assert (
-        there.node_token("r1", WRITER, EntityId(ZID, 3)) == f"@ros2_lv/5/{ZID}/3/3/NN/%/%fleet%r1/arm_driver"
-    )
+    assert there.node_token(NODE) == f"@ros2_lv/5/{ZID}/3/3/NN/%/%fleet%r1/arm_driver"
     encoder = encoder_of(there, "joint_states", 9)
     assert encoder.key == key_of(JOINT_STATES, "fleet/r1", 5)
     around = f"@ros2_lv/5/{ZID}/3/9/MP/%/%fleet%r1/arm_driver/%fleet%r1%joint_states"
@@ -77,7 +74,7 @@ def test_a_writer_is_a_node_with_an_endpoint_for_each_stream():
 
 def test_bridge_wire_has_plain_keys_own_tokens_and_no_attachment():
     bridged = Ros2DdsWire(Ros2Options(namespace="r1"))
-    assert bridged.node_token("r1", WRITER, EntityId(ZID, 3)) is None
+    assert bridged.node_token(NODE) is None
     encoder = encoder_of(bridged, "tf_static", 9)
     assert (encoder.key, encoder.attachment(8)) == ("r1/tf_static", None)
     key = f"@/{ZID}/@ros2_lv/MP/r1§tf_static/tf2_msgs§msg§TFMessage"
@@ -129,7 +126,7 @@ def test_a_publisher_is_that_of_the_robot_whose_topic_it_writes(options, namespa
         "zstate/r1/@writer/tf/x",
     ],
 )
-def test_tokens_of_anything_else_announce_nothing(token: str):
+def test_other_tokens_announce_nothing(token: str):
     assert wire().parse_token(token, "r1") is None
     assert wire().parse_token(token, "*") is None
 

@@ -151,7 +151,7 @@ def test_both_wires_carry_the_same_numbers_at_the_same_instants(sessions):
 
         return take
 
-    ears = [reader.zenoh.declare_subscriber(key, note(wire)) for wire, key in keys.items()]
+    subscribers = [reader.zenoh.declare_subscriber(key, note(wire)) for wire, key in keys.items()]
     with StatePublisher(writer, RRBOT, "r1", tuple(keys)) as publisher:
         for key in keys.values():
             wait_for_reader(writer, key)
@@ -163,7 +163,7 @@ def test_both_wires_carry_the_same_numbers_at_the_same_instants(sessions):
     for one, other in zip(native, ros, strict=True):
         assert (one.stamp, one.positions, one.velocities) == (other.stamp, other.positions, other.velocities)
         assert (one.seq + 1, one.order) == (other.seq, other.order)
-    assert len(ears) == 2
+    assert len(subscribers) == 2
 
 
 def test_behind_a_bridge_robots_are_followed_and_their_writers_named(sessions):
@@ -205,7 +205,7 @@ def test_plain_puts_of_a_bridge_need_no_token_and_jumps_of_stamps_are_new_epochs
 def test_stamp_out_of_the_range_of_ros_is_sent_on_neither_wire(sessions, stamp: int):
     writer, reader = sessions
     native, ros = "zstate/r1/joint_states", key_of(JOINT_STATES)
-    ears = KeySubscriber(reader, native), KeySubscriber(reader, ros), KeySubscriber(reader, key_of(TF))
+    subscribers = KeySubscriber(reader, native), KeySubscriber(reader, ros), KeySubscriber(reader, key_of(TF))
     with StatePublisher(writer, RRBOT, "r1", ("native", "ros2")) as publisher:
         for key in (native, ros, key_of(TF)):
             wait_for_reader(writer, key)
@@ -213,9 +213,9 @@ def test_stamp_out_of_the_range_of_ros_is_sent_on_neither_wire(sessions, stamp: 
         with pytest.raises(InvalidInput, match="stamp"):
             publisher.publish([1.0, 1.0], stamp=stamp)
         publisher.publish([2.0, 2.0], stamp=STAMP + 1)
-        for ear in ears[1:]:
-            assert [seq for seq, _, _ in ear.attachments(2)] == [1, 2]
-        assert [len(ear.wait_for(2)) for ear in ears] == [2, 2, 2]
+        for subscriber in subscribers[1:]:
+            assert [seq for seq, _, _ in subscriber.attachments(2)] == [1, 2]
+        assert [len(subscriber.wait_for(2)) for subscriber in subscribers] == [2, 2, 2]
 
 
 def test_wire_that_fails_to_open_closes_the_others(sessions):

@@ -107,10 +107,10 @@ def test_late_joiner_receives_the_description_and_the_fixed_edges(sessions):
 
 def test_each_message_is_numbered_dated_and_signed_by_an_endpoint_that_is_alive(sessions):
     writer, reader = sessions
-    ears = {topic[0]: KeySubscriber(reader, key_of(topic)) for topic in (JOINT_STATES, TF)}
+    subscribers = {topic[0]: KeySubscriber(reader, key_of(topic)) for topic in (JOINT_STATES, TF)}
     before = time.time_ns()
     with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
-        ears |= {
+        subscribers |= {
             topic[0]: KeySubscriber(reader, key_of(topic), latched=True) for topic in (TF_STATIC, DESCRIPTION)
         }
         for topic in (JOINT_STATES, TF):
@@ -119,12 +119,12 @@ def test_each_message_is_numbered_dated_and_signed_by_an_endpoint_that_is_alive(
             publisher.publish(POSITIONS, stamp=STAMP + number)
         alive = endpoints(reader, 4)
         for topic, numbers in ((JOINT_STATES, 3), (TF, 3), (TF_STATIC, 1), (DESCRIPTION, 1)):
-            decoded = ears[topic[0]].attachments(numbers)
+            decoded = subscribers[topic[0]].attachments(numbers)
             assert [seq for seq, _, _ in decoded] == list(range(1, numbers + 1))
             assert all(before <= at <= time.time_ns() for _, at, _ in decoded)
             assert {gid for _, _, gid in decoded} == {gid_of("/".join(alive[f"%{topic[0]}"]))}
             # A ROS node does not look at the encoding; none is what ROS itself gives.
-            assert {str(sample.encoding) for sample in ears[topic[0]].samples} == {"zenoh/bytes"}
+            assert {str(sample.encoding) for sample in subscribers[topic[0]].samples} == {"zenoh/bytes"}
 
 
 def test_the_graph_has_one_node_with_four_publishers_as_ros_would_announce_them(sessions):
@@ -148,34 +148,34 @@ def test_the_graph_has_one_node_with_four_publishers_as_ros_would_announce_them(
 
 def test_nothing_is_ever_deleted_from_the_keys_of_ros(sessions):
     writer, reader = sessions
-    ears = [KeySubscriber(reader, key_of(topic)) for topic in TOPICS]
+    subscribers = [KeySubscriber(reader, key_of(topic)) for topic in TOPICS]
     last = KeySubscriber(reader, "last")
     for topic in TOPICS:
         wait_for_reader(writer, key_of(topic))
     with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
         publisher.publish(POSITIONS, stamp=STAMP)
-        for ear in ears:
-            ear.wait_for(1)
+        for subscriber in subscribers:
+            subscriber.wait_for(1)
     with StaticPublisher(writer, "rrbot", "mount", wires="ros2") as statics:
         statics.set(Transform("tool", "camera", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
         statics.withdraw("camera")
     wait_for_reader(writer, "last")
     writer.zenoh.put("last", b"x")
     last.wait_for(1)
-    kinds = {str(sample.kind) for ear in ears for sample in ear.samples}
+    kinds = {str(sample.kind) for subscriber in subscribers for sample in subscriber.samples}
     assert kinds == {"SampleKind.PUT"}
-    assert [len(message.transforms) for message in ears[2].messages(3, TF_MSG)][1:] == [1, 0]
+    assert [len(message.transforms) for message in subscribers[2].messages(3, TF_MSG)][1:] == [1, 0]
 
 
 def test_humble_has_no_hashes(sessions):
     writer, reader = sessions
-    ear = KeySubscriber(reader, key_of(JOINT_STATES, written=HUMBLE))
+    subscriber = KeySubscriber(reader, key_of(JOINT_STATES, written=HUMBLE))
     with StatePublisher(writer, RRBOT, wires=("ros2:hash=humble",)) as publisher:
         wait_for_reader(writer, key_of(JOINT_STATES, written=HUMBLE))
         publisher.publish(POSITIONS, stamp=STAMP)
         alive = endpoints(reader, 4)
         assert {chunks[11] for chunks in alive.values()} == {HUMBLE}
-        ((_, _, gid),) = ear.attachments(1)
+        ((_, _, gid),) = subscriber.attachments(1)
         assert gid == gid_of("/".join(alive["%joint_states"]))
         (late,) = KeySubscriber(reader, key_of(DESCRIPTION, written=HUMBLE), latched=True).messages(
             1, STRING_MSG
@@ -186,12 +186,12 @@ def test_humble_has_no_hashes(sessions):
 def test_iron_and_humble_can_be_published_together(sessions):
     writer, reader = sessions
     keys = [key_of(JOINT_STATES), key_of(JOINT_STATES, written=HUMBLE)]
-    ears = [KeySubscriber(reader, key) for key in keys]
+    subscribers = [KeySubscriber(reader, key) for key in keys]
     with StatePublisher(writer, RRBOT, wires=("ros2", "ros2:hash=humble")) as publisher:
         for key in keys:
             wait_for_reader(writer, key)
         publisher.publish(POSITIONS, stamp=STAMP)
-        iron, humble = (ear.wait_for(1)[0] for ear in ears)
+        iron, humble = (subscriber.wait_for(1)[0] for subscriber in subscribers)
         nodes = [one.split("/")[3] for one in tokens(reader) if "/NN/" in one]
     assert iron.payload.to_bytes() == humble.payload.to_bytes()
     assert len(set(nodes)) == 2
@@ -200,11 +200,11 @@ def test_iron_and_humble_can_be_published_together(sessions):
 def test_the_domain_is_the_first_chunk_everywhere(sessions, monkeypatch: pytest.MonkeyPatch):
     writer, reader = sessions
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
-    ear = KeySubscriber(reader, key_of(JOINT_STATES, domain=7))
+    subscriber = KeySubscriber(reader, key_of(JOINT_STATES, domain=7))
     with StatePublisher(writer, RRBOT, wires=("ros2", "ros2:domain=9")) as publisher:
         wait_for_reader(writer, key_of(JOINT_STATES, domain=7))
         publisher.publish(POSITIONS, stamp=STAMP)
-        ear.wait_for(1)
+        subscriber.wait_for(1)
         for domain in (7, 9):
             assert len(endpoints(reader, 4, domain)) == 4
         assert tokens(reader, 0) == []
@@ -220,7 +220,7 @@ def test_the_domain_is_the_first_chunk_everywhere(sessions, monkeypatch: pytest.
 )
 def test_namespace_prefixes_topics_and_node(sessions, options, namespace, tf_in):
     writer, reader = sessions
-    ears = {
+    subscribers = {
         topic[0]: KeySubscriber(reader, key_of(topic, namespace), latched=topic == DESCRIPTION)
         for topic in TOPICS
     }
@@ -231,8 +231,8 @@ def test_namespace_prefixes_topics_and_node(sessions, options, namespace, tf_in)
         for key in (key_of(JOINT_STATES, namespace), key_of(TF, tf_in)):
             wait_for_reader(writer, key)
         publisher.publish(POSITIONS, stamp=STAMP)
-        for ear in (ears["joint_states"], ears["robot_description"], *shared):
-            ear.wait_for(1)
+        for subscriber in (subscribers["joint_states"], subscribers["robot_description"], *shared):
+            subscriber.wait_for(1)
         alive = endpoints(reader, 4)
     around = f"%{namespace.replace('/', '%')}"
     assert {chunks[7] for chunks in alive.values()} == {around}
@@ -257,7 +257,7 @@ def test_frame_prefix_applies_to_every_frame_of_the_robot(sessions):
 def test_two_robots_of_one_session_have_two_namespaces(sessions):
     writer, reader = sessions
     wires = ("ros2:namespace=*,frame_prefix=*/",)
-    ears = {robot: KeySubscriber(reader, key_of(JOINT_STATES, robot)) for robot in ("r1", "r2")}
+    subscribers = {robot: KeySubscriber(reader, key_of(JOINT_STATES, robot)) for robot in ("r1", "r2")}
     transforms = KeySubscriber(reader, key_of(TF))
     with (
         StatePublisher(writer, RRBOT, "r1", wires) as one,
@@ -267,8 +267,8 @@ def test_two_robots_of_one_session_have_two_namespaces(sessions):
             wait_for_reader(writer, key)
         one.publish([1.0, 1.0], stamp=STAMP)
         two.publish([2.0, 2.0], stamp=STAMP)
-        assert ears["r1"].messages(1, JOINT_STATE_MSG)[0].position.tolist() == [1.0, 1.0]
-        assert ears["r2"].messages(1, JOINT_STATE_MSG)[0].position.tolist() == [2.0, 2.0]
+        assert subscribers["r1"].messages(1, JOINT_STATE_MSG)[0].position.tolist() == [1.0, 1.0]
+        assert subscribers["r2"].messages(1, JOINT_STATE_MSG)[0].position.tolist() == [2.0, 2.0]
         decoded = transforms.messages(2, TF_MSG)
         alive = tokens(reader)
         robots = {robot.name for robot in discover(reader, wire=wires[0])}

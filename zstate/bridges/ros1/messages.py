@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.bridges.ros1.node import RospyModules
-from zstate.errors import MessageError
+from zstate.errors import InsertRefused, MessageError, SecondWriter
+from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
-from zstate.wire.joint_order import JointNumbers
+from zstate.sources.joint_source import JointStateValidator
+from zstate.wire.joint_order import Floats, JointNumbers
 from zstate.wire.keys import wire_name
-
-Floats = NDArray[np.float64]
 
 _SECOND = 1_000_000_000
 # A ROS 1 time is two unsigned numbers of 32 bits.
@@ -104,6 +104,24 @@ class TransformsWriter:
         return self._message
 
 
+class RobotWriter:
+    """Encodes samples of one model as ROS 1 messages."""
+
+    def __init__(self, model: RobotModel, ros: RospyModules, names: Ros1FrameNames) -> None:
+        self.digest = model.digest
+        self.joints = JointStateWriter(ros, model)
+        self.validator = JointStateValidator(model)
+        self._table = JointTransforms(model)
+        forms = self._table.forms
+        self._rows = [row for row, form in enumerate(forms) if form.kind != "fixed"]
+        self.has_moving_edges = bool(self._rows)
+        edges = [(names.prefix + forms[row].parent, names.prefix + forms[row].child) for row in self._rows]
+        self._transforms = TransformsWriter(ros, edges)
+
+    def transforms(self, stamp: int, positions: Floats) -> Any:
+        return self._transforms.message(stamp, self._table.poses(positions).take(self._rows, axis=0))
+
+
 def pose_from_ros(transform: Any) -> tuple[float, ...]:
     """pose7 of a ROS Transform: x y z [m], qx qy qz qw."""
     place, turn = transform.translation, transform.rotation
@@ -185,3 +203,10 @@ class Ros1FrameNames:
         """The zstate name of a ``frame_id`` in messages of this robot, whose model has ``links``."""
         bare = self.bare(frame_id)
         return wire_name(self.robot, bare) if bare in links else bare
+
+
+def refusal_reason(error: Exception) -> str:
+    """The counter of a refusal."""
+    if isinstance(error, MessageError | InsertRefused):
+        return error.reason
+    return "second writer" if isinstance(error, SecondWriter) else "bad numbers"

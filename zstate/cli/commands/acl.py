@@ -19,9 +19,8 @@ _ROLES = {
 
 def _role_options(command: Any) -> Any:
     for role, text in reversed(_ROLES.items()):
-        command = click.option(f"--{role}", multiple=True, metavar="NAME", help=f"{text}; may be repeated.")(
-            command
-        )
+        option = click.option(f"--{role}", multiple=True, metavar="NAME", help=f"{text}; may be repeated.")
+        command = option(command)
     return command
 
 
@@ -58,18 +57,12 @@ def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, .
     zstate acl --robot r1 --robot r2 --viewer rviz --wire 'ros2:namespace=*,tf=namespace' >acl.json5
     zstate router --listen tls/0.0.0.0:7447 --certs certs --identity router --acl acl.json5
     """
-    from zstate.net.security.acl import AclRoles, access_text
+    from zstate.net.security.acl import AclRoles
+    from zstate.net.security.router_config import access_text
 
     if not any(roles.values()):
         *others, last = (f"--{role} NAME" for role in _ROLES)
         raise click.UsageError(f"give at least one of {', '.join(others)} and {last}")
-    fleet = AclRoles(
-        roles["robot"],
-        roles["viewer"],
-        roles["operator"],
-        roles["timekeeper"],
-        namespace,
-        wires,
-        roles["placer"],
-    )
+    robots, viewers, operators, timekeepers, placers = (roles[role] for role in _ROLES)
+    fleet = AclRoles(robots, viewers, operators, timekeepers, namespace, wires, placers)
     print_result(access_text(fleet).rstrip("\n"))

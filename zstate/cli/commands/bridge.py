@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from zstate.cli import options
 from zstate.cli.metrics import bridge_collector, serve_metrics
-from zstate.cli.options import metrics_option, session_options
 from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import Unreachable
@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from zstate.bridges.ros2 import Way
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.session import Session
-
-# The router of rmw_zenoh on this host.
-_ROS_ROUTER = "tcp/127.0.0.1:7447"
 
 
 @click.command("bridge")
@@ -33,13 +30,13 @@ _ROS_ROUTER = "tcp/127.0.0.1:7447"
 )
 @click.option(
     "--ros",
-    default=_ROS_ROUTER,
+    default="tcp/127.0.0.1:7447",
     show_default=True,
     metavar="ENDPOINT",
     help="Router of the ROS nodes. The session options below are for the zstate side.",
 )
-@metrics_option
-@session_options
+@options.metrics_option
+@options.session_options
 def bridge_command(
     *, network: SessionOptions, robot: str | None, wire: str, ros: str, metrics: BindAddress | None
 ) -> None:
@@ -60,6 +57,9 @@ def bridge_command(
     from zstate.wire.registry import get_wire
     from zstate.wire.ros2.wire import Ros2Wire
 
+    def print_change(name: str, way: Way | None) -> None:
+        print_wrapped(f"{name!r} is no longer carried" if way is None else f"carrying {name!r}: {way}")
+
     wire_format = get_wire(wire)
     is_for_all = isinstance(wire_format, Ros2Wire) and wire_format.options.namespace == ANY
     with open_session(network) as native, _open_ros_session(ros) as session:
@@ -67,7 +67,7 @@ def bridge_command(
         if not robots and not is_for_all:
             robots = [info.name for info in discover(native)] or None
         with (
-            Bridge(native, session, wire, robots, on_change=_print_change) as bridge,
+            Bridge(native, session, wire, robots, on_change=print_change) as bridge,
             serve_metrics(metrics, bridge_collector(bridge)),
         ):
             names = " and ".join(map(repr, robots)) if robots else "every robot"
@@ -88,7 +88,3 @@ def _open_ros_session(endpoint: str) -> Session:
             f"no router of ROS 2 nodes answers at {endpoint!r}; start one (`ros2 run rmw_zenoh_cpp "
             "rmw_zenohd`, or `zstate router --ros2`), or pass its address: --ros tcp/HOST:7447"
         )
-
-
-def _print_change(robot: str, way: Way | None) -> None:
-    print_wrapped(f"{robot!r} is no longer carried" if way is None else f"carrying {robot!r}: {way}")

@@ -6,8 +6,6 @@ import click
 
 from zstate.cli.output.console import print_status, print_wrapped
 
-_ROUTER = "router"
-
 
 @click.command("certs")
 @click.argument("folder", metavar="DIR", type=click.Path(file_okay=False))
@@ -51,11 +49,9 @@ def certs_command(
     names = (*identities, *(name for name in servers if name not in identities))
     if not names:
         raise click.UsageError("no identity is named; give --identity NAME, or --server NAME for a listener")
-    may_listen = {_ROUTER, *servers}.intersection(names)
+    may_listen = {"router", *servers}.intersection(names)
     if hosts and not may_listen:
-        raise click.UsageError(
-            f"--host needs an identity that listens: --server NAME or --identity {_ROUTER}"
-        )
+        raise click.UsageError("--host needs an identity that listens: --server NAME or --identity router")
     issued = issue_identities(folder, names, hosts=hosts, servers=may_listen, days=days)
     for name, files in issued.items():
         print_wrapped(f"{name}: {files.certificate} and {files.key}, for {days} days")

@@ -6,17 +6,20 @@ import math
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.options import json_option, xacro_arguments
+from zstate.cli import options
 from zstate.cli.output.console import count_text, output_width, print_json, print_wrapped
 from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, in_columns, tree_lines
 from zstate.errors import FindingLike, ModelError
 
 if TYPE_CHECKING:
     from zstate.model.robot import Joint, RobotModel
+
+Findings = Sequence[FindingLike]
 
 _STDIN = "standard input"
 _WITHOUT_AXIS = ("fixed", "floating")
@@ -25,12 +28,12 @@ _JOINT_HEADINGS = ("joint", "type", "parent", "child", "position", "range", "vel
 
 @click.command("check")
 @click.argument("file")
-@xacro_arguments
+@options.xacro_arguments
 @click.option("--fix-hints", is_flag=True, help="Print a correction below each finding.")
 @click.option(
     "--joints", "joint_table", is_flag=True, help="Print the joints as a table instead of the tree."
 )
-@json_option("One JSON object.")
+@options.json_option("One JSON object.")
 def check_command(
     file: str, xacro_args: dict[str, str], fix_hints: bool, joint_table: bool, as_json: bool
 ) -> None:
@@ -64,12 +67,7 @@ def check_command(
 
 
 def _report(
-    name: str,
-    model: RobotModel | None,
-    findings: Sequence[FindingLike],
-    *,
-    fix_hints: bool,
-    joint_table: bool,
+    name: str, model: RobotModel | None, findings: Findings, *, fix_hints: bool, joint_table: bool
 ) -> str:
     if model is None:
         errors = sum(finding.severity == "error" for finding in findings)
@@ -80,10 +78,8 @@ def _report(
             f"{count_text(len(model.joints), 'joint')} ({len(model.joint_names)} driven)"
         ]
     places = ("file" if finding.line is None else f"line {finding.line}" for finding in findings)
-    rows = in_columns(
-        [(place, one.severity, one.message) for place, one in zip(places, findings, strict=True)]
-    )
-    for row, finding in zip(rows, findings, strict=True):
+    cells = [(place, one.severity, one.message) for place, one in zip(places, findings, strict=True)]
+    for row, finding in zip(in_columns(cells), findings, strict=True):
         lines += [f"  {row}"]
         if fix_hints and finding.fix:
             lines += [f"      fix: {finding.fix}"]
@@ -106,7 +102,7 @@ def _link_lines(model: RobotModel) -> list[str]:
         found: list[tuple[str, ...]] = [(root, "", "", "")]
         for guide, link in links:
             joint = joints[link]
-            found.append((guide + link, joint.name, joint.type, _mimic_text(joint) or _limits_text(joint)))
+            found.append((guide + link, joint.name, joint.type, _range_text(joint)))
         return found
 
     headings = ("link", "joint", "type", "range")
@@ -131,7 +127,7 @@ def _joint_lines(model: RobotModel) -> list[str]:
     rows = [
         (
             *(joint.name, joint.type, joint.parent, joint.child, indices.get(joint.name, "-")),
-            _mimic_text(joint) or _limits_text(joint) or "-",
+            _range_text(joint) or "-",
             *(
                 f"{limit:g}" if joint.type != "fixed" and math.isfinite(limit) else "-"
                 for limit in (joint.limits.velocity, joint.limits.effort)
@@ -144,47 +140,33 @@ def _joint_lines(model: RobotModel) -> list[str]:
     return Table(_JOINT_HEADINGS, rows, optional).lines(output_width())
 
 
-def _mimic_text(joint: Joint) -> str:
-    if joint.mimic is None:
-        return ""
-    offset = f" {joint.mimic.offset:+g}" if joint.mimic.offset else ""
-    return f"{joint.mimic.multiplier:g} * {joint.mimic.joint}{offset}"
+def _range_text(joint: Joint) -> str:
+    """The mimic rule or the limits; empty for a joint without either."""
+    if joint.mimic is not None:
+        offset = f" {joint.mimic.offset:+g}" if joint.mimic.offset else ""
+        return f"{joint.mimic.multiplier:g} * {joint.mimic.joint}{offset}"
+    unit = {"revolute": "rad", "prismatic": "m"}.get(joint.type)
+    return f"{joint.limits.lower:g} to {joint.limits.upper:g} {unit}" if unit else ""
 
 
-def _limits_text(joint: Joint) -> str:
-    if joint.type not in ("revolute", "prismatic"):
-        return ""
-    unit = "rad" if joint.type == "revolute" else "m"
-    return f"{joint.limits.lower:g} to {joint.limits.upper:g} {unit}"
+def _facts(name: str, model: RobotModel | None, findings: Findings) -> dict[str, Any]:
+    def joint_facts(joint: Joint) -> dict[str, Any]:
+        lower, upper = joint.limits.lower, joint.limits.upper
+        facts: dict[str, Any] = {
+            **{key: getattr(joint, key) for key in ("name", "type", "parent", "child", "line")},
+            # JSON has no infinity; a missing limit is null.
+            "lower": lower if math.isfinite(lower) else None,
+            "upper": upper if math.isfinite(upper) else None,
+        }
+        return facts if joint.mimic is None else {**facts, "mimic": asdict(joint.mimic)}
 
-
-def _facts(name: str, model: RobotModel | None, findings: Sequence[FindingLike]) -> dict[str, Any]:
+    keys = ("line", "severity", "message", "fix")
     facts: dict[str, Any] = {
         "source": name,
         "usable": model is not None,
-        "findings": [
-            {"line": one.line, "severity": one.severity, "message": one.message, "fix": one.fix}
-            for one in findings
-        ],
+        "findings": [{key: getattr(one, key) for key in keys} for one in findings],
     }
     if model is not None:
         facts |= {"robot": model.name, "digest": model.digest, "root": model.root, "links": model.links}
-        facts["joints"] = [_joint_facts(joint) for joint in model.joints]
-    return facts
-
-
-def _joint_facts(joint: Joint) -> dict[str, Any]:
-    facts: dict[str, Any] = {
-        "name": joint.name,
-        "type": joint.type,
-        "parent": joint.parent,
-        "child": joint.child,
-        "line": joint.line,
-        # JSON has no infinity; a missing limit is null.
-        "lower": joint.limits.lower if math.isfinite(joint.limits.lower) else None,
-        "upper": joint.limits.upper if math.isfinite(joint.limits.upper) else None,
-    }
-    if joint.mimic is not None:
-        mimic = joint.mimic
-        facts["mimic"] = {"joint": mimic.joint, "multiplier": mimic.multiplier, "offset": mimic.offset}
+        facts["joints"] = [joint_facts(joint) for joint in model.joints]
     return facts

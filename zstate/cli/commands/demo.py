@@ -7,12 +7,14 @@ import socket
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from math import degrees
 from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import load_robot, rate_option, seconds_option, xacro_arguments
+from zstate.cli import options
+from zstate.cli.options import load_robot
 from zstate.cli.output.console import (
     count_text,
     duration_or_dash,
@@ -53,10 +55,10 @@ _WIDTH_WITH_ANGLES = 72
 
 @click.command("demo")
 @click.argument("robot", required=False)
-@xacro_arguments
+@options.xacro_arguments
 @click.option("--robot", "robot_option", metavar="ROBOT", help="Same as the argument.")
-@rate_option
-@seconds_option
+@options.rate_option
+@options.seconds_option
 def demo_command(
     robot: str | None,
     xacro_args: dict[str, str],
@@ -107,12 +109,7 @@ def demo_command(
 
 
 def _show_transforms(  # noqa: PLR0917 - one use
-    endpoint: str,
-    robot: str,
-    root: str,
-    links: Sequence[str],
-    ended: threading.Event,
-    seconds: float | None,
+    endpoint: str, robot: str, root: str, links: Sequence[str], ended: threading.Event, seconds: float | None
 ) -> None:
     from zstate.metrics.buffer import MeteredBuffer
     from zstate.nodes.listener import TransformListener
@@ -146,16 +143,12 @@ class DemoTable:
     def __init__(
         self, listener: TransformListener, buffer: MeteredBuffer, robot: str, root: str, links: Sequence[str]
     ) -> None:
-        self._listener = listener
-        self._buffer = buffer
+        self._listener, self._buffer = listener, buffer
+        self._robot, self._root, self._links = robot, root, links
         self._statistics = buffer.statistics_of(robot)
-        self._robot = robot
-        self._root = root
-        self._links = links
         self._start = time.monotonic_ns(), self._statistics.count
 
     def show(self, ended: threading.Event, seconds: float | None) -> None:
-        """Update until ``ended`` is set, or for ``seconds``."""
         from zstate.clock import wait_interruptible
 
         until = float("inf") if seconds is None else time.monotonic() + seconds
@@ -175,7 +168,6 @@ class DemoTable:
                 live.update(self.table(), refresh=True)
 
     def summary(self) -> str:
-        """Samples, rate, losses and latency since the start."""
         stats, (start, before) = self._listener.stats, self._start
         count, now = self._statistics.count - before, time.monotonic_ns()
         seconds = (now - start) * 1e-9
@@ -201,11 +193,8 @@ class DemoTable:
         """The transforms now, without those that cannot be looked up yet."""
         found: list[Transform] = []
         for link in self._links:
-            try:
-                transform = self._buffer.lookup(f"{self._robot}/{self._root}", f"{self._robot}/{link}")
-            except LookupFailed:
-                continue
-            found.append(transform)
+            with suppress(LookupFailed):
+                found.append(self._buffer.lookup(f"{self._robot}/{self._root}", f"{self._robot}/{link}"))
         return found
 
     def table(self) -> Table:
@@ -234,12 +223,13 @@ class DemoTable:
 
     def line(self) -> str:
         """The first transform on one line."""
+        from zstate.cli.commands.tf import numbers_text
+
         text = self._freshness
         for one in self.transforms()[:1]:
-            # Adding zero turns -0 into 0.
-            xyz = ", ".join(f"{round(value, 3) + 0.0:.3f}" for value in one.translation.tolist())
-            rpy = ", ".join(f"{round(degrees(angle), 1) + 0.0:.1f}" for angle in one.rpy)
-            text += f"; {_link(one)} in {self._root}: xyz [{xyz}] m, rpy [{rpy}] deg"
+            xyz = numbers_text(one.translation.tolist(), 3)
+            rpy = numbers_text([degrees(angle) for angle in one.rpy], 1)
+            text += f"; {_link(one)} in {self._root}: xyz {xyz} m, rpy {rpy} deg"
         return text
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import json_option, session_options, timeout_option, wire_option
+from zstate.cli import options
 from zstate.cli.output.console import print_json, print_result
 from zstate.cli.session import SessionOptions
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 @click.command("doctor")
 @click.argument("robot", default="*", metavar="[ROBOT]")
-@timeout_option("How long to wait for streams that are announced but slow [s].", 3.0)
+@options.timeout_option("How long to wait for streams that are announced but slow [s].", 3.0)
 @click.option(
     "--all", "in_full", is_flag=True, help="Print every link of every robot, also those that are ok."
 )
-@json_option("One JSON object.")
-@wire_option
-@session_options
+@options.json_option("One JSON object.")
+@options.wire_option
+@options.session_options
 def doctor_command(
     *, network: SessionOptions, robot: str, timeout: float, in_full: bool, as_json: bool, wire: str
 ) -> None:
@@ -39,14 +39,14 @@ def doctor_command(
     zstate doctor panda --connect tcp/192.168.1.10:7447
     zstate doctor --json | jq .first_broken.text
     """
-    from zstate.cli.doctor.check import first_broken
-    from zstate.cli.doctor.diagnosis import (
+    from zstate.cli.doctor.check import (
         check_text,
         conclusion_text,
-        diagnosis,
         diagnosis_json,
+        first_broken,
         robot_lines,
     )
+    from zstate.cli.doctor.diagnosis import diagnosis
     from zstate.cli.output.logs import suppress_library_warnings
     from zstate.wire.keys import ANY, check_robot
 

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import click
 
-from zstate.cli.options import named_robot, refuse_topic, session_options, timeout_option, wire_option
+from zstate.cli import options
+from zstate.cli.options import named_robot, refuse_topic
 from zstate.cli.output.console import print_json, print_result
 from zstate.cli.session import SessionOptions, open_session
-
-if TYPE_CHECKING:
-    from zstate.cli.output.joint_state_text import ChangeFilter
+from zstate.errors import InvalidInput
 
 
-def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> float:
+def _check_amount(amount: float) -> float:
     if not (math.isfinite(amount) and amount >= 0.0):
-        raise click.BadParameter(f"an amount is finite and at least 0; got {amount}")
+        raise InvalidInput(f"an amount is finite and at least 0; got {amount}")
     return amount
 
 
 @click.command("echo")
 @click.argument("robot", required=False)
 @click.option("--once", is_flag=True, help="Print one document; fail after --timeout with the reason.")
-@timeout_option("How long --once waits [s].")
+@options.timeout_option("How long --once waits [s].")
 @click.option("--field", metavar="NAME", help="Print only this: stamp, positions, positions.JOINT, or JOINT.")
 @click.option(
     "--changed",
@@ -35,16 +32,14 @@ def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> flo
 )
 @click.option(
     "--by",
-    type=float,
+    type=options.number("AMOUNT", _check_amount),
     default=0.0,
-    callback=_checked_amount,
-    metavar="AMOUNT",
     help="Skip documents without a number that changed by more than this since the last printed one.",
 )
 @click.option("--csv", "form", flag_value="csv", help="Comma-separated values below a line of names.")
 @click.option("--json", "form", flag_value="json", help="One JSON value per line.")
-@wire_option
-@session_options
+@options.wire_option
+@options.session_options
 def echo_command(
     *,
     network: SessionOptions,
@@ -69,18 +64,38 @@ def echo_command(
     zstate echo --wire ros2 --once                     # /joint_states
     zstate echo --wire ros2:namespace=r1               # /r1/joint_states
     """
-    from zstate.cli.output.joint_state_text import ChangeFilter, DescribedJointStates
+    from zstate.cli.output.joint_state_text import (
+        ChangeFilter,
+        CsvFormatter,
+        DescribedJointStates,
+        select_field,
+        yaml_text,
+    )
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
     from zstate.wire.messages import JointState
 
+    table, changes = CsvFormatter(), ChangeFilter(by) if changed or by else None
+
+    def show(document: Any) -> None:
+        value = document if field is None else select_field(document, field)
+        if changes is not None and not changes.accepts(value):
+            return
+        if form == "json":
+            print_json(_with_nulls(value))
+        elif form == "csv":
+            print_result("\n".join(table.lines(value, field or "")))
+        elif field is not None and not isinstance(value, dict):
+            print_result(yaml_text(value))
+        else:
+            print_result(f"{yaml_text(value)}\n---")
+
     refuse_topic(robot, wire)
-    with ExitStack() as opened:
-        session = opened.enter_context(open_session(network, (wire,)))
-        selected = named_robot(session, robot, wire)
-        states = opened.enter_context(DescribedJointStates(session, selected, wire))
-        reader = opened.enter_context(StreamReader(session, selected, "joint_states", wire))
-        show = _printer(form, field, ChangeFilter(by) if changed or by else None)
+    with (
+        open_session(network, (wire,)) as session,
+        DescribedJointStates(session, selected := named_robot(session, robot, wire), wire) as states,
+        StreamReader(session, selected, "joint_states", wire) as reader,
+    ):
         received = reader.first(timeout if once else None)
         while True:
             if received is not None:
@@ -98,24 +113,3 @@ def _with_nulls(value: Any) -> Any:
     if isinstance(value, list):
         return [_with_nulls(inner) for inner in cast("list[Any]", value)]
     return None if value != value else value  # noqa: PLR0124 - true of NaN only
-
-
-def _printer(form: str | None, field: str | None, changes: ChangeFilter | None) -> Callable[[Any], None]:
-    from zstate.cli.output.joint_state_text import CsvFormatter, select_field, yaml_text
-
-    table = CsvFormatter()
-
-    def show(document: Any) -> None:
-        value = document if field is None else select_field(document, field)
-        if changes is not None and not changes.accepts(value):
-            return
-        if form == "json":
-            print_json(_with_nulls(value))
-        elif form == "csv":
-            print_result("\n".join(table.lines(value, field or "")))
-        elif field is not None and not isinstance(value, dict):
-            print_result(yaml_text(value))
-        else:
-            print_result(f"{yaml_text(value)}\n---")
-
-    return show

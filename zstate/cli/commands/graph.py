@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate._util.suggestions import did_you_mean
-from zstate.cli.options import form_options, session_options, wire_option
+from zstate._util.format import did_you_mean
+from zstate.cli import options
 from zstate.cli.output.console import fail, print_json, print_result, print_status, print_wrapped
 from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.session import SessionOptions, open_session
@@ -27,9 +27,9 @@ _PROGRAM_FILL = "#eef2ff"
 
 @click.command("graph")
 @click.argument("robot", default="*", metavar="[ROBOT]")
-@form_options("One JSON object: programs and streams.", "A picture, from left to right.")
-@wire_option
-@session_options
+@options.form_options("One JSON object: programs and streams.", "A picture, from left to right.")
+@options.wire_option
+@options.session_options
 def graph_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show the writers and readers of the streams of ROBOT, or of all robots.
 
@@ -61,7 +61,7 @@ def graph_command(network: SessionOptions, robot: str, form: str | None, wire: s
             fail(f"no stream of {robot!r} has a writer or a reader{hint}")
         graph = replace(graph, streams=streams)
     if form == "json":
-        print_json(graph_facts(graph))
+        print_json(_graph_facts(graph))
     elif not graph.streams:
         print_status(messages_for(wire).announced(()))
     elif form is None:
@@ -114,9 +114,8 @@ def graph_text(graph: Graph) -> str:
         names = ", ".join(stream.label for stream in group.streams)
         lines.append(f"{group.robot}: {names}" if group.robot else names)
         for role, programs in (("written by", group.writers), ("read by", group.readers)):
-            shown = programs or ("none",)
-            heads = (role, *[""] * (len(shown) - 1))
-            lines += [f"  {head:<10}  {program}" for head, program in zip(heads, shown, strict=True)]
+            for number, program in enumerate(programs or ("none",)):
+                lines.append(f"  {'' if number else role:<10}  {program}")
     return "\n".join(lines)
 
 
@@ -149,8 +148,7 @@ def graph_drawing(graph: Graph) -> Drawing:
     return Drawing("zstate", "flow", nodes, edges)
 
 
-def graph_facts(graph: Graph) -> dict[str, Any]:
-    """The graph as JSON."""
+def _graph_facts(graph: Graph) -> dict[str, Any]:
     streams = [
         {
             "robot": stream.robot,

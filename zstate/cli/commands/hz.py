@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.options import (
-    json_option,
-    named_robot,
-    refuse_topic,
-    session_options,
-    timeout_option,
-    wire_option,
-)
+from zstate.cli import options
+from zstate.cli.options import named_robot, refuse_topic
 from zstate.cli.output.console import fail, print_json, print_status, print_wrapped
 from zstate.cli.output.wire_text import is_ros
 from zstate.cli.session import SessionOptions, open_session
@@ -41,10 +34,10 @@ _SETTLING_S = 0.1
     help="Measure the last N samples.",
 )
 @click.option("--once", is_flag=True, help="Print one measurement, of the first second, and exit.")
-@timeout_option("How long --once waits for the first sample [s].")
-@json_option()
-@wire_option
-@session_options
+@options.timeout_option("How long --once waits for the first sample [s].")
+@options.json_option()
+@options.wire_option
+@options.session_options
 def hz_command(
     *,
     network: SessionOptions,
@@ -70,9 +63,10 @@ def hz_command(
     from zstate.cli.stream_reader import StreamReader
 
     refuse_topic(robot, wire)
-    with ExitStack() as opened:
-        session = opened.enter_context(open_session(network, (wire,)))
-        reader = opened.enter_context(StreamReader(session, named_robot(session, robot, wire), stream, wire))
+    with (
+        open_session(network, (wire,)) as session,
+        StreamReader(session, named_robot(session, robot, wire), stream, wire) as reader,
+    ):
         statistics = MessageStatistics(window, of_all=is_ros(wire))
         reader.first(timeout if once else None)
         _read_for(_SETTLING_S, reader, MessageStatistics(2))  # what queued up while this process was starting
@@ -80,7 +74,15 @@ def hz_command(
         while True:
             count, facts = _read_for(1.0, reader, statistics), statistics.facts()
             if facts is not None and (count or once):
-                _print_facts(facts, as_json=as_json)
+                if as_json:
+                    print_json(facts)
+                else:
+                    missed = f" missed: {facts['missed']}" if facts["missed"] else ""
+                    print_wrapped(f"average rate: {facts['rate_hz']:.3f}")
+                    print_wrapped(
+                        f"\tmin: {facts['min_s']:.3f}s max: {facts['max_s']:.3f}s "
+                        f"std dev: {facts['std_dev_s']:.5f}s window: {facts['window']}{missed}"
+                    )
                 if once:
                     return
             elif once and time.monotonic() > deadline:
@@ -133,15 +135,3 @@ def _read_for(seconds: float, reader: StreamReader, statistics: MessageStatistic
             statistics.add(received)
             count += 1
     return count
-
-
-def _print_facts(facts: dict[str, Any], *, as_json: bool) -> None:
-    if as_json:
-        print_json(facts)
-        return
-    print_wrapped(f"average rate: {facts['rate_hz']:.3f}")
-    missed = f" missed: {facts['missed']}" if facts["missed"] else ""
-    print_wrapped(
-        f"\tmin: {facts['min_s']:.3f}s max: {facts['max_s']:.3f}s "
-        f"std dev: {facts['std_dev_s']:.5f}s window: {facts['window']}{missed}"
-    )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.options import json_option
+from zstate.cli import options
 from zstate.cli.output.console import (
     count_text,
     files_text,
@@ -29,14 +29,14 @@ _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of w
 
 @click.command("info")
 @click.argument("file")
-@json_option("One JSON object.")
+@options.json_option("One JSON object.")
 def info_command(file: str, as_json: bool) -> None:
     """Show the contents of the recording FILE: robots, streams, models, times and counts.
 
     FILE is an MCAP file, the first of several split files, or a ROS 2 bag. Rates are means over the whole
     recording. Latched messages (robot_description, tf_static) are written again every 10 s, and counted.
     """
-    from zstate.recording.info import read_info, recorded_robots
+    from zstate.recording.info import mean_rate, other_channels, read_info, recorded_robots
 
     info = read_info(file)
     robots = recorded_robots(info)
@@ -44,7 +44,16 @@ def info_command(file: str, as_json: bool) -> None:
         print_json(_facts(info, robots))
         return
     lines = [*_head(info), *(line for robot in robots for line in ("", *_robot_lines(robot)))]
-    print_wrapped("\n".join([*lines, *_other_lines(info)]))
+    others = [
+        ("  " + one.topic, one.type_name, str(one.count), rate_text(mean_rate(one, info.duration_s)))
+        for one in other_channels(info)
+    ]
+    others += [
+        ("  " + one.topic, f"{one.encoding}: not read here", str(one.count), "-") for one in info.skipped
+    ]
+    if others:
+        lines += ["", "other topics", *in_columns(others)]
+    print_wrapped("\n".join(lines))
 
 
 def _head(info: RecordingInfo) -> Iterator[str]:
@@ -52,12 +61,8 @@ def _head(info: RecordingInfo) -> Iterator[str]:
     storage = ", ".join((*info.formats, *info.compressions))
     yield f"{files_text(info.files)}: {size_text(info.size)} ({storage}){libraries}"
     if info.first is not None and info.last is not None:
-        yield from in_columns(
-            [
-                ("start", _time_text(info.first), str(info.first)),
-                ("end", _time_text(info.last), str(info.last)),
-            ]
-        )
+        ends = (("start", info.first), ("end", info.last))
+        yield from in_columns([(end, _time_text(stamp), str(stamp)) for end, stamp in ends])
     yield f"{count_text(info.message_count, 'message')} in {info.duration_s:.3f} s"
     yield "complete" if info.complete else "not complete"
     yield from (f"  {loss}" for loss in info.losses)
@@ -89,19 +94,6 @@ def _robot_lines(robot: RecordedRobot) -> list[str]:
     ]
     table = Table(_HEADINGS, rows, optional=("type", "topic"), headed=False)
     return [f"{robot.name}: {described}", *table.lines(output_width())]
-
-
-def _other_lines(info: RecordingInfo) -> list[str]:
-    from zstate.recording.info import mean_rate, other_channels
-
-    rows = [
-        ("  " + one.topic, one.type_name, str(one.count), rate_text(mean_rate(one, info.duration_s)))
-        for one in other_channels(info)
-    ]
-    rows += [
-        ("  " + one.topic, f"{one.encoding}: not read here", str(one.count), "-") for one in info.skipped
-    ]
-    return ["", "other topics", *in_columns(rows)] if rows else []
 
 
 def _facts(info: RecordingInfo, robots: Sequence[RecordedRobot]) -> dict[str, Any]:

@@ -5,26 +5,22 @@ from __future__ import annotations
 import json
 import os
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import load_robot, name_option, xacro_arguments
+from zstate.cli import options
+from zstate.cli.options import load_robot
 from zstate.cli.output.console import fail, print_result, print_status
 from zstate.cli.output.text_layout import in_columns
-
-if TYPE_CHECKING:
-    from zstate.model.robot import RobotModel
 
 
 @click.command("init")
 @click.argument("robot", default="rrbot", metavar="[ROBOT]")
-@xacro_arguments
+@options.xacro_arguments
 @click.option("-o", "--output", metavar="FILE", help="Default: NAME.toml; - is standard output.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
-@name_option
+@options.name_option
 def init_command(
     robot: str, xacro_args: dict[str, str], output: str | None, force: bool, name: str | None
 ) -> None:
@@ -40,10 +36,19 @@ def init_command(
     zstate init arm.urdf.xacro prefix:=left_
     """
     from zstate.model.load import is_path
+    from zstate.model.robot import coordinate_names
 
     model, robot_name = load_robot(robot, name, xacro_args)
     file = Path(output if output not in (None, "-") else f"{robot_name}.toml")
     source = os.path.relpath(robot, file.parent) if is_path(robot) else robot
+    joints = {joint.name: joint for joint in model.joints}
+    rows: list[tuple[str, ...]] = []
+    for coordinate in coordinate_names(model):
+        kind = limits = ""
+        if (joint := joints.get(coordinate)) is not None:
+            kind, unit = joint.type, {"revolute": "rad", "prismatic": "m"}.get(joint.type)
+            limits = f"{joint.limits.lower:g} to {joint.limits.upper:g} {unit}" if unit else ""
+        rows.append((coordinate, kind, limits))
     args = ", ".join(f"{json.dumps(key)} = {json.dumps(value)}" for key, value in xacro_args.items())
     depths = {model.root: 0}
     for joint in model.joints:
@@ -53,7 +58,7 @@ def init_command(
         model=json.dumps(source),
         name=json.dumps(robot_name),
         robot=robot_name,
-        joints="\n".join(f"#   {row}" for row in _joint_rows(model)),
+        joints="\n".join(f"#   {row}" for row in (in_columns(rows) if rows else ["none"])),
         # The deepest link: a tool or a camera is likely to be mounted there.
         tip=json.dumps(max(depths, key=lambda link: depths[link])),
         xacro_args=f"xacro_args = {{ {args} }}\n" * bool(args),
@@ -69,22 +74,6 @@ def init_command(
     except OSError as error:
         fail(f"{str(file)!r} cannot be written: {error.strerror}")
     print_status(f"wrote {file}; start it with `zstate up {shlex.quote(str(file))}`")
-
-
-def _joint_rows(model: RobotModel) -> Sequence[str]:
-    from zstate.model.robot import coordinate_names
-
-    joints = {joint.name: joint for joint in model.joints}
-    rows: list[tuple[str, ...]] = []
-    for name in coordinate_names(model):
-        joint = joints.get(name)
-        kind = "" if joint is None else joint.type
-        unit = {"revolute": "rad", "prismatic": "m"}.get(kind)
-        limits = (
-            "" if joint is None or not unit else f"{joint.limits.lower:g} to {joint.limits.upper:g} {unit}"
-        )
-        rows.append((name, kind, limits))
-    return list(in_columns(rows)) if rows else ["none"]
 
 
 _TEMPLATE = """\

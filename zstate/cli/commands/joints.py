@@ -6,19 +6,9 @@ from typing import TYPE_CHECKING
 
 import click
 
+from zstate.cli import options
 from zstate.cli.metrics import publisher_collector, serve_metrics
-from zstate.cli.options import (
-    clock_option,
-    load_robot,
-    metrics_option,
-    name_option,
-    rate_option,
-    seconds_option,
-    session_options,
-    takeover_option,
-    wire_option,
-    xacro_arguments,
-)
+from zstate.cli.options import load_robot
 from zstate.cli.output.console import count_text, print_wrapped
 from zstate.cli.output.wire_text import messages_for
 from zstate.cli.session import SessionOptions, open_session
@@ -29,15 +19,15 @@ if TYPE_CHECKING:
 
 @click.command("joints")
 @click.argument("robot")
-@xacro_arguments
-@rate_option
-@seconds_option
-@name_option
-@wire_option
-@clock_option
-@takeover_option
-@metrics_option
-@session_options
+@options.xacro_arguments
+@options.rate_option
+@options.seconds_option
+@options.name_option
+@options.wire_option
+@options.clock_option
+@options.takeover_option
+@options.metrics_option
+@options.session_options
 def joints_command(
     *,
     robot: str,

@@ -6,11 +6,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from datetime import datetime
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
-from zstate.cli.options import json_option, session_options, wire_option
+from zstate.cli import options
 from zstate.cli.output.console import (
     count_text,
     is_terminal,
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
     from zstate.net.topic_statistics import TopicStatistics
+    from zstate.wire.identity import WriterId
+    from zstate.wire.keys import Stream
     from zstate.wire.ros2.wire import Ros2Wire
 
 T = TypeVar("T")
@@ -46,9 +49,9 @@ _OPTIONAL = ("since", "age")
 
 @click.command("ls")
 @click.option("--watch", is_flag=True, help="Keep the list up to date until Ctrl-C.")
-@json_option("One JSON array; on a ROS wire one object.")
-@wire_option
-@session_options
+@options.json_option("One JSON array; on a ROS wire one object.")
+@options.wire_option
+@options.session_options
 def ls_command(network: SessionOptions, *, watch: bool, as_json: bool, wire: str) -> None:
     """List the announced robots and, for each stream, its writer and since when it writes.
 
@@ -77,27 +80,19 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
 
     wire_format = get_wire(wire)
     assert isinstance(wire_format, Ros2Wire)
-
-    def discover() -> RosGraph:
-        return discover_ros_graph(session, wire_format)
-
+    discover = partial(discover_ros_graph, session, wire_format)
+    text, facts = partial(_ros_graph_text, wire=wire_format), partial(_ros_graph_facts, wire=wire_format)
     if watch:
-        _watch(
-            discover,
-            lambda graph: ros_graph_text(graph, wire_format),
-            lambda graph: ros_graph_facts(graph, wire_format),
-            as_json=as_json,
-        )
+        _watch(discover, text, facts, as_json=as_json)
     graph = discover()
     if as_json:
-        print_json(ros_graph_facts(graph, wire_format))
+        print_json(facts(graph))
     elif graph.nodes or graph.topics:
-        print_wrapped(ros_graph_text(graph, wire_format))
-        hint = _namespaces_hint(graph, wire_format)
-        if hint:
+        print_wrapped(text(graph))
+        if hint := _namespaces_hint(graph, wire_format):
             print_status(hint)
     else:
-        print_status(ros_graph_text(graph, wire_format))
+        print_status(text(graph))
 
 
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
@@ -113,12 +108,11 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
         statistics.subscribe("joint_states")
+        facts = partial(_robots_facts, statistics=statistics)
         if watch:
             with RobotDirectory(session) as directory:
                 time.sleep(_DISCOVERY_S)
-                _watch(
-                    directory.robots, text, lambda robots: robots_facts(robots, statistics), as_json=as_json
-                )
+                _watch(directory.robots, text, facts, as_json=as_json)
         robots = discover(session)
         # Only joint states are measured: a reader of transforms would make a publisher send more.
         measured = [
@@ -129,7 +123,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
         ]
         statistics.wait(measured, _MEASURED_WITHIN_S)
         if as_json:
-            print_json(robots_facts(robots, statistics))
+            print_json(facts(robots))
         elif robots:
             print_wrapped(text(robots))
         else:
@@ -168,10 +162,9 @@ def robots_text(robots: Sequence[RobotInfo], statistics: TopicStatistics, *, wid
         full.append((robot.name, "", "", "", ""))
         undated.append(full[-1])
         for stream, writer in robot.writers:
-            names = [
-                name for name in robot.names_of(writer) if stream == "tf_static" and name != MODEL_WRITER
-            ]
-            shown, rate, age = f"  {stream}/{','.join(names)}" if names else f"  {stream}", "", ""
+            names = [one for one in robot.names_of(writer) if stream == "tf_static" and one != MODEL_WRITER]
+            shown = f"  {stream}/{','.join(names)}" if names else f"  {stream}"
+            rate = age = ""
             source = statistics.get(WriterKey(robot.name, stream, writer.session))
             if source is not None:
                 rate = "silent" if source.is_stale() else rate_text(source.published_hz())
@@ -198,29 +191,26 @@ def _lasting_text(nanoseconds: int) -> str:
     return f"{minutes} min {seconds:02d} s" if minutes else format_duration(nanoseconds)
 
 
-def robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> list[dict[str, Any]]:
-    """The same as JSON."""
+def _robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> list[dict[str, Any]]:
     from zstate.net.topic_statistics import WriterKey
 
-    found: list[dict[str, Any]] = []
-    for robot in robots:
-        writers: list[dict[str, Any]] = []
-        for stream, writer in robot.writers:
-            source = statistics.get(WriterKey(robot.name, stream, writer.session))
-            writers.append(
-                {
-                    "stream": stream,
-                    **asdict(writer),
-                    "names": robot.names_of(writer) if stream == "tf_static" else (),
-                    "rate_hz": None if source is None else source.published_hz(),
-                    "silent_s": None if source is None else source.silent_s(),
-                }
-            )
-        found.append({"robot": robot.name, "writers": writers})
-    return found
+    def writer_facts(robot: RobotInfo, stream: Stream, writer: WriterId) -> dict[str, Any]:
+        source = statistics.get(WriterKey(robot.name, stream, writer.session))
+        return {
+            "stream": stream,
+            **asdict(writer),
+            "names": robot.names_of(writer) if stream == "tf_static" else (),
+            "rate_hz": None if source is None else source.published_hz(),
+            "silent_s": None if source is None else source.silent_s(),
+        }
+
+    return [
+        {"robot": robot.name, "writers": [writer_facts(robot, *pair) for pair in robot.writers]}
+        for robot in robots
+    ]
 
 
-def ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
+def _ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
     """Nodes, then topics with their publishers and subscribers; a hint if there are none."""
     from zstate.wire.ros2.topics import HUMBLE_HASH, ros_type
 
@@ -237,22 +227,15 @@ def ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
         lines += [f"  {node.full_name}" for node in graph.nodes]
     for topic in graph.topics:
         topic_type = ros_type(topic.stream)
-        ends = [("  publisher", end) for end in topic.publishers]
-        ends += [("  subscriber", end) for end in topic.subscribers]
         rows: list[tuple[str, ...]] = []
-        for role, end in ends:
-            qos = end.qos
-            depth = f"keep last {qos.depth}" if qos.history == "keep_last" else "keep all"
-            is_usual = end.hash in ("", topic_type.hash)
-            other = "" if is_usual else "another version of the type"
-            rows.append(
-                (
-                    role,
-                    end.full_name,
-                    f"{qos.reliability}, {qos.durability}, {depth}".replace("_", " "),
-                    "humble" if end.hash == HUMBLE_HASH else other,
-                )
-            )
+        for role, ends in (("  publisher", topic.publishers), ("  subscriber", topic.subscribers)):
+            for end in ends:
+                qos, is_usual = end.qos, end.hash in ("", topic_type.hash)
+                depth = f"keep last {qos.depth}" if qos.history == "keep_last" else "keep all"
+                policies = f"{qos.reliability}, {qos.durability}, {depth}".replace("_", " ")
+                version = "" if is_usual else "another version of the type"
+                version = "humble" if end.hash == HUMBLE_HASH else version
+                rows.append((role, end.full_name, policies, version))
         lines += [f"{topic.name}  {topic_type.name}", *in_columns(rows)]
     return "\n".join(lines)
 
@@ -269,22 +252,12 @@ def _namespaces_hint(graph: RosGraph, wire: Ros2Wire) -> str:
     return f"in namespaces: {', '.join(others)}; to use one of them: `--wire {spec}{others[0]}`{every}"
 
 
-def ros_graph_facts(graph: RosGraph, wire: Ros2Wire) -> dict[str, Any]:
-    """The ROS graph as JSON."""
+def _ros_graph_facts(graph: RosGraph, wire: Ros2Wire) -> dict[str, Any]:
     from zstate.wire.ros2.topics import ros_type
 
     def ends_facts(ends: Sequence[RosEndpoint]) -> list[dict[str, Any]]:
         return [
-            {
-                "node": end.full_name,
-                "zid": end.zid,
-                "type_hash": end.hash,
-                "reliability": end.qos.reliability,
-                "durability": end.qos.durability,
-                "history": end.qos.history,
-                "depth": end.qos.depth,
-            }
-            for end in ends
+            {"node": end.full_name, "zid": end.zid, "type_hash": end.hash, **asdict(end.qos)} for end in ends
         ]
 
     return {

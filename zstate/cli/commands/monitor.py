@@ -4,30 +4,43 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
+from dataclasses import asdict, dataclass
 from threading import Event
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from zstate._util.bounded import BoundedDict
+from zstate._util.closeable import Closeable
+from zstate.cli import options
 from zstate.cli.metrics import listener_collector, serve_metrics, writer_collector
-from zstate.cli.options import (
-    json_option,
-    metrics_option,
-    open_clock,
-    reading_clock_option,
-    robot_filter_option,
-    session_options,
-    timeout_option,
-    wire_option,
+from zstate.cli.options import open_clock
+from zstate.cli.output.console import (
+    fail,
+    is_terminal,
+    keep_showing,
+    output_width,
+    print_json,
+    print_result,
+    print_status,
+    print_wrapped,
+    rate_text,
+    terminal_width,
 )
-from zstate.cli.output.console import fail, is_terminal
-from zstate.cli.output.wire_text import default_stream
+from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
+from zstate.wire.keys import ANY, Stream, check_robot
 
 if TYPE_CHECKING:
-    from zstate.cli.monitor import MonitorView, RobotMonitor
+    from zstate.buffer.frame_tree import FrameInfo
+    from zstate.cli.edge_statistics import EdgeRow, EdgeStatistics
+    from zstate.clock import Clock
+    from zstate.ingest.counters import ListenerStats
+    from zstate.metrics.buffer import MeteredBuffer
     from zstate.metrics.endpoint import BindAddress
+    from zstate.net.session import Session
+    from zstate.nodes.listener import Follow, TransformListener
 
 _FIRST_AFTER_S = 1.0
 # Discovery takes less.
@@ -39,13 +52,13 @@ _DISCOVERY_S = 0.3
 @click.argument("source", metavar="B", required=False)
 @click.option("--robots", is_flag=True, help="Monitor robots rather than edges: one line for each.")
 @click.option("--once", is_flag=True, help="Print one report, of the first second; give up after --timeout.")
-@timeout_option("How long --once waits for the pose, or for a robot.")
-@robot_filter_option
-@json_option()
-@wire_option
-@reading_clock_option
-@metrics_option
-@session_options
+@options.timeout_option("How long --once waits for the pose, or for a robot.")
+@options.robot_filter_option
+@options.json_option()
+@options.wire_option
+@options.reading_clock_option
+@options.metrics_option
+@options.session_options
 def monitor_command(
     *,
     network: SessionOptions,
@@ -81,12 +94,7 @@ def monitor_command(
     zstate monitor --robots
     zstate monitor --robots --robot panda --json --metrics 9100
     """
-    from zstate.cli.monitor import (
-        AllEdgesView,
-        EdgeStatistics,
-        PathView,
-        RobotMonitor,
-    )
+    from zstate.cli.edge_statistics import EdgeStatistics
     from zstate.nodes.listener import TransformListener
 
     if robots and target is not None:
@@ -116,25 +124,31 @@ def monitor_command(
         )
         statistics = opened.enter_context(EdgeStatistics(session, robot, wire, follow, listener.buffer.clock))
         if target is None or source is None:
-            _report_edges(AllEdgesView(listener, statistics, directory), once_s, as_json=as_json)
+            monitored = AllEdges(listener, statistics, directory)
         else:
-            frames = (target, source)
-            _report_edges(PathView(listener, statistics, directory, frames), once_s, as_json=as_json)
+            monitored = PathEdges(listener, statistics, directory, (target, source))
+        _report_edges(monitored, once_s, as_json=as_json)
 
 
-def _report_edges(monitored: MonitorView, once_s: float | None, *, as_json: bool) -> None:
+def _report_edges(monitored: AllEdges, once_s: float | None, *, as_json: bool) -> None:
     from zstate.clock import SystemClock
     from zstate.rate import Rate
+
+    def report() -> None:
+        if as_json:
+            print_json(monitored.json())
+        else:
+            print_result(f"{monitored.text(output_width())}\n")
 
     monitored.wait(once_s)
     Event().wait(_FIRST_AFTER_S)
     if once_s is not None:
-        monitored.print_report(as_json=as_json)
+        report()
     elif as_json or not is_terminal():
         for _ in Rate(1.0, SystemClock(), Event()):
-            monitored.print_report(as_json=as_json)
+            report()
     else:
-        monitored.show()
+        keep_showing(lambda: monitored.text(terminal_width()))
 
 
 def _report_robots(monitor: RobotMonitor, once_s: float | None, *, as_json: bool) -> None:
@@ -155,3 +169,180 @@ def _report_robots(monitor: RobotMonitor, once_s: float | None, *, as_json: bool
         forever.wait(_DISCOVERY_S)
     forever.wait(_FIRST_AFTER_S)
     monitor.report(as_json=as_json)
+
+
+class AllEdges:
+    """All edges that ``listener`` receives, as measured."""
+
+    def __init__(
+        self, listener: TransformListener, statistics: EdgeStatistics, directory: RobotDirectory
+    ) -> None:
+        self._listener, self._statistics, self._directory = listener, statistics, directory
+
+    def wait(self, timeout_s: float | None) -> None:
+        """Wait until there are edges; prints what is missing, and fails after ``timeout_s``."""
+        from zstate.cli.waiting import ConditionWaiter
+
+        def reason() -> str:
+            robot, robots = self._listener.robot, self._directory.robots()
+            return self._directory.messages.missing_text(robot, "robot_description", robots, has_frames=False)
+
+        waiter = ConditionWaiter()
+        self._listener.add_observer(waiter.notify)
+        if not waiter.wait_for(self._rows, timeout_s, reason):
+            fail(f"gave up after {timeout_s:g} s: {reason()}")
+
+    def text(self, width: int | None) -> str:
+        from zstate.cli.edge_statistics import overview_text
+
+        return self._directory.messages.translate(overview_text(self._rows(), width=width))
+
+    def json(self) -> dict[str, Any]:
+        return {"edges": [row.json() for row in self._rows()]}
+
+    def _rows(self) -> list[EdgeRow]:
+        frames = self._listener.buffer.frames()
+        return [self._row(frame.name, frame) for frame in frames if frame.parent is not None]
+
+    def _row(self, frame: str, edge: FrameInfo | None) -> EdgeRow:
+        from zstate.cli.edge_statistics import EdgeRow
+
+        if edge is None:
+            return EdgeRow(frame, None, None, None)
+        offset = self._listener.buffer.clock_offsets.get(edge.writer or "")
+        return EdgeRow(frame, edge, self._statistics.measure(edge), None if offset is None else offset())
+
+
+class PathEdges(AllEdges):
+    """The edges on the path between two frames, as measured, and the pose."""
+
+    def __init__(
+        self,
+        listener: TransformListener,
+        statistics: EdgeStatistics,
+        directory: RobotDirectory,
+        frames: tuple[str, str],
+    ) -> None:
+        from zstate.cli.waiting import PoseWaiter
+
+        super().__init__(listener, statistics, directory)
+        self._frames = frames
+        self._pose = PoseWaiter(listener, directory, *frames)
+
+    def wait(self, timeout_s: float | None) -> None:
+        self._pose.wait(timeout_s=timeout_s)
+
+    def text(self, width: int | None) -> str:
+        from zstate.cli.edge_statistics import path_text, time_text
+
+        transform, (target, source) = self._pose.wait(), self._frames
+        age_s = self._pose.age_s(transform)
+        newest = "at any time (static)" if transform.stamp is None else "there"
+        if age_s is not None:
+            newest = f"the newest is {time_text(age_s)} old"
+        table = path_text(self._rows(), width=width)
+        return self._pose.translate(f"pose of {source} in {target}: {newest}\n{table}")
+
+    def json(self) -> dict[str, Any]:
+        transform, (target, source) = self._pose.wait(), self._frames
+        return {
+            "target": target,
+            "source": source,
+            "stamp": transform.stamp,
+            "age_s": self._pose.age_s(transform),
+            "edges": [row.json() for row in self._rows()[1:]],
+        }
+
+    def _rows(self) -> list[EdgeRow]:
+        frames = self._listener.buffer.path_frames(*self._frames)
+        return [self._row(name, edge) for name, edge in frames]
+
+
+@dataclass(eq=False)
+class MonitoredRobot:
+    """One robot and its listener, which may listen to other robots, too."""
+
+    robot: str
+    listener: TransformListener
+    buffer: MeteredBuffer
+
+    @property
+    def stats(self) -> ListenerStats:
+        return self.listener.stats_of(self.robot)
+
+
+class RobotMonitor(Closeable):
+    """Listens to the selected robots that are announced: one listener for all with the same stream."""
+
+    def __init__(
+        self, session: Session, directory: RobotDirectory, robot: str, wire: str, clock: Clock | None
+    ) -> None:
+        self._selected = robot
+        self._robot = None if robot == ANY else check_robot(robot)
+        self._session, self._directory, self._wire, self._clock = session, directory, wire, clock
+        self._reported = ""
+        self._listeners: dict[Follow, tuple[TransformListener, MeteredBuffer]] = {}
+        self._robots: BoundedDict[str, MonitoredRobot] = BoundedDict()
+        self._opened = ExitStack()
+
+    def close(self) -> None:
+        self._opened.close()
+
+    def robots(self) -> list[MonitoredRobot]:
+        return sorted(dict(self._robots).values(), key=lambda one: one.robot)
+
+    def update(self) -> str:
+        """Add robots that have appeared. While there is none, prints and returns what is missing."""
+        directory, reason = self._directory, ""
+        for info in directory.robots():
+            if self._robot in (None, info.name) and info.name not in self._robots:
+                self._add(info.name, directory.streams(info.name))
+        if not self._robots and self._robot is not None:
+            reason = directory.no_sample_text(self._robot, default_stream(self._wire))
+        elif not self._robots:
+            robots = directory.robots()
+            reason = directory.messages.announced(robots) + ", but nothing that moves" * bool(robots)
+        if reason and reason != self._reported:
+            print_status(f"waiting: {reason}", event="waiting", robot=self._robot)
+        self._reported = reason
+        return reason
+
+    def _add(self, robot: str, streams: frozenset[Stream]) -> None:
+        from zstate.metrics.buffer import MeteredBuffer
+        from zstate.nodes.listener import TransformListener
+
+        follow: Follow = "joint_states" if "joint_states" in streams else "tf"
+        if is_ros(self._wire) and "tf" in streams:
+            # All nodes share /tf. A selected robot means its joints, which need its model.
+            is_described = self._robot is not None and {"joint_states", "robot_description"} <= streams
+            follow = "joint_states" if is_described else "tf"
+        if follow not in streams:
+            return
+        if follow not in self._listeners:
+            buffer = MeteredBuffer(self._clock)
+            listener = TransformListener(
+                self._session, self._selected, buffer, self._wire, follow, history_on_join=False
+            )
+            self._listeners[follow] = self._opened.enter_context(listener), buffer
+        self._robots[robot] = MonitoredRobot(robot, *self._listeners[follow])
+        place = self._directory.messages.place(robot, (follow,))
+        print_status(f"following {place}", event="following", robot=robot)
+
+    def report(self, *, as_json: bool) -> None:
+        from zstate.cli.edge_statistics import time_text
+
+        for one in self.robots():
+            measure, stats = one.buffer.measure(one.robot), one.stats
+            if as_json:
+                print_json({"robot": one.robot, **asdict(measure), **asdict(stats)})
+                continue
+            is_stale = one.buffer.statistics_of(one.robot).is_stale()
+            reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
+            print_wrapped(
+                f"{one.robot}  {'silent' if is_stale else rate_text(measure.rate_hz)}  "
+                f"age {time_text(measure.age_s)}  latency {time_text(measure.latency_s)}  "
+                f"received {stats.received}  dropped {stats.dropped}  missed {stats.missed}  "
+                f"late {stats.late}  refused {sum(stats.refused.values())}"
+                f"{f' ({reasons})' if reasons else ''}"
+                f"{f'  off the clock {stats.off_clock}' if stats.off_clock else ''}"
+            )

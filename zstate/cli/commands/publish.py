@@ -9,23 +9,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from zstate.cli import options
 from zstate.cli.metrics import publisher_collector, serve_metrics
-from zstate.cli.options import (
-    checked_rate,
-    clock_option,
-    load_robot,
-    metrics_option,
-    name_option,
-    open_clock,
-    seconds_option,
-    session_options,
-    takeover_option,
-    wires_option,
-    xacro_arguments,
-)
+from zstate.cli.options import load_robot, open_clock
 from zstate.cli.output.console import count_text, fail, print_status, print_wrapped, report_text
 from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
@@ -40,18 +30,18 @@ _DERIVED: tuple[Stream, ...] = ("robot_description", "tf_static", "tf")
 _EVERYTHING: tuple[Stream, ...] = ("joint_states", *_DERIVED)
 
 
-def _checked_source(_: click.Context, __: click.Parameter, source: str) -> str:
+def _check_source(source: str) -> str:
     if source not in ("joints", "sine") and not Path(source).exists():
-        raise click.BadParameter(f"{source!r} is neither 'joints' nor 'sine' nor a recording that exists")
+        raise InvalidInput(f"{source!r} is neither 'joints' nor 'sine' nor a recording that exists")
     return source
 
 
 @click.command("publish")
 @click.argument("robot")
-@xacro_arguments
+@options.xacro_arguments
 @click.option(
     "--source",
-    callback=_checked_source,
+    type=options.Checked("text", _check_source),
     default="joints",
     show_default=True,
     metavar="joints|sine|FILE",
@@ -60,18 +50,16 @@ def _checked_source(_: click.Context, __: click.Parameter, source: str) -> str:
 )
 @click.option(
     "--rate",
-    type=float,
-    callback=checked_rate,
-    metavar="HZ",
+    type=options.RATE,
     help="Exact rate of samples. Default: every sample of joint_states; 100 for other sources.",
 )
-@wires_option
-@clock_option
-@seconds_option
-@name_option
-@takeover_option
-@metrics_option
-@session_options
+@options.wires_option
+@options.clock_option
+@options.seconds_option
+@options.name_option
+@options.takeover_option
+@options.metrics_option
+@options.session_options
 def publish_command(
     *,
     robot: str,
@@ -134,14 +122,14 @@ def publish_command(
             )
         if not network.is_explicit and len(set(map(is_ros, wires))) == 2:
             print_status("ROS 2 nodes are behind their router; pass --connect, such as tcp/127.0.0.1:7447")
+        rate_hz = rate or _RATE_HZ
         if derived_wires:
             _publish_joint_states(session, derived_wires[0], derived, whole, rate, seconds)
         elif source == "sine":
-            run_publisher(whole, SineSource(model), rate or _RATE_HZ, seconds)
+            run_publisher(whole, SineSource(model), rate_hz, seconds)
         else:
             from zstate.recording.source import RecordedSource
 
-            rate_hz = rate or _RATE_HZ
             with RecordedSource(source, None, model) as recorded:
                 # One tick more than the recording is long, for its last sample.
                 run_publisher(whole, recorded, rate_hz, seconds or recorded.duration_s + 1.0 / rate_hz)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import click
 
+from zstate.cli import options
 from zstate.cli.metrics import recorder_collector, serve_metrics, writer_collector
-from zstate.cli.options import checked_seconds, metrics_option, session_options, wire_option
 from zstate.cli.output.console import (
     count_text,
     fail,
@@ -22,6 +22,7 @@ from zstate.cli.output.console import (
 )
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
@@ -34,34 +35,33 @@ _INDEX_WITHIN_S = 10.0
 _DISCOVERY_S = 0.5
 
 
-def _checked_megabytes(_: click.Context, __: click.Parameter, size: float | None) -> float | None:
-    if size is not None and not (math.isfinite(size) and size >= 0.1):
-        raise click.BadParameter(f"a file has at least 0.1 MB; got {size}")
-    return size
+def _at_least(least: float, unit: str) -> Callable[[float], float]:
+    def check(size: float) -> float:
+        if not (math.isfinite(size) and size >= least):
+            raise InvalidInput(f"a file has at least {least:g} {unit}; got {size}")
+        return size
+
+    return check
 
 
 @click.command("record")
 @click.argument("file")
 @click.argument("robots", metavar="[ROBOT]...", nargs=-1)
-@wire_option
-@click.option("--duration", type=float, callback=checked_seconds, metavar="S", help="Stop after S seconds.")
+@options.wire_option
+@click.option("--duration", type=options.SECONDS, help="Stop after S seconds.")
 @click.option(
     "--split-size",
-    type=float,
-    callback=_checked_megabytes,
-    metavar="MB",
+    type=options.number("MB", _at_least(0.1, "MB")),
     help="Start a new file (FILE_1, FILE_2 ...) when one reaches this size.",
 )
 @click.option(
     "--split-seconds",
-    type=click.FloatRange(min=1.0),
-    callback=checked_seconds,
-    metavar="S",
-    help="Start a new file every S seconds.",
+    type=options.number("S", _at_least(1.0, "s")),
+    help="Start a new file every S seconds, at least 1.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing FILE.")
-@metrics_option
-@session_options
+@options.metrics_option
+@options.session_options
 def record_command(
     *,
     file: str,
@@ -149,9 +149,7 @@ class RecordProgress:
     """Progress of a recorder: its streams, its rate, and the robots it waits for."""
 
     def __init__(self, recorder: Recorder, directory: RobotDirectory, robots: Sequence[str]) -> None:
-        self._recorder = recorder
-        self._directory = directory
-        self._robots = robots
+        self._recorder, self._directory, self._robots = recorder, directory, robots
         self._listed: set[tuple[str, str]] = set()
         self._waiting = ""
         self._start = time.monotonic()
@@ -160,14 +158,12 @@ class RecordProgress:
     def line(self) -> str:
         """Duration, messages, rate since the last call, size and robots."""
         stats, now = self._recorder.stats, time.monotonic()
-        count = sum(stats.messages.values())
-        before, count_before = self._before
+        count, (before, count_before) = sum(stats.messages.values()), self._before
         self._before = (now, count)
         rate = (count - count_before) / max(now - before, 1e-9)
-        robots = ", ".join(_robots(stats)) or "no robot yet"
-        lost = f"  lost {_lost(stats)}" if _lost(stats) else ""
-        took = f"{now - self._start:.0f} s"
-        return f"{took}  {count} messages  {rate:.1f}/s  {size_text(stats.bytes)}  {robots}{lost}"
+        robots, lost = ", ".join(_robots(stats)) or "no robot yet", _lost(stats)
+        size, took = size_text(stats.bytes), f"{now - self._start:.0f} s"
+        return f"{took}  {count} messages  {rate:.1f}/s  {size}  {robots}{f'  lost {lost}' if lost else ''}"
 
     def changes(self) -> Iterator[str]:
         """Streams recorded since the last call, and robots that are missing."""
@@ -195,12 +191,11 @@ class RecordProgress:
         return "; ".join(messages.unknown(robot, announced) for robot in sorted(missing))
 
     def summary(self) -> str:
-        """Messages, robots, files and losses at the end."""
         stats, took = self._recorder.stats, time.monotonic() - self._start
         messages = count_text(sum(stats.messages.values()), "message")
         robots = f" of {', '.join(_robots(stats))}" if _robots(stats) else ""
-        lost = f"lost {_lost(stats)}" if _lost(stats) else "nothing lost"
         where = f"{files_text(stats.files)} ({size_text(stats.bytes)})"
+        lost = f"lost {_lost(stats)}" if _lost(stats) else "nothing lost"
         return f"recorded {messages}{robots} in {took:.1f} s into {where}; {lost}"
 
 

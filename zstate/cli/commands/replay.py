@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import checked_seconds, session_options, takeover_option, wires_option
+from zstate.cli import options
 from zstate.cli.output.console import count_text, fail, is_terminal, print_status, print_wrapped
 from zstate.cli.session import SessionOptions, open_session
-from zstate.errors import InvalidInput, format_duration
+from zstate.errors import format_duration
 
 if TYPE_CHECKING:
     from zstate.cli.processes import BackgroundCall
@@ -22,13 +22,10 @@ _LINE_S = 1.0
 _REFRESH_S = 0.1
 
 
-def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
+def _check_speed(rate: float) -> float:
     from zstate.recording.player_clock import check_speed
 
-    try:
-        return check_speed(rate)
-    except InvalidInput as error:
-        raise click.BadParameter(str(error)) from None
+    return check_speed(rate)
 
 
 @click.command("replay")
@@ -36,11 +33,9 @@ def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
 @click.argument("robots", metavar="[ROBOT]...", nargs=-1)
 @click.option(
     "--rate",
-    type=float,
+    type=options.number("X", _check_speed),
     default=1.0,
     show_default=True,
-    callback=_checked_rate,
-    metavar="X",
     help="Playback speed, 1 is real time; inf: as fast as possible.",
 )
 @click.option(
@@ -50,13 +45,11 @@ def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
     metavar="S",
     help="Start S seconds after the start of the recording.",
 )
-@click.option(
-    "--duration", type=float, callback=checked_seconds, metavar="S", help="Replay S seconds of the recording."
-)
+@click.option("--duration", type=options.SECONDS, help="Replay S seconds of the recording.")
 @click.option("--loop", is_flag=True, help="Start again at the end, until Ctrl-C.")
-@wires_option
-@takeover_option
-@session_options
+@options.wires_option
+@options.takeover_option
+@options.session_options
 def replay_command(
     *,
     file: str,
@@ -80,6 +73,7 @@ def replay_command(
     zstate replay bag_folder --wire ros2:domain=5
     """
     from zstate.cli.processes import BackgroundCall
+    from zstate.clock import format_stamp
     from zstate.recording.player import Player
 
     with (
@@ -99,7 +93,11 @@ def replay_command(
         conflicts = _conflicting_writers(session, player.robots, wires)
         if conflicts and not takeover:
             fail(f"already published on the network: {'; '.join(conflicts)}; stop that, or use --takeover")
-        print_wrapped(_heading(player, file))
+        first, last = player.span
+        names = ", ".join(map(repr, player.robots))
+        speed = "as fast as possible" if rate == float("inf") else f"at {rate:g} times its speed"
+        span = f"{(last - first) / 1e9:.1f} s, {format_stamp(first)} to {format_stamp(last)}"
+        print_wrapped(f"replaying {names} from {file}: {span}, {speed}")
         call = BackgroundCall("zstate replay", player.run)
         try:
             report = _show(player, call)
@@ -151,21 +149,7 @@ def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequenc
     return conflicts
 
 
-def _heading(player: Player, file: str) -> str:
-    """Robots, time span and rate."""
-    from zstate.clock import format_stamp
-
-    first, last = player.span
-    robots = ", ".join(map(repr, player.robots))
-    rate = "as fast as possible" if player.rate == float("inf") else f"at {player.rate:g} times its speed"
-    duration = f"{(last - first) / 1e9:.1f} s"
-    return (
-        f"replaying {robots} from {file}: {duration}, {format_stamp(first)} to {format_stamp(last)}, {rate}"
-    )
-
-
 def _line(player: Player) -> str:
-    """Position, rate and lateness."""
     from zstate.clock import format_stamp
 
     first, last = player.span
@@ -176,7 +160,6 @@ def _line(player: Player) -> str:
 
 
 def _summary(report: PlayerReport) -> str:
-    """Samples, rate, lateness and refusals at the end."""
     late = (
         f"late by {format_duration(report.lateness_p50)} (median), {format_duration(report.lateness_p99)} "
         f"(p99), {format_duration(report.lateness_max)} (maximum)"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import click
 
-from zstate.cli.options import json_option
+from zstate.cli import options
 from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
 
 
 @click.command("robots")
 @click.argument("name", metavar="[TEXT]", default="")
-@json_option("One JSON array of objects with name, path and origin.")
+@options.json_option("One JSON array of objects with name, path and origin.")
 def robots_command(name: str, *, as_json: bool) -> None:
     """List the robot models that commands accept by name, or those whose name contains TEXT.
 

@@ -6,7 +6,7 @@ from threading import Event
 
 import click
 
-from zstate.cli.options import session_options
+from zstate.cli import options
 from zstate.cli.output.console import count_text, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
 
@@ -25,7 +25,7 @@ _CHECK_HZ = 2.0
 )
 @click.option("--frame-prefix", default="", metavar="P", help="Prefix of the robot's frames in ROS.")
 @click.option("--no-description", is_flag=True, help="Do not set the parameter robot_description.")
-@session_options
+@options.session_options
 def ros1_command(
     *,
     robot: str,

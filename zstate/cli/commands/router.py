@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from zstate.cli import options
 from zstate.cli.metrics import connection_collector, serve_metrics, writer_collector
-from zstate.cli.options import config_option, metrics_option, router_identity_options
 from zstate.cli.output.console import fail, print_result, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
@@ -27,12 +27,7 @@ if TYPE_CHECKING:
     help="Endpoint for clients; default: tcp/127.0.0.1:7447. May be repeated.",
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="Another router; may be repeated.")
-@click.option(
-    "--acl",
-    type=click.Path(exists=True, dir_okay=False),
-    metavar="FILE",
-    help="Access control: the output of `zstate acl`.",
-)
+@click.option("--acl", type=options.EXISTING_FILE, help="Access control: the output of `zstate acl`.")
 @click.option(
     "--downsample",
     multiple=True,
@@ -48,14 +43,13 @@ if TYPE_CHECKING:
 )
 @click.option("--namespace", default="", metavar="KEY", help="Zenoh namespace of the --robot sessions.")
 @click.option("--ros2", is_flag=True, help="Use the settings of rmw_zenohd, to replace it.")
-@router_identity_options
-@config_option
-@metrics_option
+@options.router_identity_options
+@options.config_option
+@options.metrics_option
 @click.option("--print", "only_print", is_flag=True, help="Print the configuration (JSON5) and exit.")
 @click.option(
     "--output",
     type=click.Path(dir_okay=False),
-    metavar="FILE",
     help="Write the configuration, with the password of --user, to a new FILE that only you can read.",
 )
 def router_command(
@@ -93,14 +87,9 @@ def router_command(
 
     file = config or (None if ros2 else os.environ.get("ZENOH_CONFIG"))
     if file:
-        exclusive = {
-            "--ros2": ros2,
-            "--acl": acl,
-            "--downsample": downsample,
-            "--print": only_print,
-            "--output": output,
-        }
-        conflicts = [option for option, value in exclusive.items() if value]
+        names = ("ros2", "acl", "downsample", "print", "output")
+        values = (ros2, acl, downsample, only_print, output)
+        conflicts = [f"--{name}" for name, value in zip(names, values, strict=True) if value]
         if conflicts:
             raise click.UsageError(
                 f"{' and '.join(conflicts)} and the file {file!r} (--config, ZENOH_CONFIG) exclude each "
@@ -110,7 +99,15 @@ def router_command(
         return
     downsampling = None
     if downsample:
-        rates = dict(map(_parse_stream_rate, downsample))
+        rates: dict[str, float] = {}
+        for text in downsample:
+            stream, _, rate = text.partition("=")
+            try:
+                rates[stream] = float(rate)
+            except ValueError:
+                raise click.UsageError(
+                    f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10"
+                ) from None
         downsampling = Downsampling(rates, robot, wan, namespace)
     elif robot or wan or namespace:
         raise click.UsageError("--robot, --wan and --namespace need --downsample STREAM=HZ")
@@ -129,14 +126,6 @@ def router_command(
     if not only_print and output is None:
         network = SessionOptions("router", config=router.settings(), credentials=credentials)
         _run(network, router.listen, metrics)
-
-
-def _parse_stream_rate(text: str) -> tuple[str, float]:
-    stream, _, rate = text.partition("=")
-    try:
-        return stream, float(rate)
-    except ValueError:
-        raise click.UsageError(f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10") from None
 
 
 def _run(

@@ -4,28 +4,14 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 from click.core import ParameterSource
 
-from zstate.cli.options import (
-    checked_rate,
-    seconds_option,
-    session_options,
-    takeover_option,
-    timeout_option,
-    wire_option,
-    wires_option,
-)
+from zstate.cli import options
 from zstate.cli.output import logs
 from zstate.cli.output.console import count_text, fail, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
-
-if TYPE_CHECKING:
-    from zstate.cli.snapshot import Configuration
-
-_RATE_HZ = 10.0
 
 
 @click.group("snapshot")
@@ -43,9 +29,9 @@ def snapshot_command() -> None:
 @click.argument("file", metavar="FILE")
 @click.argument("robots", nargs=-1, metavar="[ROBOT]...")
 @click.option("--force", is_flag=True, help="Replace an existing FILE.")
-@timeout_option("How long to wait for announced streams [s].", 3.0)
-@wire_option
-@session_options
+@options.timeout_option("How long to wait for announced streams [s].", 3.0)
+@options.wire_option
+@options.session_options
 def save_command(
     *, file: str, robots: tuple[str, ...], force: bool, timeout: float, wire: str, network: SessionOptions
 ) -> None:
@@ -58,7 +44,7 @@ def save_command(
     zstate snapshot save cell.toml
     zstate snapshot save - panda | less
     """
-    from zstate.cli.snapshot import capture
+    from zstate.cli.snapshot_file import capture
 
     path = Path(file)
     if file != "-" and path.exists() and not force:
@@ -78,26 +64,18 @@ def save_command(
 
 
 @snapshot_command.command("load")
-@click.argument("file", type=click.Path(exists=True, dir_okay=False))
+@click.argument("file", type=options.EXISTING_FILE)
 @click.argument("robots", nargs=-1, metavar="[ROBOT]...")
-@click.option(
-    "--rate",
-    type=float,
-    callback=checked_rate,
-    default=_RATE_HZ,
-    show_default=True,
-    metavar="HZ",
-    help="Rate of the joint states.",
-)
+@click.option("--rate", type=options.RATE, default=10.0, show_default=True, help="Rate of the joint states.")
 @click.option(
     "--as-saved",
     is_flag=True,
     help="Use the session options and the wire with which FILE was saved; options below take precedence.",
 )
-@seconds_option
-@takeover_option
-@wires_option
-@session_options
+@options.seconds_option
+@options.takeover_option
+@options.wires_option
+@options.session_options
 def load_command(
     *,
     file: str,
@@ -119,32 +97,22 @@ def load_command(
     zstate snapshot load cell.toml --as-saved          # with the session options it was saved with
     zstate snapshot load cell.toml panda --wire ros2
     """
-    from zstate.cli.snapshot import SnapshotPublisher, read_snapshot
+    from zstate.cli.snapshot_file import publish_snapshot, read_snapshot
 
     snapshot = read_snapshot(Path(file))
     selected, edges = snapshot.select(robots)
     if not selected and not edges:
         fail(f"{file!r} contains no robot")
-    network, wires = _session_options(snapshot.configuration, network, wires, as_saved=as_saved)
-    with (
-        open_session(network, wires) as session,
-        SnapshotPublisher(session, selected, edges, wires, takeover=takeover) as publisher,
-    ):
-        publisher.run(rate, seconds)
-
-
-def _session_options(
-    saved: Configuration, network: SessionOptions, wires: tuple[str, ...], *, as_saved: bool
-) -> tuple[SessionOptions, tuple[str, ...]]:
-    """The session options and wires to use. Logs a note if they differ from the saved ones or repeat them."""
-    has_wire_option = click.get_current_context().get_parameter_source("wires") != ParameterSource.DEFAULT
+    saved, source = snapshot.configuration, click.get_current_context().get_parameter_source("wires")
+    has_wire_option = source != ParameterSource.DEFAULT
     if as_saved:
+        network, wires = saved.network(network), wires if has_wire_option else (saved.wire,)
         if not saved.is_default:
             print_status(f"as saved on {saved.host!r}: {saved.options()}")
-        return saved.network(network), wires if has_wire_option else (saved.wire,)
-    if not (saved.is_default or network.is_explicit or has_wire_option):
+    elif not (saved.is_default or network.is_explicit or has_wire_option):
         print_status(f"saved on {saved.host!r} with {saved.options()}; --as-saved uses the same options")
-    return network, wires
+    with open_session(network, wires) as session:
+        publish_snapshot(session, selected, edges, wires, takeover=takeover, rate_hz=rate, seconds=seconds)
 
 
 for command in snapshot_command.commands.values():

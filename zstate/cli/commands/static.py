@@ -6,17 +6,16 @@ import threading
 from contextlib import ExitStack
 from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.options import session_options, takeover_option, wire_option
+from zstate.cli import options
 from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
-    from zstate.cli.up.schema import Quaternion, Vector3
     from zstate.cli.up.static_edges import OwnedEdge
     from zstate.net.session import Session
     from zstate.nodes.static_publisher import StaticPublisher
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 @click.option("--quat-xyzw", type=float, nargs=4, metavar="X Y Z W", help="Rotation as a unit quaternion.")
 @click.option(
     "--file",
-    type=click.Path(exists=True, dir_okay=False),
+    type=options.EXISTING_FILE,
     help="All [[static]] of a `zstate up` file, or a calibration in YAML or JSON.",
 )
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter of --file.")
@@ -45,17 +44,13 @@ if TYPE_CHECKING:
     "--writer", metavar="NAME", help="Name of the writer; default: this program and its process id."
 )
 @click.option("--new", is_flag=True, help="TARGET is a new frame: do not warn that the robot lacks it.")
-@takeover_option
-@wire_option
-@session_options
+@options.takeover_option
+@options.wire_option
+@options.session_options
 def static_command(
     *,
     target: str | None,
     source: str | None,
-    xyz: Vector3 | None,
-    rpy_deg: Vector3 | None,
-    rpy: Vector3 | None,
-    quat_xyzw: Quaternion | None,
     file: str | None,
     settings: tuple[str, ...],
     robot: str | None,
@@ -64,6 +59,7 @@ def static_command(
     takeover: bool,
     wire: str,
     network: SessionOptions,
+    **pose: Any,
 ) -> None:
     """Publish the pose of SOURCE in TARGET until Ctrl-C, which withdraws it.
 
@@ -89,14 +85,13 @@ def static_command(
 
     if file is not None:
         edges = _read_edges(file, settings, target, source)
-    elif target is None or source is None or (xyz, rpy_deg, rpy, quat_xyzw) == (None,) * 4:
+    elif target is None or source is None or all(part is None for part in pose.values()):
         raise click.UsageError("give TARGET, SOURCE and --xyz, a rotation or both; or --file")
     else:
-        from zstate.cli.up.schema import StaticSection
+        from zstate.cli.up.cell import StaticSection
         from zstate.cli.up.static_edges import OwnedEdge
 
-        edge = StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw).transform()
-        edges = [OwnedEdge(edge, robot)]
+        edges = [OwnedEdge(StaticSection(target, source, **pose).transform(), robot)]
     all_wires = {name for edge in edges for name in edge.wires or (wire,)}
     with open_session(network, tuple(sorted(all_wires))) as session, ExitStack() as publishers:
         to_check: list[tuple[StaticPublisher, list[Transform]]] = []

@@ -10,21 +10,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import (
-    checked_rate,
-    json_option,
-    open_clock,
-    reading_clock_option,
-    robot_filter_option,
-    session_options,
-    timeout_option,
-    wire_option,
-)
+from zstate.cli import options
+from zstate.cli.options import open_clock
 from zstate.cli.output.console import print_json, print_result, print_status
 from zstate.cli.output.wire_text import default_stream
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
-from zstate.errors import LookupFailed
+from zstate.errors import InvalidInput, LookupFailed
 
 if TYPE_CHECKING:
     from zstate.nodes.listener import TransformListener
@@ -36,17 +28,15 @@ _UNKNOWN_S = 2.0
 _TWIST_WITHIN_S = 1.0
 
 
-def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | None:
+def _parse_stamp(text: str) -> int:
     """An exact stamp [ns], from nanoseconds or from seconds with a point, as this command prints them."""
-    if text is None:
-        return None
     try:
         number = Decimal(text) * (1_000_000_000 if "." in text else 1)
         stamp = int(number)
     except (InvalidOperation, ValueError, OverflowError):
         number, stamp = Decimal(), None
     if stamp is None or stamp != number or abs(stamp) >= 2**63:
-        raise click.BadParameter(
+        raise InvalidInput(
             f"{text!r} is not a stamp: give nanoseconds since the Unix epoch, or seconds with a point and at "
             "most nine decimals"
         )
@@ -57,16 +47,9 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
 @click.argument("target", metavar="A")
 @click.argument("source", metavar="B")
 @click.option("--once", is_flag=True, help="Print one pose; fail after --timeout with the reason.")
-@click.option("--at", callback=_stamp, metavar="STAMP", help="Print one pose, at this stamp.")
-@timeout_option("How long --once and --at wait [s].")
-@click.option(
-    "--rate",
-    type=float,
-    callback=checked_rate,
-    default=1.0,
-    metavar="HZ",
-    help="Maximum rate of printed poses; default: 1.",
-)
+@click.option("--at", type=options.Checked("STAMP", _parse_stamp), help="Print one pose, at this stamp.")
+@options.timeout_option("How long --once and --at wait [s].")
+@click.option("--rate", type=options.RATE, default=1.0, help="Maximum rate of printed poses; default: 1.")
 @click.option("--twist", is_flag=True, help="Also print the velocity of B in A.")
 @click.option(
     "--precision",
@@ -76,11 +59,11 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
     show_default=True,
     help="Number of decimals; JSON has all digits.",
 )
-@robot_filter_option
-@json_option()
-@wire_option
-@reading_clock_option
-@session_options
+@options.robot_filter_option
+@options.json_option()
+@options.wire_option
+@options.reading_clock_option
+@options.session_options
 def tf_command(
     *,
     network: SessionOptions,
@@ -135,8 +118,14 @@ def tf_command(
                 print_json(facts)
             else:
                 print_result(transform_text(transform, precision))
-                if twist:
-                    print_result(_twist_text(velocity, precision))
+                if velocity is not None:
+                    for kind, vector, unit in (
+                        ("linear", velocity.linear, "m/s"),
+                        ("angular", velocity.angular, "rad/s"),
+                    ):
+                        print_result(f"- Twist: {kind} {numbers_text(vector.tolist(), precision)} {unit}")
+                elif twist:
+                    print_result("- Twist: not known yet")
 
         if not as_json:
             print_result(f"pose of {source} in {target}")
@@ -182,24 +171,18 @@ def transform_text(transform: Transform, precision: int = 3) -> str:
     rows = [[_digits(value, precision) for value in row] for row in transform.matrix.tolist()]
     lines = [
         when,
-        f"- Translation: {_listed(pose[:3], precision)}",
-        f"- Rotation: in Quaternion (xyzw) {_listed(pose[3:], precision)}",
-        f"- Rotation: in RPY (radian) {_listed(rpy, precision)}",
-        f"- Rotation: in RPY (degree) {_listed([degrees(angle) for angle in rpy], precision)}",
+        f"- Translation: {numbers_text(pose[:3], precision)}",
+        f"- Rotation: in Quaternion (xyzw) {numbers_text(pose[3:], precision)}",
+        f"- Rotation: in RPY (radian) {numbers_text(rpy, precision)}",
+        f"- Rotation: in RPY (degree) {numbers_text([degrees(angle) for angle in rpy], precision)}",
         "- Matrix:",
         *(" " + " ".join(cell.rjust(precision + 3) for cell in row) for row in rows),
     ]
     return "\n".join(lines)
 
 
-def _twist_text(twist: Twist | None, precision: int) -> str:
-    if twist is None:
-        return "- Twist: not known yet"
-    linear, angular = (_listed(vector.tolist(), precision) for vector in (twist.linear, twist.angular))
-    return f"- Twist: linear {linear} m/s\n- Twist: angular {angular} rad/s"
-
-
-def _listed(values: list[float], precision: int) -> str:
+def numbers_text(values: list[float], precision: int) -> str:
+    """Numbers with ``precision`` decimals, as in [0.100, -2.000]."""
     return f"[{', '.join(_digits(value, precision) for value in values)}]"
 
 

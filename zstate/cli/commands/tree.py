@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import form_options, session_options, wire_option
+from zstate.cli import options
 from zstate.cli.output.console import (
     count_text,
     fail,
@@ -46,9 +47,9 @@ _NARROW_HEADINGS = ("frame", "rate and age", "writer")
 
 @click.command("tree")
 @click.argument("robot", default="*", metavar="[ROBOT]")
-@form_options("One JSON array of frames.", "A picture, from the top down.")
-@wire_option
-@session_options
+@options.form_options("One JSON array of frames.", "A picture, from the top down.")
+@options.wire_option
+@options.session_options
 def tree_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show the frames of ROBOT, or of all announced robots, as a tree.
 
@@ -75,13 +76,9 @@ def tree_command(network: SessionOptions, robot: str, form: str | None, wire: st
         return
     if not frames:
         return
+    translate = messages.translate
     frames = [
-        replace(
-            frame,
-            name=messages.translate(frame.name),
-            parent=None if frame.parent is None else messages.translate(frame.parent),
-        )
-        for frame in frames
+        replace(one, name=translate(one.name), parent=one.parent and translate(one.parent)) for one in frames
     ]
     if form is None:
         print_result(tree_text(frames, now, in_full=not is_native, width=output_width()))
@@ -105,10 +102,8 @@ def _collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     from zstate.wire.keys import ANY, MODEL_WRITER
 
     # Models and static edges arrive during discovery, which is mostly waiting.
-    discovery = BackgroundCall(
-        "zstate announced",
-        lambda: discover(session) if robot == ANY else announced_robots(session, robot),
-    )
+    find = partial(discover, session) if robot == ANY else partial(announced_robots, session, robot)
+    discovery = BackgroundCall("zstate announced", find)
     from zstate.nodes.listener import TransformListener
 
     waiter = ConditionWaiter()
@@ -264,9 +259,7 @@ def tree_drawing(frames: Sequence[FrameInfo], now: int, *, in_full: bool) -> Dra
         lines, text_color = [_shown_name(frame, in_full)], MUTED
         if frame.kind in ("joint", "pose"):
             rate, age = _rate_and_age(frame, now)
-            lines.append(
-                f"{frame.kind}, no sample" if frame.newest is None else f"{frame.kind} · {rate} · {age}"
-            )
+            lines.append(f"{frame.kind}, {age}" if frame.newest is None else f"{frame.kind} · {rate} · {age}")
             is_old = newest is not None and is_stale((now - newest) * 1e-9, frame.rate_hz)
             text_color = ALARM if is_old or frame.newest is None else MUTED
         elif not is_static:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import click
@@ -89,17 +88,11 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
         rows = [(spec.name, shlex.join(command)) for spec, command in zip(specs, commands, strict=True)]
         print_result("\n".join(in_columns(rows)))
         return
-    failure = Supervisor(specs, _line_printer([spec.name for spec in specs])).run()
-    if failure:
-        fail(failure)
-
-
-def _line_printer(names: Sequence[str]) -> Callable[[str, str, bool], None]:
-    width = max(map(len, names))
-    prefixes = {name: f"{name:<{width}} | " for name in names}
+    width = max(len(spec.name) for spec in specs)
+    prefixes = {spec.name: f"{spec.name:<{width}} | " for spec in specs}
     if not os.environ.get("NO_COLOR"):
-        for number, name in enumerate(names):
-            prefixes[name] = click.style(prefixes[name], fg=_COLORS[number % len(_COLORS)])
+        for number, (name, prefix) in enumerate(prefixes.items()):
+            prefixes[name] = click.style(prefix, fg=_COLORS[number % len(_COLORS)])
 
     def show(name: str, line: str, is_error: bool) -> None:
         if logs.is_json():
@@ -107,4 +100,6 @@ def _line_printer(names: Sequence[str]) -> Callable[[str, str, bool], None]:
         else:
             print_result(prefixes[name] + line)
 
-    return show
+    failure = Supervisor(specs, show).run()
+    if failure:
+        fail(failure)

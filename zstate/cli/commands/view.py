@@ -6,28 +6,21 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from zstate.cli.options import (
-    checked_rate,
-    load_robot,
-    open_clock,
-    parse_models,
-    reading_clock_option,
-    session_options,
-    wire_option,
-)
+from zstate.cli import options
+from zstate.cli.options import load_robot, open_clock, parse_models
 from zstate.cli.output.console import count_text, fail, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from zstate.cli.processes import BackgroundCall
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.view.camera import Camera
@@ -46,21 +39,19 @@ _ENDS_WITHIN_S = 0.8
 _MAX_NAMED = 3
 
 
-def _checked_picture(_: click.Context, __: click.Parameter, file: str | None) -> Path | None:
-    if file is not None and Path(file).suffix.lower() != ".png":
-        raise click.BadParameter(f"{file!r} does not end with .png")
-    return None if file is None else Path(file)
+def _check_picture(file: str) -> Path:
+    if Path(file).suffix.lower() != ".png":
+        raise InvalidInput(f"{file!r} does not end with .png")
+    return Path(file)
 
 
-def _checked_camera(_: click.Context, __: click.Parameter, text: str | None) -> Camera | None:
-    if text is None:
-        return None
+def _parse_camera(text: str) -> Camera:
     from zstate.view.camera import Camera
 
     eye, separator, target = text.partition(":")
     camera = Camera(_point(eye), _point(target) if separator else None)
     if camera.look_at == camera.position:
-        raise click.BadParameter(f"a camera at {eye} cannot look at the same point")
+        raise InvalidInput(f"a camera at {eye} cannot look at the same point")
     return camera
 
 
@@ -70,7 +61,7 @@ def _point(text: str) -> tuple[float, float, float]:
     except ValueError:
         x = y = z = math.nan
     if not all(map(math.isfinite, (x, y, z))):
-        raise click.BadParameter(f"{text!r} is not three numbers with commas between, such as 2,1.5,1")
+        raise InvalidInput(f"{text!r} is not three numbers with commas between, such as 2,1.5,1")
     return x, y, z
 
 
@@ -83,15 +74,13 @@ def _point(text: str) -> tuple[float, float, float]:
 @click.option(
     "--port", type=click.IntRange(0, 65535), help="0: any free port; default: the first free one from 8080."
 )
+@click.option("--rate", type=options.RATE, default=30.0, show_default=True, help="Updates per second [Hz].")
 @click.option(
-    "--rate",
-    type=float,
-    default=30.0,
-    show_default=True,
-    callback=checked_rate,
-    help="Updates per second [Hz].",
+    "--snapshot",
+    type=options.Checked("file", _check_picture),
+    metavar="FILE.png",
+    help="Write one picture and exit.",
 )
-@click.option("--snapshot", callback=_checked_picture, metavar="FILE.png", help="Write one picture and exit.")
 @click.option(
     "--size",
     nargs=2,
@@ -104,14 +93,13 @@ def _point(text: str) -> tuple[float, float, float]:
 @click.option("--fixed-frame", default="", metavar="FRAME", help="Initial fixed frame.")
 @click.option(
     "--camera",
-    callback=_checked_camera,
-    metavar="X,Y,Z[:X,Y,Z]",
+    type=options.Checked("X,Y,Z[:X,Y,Z]", _parse_camera),
     help="Initial position of the camera and, after the colon, the point it looks at [m, fixed frame]; "
     "default: all robots in sight.",
 )
-@wire_option
-@reading_clock_option
-@session_options
+@options.wire_option
+@options.reading_clock_option
+@options.session_options
 def view_command(
     *,
     network: SessionOptions,
@@ -153,7 +141,9 @@ def view_command(
     """
     import_module("zstate.view")  # reports a missing viser before anything starts
 
+    from zstate.cli.processes import BackgroundCall
     from zstate.model.load import is_path
+    from zstate.view.access import is_loopback
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
     from zstate.view.view import View
@@ -196,13 +186,26 @@ def view_command(
                 aspect=size[0] / size[1] if snapshot else 1.0,
             )
         )
-        with _running(view) as call:
+        stop = threading.Event()
+        call = BackgroundCall("zstate view", lambda: view.run(stop))
+        try:
             if snapshot is None:
-                _print_address(page)
+                print_result(f"the view is at {page.url}")
+                if not is_loopback(page.host):
+                    print_status(
+                        "anyone with this address can see the view and move sliders; it is sent unencrypted"
+                    )
+                elif os.environ.get("SSH_CONNECTION"):
+                    tunnel = f"ssh -L {page.port}:127.0.0.1:{page.port} {os.uname().nodename}"
+                    print_status(f"from your own machine: {tunnel}")
                 call.result()
             else:
                 names = tuple(one.robot for one in named)
                 _write_snapshot(source, view, page, names, path=snapshot, size=size, fixed_frame=fixed_frame)
+        finally:
+            stop.set()
+            with suppress(TimeoutError):
+                call.result(_ENDS_WITHIN_S)
 
 
 class NamedRobot(NamedTuple):
@@ -255,30 +258,6 @@ def _receive_model(session: Session, robot: str, wire: str) -> RobotModel:
         if not _wait_for(source, lambda: robot in source.models, _ANNOUNCED_WITHIN_S):
             fail(f"{robot!r} is announced, but its model does not arrive; `zstate doctor {robot}` shows why")
         return source.models[robot]
-
-
-@contextmanager
-def _running(view: View) -> Generator[BackgroundCall[None]]:
-    from zstate.cli.processes import BackgroundCall
-
-    stop = threading.Event()
-    call = BackgroundCall("zstate view", lambda: view.run(stop))
-    try:
-        yield call
-    finally:
-        stop.set()
-        with suppress(TimeoutError):
-            call.result(_ENDS_WITHIN_S)
-
-
-def _print_address(page: ViewServer) -> None:
-    from zstate.view.access import is_loopback
-
-    print_result(f"the view is at {page.url}")
-    if not is_loopback(page.host):
-        print_status("anyone with this address can see the view and move sliders; it is sent unencrypted")
-    elif os.environ.get("SSH_CONNECTION"):
-        print_status(f"from your own machine: ssh -L {page.port}:127.0.0.1:{page.port} {os.uname().nodename}")
 
 
 def _write_snapshot(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import click
 
-from zstate.cli.options import json_option, session_options, timeout_option, wire_option
+from zstate.cli import options
 from zstate.cli.output.console import GRACE_S, count_text, fail, print_json, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import Unreachable, ZStateError
@@ -16,10 +16,10 @@ from zstate.errors import Unreachable, ZStateError
 @click.command("wait")
 @click.argument("what", type=click.Choice(["robot", "frame", "router"]), metavar="robot|frame|router")
 @click.argument("names", nargs=-1, metavar="[NAME]...")
-@timeout_option("Fail after this time, with the reason [s].", 30.0)
-@json_option("One JSON object, also after the timeout.")
-@wire_option
-@session_options
+@options.timeout_option("Fail after this time, with the reason [s].", 30.0)
+@options.json_option("One JSON object, also after the timeout.")
+@options.wire_option
+@options.session_options
 def wait_command(
     *, network: SessionOptions, what: str, names: tuple[str, ...], timeout: float, as_json: bool, wire: str
 ) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.robot_probe import RobotProbe
@@ -11,6 +11,7 @@ from zstate.errors import NoClock, format_duration
 from zstate.ingest.stamp_checks import FAR_NS, likely_cause
 from zstate.net.clock_offset import MeasuredOffset
 from zstate.net.session import Session
+from zstate.nodes.clock import SimulatedClock
 
 _DISTURBS_NS = 20_000_000
 _BREAKS_NS = 1_000_000_000
@@ -37,20 +38,16 @@ def _offset_text(one: MeasuredOffset) -> str:
     return f"that of {one.writer} is {size} {side} this one (± {bound})"
 
 
-def domains_check(clocks: Mapping[str, str]) -> Check | None:
-    """Warning if ``clocks``, the clock domains by robot, differ; "" is an unknown one."""
+def domains_check(clocks: Mapping[str, str]) -> Iterator[Check]:
+    """A warning if ``clocks``, the clock domains by robot, differ; "" is an unknown one."""
     domains: dict[str, list[str]] = {}
     for robot, clock in clocks.items():
-        if clock:
-            domains.setdefault(clock, []).append(robot)
-    if len(domains) < 2:
-        return None
-    parts = (f"{', '.join(map(repr, names))} in {domain!r} time" for domain, names in domains.items())
-    return warning(
-        "clocks",
-        f"robots are stamped by different clocks: {'; '.join(parts)}; there are no poses between them",
-        "zstate publish --help  # --clock: start all of them with the same",
-    )
+        domains.setdefault(clock, []).append(repr(robot))
+    domains.pop("", None)
+    if len(domains) > 1:
+        parts = (f"{', '.join(names)} in {domain!r} time" for domain, names in domains.items())
+        text = f"robots are stamped by different clocks: {'; '.join(parts)}; there are no poses between them"
+        yield warning("clocks", text, "zstate publish --help  # --clock: start all of them with the same")
 
 
 def stamps_check(probe: RobotProbe, session: Session) -> Check:
@@ -59,8 +56,13 @@ def stamps_check(probe: RobotProbe, session: Session) -> Check:
     window = statistics.window()
     if window is None:
         return skipped("stamps", "there is no sample")
-    if probe.description is not None and probe.description.clock not in ("", SYSTEM):
-        return _simulated_check(probe.description.clock, session)
+    if probe.description is not None and (domain := probe.description.clock) not in ("", SYSTEM):
+        with SimulatedClock(session) as clock:
+            try:
+                now = clock.wait(0.5)
+            except NoClock as error:
+                return broken("stamps", f"simulated time {domain!r}: {error}", "zstate replay FILE --clock")
+        return ok("stamps", f"simulated time {domain!r}, which is now {format_stamp(now)}")
     writer, least = probe.writer_name(statistics.session), window.delays[0]
     stamp, stamps = window.received[-1].stamp, {one.stamp for one in window.received}
     if abs(least) > FAR_NS:
@@ -77,34 +79,20 @@ def stamps_check(probe: RobotProbe, session: Session) -> Check:
 def _delay_check(probe: RobotProbe, session: int, delays: tuple[int, int]) -> Check:
     """Whether samples arrive soon after their stamps; ``delays`` are the least and the greatest [ns]."""
     writer, (least, greatest) = probe.writer_name(session), delays
+    cause, then = "", _SET_CLOCKS
+    for measured in probe.offsets:
+        if measured.writer.session == session and abs(measured.offset_ns) > _DISTURBS_NS:
+            cause = f": {_offset_text(measured)}"
+        elif measured.writer.session == session:
+            cause, then = (
+                "; its clock is right, so it stamps another instant than that of the sample",
+                _STAMPS,
+            )
     if least < -_DISTURBS_NS:
-        cause, then = _cause(probe, session)
         text = f"{writer} stamps samples up to {format_duration(-least)} in the future{cause}"
         return (broken if least < -_BREAKS_NS else warning)("stamps", text, then)
     if least > _BREAKS_NS:
-        cause, then = _cause(probe, session)
         text = f"samples of {writer} arrive {format_duration(least)} after their stamps{cause}"
         return warning("stamps", text, then)
     low, high = (format_duration(max(delay, 0)) for delay in (least, greatest))
     return ok("stamps", f"{low} to {high} old on arrival")
-
-
-def _cause(probe: RobotProbe, session: int) -> tuple[str, str]:
-    """Whether the clock of the writer explains the delays, and the next command."""
-    measured = next((one for one in probe.offsets if one.writer.session == session), None)
-    if measured is None:
-        return "", _SET_CLOCKS
-    if abs(measured.offset_ns) > _DISTURBS_NS:
-        return f": {_offset_text(measured)}", _SET_CLOCKS
-    return "; its clock is right, so it stamps another instant than that of the sample", _STAMPS
-
-
-def _simulated_check(domain: str, session: Session) -> Check:
-    from zstate.nodes.clock import SimulatedClock
-
-    with SimulatedClock(session) as clock:
-        try:
-            now = clock.wait(0.5)
-        except NoClock as error:
-            return broken("stamps", f"simulated time {domain!r}: {error}", "zstate replay FILE --clock")
-    return ok("stamps", f"simulated time {domain!r}, which is now {format_stamp(now)}")

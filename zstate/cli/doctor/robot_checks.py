@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence, Set
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
-from zstate.cli.doctor.robot_probe import PositionRanges, RobotProbe
+from zstate.cli.doctor.robot_probe import RobotProbe, WriterSamples
 from zstate.cli.frame_checks import similar_frames, without_program_advice
 from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import publish_command_for
@@ -51,8 +51,8 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
     yield clocks_check(probe)
     yield stamps_check(probe, session)
     if model is not None:
-        ranges = [writer.ranges for writer in probe.samples.writers.values()]
-        yield from limits_check(probe, model, ranges, f"zstate echo {probe.info.name}")
+        writers = probe.samples.writers.values()
+        yield from limits_check(probe, model, writers, f"zstate echo {probe.info.name}")
     yield statics_check(probe)
     yield poses_check(probe, model)
 
@@ -94,18 +94,25 @@ def _silent_check(probe: RobotProbe, session: Session) -> Check:
             f"{robot!r} is announced, but none of its data arrives: the router denies zstate/{robot}/** to "
             f"{identity}; its access control lists the viewers that may read"
         )
-        return broken(
-            "access", text, "zstate acl --viewer NAME  # for the router, which then needs a restart"
-        )
+        then = "zstate acl --viewer NAME  # for the router, which then needs a restart"
+        return broken("access", text, then)
     text = f"{writer} is announced, but none of its data arrives"
     return broken("writers", text, f"zstate echo {robot}")
 
 
 def model_check(probe: RobotProbe) -> tuple[RobotModel | None, Check]:
     """The model of the robot if it can be used, and the check."""
-    robot = probe.info.name
+    robot, writers = probe.info.name, probe.writers("robot_description")
     if probe.description is None:
-        return None, _no_model_check(probe)
+        if writers:
+            text = f"{writers[-1]} announces the model, which has not arrived"
+            check = broken("model", text, f"zstate doctor {robot} --timeout 10")
+        elif probe.followed == "tf":
+            check = ok("model", "not published, and not needed: the poses are published on tf")
+        else:
+            text = f"the model of {robot!r} has no publisher"
+            check = broken("model", text, publish_command_for("publish", robot))
+        return None, check
     try:
         model = parse_urdf(probe.description.urdf, f"the URDF of {robot!r}")
     except ModelError as error:
@@ -122,17 +129,6 @@ def model_check(probe: RobotProbe) -> tuple[RobotModel | None, Check]:
     return model, ok("model", text)
 
 
-def _no_model_check(probe: RobotProbe) -> Check:
-    robot, writers = probe.info.name, probe.writers("robot_description")
-    if writers:
-        text = f"{writers[-1]} announces the model, which has not arrived"
-        return broken("model", text, f"zstate doctor {robot} --timeout 10")
-    if probe.followed == "tf":
-        return ok("model", "not published, and not needed: the poses are published on tf")
-    text = f"the model of {robot!r} has no publisher"
-    return broken("model", text, publish_command_for("publish", robot))
-
-
 def _samples_check(probe: RobotProbe) -> Check:
     stream, robot, statistics = probe.followed, probe.info.name, probe.samples.statistics
     writers, window = probe.writers(stream), statistics.window()
@@ -140,8 +136,7 @@ def _samples_check(probe: RobotProbe) -> Check:
         return _no_writer_check(probe)
     writer = str(writers[-1]) if writers else "an unannounced writer"
     if window is None:
-        status = probe.statuses.get(writers[-1].session)
-        if status is not None:
+        if (status := probe.statuses.get(writers[-1].session)) is not None:
             cause = f"it runs, but {status.text or 'publishes nothing'}"
         else:
             is_stuck = writers[-1] in probe.unresponsive
@@ -164,8 +159,8 @@ def _rate_check(probe: RobotProbe, writer: str, rate_hz: float) -> Check:
     text, stats = f"{rate_hz:.1f} Hz from {writer}", probe.listener.stats
     status = probe.statuses.get(statistics.session)
     if status is not None and rate_hz < _MIN_RECEIVED * status.rate_hz:
-        sent = f"which sends {status.rate_hz:.1f} Hz"
-        return warning(stream, f"{text}, {sent}: the rest is lost or downsampled on the way", hz)
+        text += f", which sends {status.rate_hz:.1f} Hz: the rest is lost or downsampled on the way"
+        return warning(stream, text, hz)
     if stats.missed + stats.dropped > _MIN_RECEIVED * statistics.count:
         text += f"; {stats.missed} were lost on the way and {stats.dropped} here"
         return warning(stream, text, f"zstate monitor --robots --robot {robot}")
@@ -176,9 +171,8 @@ def _no_writer_check(probe: RobotProbe) -> Check:
     robot, waiting = probe.info.name, probe.writers("tf")
     then = f"{publish_command_for('joints', robot)}  # moves it, until the driver runs"
     if "robot_description" not in probe.streams and not waiting:
-        return warning(
-            "joint_states", f"{robot!r} has no writer of joint_states or tf: it does not move", then
-        )
+        text = f"{robot!r} has no writer of joint_states or tf: it does not move"
+        return warning("joint_states", text, then)
     waits = f", which {waiting[-1]} waits for" if waiting else ""
     text = f"{robot!r} has no writer of joint_states{waits}: its driver is not running"
     for info in probe.neighbours:
@@ -206,11 +200,11 @@ def refused_check(probe: RobotProbe) -> Check | None:
 
 
 def limits_check(
-    probe: RobotProbe, model: RobotModel, ranges: Iterable[PositionRanges], echo: str
+    probe: RobotProbe, model: RobotModel, writers: Iterable[WriterSamples], echo: str
 ) -> Iterator[Check]:
     """Warnings if joint positions of ``model`` are outside its limits; the command ``echo`` prints them."""
     limits = JointLimits(model)
-    found = [text for writer in ranges if (text := limits.explanation(writer.positions(model)))]
+    found = [text for writer in writers if (text := limits.explanation(writer.positions(model)))]
     reported = [status.text for status in probe.statuses.values() if ARE_OUTSIDE in status.text]
     for text in found or reported[:1]:
         yield warning("limits", text, f"{echo} --once  # `zstate check FILE --joints` shows the limits")

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate.cli.waiting import ConditionWaiter
-from zstate.errors import MessageError
 from zstate.ingest.events import WriterEvent
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.clock_offset import MeasuredOffset
-from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo
 from zstate.net.queryable import query
 from zstate.net.session import Session
-from zstate.net.status import watch_status
+from zstate.net.status import StatusSubscriber
+from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.wire.identity import WriterId
@@ -34,7 +32,7 @@ from zstate.wire.messages import (
     from_block,
     order_digest,
 )
-from zstate.wire.protocol import SerializedSample, Wire
+from zstate.wire.protocol import Wire
 from zstate.wire.registry import get_wire
 
 _MIN_WINDOW_S = 1.2  # writers publish their status once a second
@@ -43,28 +41,32 @@ _ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf")
 _ALL = ""
 
 
-class PositionRanges:
-    """The least and greatest positions of the samples of one writer."""
+class WriterSamples:
+    """Samples of one writer: ``statistics``, ``names`` of joints or child frames, and ranges of positions."""
 
-    def __init__(self) -> None:
-        self._kind: object = None
-        self._names: tuple[str, ...] | None = None
+    def __init__(self, statistics: IntervalStatistics) -> None:
+        self.statistics = statistics
+        self.names: dict[str, None] = {}
+        self._joints: tuple[str, ...] | None = None
         self._order = b""
         self._extremes = np.empty((2, 0))
 
-    def add(self, state: JointState) -> None:
-        """Include the positions of ``state``; those of another writer or joint order replace all before."""
-        positions = from_block(state.positions)
-        kind = (state.session, state.order, positions.size)
-        if kind != self._kind:
-            self._kind, self._names, self._order = kind, state.names, state.order
-            self._extremes = np.stack((positions, positions))
-        np.fmin(self._extremes[0], positions, out=self._extremes[0])
-        np.fmax(self._extremes[1], positions, out=self._extremes[1])
+    def add(self, sample: Sample) -> None:
+        """Include ``sample``; positions in another joint order replace all before."""
+        if isinstance(sample, TransformSample):
+            self.names.update(dict.fromkeys(child for _, child in sample.edges or ()))
+        elif isinstance(sample, JointState):
+            self.names.update(dict.fromkeys(sample.names or ()))
+            positions = from_block(sample.positions)
+            if (sample.order, positions.size) != (self._order, self._extremes.shape[1]):
+                self._joints, self._order = sample.names, sample.order
+                self._extremes = np.stack((positions, positions))
+            np.fmin(self._extremes[0], positions, out=self._extremes[0])
+            np.fmax(self._extremes[1], positions, out=self._extremes[1])
 
     def positions(self, model: RobotModel) -> NDArray[np.float64]:
         """Two position vectors of ``model``, the least and the greatest; NaN for what the samples lack."""
-        coordinates, names = coordinate_names(model), self._names
+        coordinates, names = coordinate_names(model), self._joints
         if names is None:
             names = coordinates if self._order == order_digest(model.joint_names) else ()
         columns = {name: column for column, name in enumerate(names)}
@@ -73,15 +75,6 @@ class PositionRanges:
             if name in columns:
                 found[:, column] = self._extremes[:, columns[name]]
         return found
-
-
-@dataclass
-class WriterSamples:
-    """Statistics of one writer, its joints or child frames, and the ranges of its joint positions."""
-
-    statistics: IntervalStatistics
-    names: dict[str, None] = field(default_factory=dict[str, None])
-    ranges: PositionRanges = field(default_factory=PositionRanges)
 
 
 class StreamSamples(Closeable):
@@ -96,30 +89,23 @@ class StreamSamples(Closeable):
         on_change: Callable[[], object] = lambda: None,
     ) -> None:
         self._writers: dict[int, WriterSamples] = {}
-        self._on_change = on_change
+
+        def on_sample(_: Stream, sample: Sample) -> None:
+            writer = self._writers.get(sample.session)
+            if writer is None:
+                statistics = self.topic.get(sample.session)
+                assert statistics is not None
+                writer = self._writers[sample.session] = WriterSamples(statistics)
+            writer.add(sample)
+            on_change()
+
         self.topic = TopicStatistics(
-            session,
-            wire,
-            sources=lambda _, __, sample: iter((_ALL, sample.session)),
-            on_sample=self._on_sample,
+            session, wire, sources=lambda _, __, sample: iter((_ALL, sample.session)), on_sample=on_sample
         )
         self.topic.subscribe(stream, robot)
 
     def close(self) -> None:
         self.topic.close()
-
-    def _on_sample(self, stream: Stream, sample: Sample) -> None:
-        writer = self._writers.get(sample.session)
-        if writer is None:
-            statistics = self.topic.get(sample.session)
-            assert statistics is not None
-            writer = self._writers[sample.session] = WriterSamples(statistics)
-        if isinstance(sample, JointState):
-            writer.names.update(dict.fromkeys(sample.names or ()))
-            writer.ranges.add(sample)
-        elif isinstance(sample, TransformSample):
-            writer.names.update(dict.fromkeys(child for _, child in sample.edges or ()))
-        self._on_change()
 
     @property
     def statistics(self) -> IntervalStatistics:
@@ -144,10 +130,10 @@ class RobotProbe(Closeable):
         session: Session,
         info: RobotInfo,
         wire: str,
-        neighbours: Iterable[RobotInfo] = (),
-        on_change: Callable[[], object] = lambda: None,
+        neighbours: Sequence[RobotInfo],
+        on_change: Callable[[], object],
     ) -> None:
-        self.info, self.neighbours = info, tuple(neighbours)
+        self.info, self.neighbours = info, neighbours
         self.streams = frozenset(stream for stream, _ in info.writers)
         is_native = wire == "native"
         moves_by_joints = "joint_states" in self.streams or "tf" not in self.streams
@@ -158,18 +144,19 @@ class RobotProbe(Closeable):
         self.offsets: tuple[MeasuredOffset, ...] = ()
         self.unresponsive: set[WriterId] = set()
         self.nodes: dict[Stream, StreamSamples] = {}
-        self._session, self._wire, self._on_change = session, get_wire(wire), on_change
+        self._session, self._on_change, wire_format = session, on_change, get_wire(wire)
         with ExitStack() as opening:
-            key = self._wire.expression(info.name, "robot_description")
-            opening.enter_context(LatchedSubscriber(session, key, self._on_description))
-            samples = StreamSamples(session, info.name, self.followed, self._wire, on_change)
+            description = subscribe(
+                session, wire_format, info.name, "robot_description", self._on_description
+            )
+            opening.enter_context(description)
+            samples = StreamSamples(session, info.name, self.followed, wire_format, on_change)
             self.samples = opening.enter_context(samples)
             if is_native:
-                opening.enter_context(watch_status(session, info.name, self._on_status))
-            else:
-                for stream in _ROS_STREAMS:
-                    nodes = StreamSamples(session, info.name, stream, self._wire)
-                    self.nodes[stream] = opening.enter_context(nodes)
+                opening.enter_context(StatusSubscriber(session, info.name, self._on_status))
+            for stream in () if is_native else _ROS_STREAMS:
+                nodes = StreamSamples(session, info.name, stream, wire_format)
+                self.nodes[stream] = opening.enter_context(nodes)
             listener = TransformListener(
                 session, info.name, wire=wire, follow=self.followed, on_event=self.events.append
             )
@@ -179,12 +166,11 @@ class RobotProbe(Closeable):
     def close(self) -> None:
         self._opened.close()
 
-    def _on_description(self, arrival: SerializedSample) -> None:
-        with suppress(MessageError):  # withdrawn; or invalid, which the listener counts and reports
-            for message in self._wire.decode("robot_description", arrival, self.info.name):
-                if isinstance(message, RobotDescription):
-                    self.description = message
-                    self._on_change()
+    def _on_description(self, received: list[Received]) -> None:
+        for _, _, message in received:
+            if isinstance(message, RobotDescription):
+                self.description = message
+                self._on_change()
 
     def _on_status(self, _: str, status: Status) -> None:
         self.statuses[status.session] = status

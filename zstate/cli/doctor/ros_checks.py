@@ -43,32 +43,28 @@ class _RosChecks:
         self._by_node = {stream: nodes.writers for stream, nodes in probe.nodes.items()}
 
     def run(self, model_name: str) -> Iterator[Check]:
-        probe = self._probe
-        yield self._writers_check()
+        probe, writers = self._probe, self._probe.writers("robot_description")
+        if len(writers) < 2:
+            yield ok("writers", probe.writers_text())
+        else:
+            listed = _listed(map(str, writers))
+            text = f"{len(writers)} nodes publish the model, {listed}: readers use the newest"
+            yield warning("writers", text, "zstate ls  # stop one of them, or give each robot a namespace")
         if probe.is_silent and not any(self._by_node.values()):
-            nodes = _listed(dict.fromkeys(str(writer) for _, writer in probe.info.writers))
-            text = (
-                f"{nodes} announced, but no message arrives: no node publishes, or the router denies reading"
-            )
-            yield broken("writers", text, "zstate ls")
+            names = _listed(dict.fromkeys(str(writer) for _, writer in probe.info.writers))
+            why = "no node publishes, or the router denies reading"
+            yield broken("writers", f"{names} announced, but no message arrives: {why}", "zstate ls")
             return
         model, check = self._model_check(model_name)
         yield check
-        yield self._joints_check(model)
-        yield self._transforms_check()
+        nodes, publishers = self._by_node["joint_states"], self._by_node["tf"]
+        yield self._joints_check(model) if nodes else self._no_joints_check(model)
+        yield self._transforms_check() if publishers else self._no_transforms_check()
         yield stamps_check(probe, self._session)
         if model is not None:
-            ranges = [node.ranges for node in self._by_node["joint_states"].values()]
-            yield from limits_check(probe, model, ranges, f"zstate echo{self._robot}")
+            yield from limits_check(probe, model, nodes.values(), f"zstate echo{self._robot}")
         yield statics_check(probe)
         yield poses_check(probe, model)
-
-    def _writers_check(self) -> Check:
-        nodes = self._probe.writers("robot_description")
-        if len(nodes) < 2:
-            return ok("writers", self._probe.writers_text())
-        text = f"{len(nodes)} nodes publish the model, {_listed(map(str, nodes))}: readers use the newest"
-        return warning("writers", text, "zstate ls  # stop one of them, or give each robot a namespace")
 
     def _model_check(self, name: str) -> tuple[RobotModel | None, Check]:
         probe, topic = self._probe, self._topic("robot_description")
@@ -81,22 +77,17 @@ class _RosChecks:
         return model, warning("model", text, "zstate ls  # shows the domain and namespace of each node")
 
     def _joints_check(self, model: RobotModel | None) -> Check:
-        topic, samples = self._topic("joint_states"), self._by_node["joint_states"]
-        if not samples:
-            return self._no_joints_check(model, topic)
-        rates, silent = self._rates_text("joint_states"), self._silent_text("joint_states")
+        """Whether one node publishes each joint of ``model``; other joints are allowed."""
+        topic, echo = self._topic("joint_states"), f"zstate echo{self._robot} --once"
+        rates, silent = self._rates("joint_states")
         if silent:
             hz = f"zstate hz{self._robot} --stream joint_states"
             return broken("joint_states", f"{silent}; all nodes: {rates}", hz)
         if model is None:
             return ok("joint_states", rates)
-        return self._model_joints_check(model, topic, rates)
-
-    def _model_joints_check(self, model: RobotModel, topic: str, rates: str) -> Check:
-        """Whether one node publishes each joint of ``model``; other joints are allowed."""
-        echo = f"zstate echo{self._robot} --once"
         names = self._names("joint_states")
-        missing = [name for name in model.joint_names if name not in names]
+        missing = [repr(name) for name in model.joint_names if name not in names]
+        others = [repr(name) for name in names if name not in model.joint_names]
         if len(missing) == len(model.joint_names):
             found = _listed(map(repr, names), _MAX_NAMES)
             text = f"no joint on {topic} ({found}) is in the model {model.name!r}: {rates}"
@@ -106,17 +97,15 @@ class _RosChecks:
                 text = f"joint {name!r} is published by {_listed(nodes)}: poses will jump between them"
                 return warning("joint_states", f"{text}; {rates}", "zstate ls  # stop one of them")
         if missing:
-            count, found = count_text(len(missing), "joint"), _listed(map(repr, missing), _MAX_NAMES)
+            count, found = count_text(len(missing), "joint"), _listed(missing, _MAX_NAMES)
             text = f"{count} of the model without a publisher: {found}; {rates}"
             return warning("joint_states", text, f"{echo}  # shows the published joints")
-        others = [name for name in names if name not in model.joint_names]
         if others:
-            listed = _listed(map(repr, others), _MAX_NAMES)
-            rates += f"; {count_text(len(others), 'joint')} outside the model: {listed}"
+            rates += f"; {count_text(len(others), 'joint')} outside the model: {_listed(others, _MAX_NAMES)}"
         return ok("joint_states", rates)
 
-    def _no_joints_check(self, model: RobotModel | None, topic: str) -> Check:
-        probe = self._probe
+    def _no_joints_check(self, model: RobotModel | None) -> Check:
+        probe, topic = self._probe, self._topic("joint_states")
         if writers := probe.writers("joint_states"):
             text = f"{_listed(map(str, writers))} announced on {topic}, but no message arrives"
             return broken("joint_states", text, f"zstate hz{self._robot} --stream joint_states")
@@ -130,15 +119,13 @@ class _RosChecks:
         return broken("joint_states", text, "zstate joints FILE  # moves it, until the driver runs")
 
     def _transforms_check(self) -> Check:
-        if not self._by_node["tf"]:
-            return self._no_transforms_check()
         refused = refused_check(self._probe)
         if refused is not None:
             return refused
-        rates, silent = self._rates_text("tf"), self._silent_text("tf")
-        for child, writers in self._names("tf").items():
-            if len(writers) > 1:
-                text = f"{child!r} is placed by {_listed(writers)}: it jumps between them; {rates}"
+        rates, silent = self._rates("tf")
+        for child, nodes in self._names("tf").items():
+            if len(nodes) > 1:
+                text = f"{child!r} is placed by {_listed(nodes)}: it jumps between them; {rates}"
                 return warning("tf", text, "zstate ls  # stop one of them, or give each robot a namespace")
         if silent:
             return warning("tf", f"{silent}; all nodes: {rates}", f"zstate hz{self._robot} --stream tf")
@@ -165,22 +152,17 @@ class _RosChecks:
                 names.setdefault(name, []).append(self._probe.writer_name(session))
         return names
 
-    def _silent_text(self, stream: Stream) -> str:
-        """The node that has stopped publishing; empty if there is none."""
+    def _rates(self, stream: Stream) -> tuple[str, str]:
+        """The rate of each node on a topic; and the first one that has stopped publishing, or ""."""
+        texts, silent = list[str](), ""
         for session, node in self._by_node[stream].items():
-            if node.statistics.is_stale():
-                duration = format_duration(round(node.statistics.silent_s() * 1e9))
-                return f"{self._probe.writer_name(session)} has published nothing for {duration}"
-        return ""
-
-    def _rates_text(self, stream: Stream) -> str:
-        texts: list[str] = []
-        for session, node in self._by_node[stream].items():
-            window = node.statistics.window()
+            name, window = self._probe.writer_name(session), node.statistics.window()
             rate_hz = None if window is None else window.rate_hz
-            rate = "one message" if rate_hz is None else rate_text(rate_hz)
-            texts.append(f"{rate} from {self._probe.writer_name(session)}")
-        return ", ".join(texts)
+            texts.append(f"{'one message' if rate_hz is None else rate_text(rate_hz)} from {name}")
+            if not silent and node.statistics.is_stale():
+                duration = format_duration(round(node.statistics.silent_s() * 1e9))
+                silent = f"{name} has published nothing for {duration}"
+        return ", ".join(texts), silent
 
 
 def _listed(names: Iterable[str], most: int | None = None) -> str:

@@ -88,11 +88,6 @@ def duration_or_dash(nanoseconds: int | None) -> str:
     return "-" if nanoseconds is None else format_duration(nanoseconds)
 
 
-def age_text(stamp: int | None, now: int) -> str:
-    """The age of a stamp as text; "-" for None."""
-    return duration_or_dash(None if stamp is None else now - stamp)
-
-
 def sample_age_text(frame: FrameInfo, now: int) -> str:
     """The age of the newest sample of a frame by the system clock; if another clock stamps it, its name."""
     from zstate.clock import SYSTEM  # loads numpy, which help texts do not need
@@ -100,7 +95,7 @@ def sample_age_text(frame: FrameInfo, now: int) -> str:
     if frame.newest is None:
         return "no sample"
     newest = frame.newest_in(SYSTEM)
-    return f"{frame.domain} time" if newest is None else age_text(newest, now)
+    return f"{frame.domain} time" if newest is None else format_duration(now - newest)
 
 
 def rate_text(rate_hz: float | None) -> str:

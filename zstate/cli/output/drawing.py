@@ -125,25 +125,22 @@ def svg(drawing: Drawing, title: str) -> str:
 
 def dot(drawing: Drawing) -> str:
     """The drawing in the language of Graphviz."""
+
+    def quoted(text: str) -> str:
+        return json.dumps(text, ensure_ascii=False)
+
     lines = [f"digraph {drawing.name} {{", "  node [shape=box];"]
     if drawing.form == "flow":
         lines.insert(1, "  rankdir=LR;")
     for node in drawing.nodes:
         attributes = ["shape=ellipse"] * node.rounded
-        attributes += [f"label={_quoted(node.text)}"] * (node.text != node.name)
-        lines.append(f"  {_quoted(node.name)}{_attributes(attributes)};")
+        attributes += [f"label={quoted(node.text)}"] * (node.text != node.name)
+        suffix = f" [{', '.join(attributes)}]" if attributes else ""
+        lines.append(f"  {quoted(node.name)}{suffix};")
     for edge in drawing.edges:
-        label = _attributes([f"label={_quoted(edge.label)}"] * bool(edge.label))
-        lines.append(f"  {_quoted(edge.start)} -> {_quoted(edge.end)}{label};")
+        label = f" [label={quoted(edge.label)}]" if edge.label else ""
+        lines.append(f"  {quoted(edge.start)} -> {quoted(edge.end)}{label};")
     return "\n".join([*lines, "}"])
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
-
-
-def _attributes(attributes: Sequence[str]) -> str:
-    return f" [{', '.join(attributes)}]" if attributes else ""
 
 
 def mermaid(drawing: Drawing) -> str:

@@ -12,14 +12,13 @@ from threading import Event
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from zstate._util.closeable import Closeable
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.output.console import print_status
 from zstate.clock import wait_interruptible
-from zstate.errors import InvalidInput, MessageError, ModelError
+from zstate.errors import InvalidInput, ModelError
 from zstate.model.urdf import parse_urdf
-from zstate.net.latched import LatchedSubscriber
+from zstate.net.subscription import Received, subscribe
 from zstate.wire.messages import JointState, RobotDescription, from_block, order_digest
-from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
@@ -46,14 +45,10 @@ class JointStateFormatter:
     """
 
     def __init__(self) -> None:
-        self._model: RobotModel | None = None
+        self.model: RobotModel | None = None
+        """The model of the newest description, or None if its URDF cannot be parsed."""
         self._names: tuple[str, ...] = ()
         self._order = b""
-
-    @property
-    def model(self) -> RobotModel | None:
-        """The model of the newest description, or None if its URDF cannot be parsed."""
-        return self._model
 
     def set_description(self, description: RobotDescription) -> None:
         """Use the joint names of ``description``."""
@@ -61,9 +56,9 @@ class JointStateFormatter:
         self._order = order_digest(self._names)
         try:
             # Plain URDF only: input from the network opens no files and runs no xacro.
-            self._model = parse_urdf(description.urdf, "its URDF")
+            self.model = parse_urdf(description.urdf, "its URDF")
         except ModelError:
-            self._model = None  # the names suffice for joints with one number
+            self.model = None  # the names suffice for joints with one number
 
     def has_names(self, state: JointState) -> bool:
         """Whether the joint names of ``state`` are known."""
@@ -82,7 +77,7 @@ class JointStateFormatter:
         names = state.names if state.names is not None else self._names if self.has_names(state) else ()
         if len(names) == len(numbers):
             return dict(zip(names, numbers, strict=True))
-        model = self._model
+        model = self.model
         if state.names is not None or model is None or model.joint_names != names:
             return numbers
         is_position = block == "positions"
@@ -97,50 +92,44 @@ class JointStateFormatter:
         }
 
 
-class DescribedJointStates(Closeable):
+class DescribedJointStates(JointStateFormatter, Closeable):
     """Formats the joint states of ``robot`` with the joint names of its published description."""
 
     def __init__(self, session: Session, robot: str, wire: str = "native") -> None:
+        super().__init__()
         self._robot = robot
-        self._wire = get_wire(wire)
-        self._formatter = JointStateFormatter()
         self._described = Event()
         self._warned = False
-        key = self._wire.expression(robot, "robot_description")
-        self._subscriber = LatchedSubscriber(session, key, self._on_description)
+        self._subscriber = subscribe(
+            session,
+            get_wire(wire),
+            robot,
+            "robot_description",
+            self._on_descriptions,
+            on_error=lambda _, text: print_status(text),
+        )
 
     def close(self) -> None:
         self._subscriber.close()
 
-    @property
-    def model(self) -> RobotModel | None:
-        """The model of the robot; None before its description arrives."""
-        return self._formatter.model
-
     def document(self, state: JointState) -> Document:
         """``state`` as a document. Waits up to 1 s for the description if the names are unknown, once."""
-        if not self._formatter.has_names(state) and not self._warned:
+        if not self.has_names(state) and not self._warned:
             wait_interruptible(self._described, _DESCRIPTION_WITHIN_S)
-            if not self._formatter.has_names(state):
+            if not self.has_names(state):
                 self._warned = True
                 reason = "is for another model" if self._described.is_set() else "is missing"
                 print_status(
                     f"the description of {self._robot!r} {reason}, so its joints are shown without names; "
                     f"`zstate publish {self._robot}` publishes it"
                 )
-        return self._formatter.document(state)
+        return super().document(state)
 
-    def _on_description(self, arrival: SerializedSample) -> None:
-        if not arrival.payload:
-            return
-        try:
-            (description,) = self._wire.decode("robot_description", arrival, self._robot)
-        except MessageError as error:
-            print_status(f"{arrival.key}: {error}")
-            return
-        assert isinstance(description, RobotDescription)
-        self._formatter.set_description(description)
-        self._described.set()
+    def _on_descriptions(self, received: list[Received]) -> None:
+        for _, _, description in received:
+            assert isinstance(description, RobotDescription)
+            self.set_description(description)
+            self._described.set()
 
 
 def yaml_text(value: Any, indent: str = "") -> str:

@@ -208,23 +208,18 @@ def _ports(
 
 @dataclass(frozen=True, slots=True)
 class _Arrangement:
-    """One way to place a subtree: its size, and the (x, width, height) of its root in it.
+    """One way to place a subtree, in coordinates from its upper left corner.
 
-    Without a ``name`` there is no root: the ``parts`` are children of one node that share a rail.
+    ``middle`` is the x at which the line from the parent arrives, above the middle of the root. ``parts`` are
+    subtrees with their corners. Without a ``name`` there is no root: the parts share a rail of the parent.
     """
 
     name: str | None
     width: float
     height: float
-    box: tuple[float, float, float]
-    has_rail: bool
-    parts: tuple[_Arrangement, ...]
-
-    @property
-    def middle(self) -> float:
-        """The x at which the line from the parent arrives."""
-        x, width, _ = self.box
-        return x + width / 2
+    middle: float
+    parts: Sequence[tuple[_Arrangement, float, float]] = ()
+    has_rail: bool = False
 
 
 def tree_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
@@ -276,7 +271,7 @@ def _arrangements(
 
 def _arrange(name: str, size: Size, below: Sequence[list[_Arrangement]]) -> Iterator[_Arrangement]:
     if not below:
-        yield _Arrangement(name, *size, (0.0, *size), False, ())
+        yield _Arrangement(name, *size, size[0] / 2)
         return
     leaves = [ways for ways in below if not ways[0].parts]
     others = [ways for ways in below if ways[0].parts]
@@ -297,56 +292,43 @@ def _side_by_side(name: str, size: Size, below: Sequence[list[_Arrangement]]) ->
     for height in sorted({way.height for ways in below for way in ways}):
         fitting = [[way for way in ways if way.height <= height] for ways in below]
         if all(fitting):
-            row = tuple(min(ways, key=lambda way: way.width) for ways in fitting)
-            width, middle = _row_span(row)
-            x = middle - size[0] / 2
+            row = [min(ways, key=lambda way: way.width) for ways in fitting]
+            lefts = [0.0]
+            for way in row:
+                lefts.append(lefts[-1] + way.width + _ACROSS)
+            # The root is above the middle of the lines that arrive at its children.
+            middle = (row[0].middle + lefts[-2] + row[-1].middle) / 2
+            x, top = middle - size[0] / 2, size[1] + _BELOW
             shift = max(0.0, -x)
-            whole = (
-                max(width + shift, x + shift + size[0]),
-                size[1] + _BELOW + max(way.height for way in row),
-            )
-            yield _Arrangement(name, *whole, (x + shift, *size), False, row)
-
-
-def _row_span(row: Sequence[_Arrangement]) -> tuple[float, float]:
-    """The width of a row, and the middle of the lines that arrive at it."""
-    width = sum(way.width for way in row) + _ACROSS * (len(row) - 1)
-    return width, (row[0].middle + width - row[-1].width + row[-1].middle) / 2
+            width = max(lefts[-1] - _ACROSS + shift, x + shift + size[0])
+            parts = [(way, left + shift, top) for way, left in zip(row, lefts, strict=False)]
+            yield _Arrangement(name, width, top + max(way.height for way in row), middle + shift, parts)
 
 
 def _along_rail(name: str | None, size: Size, column: Sequence[_Arrangement]) -> _Arrangement:
     width = max(size[0], _INDENT + max(way.width for way in column))
-    height = size[1] + sum(_STACKED + way.height for way in column)
-    box = (0.0, *size) if name is not None else (0.0, 2 * _RAIL, 0.0)
-    return _Arrangement(name, width, height, box, True, tuple(column))
+    parts, y = list[tuple[_Arrangement, float, float]](), size[1]
+    for way in column:
+        parts.append((way, _INDENT, y + _STACKED))
+        y += _STACKED + way.height
+    middle = _RAIL if name is None else size[0] / 2
+    return _Arrangement(name, width, y, middle, parts, has_rail=True)
 
 
 def _place(tree: _Arrangement, corner: Point, sizes: Mapping[str, Size], layout: Layout) -> None:
     """Add the nodes and edges of ``tree`` to ``layout``; ``corner`` is the upper left one."""
-    places = layout.places
     stack: list[tuple[_Arrangement, float, float, str | None, float | None]] = [(tree, *corner, None, None)]
     while stack:
         way, left, top, parent, rail = stack.pop()
-        box_x, width, height = way.box
         if way.name is not None:
-            places[way.name] = (left + box_x, top)
+            size = sizes[way.name]
+            layout.places[way.name] = corner = left + way.middle - size[0] / 2, top
             if parent is not None:
-                ends = (places[parent], sizes[parent]), (places[way.name], sizes[way.name])
+                ends = (layout.places[parent], sizes[parent]), (corner, size)
                 layout.routes[parent, way.name] = _connect(*ends, rail)
             parent = way.name
-        if way.has_rail:
-            part_x, part_y, rail = left + _INDENT, top + height + _STACKED, left + _RAIL
-        else:
-            arrival = _row_span(way.parts)[1] if way.parts else 0.0
-            part_x, part_y, rail = left + box_x + width / 2 - arrival, top + height + _BELOW, None
-        parts: list[tuple[_Arrangement, float, float, str | None, float | None]] = []
-        for part in way.parts:
-            parts.append((part, part_x, part_y, parent, rail))
-            if way.has_rail:
-                part_y += part.height + _STACKED
-            else:
-                part_x += part.width + _ACROSS
-        stack += parts[::-1]
+        rail = left + _RAIL if way.has_rail else None
+        stack += [(part, left + x, top + y, parent, rail) for part, x, y in reversed(way.parts)]
 
 
 def _connect(parent: tuple[Point, Size], child: tuple[Point, Size], rail: float | None) -> list[Point]:

@@ -107,13 +107,10 @@ def as_json(text: str, *, level: str = "info", event: str = "note", **facts: obj
 
 def forward_line(line: str, *, is_error: bool, **facts: object) -> None:
     """Write a line of another program as JSON: an object of zstate with ``facts`` added, or any text."""
-    try:
-        entry = json.loads(line)
-    except ValueError:
-        entry = None
-    if not isinstance(entry, dict):
+    entry = _entry(line)
+    if entry is None:
         entry = {"time": _time_text(), "event": "line", "text": line}
-    written = json.dumps({**cast("dict[str, object]", entry), **facts})
+    written = json.dumps(entry | facts)
     if is_error:
         _write_line(written)
     else:
@@ -122,12 +119,17 @@ def forward_line(line: str, *, is_error: bool, **facts: object) -> None:
 
 def text_in(line: str) -> str:
     """The text of a line that another zstate process wrote, in either format."""
+    text = (_entry(line) or {}).get("text")
+    return line if text is None else str(text)
+
+
+def _entry(line: str) -> dict[str, object] | None:
+    """The JSON object in ``line``; None for any other text."""
     try:
         entry = json.loads(line)
     except ValueError:
-        return line
-    text = cast("dict[str, object]", entry).get("text") if isinstance(entry, dict) else None
-    return line if text is None else str(text)
+        return None
+    return cast("dict[str, object]", entry) if isinstance(entry, dict) else None
 
 
 def warn_on_standard_error() -> None:

@@ -15,33 +15,27 @@ _WIDE_ENOUGH = 20
 """Text is wrapped within the last column if that has at least this many letters."""
 
 
-def tree_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:
+def tree_lines(
+    root: str, children: Mapping[str, Sequence[str]], *, is_chain: bool = False
+) -> Iterator[tuple[str, str]]:
     """(guide, name) of ``root`` and of each node below it, parents first; of any depth: not recursive."""
+    guides = (("├ ", "│ "), ("└ ", "  ")) if is_chain else (("├── ", "│   "), ("└── ", "    "))
     stack = [(root, "", "")]
     while stack:
         name, guide, guide_below = stack.pop()
         yield guide, name
         below = children.get(name, ())
+        if is_chain and len(below) == 1:
+            stack.append((below[0], f"{guide_below}↓ ", guide_below))
+            continue
         for position in reversed(range(len(below))):
-            is_last = position == len(below) - 1
-            fork, rail = ("└── ", "    ") if is_last else ("├── ", "│   ")
+            fork, rail = guides[position == len(below) - 1]
             stack.append((below[position], guide_below + fork, guide_below + rail))
 
 
 def chain_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:
     """As ``tree_lines``, but indented by two and only at forks; "↓" marks an only child."""
-    stack = [(root, "", "")]
-    while stack:
-        name, guide, rail = stack.pop()
-        yield guide, name
-        below = children.get(name, ())
-        if len(below) == 1:
-            stack.append((below[0], f"{rail}↓ ", rail))
-            continue
-        for position in reversed(range(len(below))):
-            is_last = position == len(below) - 1
-            fork, below_it = ("└ ", "  ") if is_last else ("├ ", "│ ")
-            stack.append((below[position], rail + fork, rail + below_it))
+    return tree_lines(root, children, is_chain=True)
 
 
 def in_columns(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from zstate._util.endpoint import format_host
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.options import load_robot, parse_xacro_args
-from zstate.cli.up.cell import Cell
-from zstate.cli.up.schema import (
+from zstate.cli.up.cell import (
+    Cell,
     NetworkSection,
     ProgramSection,
     Restart,
@@ -29,9 +29,9 @@ from zstate.model.load import is_path
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import check_robot
 
-# The keys of [network] with one value, and with several. Options and variables are named after them.
-_SINGLE = ("mode", "config", "certs", "identity", "user", "password_file")
-_REPEATED = ("connect", "listen")
+_Values = dict[str, tuple[str, ...]]
+"""Values by key. Options and environment variables are named after the keys of [network] and [router]."""
+
 _NETWORK_PATHS = ("config", "certs", "password_file")
 _ROUTER_PATHS = ("acl", "certs", "password_file", "users")
 
@@ -80,17 +80,27 @@ def _specs(cell: Cell, file: Path, settings: Mapping[str, str]) -> Iterator[tupl
     router = cell.router
     first = () if router is None else ("router",)
     if router is not None:
-        arguments = ("router", *_router_options(router))
-        yield ProcessSpec("router", arguments, restart=router.section.restart), router
+        yield _router_spec(router), router
     for robot in cell.robot:
         yield _robot_spec(robot, cell, first), robot
     if cell.static:
         check_edges(cell, robot_names(cell))
-        sets = _repeated("--set", tuple(f"{key}={value}" for key, value in settings.items()))
-        arguments = ("static", "--file", str(file), *sets, *_session_options(cell))
+        sets = {"set": tuple(f"{key}={value}" for key, value in settings.items())}
+        arguments = ("static", "--file", str(file), *_options(sets | _session_values(cell)))
         yield ProcessSpec("static", arguments, first), cell.static[0]
     for program in cell.program:
         yield _program_spec(program, cell, first), program
+
+
+def _router_spec(table: Located[RouterSection]) -> ProcessSpec:
+    router = table.section
+    values: _Values = {"listen": _router_endpoints(router), "connect": router.connect}
+    for key in _ROUTER_PATHS:
+        values[key] = (table.resolve(path),) if (path := getattr(router, key)) else ()
+    for key in ("identity", "user", "metrics"):
+        values[key] = () if (value := getattr(router, key)) is None else (str(value),)
+    ros2 = ("--ros2",) if router.ros2 else ()
+    return ProcessSpec("router", ("router", *ros2, *_options(values)), restart=router.restart)
 
 
 def _robot_spec(table: Located[RobotSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
@@ -108,17 +118,19 @@ def _robot_spec(table: Located[RobotSection], cell: Cell, first: tuple[str, ...]
 
         host, port = BindAddress.parse(str(robot.metrics))
         # Each robot of a loop has the next port.
-        port = port + table.iteration if port else 0
-        metrics = ("--metrics", f"{format_host(host)}:{port}")
+        metrics = (f"{format_host(host)}:{port + table.iteration if port else 0}",)
     _check_identity(table, cell)
+    values: _Values = {
+        "name": (name,),
+        "source": (source,),
+        "rate": () if robot.rate is None else (repr(robot.rate),),
+        "wire": robot.wires,
+        "clock": () if robot.clock == "system" else (robot.clock,),
+    }
     arguments = (
-        *("publish", model, *_xacro_texts(robot), "--name", name, "--source", source),
-        *(() if robot.rate is None else ("--rate", repr(robot.rate))),
-        *_repeated("--wire", robot.wires),
-        *(() if robot.clock == "system" else ("--clock", robot.clock)),
+        *("publish", model, *_xacro_texts(robot), *_options(values)),
         *(("--takeover",) if robot.takeover else ()),
-        *metrics,
-        *_session_options(cell, robot.identity),
+        *_options({"metrics": metrics, **_session_values(cell, robot.identity)}),
     )
     return ProcessSpec(name, arguments, (*first, *as_tuple(robot.after)), robot.restart)
 
@@ -163,7 +175,9 @@ def _program_spec(table: Located[ProgramSection], cell: Cell, first: tuple[str, 
     _check_identity(table, cell)
     script = next((word for word in command if word.endswith(".py")), command[0])
     default = next(iter(command[1:]), "zstate") if is_zstate else Path(script).stem
-    variables = {key: str(value) for key, value in program.environment.items()}
+    session = _session_values(cell, program.identity).items()
+    environment = {f"ZSTATE_{key.upper()}": " ".join(values) for key, values in session if values}
+    environment |= {key: str(value) for key, value in program.environment.items()}
     return ProcessSpec(
         program.name or default,
         command[1:] if is_zstate else command,
@@ -172,7 +186,7 @@ def _program_spec(table: Located[ProgramSection], cell: Cell, first: tuple[str, 
         program.ready or "" if is_zstate else program.ready,
         is_program=not is_zstate,
         folder=str(table.file.folder.resolve()),
-        environment={**_session_variables(cell, program.identity), **variables},
+        environment=environment,
     )
 
 
@@ -200,22 +214,23 @@ def _check_order(name: str, specs: Mapping[str, ProcessSpec], table: Located[Any
                 new.append(other)
 
 
-def _session_values(cell: Cell, identity: str | None) -> dict[str, tuple[str, ...]]:
-    """The values of [network] by key, with ``identity`` if it is set.
+def _session_values(cell: Cell, identity: str | None = None) -> _Values:
+    """The values of [network], with ``identity`` if it is set.
 
     Without an endpoint or a mode, the processes connect to the router of the file.
     """
     network = NetworkSection() if cell.network is None else cell.network.section
-    values: dict[str, tuple[str, ...]] = {
-        key: (str(value),) for key in _SINGLE if (value := getattr(network, key)) is not None
-    }
+    values: _Values = {}
+    for key in ("mode", "config", "certs", "identity", "user", "password_file"):
+        if (value := getattr(network, key)) is not None:
+            values[key] = (value,)
     if cell.network is not None:
         values |= {key: (cell.network.resolve(values[key][0]),) for key in _NETWORK_PATHS if key in values}
     if identity is not None:
         values["identity"] = (identity,)
     if "certs" not in values:
         values.pop("identity", None)
-    values |= {key: tuple(getattr(network, key)) for key in _REPEATED}
+    values |= {"connect": network.connect, "listen": network.listen}
     has_place = network.mode or network.connect or network.listen or network.config
     if cell.router is not None and not has_place:
         endpoint = _router_endpoints(cell.router.section)[0]
@@ -225,48 +240,12 @@ def _session_values(cell: Cell, identity: str | None) -> dict[str, tuple[str, ..
     return values
 
 
-def _session_options(cell: Cell, identity: str | None = None) -> tuple[str, ...]:
-    """[network] as session options."""
-    values = _session_values(cell, identity)
-    return tuple(word for key in values for word in _repeated(_option(key), values[key]))
-
-
-def _session_variables(cell: Cell, identity: str | None = None) -> dict[str, str]:
-    """[network] as environment variables, for programs and the commands of zstate in them."""
-    values = _session_values(cell, identity)
-    return {f"ZSTATE_{key.upper()}": " ".join(values[key]) for key in values if values[key]}
-
-
-def _router_options(router: Located[RouterSection]) -> tuple[str, ...]:
-    """[router] as options of `zstate router`."""
-    section = router.section
-    return (
-        *(("--ros2",) if section.ros2 else ()),
-        *_repeated("--listen", _router_endpoints(section)),
-        *_repeated("--connect", section.connect),
-        *(
-            word
-            for key in _ROUTER_PATHS
-            if (path := getattr(section, key))
-            for word in (_option(key), router.resolve(path))
-        ),
-        *(
-            word
-            for key in ("identity", "user", "metrics")
-            if (value := getattr(section, key)) is not None
-            for word in (_option(key), str(value))
-        ),
-    )
-
-
 def _router_endpoints(router: RouterSection) -> tuple[str, ...]:
     default = ROUTER_ENDPOINT if router.certs is None else ROUTER_ENDPOINT.replace("tcp/", "tls/", 1)
     return router.listen or (default,)
 
 
-def _repeated(option: str, values: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(word for value in values for word in (option, value))
-
-
-def _option(key: str) -> str:
-    return f"--{key.replace('_', '-')}"
+def _options(values: _Values) -> tuple[str, ...]:
+    """The values as options of a command."""
+    pairs = [(f"--{key.replace('_', '-')}", value) for key in values for value in values[key]]
+    return tuple(word for pair in pairs for word in pair)

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.cli.up.cell import Cell
-from zstate.cli.up.schema import StaticSection, as_tuple
+from zstate.cli.up.cell import Cell, StaticSection, as_tuple
 from zstate.cli.up.template import Located
 from zstate.errors import ConfigError, InvalidInput, LibraryMissing
 from zstate.transform import Transform
@@ -88,8 +87,7 @@ def _table_robots(table: Located[StaticSection], robots: Sequence[str], edge: Tr
     for pattern in patterns:
         matching = [robot for robot in robots if fnmatchcase(robot, pattern)] if "*" in pattern else [pattern]
         if not matching:
-            known = _listed(robots)
-            raise table.error(f"no robot matches {pattern!r}; in this file: {known}", "robot")
+            raise table.error(f"no robot matches {pattern!r}; in this file: {_listed(robots)}", "robot")
         names |= dict.fromkeys(matching)
     return tuple(names)
 
@@ -147,23 +145,20 @@ def _calibrated_edges(document: Any) -> Sequence[Transform]:
     if "child_frame_id" in table:
         return [_ros_transform(table["header"]["frame_id"], table["child_frame_id"], table["transform"])]
     if "transformation" in table or "transform" in table:
-        return [_handeye(table)]
+        # The oldest files have the parameters at the top level, like the transformation.
+        parameters = table.get("parameters", table)
+        in_hand = parameters.get("eye_on_hand", parameters.get("calibration_type") == "eye_in_hand")
+        target = parameters["robot_effector_frame" if in_hand else "robot_base_frame"]
+        source = parameters["tracking_base_frame"]
+        if "transform" in table:
+            return [_ros_transform(target, source, table["transform"])]
+        pose = table["transformation"]
+        xyz, rotation = _numbers(pose, "x", "y", "z"), _numbers(pose, "qx", "qy", "qz", "qw")
+        return [Transform(target, source, xyz, rotation)]
     unknown = sorted(set(table) - _SECTION_KEYS)
     if unknown:
         raise InvalidInput(f"{', '.join(map(repr, unknown[:5]))} is unknown; a calibration is {_FORMS}")
     return [StaticSection(**table).transform()]
-
-
-def _handeye(table: Mapping[str, Any]) -> Transform:
-    # The oldest files have the parameters at the top level, like the transformation.
-    parameters = table.get("parameters", table)
-    in_hand = parameters.get("eye_on_hand", parameters.get("calibration_type") == "eye_in_hand")
-    target = parameters["robot_effector_frame" if in_hand else "robot_base_frame"]
-    source = parameters["tracking_base_frame"]
-    if "transform" in table:
-        return _ros_transform(target, source, table["transform"])
-    pose = table["transformation"]
-    return Transform(target, source, _numbers(pose, "x", "y", "z"), _numbers(pose, "qx", "qy", "qz", "qw"))
 
 
 def _ros_transform(target: str, source: str, pose: Mapping[str, Any]) -> Transform:

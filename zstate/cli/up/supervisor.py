@@ -21,7 +21,7 @@ _REQUESTED_EXIT_CODES = (0, 130, 143, -2, -15)
 
 
 class ManagedProcess:
-    """One process, over all its restarts."""
+    """One process, over all its restarts; times are those of ``time.monotonic`` [s]."""
 
     def __init__(self, spec: ProcessSpec) -> None:
         self.spec = spec
@@ -29,17 +29,12 @@ class ManagedProcess:
         self.is_ready = False
         self.is_over = False
         self.due = time.monotonic()
-        self._started = 0.0
+        self.started = 0.0
         self._pause_s = FIRST_PAUSE_S
-
-    def set_child(self, child: ChildProcess) -> None:
-        """The process runs as ``child``."""
-        self.child, self._started = child, time.monotonic()
-        self.is_ready = self.is_ready or self.spec.ready is None
 
     def pause(self) -> float:
         """Set the time of the restart and return the pause [s], which doubles after each short run."""
-        if time.monotonic() - self._started > LONGEST_PAUSE_S:
+        if time.monotonic() - self.started > LONGEST_PAUSE_S:
             self._pause_s = FIRST_PAUSE_S
         pause_s, self._pause_s = self._pause_s, min(2.0 * self._pause_s, LONGEST_PAUSE_S)
         self.child, self.due = None, time.monotonic() + pause_s
@@ -64,7 +59,11 @@ class Supervisor:
         report_at = time.monotonic() + _REPORT_AFTER_S
         try:
             while not failure and not all(process.is_over for process in self._processes.values()):
-                self._start_due()
+                for process in self._processes.values():
+                    is_due = process.child is None and not process.is_over and time.monotonic() >= process.due
+                    if is_due and not self._not_ready(process):
+                        process.child, process.started = self._start(process), time.monotonic()
+                        process.is_ready = process.is_ready or process.spec.ready is None
                 failure = self._next_event()
                 if time.monotonic() > report_at:
                     report_at = float("inf")
@@ -75,12 +74,6 @@ class Supervisor:
         finally:
             self._end_all()
         return failure
-
-    def _start_due(self) -> None:
-        for process in self._processes.values():
-            is_due = process.child is None and not process.is_over and time.monotonic() >= process.due
-            if is_due and not self._not_ready(process):
-                process.set_child(self._start(process))
 
     def _start(self, process: ManagedProcess) -> ChildProcess:
         spec = process.spec
@@ -107,12 +100,10 @@ class Supervisor:
 
     def _next_event(self) -> str:
         """Wait for the next event or restart; the text of a failure that ends everything, else ""."""
-        dues = [
-            process.due - time.monotonic() for process in self._processes.values() if process.child is None
-        ]
-        timeout_s = min([LONGEST_WAIT_S, *(due for due in dues if due > 0.0)])
+        pauses_s = [one.due - time.monotonic() for one in self._processes.values() if one.child is None]
         try:
-            event, process = self._events.get(timeout=timeout_s)
+            within_s = min([LONGEST_WAIT_S, *(pause_s for pause_s in pauses_s if pause_s > 0.0)])
+            event, process = self._events.get(timeout=within_s)
         except queue.Empty:
             return ""
         if event == "ready":

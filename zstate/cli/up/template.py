@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.up.toml_file import TomlFile
 from zstate.errors import ConfigError, InvalidInput
 
@@ -26,8 +26,8 @@ else:
 SINGLE = ("router", "network")
 LISTS = ("robot", "static", "program")
 _TABLES = (*LISTS, *SINGLE, "parameters", "include")
-_LOOPS = ("robot", "program")
-_LOOP_KEYS = ("names", "count", "when")
+LOOPS = ("robot", "program")
+LOOP_KEYS = ("names", "count", "when")
 
 _REFERENCE = re.compile(r"\$?\$\{(?P<name>[^{}:]*)(?::-(?P<default>[^{}]*))?\}")
 _TRUE = ("true", "yes", "on", "1")
@@ -54,52 +54,44 @@ class Located(Generic[Section]):
         return str(self.file.folder.resolve() / Path(path).expanduser())
 
 
-class Variables:
-    """The values of ``${NAME}``: ``values``, then the environment."""
+def substitute(value: Any, variables: Mapping[str, Any]) -> Any:
+    """Replace ``${NAME}`` in ``value`` by the variables, or else by the environment.
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self.values = dict(values)
+    A text that is only a reference takes the type of its value. ``${NAME:-DEFAULT}`` is DEFAULT if NAME is
+    unset or empty, ``$${`` is ``${``. Raises InvalidInput if a name is unknown.
+    """
+    if isinstance(value, dict):
+        return {key: substitute(inner, variables) for key, inner in cast("dict[str, Any]", value).items()}
+    if isinstance(value, list):
+        return [substitute(inner, variables) for inner in cast("list[Any]", value)]
+    if not isinstance(value, str):
+        return value
+    reference = _REFERENCE.fullmatch(value)
+    if reference is not None and not value.startswith("$$"):
+        return _referenced(reference, variables)
 
-    def extended(self, values: Mapping[str, Any]) -> Variables:
-        """These variables and ``values``, which take precedence."""
-        return Variables({**self.values, **values})
-
-    def substitute(self, value: Any) -> Any:
-        """Replace the references in ``value``; a text that is only a reference takes the type of its value.
-
-        ``${NAME:-DEFAULT}`` is DEFAULT if NAME is unset or empty, ``$${`` is ``${``. Raises InvalidInput if a
-        name is unknown.
-        """
-        if isinstance(value, dict):
-            return {key: self.substitute(inner) for key, inner in cast("dict[str, Any]", value).items()}
-        if isinstance(value, list):
-            return [self.substitute(inner) for inner in cast("list[Any]", value)]
-        if not isinstance(value, str):
-            return value
-        reference = _REFERENCE.fullmatch(value)
-        if reference is not None and not value.startswith("$$"):
-            return self._value(reference)
-        return _REFERENCE.sub(self._text, value)
-
-    def _text(self, reference: re.Match[str]) -> str:
+    def text(reference: re.Match[str]) -> str:
         if reference[0].startswith("$$"):
             return reference[0][1:]
-        value = self._value(reference)
-        if not isinstance(value, str | int | float):
-            raise InvalidInput(f"${{{reference['name']}}} is {value!r}, which cannot be a part of a text")
-        return str(value).lower() if isinstance(value, bool) else str(value)
+        part = _referenced(reference, variables)
+        if not isinstance(part, str | int | float):
+            raise InvalidInput(f"${{{reference['name']}}} is {part!r}, which cannot be a part of a text")
+        return str(part).lower() if isinstance(part, bool) else str(part)
 
-    def _value(self, reference: re.Match[str]) -> Any:
-        name, default = reference["name"].strip(), reference["default"]
-        value = self.values.get(name, os.environ.get(name))
-        if default is not None and value in (None, ""):
-            return default
-        if value is None:
-            raise InvalidInput(
-                f"${{{name}}} is neither a parameter nor set in the environment"
-                f"{did_you_mean(name, self.values)}; ${{{name}:-DEFAULT}} would have a default"
-            )
-        return value
+    return _REFERENCE.sub(text, value)
+
+
+def _referenced(reference: re.Match[str], variables: Mapping[str, Any]) -> Any:
+    name, default = reference["name"].strip(), reference["default"]
+    value = variables.get(name, os.environ.get(name))
+    if default is not None and value in (None, ""):
+        return default
+    if value is None:
+        raise InvalidInput(
+            f"${{{name}}} is neither a parameter nor set in the environment"
+            f"{did_you_mean(name, variables)}; ${{{name}:-DEFAULT}} would have a default"
+        )
+    return value
 
 
 def expand(path: Path, settings: Mapping[str, str]) -> Iterator[tuple[str, Located[dict[str, Any]]]]:
@@ -109,7 +101,14 @@ def expand(path: Path, settings: Mapping[str, str]) -> Iterator[tuple[str, Locat
     """
     files = list(_with_includes(TomlFile(path), (), set()))
     for file in files:
-        _check_tables(file)
+        for name, value in file.tables.items():
+            if name not in _TABLES:
+                raise file.error(name, f"there is no such table{did_you_mean(name, _TABLES)}")
+            tables = cast("list[Any]", value if isinstance(value, list) else [value])
+            are_tables = all(isinstance(one, dict) for one in tables)
+            if name != "include" and not (are_tables and isinstance(value, list) == (name in LISTS)):
+                brackets = f"[[{name}]]" if name in LISTS else f"[{name}]"
+                raise file.error(name, f"write {brackets}, and below it key = value")
     variables = _parameters(files, settings)
     for file in files:
         for kind in SINGLE:
@@ -133,11 +132,6 @@ def parse_settings(texts: Sequence[str]) -> dict[str, str]:
     return settings
 
 
-def valid_keys(kind: str, section: Sequence[str]) -> tuple[str, ...]:
-    """The keys of a table: those of its ``section``, and those of its loop and condition."""
-    return (*section, *(_LOOP_KEYS if kind in _LOOPS else ("when",)))
-
-
 def evaluate_condition(condition: object) -> bool:
     """The value of ``when``: true, false, or ``A == B`` or ``A != B`` of texts. Raises InvalidInput."""
     if isinstance(condition, bool):
@@ -158,7 +152,7 @@ def _with_includes(file: TomlFile, above: tuple[Path, ...], read: set[Path]) -> 
     includes = file.tables.get("include", [])
     for name in [includes] if isinstance(includes, str) else includes:
         with _error_at(file, "include"):
-            path = file.folder / Path(str(Variables({}).substitute(name))).expanduser()
+            path = file.folder / Path(str(substitute(name, {}))).expanduser()
         if path.resolve() in chain:
             raise file.error("include", f"{name!r} includes this file again")
         if not path.is_file():
@@ -169,18 +163,7 @@ def _with_includes(file: TomlFile, above: tuple[Path, ...], read: set[Path]) -> 
     yield file
 
 
-def _check_tables(file: TomlFile) -> None:
-    for name, value in file.tables.items():
-        if name not in _TABLES:
-            raise file.error(name, f"there is no such table{did_you_mean(name, _TABLES)}")
-        tables = cast("list[Any]", value if isinstance(value, list) else [value])
-        is_right = isinstance(value, list) == (name in LISTS) and all(isinstance(one, dict) for one in tables)
-        if name != "include" and not is_right:
-            brackets = f"[[{name}]]" if name in LISTS else f"[{name}]"
-            raise file.error(name, f"write {brackets}, and below it key = value")
-
-
-def _parameters(files: Sequence[TomlFile], settings: Mapping[str, str]) -> Variables:
+def _parameters(files: Sequence[TomlFile], settings: Mapping[str, str]) -> dict[str, Any]:
     """The parameters of all files, later ones first; a setting needs the type of its parameter."""
     declared: dict[str, tuple[TomlFile, Any]] = {
         name: (file, value) for file in files for name, value in file.tables.get("parameters", {}).items()
@@ -190,12 +173,11 @@ def _parameters(files: Sequence[TomlFile], settings: Mapping[str, str]) -> Varia
             known = ", ".join(declared) or "none"
             text = f"has no parameter {name!r}{did_you_mean(name, declared)}; its [parameters]: {known}"
             raise ConfigError(f"{files[-1].shown} {text}", path=f"parameters.{name}")
-    variables = Variables({})
+    variables: dict[str, Any] = {}
     for name, (file, value) in declared.items():
         with _error_at(file, f"parameters.{name}"):
             is_set = name in settings
-            parsed = _parsed_like(value, settings[name]) if is_set else variables.substitute(value)
-        variables = variables.extended({name: parsed})
+            variables[name] = _parsed_like(value, settings[name]) if is_set else substitute(value, variables)
     return variables
 
 
@@ -214,52 +196,52 @@ def _parsed_like(value: object, text: str) -> Any:
 
 
 def _iterations(
-    kind: str, table: Located[dict[str, Any]], variables: Variables
+    kind: str, table: Located[dict[str, Any]], variables: Mapping[str, Any]
 ) -> Iterator[tuple[str, Located[dict[str, Any]]]]:
     """The table with plain values, once for each iteration of its loop whose condition holds."""
     keys, file, place = table.section, table.file, table.place
     for iteration, loop_variables in enumerate(_loop_variables(kind, table, variables)):
-        inner = variables.extended(loop_variables)
+        inner = {**variables, **loop_variables}
         if "name" in keys:
-            with _error_at(file, f"{place}.name"):
-                inner = inner.extended({"name": inner.substitute(keys["name"])})
+            inner |= _substituted(table, {"name": keys["name"]}, inner)
         with _error_at(file, f"{place}.when"):
-            is_enabled = evaluate_condition(inner.substitute(keys.get("when", True)))
+            is_enabled = evaluate_condition(substitute(keys.get("when", True), inner))
         if is_enabled:
-            rest = {key: value for key, value in keys.items() if key not in (*_LOOP_KEYS, "name")}
+            rest = {key: value for key, value in keys.items() if key not in (*LOOP_KEYS, "name")}
             values = _substituted(table, rest, inner)
             if "name" in keys or "names" in keys:
-                values["name"] = inner.values["name"]
+                values["name"] = inner["name"]
             yield kind, Located(values, file, place, iteration)
 
 
-def _loop_variables(kind: str, table: Located[dict[str, Any]], variables: Variables) -> list[dict[str, Any]]:
+def _loop_variables(
+    kind: str, table: Located[dict[str, Any]], variables: Mapping[str, Any]
+) -> list[dict[str, Any]]:
     """The variables of each iteration: ``name`` from ``names``, or ``number`` from ``count``."""
     loop = {key: table.section[key] for key in ("names", "count") if key in table.section}
     if not loop:
         return [{}]
-    if kind not in _LOOPS:
-        raise table.error(f"only {' and '.join(_LOOPS)} can be a loop of names or count")
+    if kind not in LOOPS:
+        raise table.error(f"only {' and '.join(LOOPS)} can be a loop of names or count")
     loop = _substituted(table, loop, variables)
     if len(loop) > 1 or ("name" in table.section) is not ("count" in loop):
         raise table.error("a loop is names = ['left', 'right'], or count = 3 and name = 'arm${number}'")
     if "names" in loop:
         names = loop["names"]
-        return [
-            {"name": name} for name in (re.findall(r"[^\s,]+", names) if isinstance(names, str) else names)
-        ]
+        listed = re.findall(r"[^\s,]+", names) if isinstance(names, str) else names
+        return [{"name": name} for name in listed]
     if not str(loop["count"]).isdecimal():
         raise table.error(f"{loop['count']!r} is not a count", "count")
     return [{"number": number} for number in range(1, int(loop["count"]) + 1)]
 
 
 def _substituted(
-    table: Located[dict[str, Any]], values: Mapping[str, Any], variables: Variables
+    table: Located[dict[str, Any]], values: Mapping[str, Any], variables: Mapping[str, Any]
 ) -> dict[str, Any]:
     substituted: dict[str, Any] = {}
     for key, value in values.items():
         with _error_at(table.file, f"{table.place}.{key}"):
-            substituted[key] = variables.substitute(value)
+            substituted[key] = substitute(value, variables)
     return substituted
 
 

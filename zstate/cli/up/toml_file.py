@@ -28,9 +28,13 @@ class TomlFile:
         self.path = path
         self.shown = str(path)
         self.folder = path.parent
-        self._text = self._read()
         try:
+            self._text = path.read_bytes().decode()
             self.tables: dict[str, Any] = tomllib.loads(self._text)
+        except OSError as error:
+            raise ConfigError(f"{self.shown!r} cannot be read: {error.strerror}", path=self.shown) from None
+        except UnicodeDecodeError as error:
+            raise ConfigError(f"{self.shown!r} is not UTF-8 text: {error.reason}", path=self.shown) from None
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"{self.shown} is not TOML: {error}", path=self.shown) from None
 
@@ -46,25 +50,13 @@ class TomlFile:
         if match is None:
             return None
         lines = self._text.splitlines()
-        begin = self._header_line(match["table"], int(match["number"] or 0), lines)
+        headers = [_HEADER.match(line) for line in lines]
+        tables = [at for at, one in enumerate(headers, 1) if one and one[1] == match["table"]]
+        begin = next(iter(tables[int(match["number"] or 0) :]), None)
         key = match["table"] if begin is None else match["key"]
-        for number, line in enumerate(lines[begin or 0 :], (begin or 0) + 1):
-            if _HEADER.match(line):
+        for number in range(begin or 0, len(lines)):
+            if headers[number]:
                 break
-            if key and re.match(rf"\s*{re.escape(key)}\s*[.=]", line):
-                return number
+            if key and re.match(rf"\s*{re.escape(key)}\s*[.=]", lines[number]):
+                return number + 1
         return begin
-
-    @staticmethod
-    def _header_line(table: str, number: int, lines: list[str]) -> int | None:
-        headers = (_HEADER.match(line) for line in lines)
-        begins = [at for at, header in enumerate(headers, 1) if header and header[1] == table]
-        return begins[number] if number < len(begins) else None
-
-    def _read(self) -> str:
-        try:
-            return self.path.read_bytes().decode()
-        except OSError as error:
-            raise ConfigError(f"{self.shown!r} cannot be read: {error.strerror}", path=self.shown) from None
-        except UnicodeDecodeError as error:
-            raise ConfigError(f"{self.shown!r} is not UTF-8 text: {error.reason}", path=self.shown) from None

@@ -16,15 +16,15 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import user_config
-from zstate.net.security.json5 import json5_text
-from zstate.wire.keys import CLOCK_KEY, check_robot
+from zstate.net.security.credentials import check_identity
+from zstate.wire.keys import CLOCK_KEY, VERBATIM_CHUNKS, check_robot
 from zstate.wire.registry import ros_options
 from zstate.wire.ros2.options import Ros2Options
 
@@ -33,18 +33,10 @@ Rule = dict[str, object]
 PUBLISH = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
 SUBSCRIBE = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 
-_AT_CHUNKS = ("@adv", "@writer", "@clock", "@edge", "@reader")
+_WRITER, _, _EDGE, _READER = VERBATIM_CHUNKS
+_READING = ("NN", "MS", "SC")  # tokens of nodes, of their subscribers and of their service clients
 _NODE_TOPICS = ("rosout", "parameter_events")  # outside of all namespaces; each ROS node writes them
 _SECTIONS = ("rules", "subjects", "policies")
-_IDENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-
-_HEAD = """\
-Access control for a Zenoh router: what no rule allows is denied.
-
-{roles}
-A name is the common name of a certificate (mTLS: enable_mtls in transport/link/tls) or a user
-(transport/auth/usrpwd). A router that requires neither identifies no session, and denies everything.
-It is read when the router starts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +49,7 @@ class AclRoles:
     edges under its own name, and reads those of the robots: it places their roots, as in
     ``fleet/map -> r1/odom``; readers with ``placers=`` accept such edges from these only. A name may have
     several roles. ``namespace`` is that of the sessions behind the router, if they have one. ``wires``:
-    "native", and "ros2" with its options, see Ros2AclRules.
+    "native", and "ros2" with its options, see ``_Ros2Rules``.
     Raises InvalidInput for names that cannot be names of identities.
     """
 
@@ -71,11 +63,7 @@ class AclRoles:
 
     def __post_init__(self) -> None:
         for name in self.identities:
-            if not _IDENTITY.fullmatch(name):
-                raise InvalidInput(
-                    f"{name!r} cannot be the name of an identity; use up to 64 of A-Z a-z 0-9 . _ -, "
-                    "beginning with a letter or digit"
-                )
+            check_identity(name)
         check_namespace(self.namespace)
         if not self.identities:
             raise InvalidInput("no role has a name; access control without names would deny everything")
@@ -83,8 +71,12 @@ class AclRoles:
     @property
     def identities(self) -> tuple[str, ...]:
         """All names, each once."""
-        names = (*self.robots, *self.viewers, *self.operators, *self.timekeepers, *self.placers)
-        return tuple(dict.fromkeys(names))
+        return tuple(dict.fromkeys((*self.robots, *self.readers, *self.placers)))
+
+    @property
+    def readers(self) -> tuple[str, ...]:
+        """The names that may read everything."""
+        return (*self.viewers, *self.operators, *self.timekeepers)
 
 
 def check_namespace(namespace: str) -> str:
@@ -99,17 +91,7 @@ def check_namespace(namespace: str) -> str:
     return namespace
 
 
-def ingress(name: str, messages: Sequence[str], keys: Iterable[str]) -> Rule:
-    """A rule for messages to the router."""
-    return _rule(name, "ingress", messages, keys)
-
-
-def egress(name: str, messages: Sequence[str], keys: Iterable[str]) -> Rule:
-    """A rule for messages that the router forwards."""
-    return _rule(name, "egress", messages, keys)
-
-
-def _rule(name: str, flow: str, messages: Sequence[str], keys: Iterable[str]) -> Rule:
+def _rule(flow: str, name: str, messages: Sequence[str], keys: Iterable[str]) -> Rule:
     return {
         "id": name,
         "permission": "allow",
@@ -119,62 +101,48 @@ def _rule(name: str, flow: str, messages: Sequence[str], keys: Iterable[str]) ->
     }
 
 
-class NativeAclRules:
-    """The rules for ``roles`` on the native wire."""
+_ingress, _egress = partial(_rule, "ingress"), partial(_rule, "egress")
+"""A rule for messages to the router; and for messages that the router forwards."""
 
-    def __init__(self, roles: AclRoles) -> None:
-        self._roles = roles
 
-    def rule_ids(self, name: str) -> Iterator[str]:
-        """The ids of the rules of ``name``."""
-        roles = self._roles
-        if name in roles.robots:
-            yield from (f"{name} writes", f"{name} reads", f"{name} is given")
-            yield from ("robots read", "robots are given", "robots are asked")
-        elif name in roles.placers:
-            yield from (f"{name} places", "robots read", "robots are given", "robots are asked")
-        yield "readers are known"
-        if name in (*roles.viewers, *roles.operators, *roles.timekeepers):
-            yield from ("viewers read", "viewers are given")
-        if name in roles.operators:
-            yield "operators command"
-        if name in roles.timekeepers:
-            yield "timekeepers write"
+Grants = Iterator[tuple[Sequence[str], Rule]]
+"""Rules, each with the names that it is for; a rule without names is left out."""
 
-    def rules(self) -> Iterator[Rule]:
-        """The rules of all names."""
-        namespace = self._roles.namespace
-        root = f"{namespace}/zstate" if namespace else "zstate"
-        everything, clock = _below(root), root.removesuffix("zstate") + CLOCK_KEY
-        statics = f"{root}/*/tf_static/*"
-        shared = (statics, f"{statics}/@adv/**", f"{root}/*/@edge/**", f"{root}/*/@writer/**", clock)
-        for robot in dict.fromkeys(self._roles.robots):
-            keys = _below(f"{root}/{check_robot(robot)}")
-            yield ingress(f"{robot} writes", PUBLISH, keys)
-            yield ingress(f"{robot} reads", SUBSCRIBE, keys)
-            yield egress(f"{robot} is given", PUBLISH, keys)
-        for placer in dict.fromkeys(self._roles.placers):
-            prefix = f"{root}/{check_robot(placer)}"
-            edges = (f"{prefix}/tf_static/*", f"{prefix}/tf_static/*/@adv/**")
-            tokens = (f"{prefix}/@writer/tf_static/*", f"{prefix}/@edge/**")
-            yield ingress(f"{placer} places", PUBLISH, (*edges, *tokens))
-        yield ingress("robots read", SUBSCRIBE, shared)
-        yield egress("robots are given", PUBLISH, shared)
-        # A query for all robots goes to each of them; a reply has the robot's own data only.
-        yield egress("robots are asked", SUBSCRIBE, everything)
-        yield ingress("viewers read", SUBSCRIBE, everything)
-        yield egress("viewers are given", PUBLISH, everything)
-        yield ingress("readers are known", ("liveliness_token",), (f"{root}/@reader/**",))
-        yield ingress("operators command", ("put",), (f"{root}/*/joint_commands",))
-        yield ingress("timekeepers write", ("put",), (clock,))
+
+def _native_rules(roles: AclRoles) -> Grants:
+    root = f"{roles.namespace}/zstate" if roles.namespace else "zstate"
+    everything, clock = _below(root), root.removesuffix("zstate") + CLOCK_KEY
+    statics = f"{root}/*/tf_static/*"
+    shared = (statics, f"{statics}/@adv/**", f"{root}/*/{_EDGE}/**", f"{root}/*/{_WRITER}/**", clock)
+    for robot in dict.fromkeys(roles.robots):
+        keys = _below(f"{root}/{check_robot(robot)}")
+        yield (robot,), _ingress(f"{robot} writes", PUBLISH, keys)
+        yield (robot,), _ingress(f"{robot} reads", SUBSCRIBE, keys)
+        yield (robot,), _egress(f"{robot} is given", PUBLISH, keys)
+    for placer in dict.fromkeys(roles.placers):
+        prefix = f"{root}/{check_robot(placer)}"
+        edges = (f"{prefix}/tf_static/*", f"{prefix}/tf_static/*/@adv/**")
+        tokens = (f"{prefix}/{_WRITER}/tf_static/*", f"{prefix}/{_EDGE}/**")
+        names = (placer,) if placer not in roles.robots else ()
+        yield names, _ingress(f"{placer} places", PUBLISH, (*edges, *tokens))
+    robots = (*roles.robots, *roles.placers)
+    yield robots, _ingress("robots read", SUBSCRIBE, shared)
+    yield robots, _egress("robots are given", PUBLISH, shared)
+    # A query for all robots goes to each of them; a reply has the robot's own data only.
+    yield robots, _egress("robots are asked", SUBSCRIBE, everything)
+    yield roles.readers, _ingress("viewers read", SUBSCRIBE, everything)
+    yield roles.readers, _egress("viewers are given", PUBLISH, everything)
+    yield roles.identities, _ingress("readers are known", ("liveliness_token",), (f"{root}/{_READER}/**",))
+    yield roles.operators, _ingress("operators command", ("put",), (f"{root}/*/joint_commands",))
+    yield roles.timekeepers, _ingress("timekeepers write", ("put",), (clock,))
 
 
 def _below(key: str) -> tuple[str, ...]:
-    return (f"{key}/**", *(f"{key}/**/{chunk}/**" for chunk in _AT_CHUNKS))
+    return (f"{key}/**", *(f"{key}/**/{chunk}/**" for chunk in ("@adv", *VERBATIM_CHUNKS)))
 
 
-class Ros2AclRules:
-    """The rules for ``roles`` in one ROS domain, where each robot has a namespace.
+class _Ros2Rules:
+    """The rules in one ROS domain, where each robot has a namespace.
 
     A robot writes the topics of its namespace, serves its services, and announces only these in the graph;
     global /tf and /tf_static belong to all robots. A viewer subscribes to all topics and calls no service;
@@ -194,46 +162,33 @@ class Ros2AclRules:
                 "control cannot separate; give each a namespace of its name: 'ros2:namespace=*'"
             )
 
-    def rule_ids(self, name: str) -> Iterator[str]:
-        """The ids of the rules of ``name``."""
+    def rules(self) -> Grants:
         roles = self._roles
-        if name in roles.robots:
-            yield from map(self._id, (f"{name} writes", f"{name} reads", f"{name} is given"))
-            yield from map(self._id, ("robots write", "robots read", "robots are given", "robots are asked"))
-        if name in (*roles.viewers, *roles.operators, *roles.timekeepers):
-            viewing = ("viewers are known", "viewers subscribe", "viewers ask", "viewers are given")
-            yield from map(self._id, viewing)
-        if name in roles.operators:
-            yield self._id("operators call")
-        if name in roles.timekeepers:
-            yield self._id("timekeepers write")
-
-    def rules(self) -> Iterator[Rule]:
-        """The rules of all names."""
         topics, history = f"{self._domain}/**", f"{self._domain}/**/@adv/**"
         graph = f"{self._graph}/**"
         everything = (topics, history, graph)
         clock = self._topic("clock")
         shared = tuple(key for name in self._global for key in self._topic(name))
-        for robot in dict.fromkeys(self._roles.robots):
+        for robot in dict.fromkeys(roles.robots):
             namespace = self._options.robot_namespace(robot)
             keys = self._topic(namespace) if namespace else (topics, history)
-            yield ingress(self._id(f"{robot} writes"), PUBLISH, (*keys, *self._robot_tokens(namespace)))
-            yield ingress(self._id(f"{robot} reads"), SUBSCRIBE, keys)
-            yield egress(self._id(f"{robot} is given"), PUBLISH, keys)
-        yield ingress(self._id("robots write"), PUBLISH, shared)
-        yield ingress(self._id("robots read"), SUBSCRIBE, (*shared, *clock, graph))
-        yield egress(self._id("robots are given"), PUBLISH, (*shared, *clock, graph))
+            tokens = self._robot_tokens(namespace)
+            yield (robot,), _ingress(self._id(f"{robot} writes"), PUBLISH, (*keys, *tokens))
+            yield (robot,), _ingress(self._id(f"{robot} reads"), SUBSCRIBE, keys)
+            yield (robot,), _egress(self._id(f"{robot} is given"), PUBLISH, keys)
+        yield roles.robots, _ingress(self._id("robots write"), PUBLISH, shared)
+        yield roles.robots, _ingress(self._id("robots read"), SUBSCRIBE, (*shared, *clock, graph))
+        yield roles.robots, _egress(self._id("robots are given"), PUBLISH, (*shared, *clock, graph))
         # A query for all robots goes to each of them; a reply has the robot's own data only.
-        yield egress(self._id("robots are asked"), SUBSCRIBE, everything)
-        tokens = (f"{self._graph}/*/*/*/{kind}/**" for kind in ("NN", "MS", "SC"))
-        viewers = (*tokens, f"{self._domain}/**/@adv/sub/**")
-        yield ingress(self._id("viewers are known"), ("liveliness_token",), viewers)
-        yield ingress(self._id("viewers subscribe"), ("declare_subscriber",), (topics,))
-        yield ingress(self._id("viewers ask"), SUBSCRIBE, (history, graph))
-        yield egress(self._id("viewers are given"), PUBLISH, everything)
-        yield ingress(self._id("operators call"), ("query",), (topics,))
-        yield ingress(self._id("timekeepers write"), PUBLISH, (*clock, self._token("MP", "*", "%clock")))
+        yield roles.robots, _egress(self._id("robots are asked"), SUBSCRIBE, everything)
+        viewers = (*(f"{self._graph}/*/*/*/{kind}/**" for kind in _READING), f"{self._domain}/**/@adv/sub/**")
+        yield roles.readers, _ingress(self._id("viewers are known"), ("liveliness_token",), viewers)
+        yield roles.readers, _ingress(self._id("viewers subscribe"), ("declare_subscriber",), (topics,))
+        yield roles.readers, _ingress(self._id("viewers ask"), SUBSCRIBE, (history, graph))
+        yield roles.readers, _egress(self._id("viewers are given"), PUBLISH, everything)
+        yield roles.operators, _ingress(self._id("operators call"), ("query",), (topics,))
+        clock_writer = self._token("MP", "*", "%clock")
+        yield roles.timekeepers, _ingress(self._id("timekeepers write"), PUBLISH, (*clock, clock_writer))
 
     def _id(self, text: str) -> str:
         return f"{text} in ROS domain {self._domain}"
@@ -248,7 +203,7 @@ class Ros2AclRules:
             return
         root = "%" + namespace.replace("/", "%")
         for place in (root, f"{root}%$*"):
-            for kind in ("NN", "MS", "SC"):
+            for kind in _READING:
                 yield f"{self._graph}/*/*/*/{kind}/*/{place}/**"
             yield self._token("SS", place, f"{root}%$*")
             for topic in (f"{root}%$*", *(f"%{name}" for name in self._global)):
@@ -258,50 +213,39 @@ class Ros2AclRules:
         return f"{self._graph}/*/*/*/{kind}/*/{place}/*/{topic}/**"
 
 
-def access_text(roles: AclRoles) -> str:
-    """The access control of ``roles`` as JSON5: the configuration of a router, or a part of it."""
-    names = {
-        "robots": roles.robots,
-        "viewers": roles.viewers,
-        "operators": roles.operators,
-        "timekeepers": roles.timekeepers,
-        "placers": roles.placers,
-    }
-    if roles.wires != ("native",):
-        names["wires"] = roles.wires
-    lines = [f"{role + ':':<13}{', '.join(listed)}\n" for role, listed in names.items() if listed]
-    return json5_text({"access_control": access_control(roles)}, head=_HEAD.format(roles="".join(lines)))
-
-
 def access_control(roles: AclRoles) -> dict[str, object]:
     """The section ``access_control`` of a Zenoh configuration."""
-    wires = [_wire_rules(roles, wire) for wire in dict.fromkeys(roles.wires)]
-    ids = {name: [rule for wire in wires for rule in wire.rule_ids(name)] for name in roles.identities}
-    used = {rule for rules in ids.values() for rule in rules}
+    rules: list[Rule] = []
+    ids: dict[str, list[object]] = {name: [] for name in roles.identities}
+    for wire in dict.fromkeys(roles.wires):
+        for names, rule in _wire_rules(roles, wire):
+            rules += [rule] if names else []
+            for name in dict.fromkeys(names):
+                ids[name].append(rule["id"])
     # Two subjects for a name, as one subject with both properties would match only sessions with both.
     subjects = {
         name: (
             {"id": f"certificate {name}", "cert_common_names": [name]},
             {"id": f"user {name}", "usernames": [name]},
         )
-        for name in roles.identities
+        for name in ids
     }
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": [rule for wire in wires for rule in wire.rules() if rule["id"] in used],
+        "rules": rules,
         "subjects": [subject for pair in subjects.values() for subject in pair],
         "policies": [
-            {"id": name, "rules": rules, "subjects": [subject["id"] for subject in subjects[name]]}
-            for name, rules in ids.items()
+            {"id": name, "rules": ids[name], "subjects": [subject["id"] for subject in pair]}
+            for name, pair in subjects.items()
         ],
     }
 
 
-def _wire_rules(roles: AclRoles, wire: str) -> NativeAclRules | Ros2AclRules:
+def _wire_rules(roles: AclRoles, wire: str) -> Grants:
     kind, _, options = wire.partition(":")
     if wire == "native":
-        return NativeAclRules(roles)
+        return _native_rules(roles)
     if kind != "ros2":
         raise InvalidInput(
             f"there is no access control for the wire {wire!r}; there is for 'native' and 'ros2'"
@@ -311,7 +255,7 @@ def _wire_rules(roles: AclRoles, wire: str) -> NativeAclRules | Ros2AclRules:
             f"ROS nodes have no Zenoh namespace, such as {roles.namespace!r}; write 'ros2:namespace=NAME' "
             "for that of their topics"
         )
-    return Ros2AclRules(roles, ros_options(options))
+    return _Ros2Rules(roles, ros_options(options)).rules()
 
 
 def read_access_control(path: str | os.PathLike[str]) -> dict[str, object]:
@@ -321,11 +265,11 @@ def read_access_control(path: str | os.PathLike[str]) -> dict[str, object]:
         raise ConfigError(
             f"{str(path)!r} has no access_control that is enabled; `zstate acl` prints one", path=str(path)
         )
-    lists = {name: [_without_defaults(entry) for entry in section[name] or ()] for name in _SECTIONS}
+
+    def without_defaults(entry: Mapping[str, Any]) -> dict[str, Any]:
+        # Zenoh sorts the names, and adds absent ones as null.
+        names = sorted(entry, key=lambda name: (name != "id", isinstance(entry[name], list), name))
+        return {name: entry[name] for name in names if entry[name] is not None}
+
+    lists = {name: list(map(without_defaults, section[name] or ())) for name in _SECTIONS}
     return {"enabled": True, "default_permission": section["default_permission"], **lists}
-
-
-def _without_defaults(entry: Mapping[str, Any]) -> dict[str, Any]:
-    # Zenoh sorts the names, and adds absent ones as null.
-    names = sorted(entry, key=lambda name: (name != "id", isinstance(entry[name], list), name))
-    return {name: entry[name] for name in names if entry[name] is not None}

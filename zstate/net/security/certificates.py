@@ -11,12 +11,11 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 from zstate.errors import ConfigError, InvalidInput, LibraryMissing
-from zstate.net.security.credentials import AUTHORITY, CertificateFiles
+from zstate.net.security.credentials import AUTHORITY, CertificateFiles, check_identity
 
 THIS_HOST = ("localhost", "127.0.0.1", "::1")
 
 _CLOCK_DIFFERENCE = timedelta(hours=1)  # a machine whose clock is behind accepts a new certificate, too
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")  # a common name has 64 characters at most
 _HOST_NAME = re.compile(r"(\*\.)?[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?")
 
 
@@ -39,7 +38,17 @@ def issue_identities(
     Raises InvalidInput before any file is written, ConfigError for an unusable authority and files that
     cannot be written. Importing this module raises LibraryMissing without ``cryptography``.
     """
-    _check(names, hosts, days)
+    for name in names:
+        check_identity(name, reserved=AUTHORITY)
+        if names.count(name) > 1:
+            raise InvalidInput(f"the identity {name!r} is named twice")
+    for host in hosts:
+        if not _is_address(host) and not _HOST_NAME.fullmatch(host):
+            raise InvalidInput(
+                f"{host!r} is neither a host name nor an IP address; give it without protocol and port"
+            )
+    if days < 1:
+        raise InvalidInput(f"days is {days}; a certificate is valid for one day at least")
     issued = {name: CertificateFiles.for_name(folder, name) for name in names}
     for name, files in issued.items():
         if files.existing:
@@ -56,24 +65,6 @@ def issue_identities(
         is_server = servers is None or name in servers
         authority.issue(name, files, (*THIS_HOST, *hosts) if is_server else (), (first, last))
     return issued
-
-
-def _check(names: Sequence[str], hosts: Sequence[str], days: int) -> None:
-    for name in names:
-        if not _NAME.fullmatch(name) or name == AUTHORITY:
-            raise InvalidInput(
-                f"{name!r} cannot be the name of an identity; use up to 64 of A-Z a-z 0-9 . _ -, beginning "
-                f"with a letter or digit, and not {AUTHORITY!r}"
-            )
-        if names.count(name) > 1:
-            raise InvalidInput(f"the identity {name!r} is named twice")
-    for host in hosts:
-        if not _is_address(host) and not _HOST_NAME.fullmatch(host):
-            raise InvalidInput(
-                f"{host!r} is neither a host name nor an IP address; give it without protocol and port"
-            )
-    if days < 1:
-        raise InvalidInput(f"days is {days}; a certificate is valid for one day at least")
 
 
 def _is_address(host: str) -> bool:
@@ -113,7 +104,7 @@ class CertificateAuthority:
 
     @classmethod
     def in_folder(cls, folder: Path) -> CertificateAuthority:
-        """The authority in ``folder``, or a new one. Raises ConfigError if one of its files is missing."""
+        """The authority in ``folder``, or a new one. Raises ConfigError if its files are not both usable."""
         files = CertificateFiles.for_name(folder, AUTHORITY)
         if not files.existing:
             return cls._create(folder, files)
@@ -124,7 +115,19 @@ class CertificateAuthority:
                 "files: use the folder in which it was made, or a new one",
                 path=str(missing),
             )
-        return cls._read(files)
+        try:
+            certificate = x509.load_pem_x509_certificate(files.certificate.read_bytes())
+            key = load_pem_private_key(files.key.read_bytes(), None)
+        except (OSError, ValueError, TypeError) as error:
+            raise ConfigError(
+                f"the authority in {str(files.key.parent)!r} cannot be read: {error}", path=str(files.key)
+            ) from None
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+            raise ConfigError(
+                f"{str(files.key)!r} is not the key that `zstate certs` made for {str(files.certificate)!r}",
+                path=str(files.key),
+            )
+        return cls(certificate, key)
 
     @classmethod
     def _create(cls, folder: Path, files: CertificateFiles) -> CertificateAuthority:
@@ -144,22 +147,6 @@ class CertificateAuthority:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         _write(files, key, authority.certificate)
         return authority
-
-    @classmethod
-    def _read(cls, files: CertificateFiles) -> CertificateAuthority:
-        try:
-            certificate = x509.load_pem_x509_certificate(files.certificate.read_bytes())
-            key = load_pem_private_key(files.key.read_bytes(), None)
-        except (OSError, ValueError, TypeError) as error:
-            raise ConfigError(
-                f"the authority in {str(files.key.parent)!r} cannot be read: {error}", path=str(files.key)
-            ) from None
-        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
-            raise ConfigError(
-                f"{str(files.key)!r} is not the key that `zstate certs` made for {str(files.certificate)!r}",
-                path=str(files.key),
-            )
-        return cls(certificate, key)
 
     def check_outlives(self, last: datetime) -> None:
         """Raise InvalidInput if a certificate valid until ``last`` were valid longer than this authority."""

@@ -22,13 +22,13 @@ from zstate.net.security.credential_files import client_context
 from zstate.net.security.credentials import Credentials
 
 _CONNECT_TIMEOUT_S = 2.0
-_REFUSAL_TIMEOUT_S = 1.0  # a router checks our certificate after our part of the handshake
+_DENIAL_TIMEOUT_S = 1.0  # a router checks our certificate after our part of the handshake
 _TCP_TIMEOUT_S = 1.0  # check_tcp
 
 
 @dataclass(frozen=True, slots=True)
-class RefusalReason:
-    """Why a router refuses: ``reason`` for programs, ``text`` for users, with what to check."""
+class DenialReason:
+    """Why a router denies a session: ``reason`` for programs, ``text`` for users, with what to check."""
 
     reason: str
     text: str
@@ -36,29 +36,29 @@ class RefusalReason:
 
 @dataclass(frozen=True, slots=True)
 class CheckResults:
-    """The reasons of refusals by endpoint; None if no program listens, or the protocol has no check.
+    """The reasons of denials by endpoint; None if no program listens, or the protocol has no check.
 
     NO_REPLY if connections are accepted without a reply: such a router may accept the session later.
     """
 
-    refusals: Mapping[str, RefusalReason | None]
+    denials: Mapping[str, DenialReason | None]
 
     @property
-    def are_refusals(self) -> bool:
-        """Whether every endpoint refuses the session."""
-        return bool(self.refusals) and {None, NO_REPLY}.isdisjoint(self.refusals.values())
+    def is_denied(self) -> bool:
+        """Whether every endpoint denies the session."""
+        return bool(self.denials) and {None, NO_REPLY}.isdisjoint(self.denials.values())
 
     @property
     def error(self) -> NetworkError:
         """The error if none is reached: AccessDenied, or Unreachable if none answers."""
-        no_answer = [repr(one) for one, refusal in self.refusals.items() if refusal in (None, NO_REPLY)]
-        for endpoint, refusal in self.refusals.items():
-            if refusal not in (None, NO_REPLY):
+        no_answer = [repr(one) for one, denial in self.denials.items() if denial in (None, NO_REPLY)]
+        for endpoint, denial in self.denials.items():
+            if denial not in (None, NO_REPLY):
                 rest = f" (nothing answers at {' or '.join(no_answer)})" if no_answer else ""
-                text = f"{endpoint!r} answers and does not let this session in: {refusal.text}{rest}"
-                return AccessDenied(text, reason=refusal.reason, endpoint=endpoint)
-        endpoints = tuple(self.refusals)
-        no_reply = [repr(endpoint) for endpoint, refusal in self.refusals.items() if refusal is NO_REPLY]
+                text = f"{endpoint!r} answers and does not let this session in: {denial.text}{rest}"
+                return AccessDenied(text, reason=denial.reason, endpoint=endpoint)
+        endpoints = tuple(self.denials)
+        no_reply = [repr(endpoint) for endpoint, denial in self.denials.items() if denial is NO_REPLY]
         if no_reply:
             return Unreachable(f"{' and '.join(no_reply)}: {NO_REPLY.text}", endpoints=endpoints)
         where = " or ".join(no_answer) or "the configured endpoints"
@@ -66,19 +66,19 @@ class CheckResults:
         return Unreachable(text, endpoints=endpoints)
 
 
-def check_endpoints(endpoints: Sequence[str], credentials: Credentials | None) -> CheckResults:
+def check_connections(endpoints: Sequence[str], credentials: Credentials | None) -> CheckResults:
     """Connects plain sockets to all ``endpoints`` in parallel; takes a few seconds at most.
 
-    For sessions that Zenoh did not open: a router that accepts the certificate is assumed to refuse the user.
+    For sessions that Zenoh did not open: a router that accepts the certificate is assumed to deny the user.
     """
     if len(endpoints) == 1:  # without a pool, which starts no thread while the interpreter exits
-        return CheckResults({endpoints[0]: _check_endpoint(endpoints[0], credentials)})
+        return CheckResults({endpoints[0]: _check_connection(endpoints[0], credentials)})
     with ThreadPoolExecutor(len(endpoints) or 1) as pool:
-        refusals = pool.map(partial(_check_endpoint, credentials=credentials), endpoints)
-        return CheckResults(dict(zip(endpoints, refusals, strict=True)))
+        denials = pool.map(partial(_check_connection, credentials=credentials), endpoints)
+        return CheckResults(dict(zip(endpoints, denials, strict=True)))
 
 
-def _check_endpoint(endpoint: str, credentials: Credentials | None) -> RefusalReason | None:
+def _check_connection(endpoint: str, credentials: Credentials | None) -> DenialReason | None:
     parsed = parse_endpoint(endpoint)
     if parsed is None or parsed.protocol not in ("tcp", "tls"):
         return None
@@ -86,15 +86,15 @@ def _check_endpoint(endpoint: str, credentials: Credentials | None) -> RefusalRe
     try:
         with socket.create_connection(address, _CONNECT_TIMEOUT_S) as link:
             if parsed.protocol == "tls":
-                refusal = _handshake(link, parsed.host, credentials)
+                denial = _handshake(link, parsed.host, credentials)
             elif credentials is not None and credentials.ca is not None:
-                refusal = _NO_TLS  # found by multicast; a session with a ca does not connect to it
+                denial = _NO_TLS  # found by multicast; a session with a ca does not connect to it
             else:
-                refusal = _TLS_ONLY if _accepts_tls(link) else _user_reason(credentials)
+                denial = _TLS_ONLY if _accepts_tls(link) else _user_reason(credentials)
     except (OSError, UnicodeError):
         return None
-    assumes_no_tls = refusal is _NO_TLS or (parsed.protocol == "tcp" and refusal is not _TLS_ONLY)
-    return NO_REPLY if assumes_no_tls and not _replies_without_tls(address) else refusal
+    assumes_no_tls = denial is _NO_TLS or (parsed.protocol == "tcp" and denial is not _TLS_ONLY)
+    return NO_REPLY if assumes_no_tls and not _replies_without_tls(address) else denial
 
 
 def _replies_without_tls(address: tuple[str, int]) -> bool:
@@ -106,7 +106,7 @@ def _replies_without_tls(address: tuple[str, int]) -> bool:
     """
     try:
         with socket.create_connection(address, _CONNECT_TIMEOUT_S) as link:
-            link.settimeout(_REFUSAL_TIMEOUT_S)
+            link.settimeout(_DENIAL_TIMEOUT_S)
             link.sendall(b"\x01\x00\x00")
             return bool(link.recv(1))
     except OSError:
@@ -117,7 +117,7 @@ def _accepts_tls(link: socket.socket) -> bool:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE  # no data is sent
-    link.settimeout(_REFUSAL_TIMEOUT_S)
+    link.settimeout(_DENIAL_TIMEOUT_S)
     try:
         context.wrap_socket(link).close()
     except OSError:
@@ -125,8 +125,8 @@ def _accepts_tls(link: socket.socket) -> bool:
     return True
 
 
-def _handshake(link: socket.socket, host: str, credentials: Credentials | None) -> RefusalReason:
-    link.settimeout(_REFUSAL_TIMEOUT_S)
+def _handshake(link: socket.socket, host: str, credentials: Credentials | None) -> DenialReason:
+    link.settimeout(_DENIAL_TIMEOUT_S)
     trusted = credentials if credentials and credentials.ca else None
     context = client_context(trusted) if trusted else ssl.create_default_context()
     try:
@@ -138,7 +138,7 @@ def _handshake(link: socket.socket, host: str, credentials: Credentials | None) 
     except OSError:
         return _NO_TLS
     with secured:
-        secured.settimeout(_REFUSAL_TIMEOUT_S)
+        secured.settimeout(_DENIAL_TIMEOUT_S)
         try:
             secured.recv(1)
         except ssl.SSLError as error:
@@ -148,72 +148,72 @@ def _handshake(link: socket.socket, host: str, credentials: Credentials | None) 
     return _user_reason(credentials)
 
 
-NO_REPLY = RefusalReason(
+NO_REPLY = DenialReason(
     "no answer",
     "connections are accepted and nothing is answered: the router process is stopped, or busy with other "
     "connections that never complete (deploy/README.md: firewall), or it is no router",
 )
-"""Of a listener that accepts connections without a reply: not a refusal, as it may be temporary."""
+"""Of a listener that accepts connections without a reply: not a denial, as it may be temporary."""
 
-_NO_TLS = RefusalReason(
+_NO_TLS = DenialReason(
     "no TLS there",
     "it does not use TLS; let it listen at tls/... with a certificate (`zstate router --certs DIR "
     "--identity NAME`), or write 'tcp/' here without certificates",
 )
-_TLS_ONLY = RefusalReason(
+_TLS_ONLY = DenialReason(
     "TLS demanded",
     "it accepts TLS only; write 'tls/' and give a certificate: --certs DIR --identity NAME, or credentials=",
 )
-_WANTS_CERTIFICATE = RefusalReason(
+_WANTS_CERTIFICATE = DenialReason(
     "certificate demanded",
     "it requires a certificate; give --certs DIR --identity NAME, or certificate= and key=",
 )
-_WANTS_USER = RefusalReason(
+_WANTS_USER = DenialReason(
     "user demanded",
     "it accepts the link and refuses the session; it probably requires a user: give --user NAME with the "
     "password in ZSTATE_PASSWORD, or user= and password=",
 )
-_UNKNOWN_AUTHORITY = RefusalReason(
+_UNKNOWN_AUTHORITY = DenialReason(
     "wrong CA",
     "its certificate is signed by no public authority, and this session was given no other to trust; give "
     "--certs DIR --identity NAME, or credentials= with the ca.pem of the authority that signed it",
 )
-_NO_SERVER = RefusalReason(
+_NO_SERVER = DenialReason(
     "not a server",
     "its certificate is for clients only; make one for servers: `zstate certs DIR --server NAME`",
 )
-_EXPIRED = RefusalReason(
+_EXPIRED = DenialReason(
     "their certificate expired", "its certificate has expired; renew it there, and check both clocks"
 )
-_NOT_YET_VALID = RefusalReason(
+_NOT_YET_VALID = DenialReason(
     "their certificate not yet valid", "its certificate is not valid yet; is this machine's clock behind?"
 )
 
 
 def _server_certificate_reason(
     error: ssl.SSLCertVerificationError, host: str, credentials: Credentials | None
-) -> RefusalReason:
+) -> DenialReason:
     # OpenSSL's numbers (x509_vfy.h).
     if error.verify_code in (9, 10):
         return _NOT_YET_VALID if error.verify_code == 9 else _EXPIRED
     if error.verify_code == 26:
         return _NO_SERVER
     if error.verify_code in (62, 64):
-        return RefusalReason(
+        return DenialReason(
             "name mismatch",
             f"its certificate is not for {host!r}; connect to a name or address in it, or make one "
             f"for {host!r}: `zstate certs DIR --server NAME --host {host}`",
         )
     if credentials is None or credentials.ca is None:
         return _UNKNOWN_AUTHORITY
-    return RefusalReason(
+    return DenialReason(
         "wrong CA",
         f"its certificate is not signed by {str(credentials.ca)!r} ({error.verify_message}); both sides "
         "need the ca.pem of one authority: make their identities in one folder",
     )
 
 
-def _alert_reason(error: ssl.SSLError, credentials: Credentials | None) -> RefusalReason | None:
+def _alert_reason(error: ssl.SSLError, credentials: Credentials | None) -> DenialReason | None:
     """The reason in the TLS alert of a router that refuses our certificate (RFC 8446, section 6)."""
     alert = (error.reason or "").partition("ALERT_")[2]
     local = (
@@ -222,22 +222,22 @@ def _alert_reason(error: ssl.SSLError, credentials: Credentials | None) -> Refus
     if not alert or alert == "CERTIFICATE_REQUIRED":
         return _WANTS_CERTIFICATE if alert else None
     if alert == "CERTIFICATE_EXPIRED":
-        return RefusalReason(
+        return DenialReason(
             "our certificate expired",
             f"{local} has expired, or is not valid yet by the router's clock; "
             "renew it, and check both clocks",
         )
-    return RefusalReason(
+    return DenialReason(
         "our certificate refused",
         f"it refuses {local} ({alert.lower().replace('_', ' ')}); make the identity in the folder of "
         "the router's",
     )
 
 
-def _user_reason(credentials: Credentials | None) -> RefusalReason:
+def _user_reason(credentials: Credentials | None) -> DenialReason:
     if credentials is None or credentials.user is None:
         return _WANTS_USER
-    return RefusalReason(
+    return DenialReason(
         "user or password",
         f"the user {credentials.user!r} or the password is not in its --users file (a router without "
         "one refuses every session with a user)",
@@ -274,11 +274,6 @@ def check_tcp(endpoint: str) -> Unreachability | None:
     else:
         return None
     return Unreachability(text, f"ping -c 3 {host}")
-
-
-def accepts_tcp(endpoint: str) -> bool:
-    """Whether any program accepts TCP connections at ``endpoint``."""
-    return _tcp_address(endpoint) is not None and check_tcp(endpoint) is None
 
 
 def check_all_tcp(endpoints: Sequence[str]) -> Unreachability:

@@ -1,10 +1,4 @@
-"""Connection monitor: logs why endpoints refuse a session that keeps trying to connect.
-
-A probe session is a second session with the same credentials, which checks that the router forwards a sample.
-"""
-
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
+"""Connection monitor: logs why endpoints deny a session that keeps trying to connect."""
 
 from __future__ import annotations
 
@@ -15,7 +9,6 @@ import socket
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 import zenoh
 
@@ -23,6 +16,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.endpoint import Endpoint, parse_endpoint
 from zstate.errors import Closed
 from zstate.net.at_exit import join_at_exit
+from zstate.net.config import apply_settings
 from zstate.net.open import open_zenoh
 from zstate.net.rendezvous import JOIN_WITHIN_S
 from zstate.net.security.credentials import Credentials
@@ -41,9 +35,9 @@ _BYPASS = (
 
 
 class ConnectionMonitor(Closeable):
-    """Checks every few seconds for ``endpoints`` without a link from ``session``, and logs their refusals.
+    """Checks every few seconds for ``endpoints`` without a link from ``session``, and logs their denials.
 
-    With multicast and without any link, it also checks the endpoints found by scouting. A refusal is logged
+    With multicast and without any link, it also checks the endpoints found by scouting. A denial is logged
     once until there is a link. A client needs only one link. Endpoints without a listener are not logged,
     as programs may start in any order.
 
@@ -74,7 +68,6 @@ class ConnectionMonitor(Closeable):
             self._thread.start()
 
     def close(self) -> None:
-        """Stop checking. A second call does nothing."""
         self._stop.set()
         if self._thread.ident not in (None, threading.get_ident()):
             self._thread.join(JOIN_WITHIN_S)
@@ -100,25 +93,23 @@ class ConnectionMonitor(Closeable):
             if _addresses(endpoint) & linked:
                 self._checked.discard(endpoint)
             elif endpoint not in self._checked and not self._stop.is_set():
-                self._check_endpoint(endpoint)
+                self._log_denial(endpoint)
 
     def _scout(self) -> list[str]:
         """The endpoints of sessions that reply by multicast."""
         ring: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(64)
         scout = zenoh.scout(ring, what="peer|router", config=self._config)
         self._stop.wait(_SCOUT_S)
-        hellos: dict[str, list[str]] = {}
-        while (hello := scout.try_recv()) is not None:
-            hellos[str(hello.zid)] = hello.locators
+        hellos = {str(hello.zid): hello.locators for hello in iter(scout.try_recv, None)}
         scout.stop()
         hellos.pop(str(self._session.zid()), None)
         return [locator for locators in hellos.values() for locator in locators]
 
-    def _check_endpoint(self, endpoint: str) -> None:
-        from zstate.net.security.connection_check import check_endpoints  # noqa: PLC0415  # loads ssl, which few need
+    def _log_denial(self, endpoint: str) -> None:
+        from zstate.net.security.connection_check import check_connections  # noqa: PLC0415  # loads ssl, which few need
 
-        results = check_endpoints([endpoint], self._credentials)
-        if not results.are_refusals:
+        results = check_connections([endpoint], self._credentials)
+        if not results.is_denied:
             return
         self._checked.add(endpoint)
         if not self._accepts(endpoint):
@@ -128,7 +119,6 @@ class ConnectionMonitor(Closeable):
 
     def _accepts(self, endpoint: str) -> bool:
         """Whether a client with this configuration is accepted: then the session has a link, or one soon."""
-        config = zenoh.Config.from_json5(str(self._config))
         settings: dict[str, object] = {
             "id": f"1{secrets.token_hex(15)}",
             "mode": "client",
@@ -136,10 +126,8 @@ class ConnectionMonitor(Closeable):
             "listen/endpoints": [],
             "scouting/multicast/enabled": False,
         }
-        for path, value in settings.items():
-            config.insert_json5(path, json.dumps(value))
         try:
-            open_zenoh(config).close()
+            open_zenoh(apply_settings(zenoh.Config.from_json5(str(self._config)), settings)).close()
         except zenoh.ZError:
             return False
         return True
@@ -156,23 +144,3 @@ def _addresses(endpoint: str) -> frozenset[Endpoint]:
         return frozenset()
     hosts = {str(info[4][0]).removeprefix("::ffff:") for info in found}
     return frozenset(Endpoint(parsed.protocol, host, parsed.port) for host in hosts)
-
-
-@dataclass(frozen=True, slots=True)
-class ProbeSession:
-    """Configuration of a second client with the same ``identity`` to routers."""
-
-    config: zenoh.Config
-    identity: str
-
-    @classmethod
-    def for_config(cls, config: zenoh.Config, credentials: Credentials | None) -> ProbeSession | None:
-        """For the session that ``config`` opened; None unless it is a client with an identity."""
-        if credentials is None or not credentials.identity or json.loads(config.get_json("mode")) != "client":
-            return None
-        config.insert_json5("connect/timeout_ms", "0")  # each endpoint once
-        return cls(config, credentials.identity)
-
-    def open(self) -> zenoh.Session:
-        """Open it. Raises zenoh.ZError if no router answers."""
-        return open_zenoh(self.config)

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from zstate.errors import ConfigError
+from zstate.errors import ConfigError, InvalidInput
 
 AUTHORITY = "ca"
 File = str | os.PathLike[str]
 
 _ENCRYPTED = ("tls/", "quic/")
+_IDENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")  # a common name has 64 characters at most
+
+
+def check_identity(name: str, *, reserved: str | None = None) -> None:
+    """Raise InvalidInput unless ``name`` can be that of a certificate or a user, and is not ``reserved``."""
+    if not _IDENTITY.fullmatch(name) or name == reserved:
+        raise InvalidInput(
+            f"{name!r} cannot be the name of an identity; use up to 64 of A-Z a-z 0-9 . _ -, beginning with "
+            f"a letter or digit{'' if reserved is None else f', and not {reserved!r}'}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,16 +68,14 @@ class Credentials:
     users: File | None = None
 
     def __post_init__(self) -> None:
-        if (self.user is None) != (self.password is None):
-            has, lacks = ("user", "password") if self.password is None else ("password", "user")
-            raise ConfigError(f"there is a {has} and no {lacks}; give both, or neither", path=lacks)
+        for one, other in (("user", "password"), ("certificate", "key")):
+            has, lacks = (one, other) if getattr(self, other) is None else (other, one)
+            if getattr(self, has) is not None and getattr(self, lacks) is None:
+                raise ConfigError(f"there is a {has} and no {lacks}; give both, or neither", path=lacks)
         if self.user is not None and (not self.user or ":" in self.user or not self.password):
             raise ConfigError(
                 "a user's name is not empty and has no ':', a password is not empty", path="user"
             )
-        if (self.certificate is None) != (self.key is None):
-            has, lacks = ("certificate", "key") if self.key is None else ("key", "certificate")
-            raise ConfigError(f"there is a {has} and no {lacks}; give both, or neither", path=lacks)
         if self.certificate is not None and self.ca is None:
             raise ConfigError(
                 "there is a certificate and no ca; give the ca.pem that checks the certificates of others",

@@ -1,24 +1,29 @@
-"""Router configuration: JSON5 that zenohd reads unchanged, and that ``zstate router`` runs.
+"""Router configuration: commented JSON5 that zenohd reads unchanged, and that ``zstate router`` runs.
 
 Downsampling limits the rate at which a router forwards streams, for slow links.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
-from zstate.net.security.acl import check_namespace
+from zstate.net.security.acl import AclRoles, access_control, check_namespace
 from zstate.net.security.credentials import Credentials
-from zstate.net.security.json5 import json5_text
 from zstate.wire.keys import Stream, stream_key
 
 DOWNSAMPLED: tuple[Stream, ...] = ("joint_states", "tf")
 """Streams that may lose samples: each is replaced by a newer one."""
+
+_WIDTH = 100
+_INDENT = "  "
+_BARE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +66,13 @@ class Downsampling:
         return [{"id": "streams", **interfaces, "flows": ["egress"], "messages": ["put"], "rules": rules}]
 
 
+_ACCESS_HEAD = """\
+Access control for a Zenoh router: what no rule allows is denied.
+
+{roles}
+A name is the common name of a certificate (mTLS: enable_mtls in transport/link/tls) or a user
+(transport/auth/usrpwd). A router that requires neither identifies no session, and denies everything.
+It is read when the router starts."""
 _PRIVATE = ("tcp/127.", "tcp/localhost:", "tcp/[::1]:", "unixsock-stream/")
 _HEAD = "The configuration of a Zenoh router: `zenohd -c FILE.json5`, or `zstate router --config FILE.json5`."
 
@@ -157,7 +169,7 @@ class RouterConfig:
         settings = self.settings()
         if masked and self.credentials is not None and self.credentials.password is not None:
             _merge(settings, {"transport/auth/usrpwd/password": "********"})
-        return json5_text(settings, comments, _HEAD)
+        return _json5(settings, comments, _HEAD)
 
 
 def _merge(nested: dict[str, Any], settings: Mapping[str, Any]) -> None:
@@ -171,3 +183,63 @@ def _merge(nested: dict[str, Any], settings: Mapping[str, Any]) -> None:
             _merge(place.setdefault(last, {}), value)  # pyright: ignore[reportUnknownArgumentType]
         else:
             place[last] = value
+
+
+def access_text(roles: AclRoles) -> str:
+    """The access control of ``roles`` as JSON5: the configuration of a router, or a part of it."""
+    names = {
+        "robots": roles.robots,
+        "viewers": roles.viewers,
+        "operators": roles.operators,
+        "timekeepers": roles.timekeepers,
+        "placers": roles.placers,
+    }
+    if roles.wires != ("native",):
+        names["wires"] = roles.wires
+    lines = [f"{role + ':':<13}{', '.join(listed)}\n" for role, listed in names.items() if listed]
+    return _json5({"access_control": access_control(roles)}, head=_ACCESS_HEAD.format(roles="".join(lines)))
+
+
+def _json5(settings: Mapping[str, object], comments: Mapping[str, str] | None = None, head: str = "") -> str:
+    """``settings`` as a document that begins with the comment ``head``.
+
+    ``comments`` are keyed by the path of the setting below them, such as "connect/endpoints".
+    """
+    return "\n".join([*_comment(head), *_value(settings, "", "", comments or {}).splitlines()]) + "\n"
+
+
+def _comment(text: str, indent: str = "") -> list[str]:
+    return [f"{indent}// {line}".rstrip() for line in text.splitlines()]
+
+
+def _value(value: object, indent: str, path: str, comments: Mapping[str, str]) -> str:
+    below = f"{path}/" if path else ""
+    # One line per member if a comment is below, or if one line for all is too long.
+    if not any(commented.startswith(below) and commented != path for commented in comments):
+        short = _short(value)
+        if len(indent) + len(short) < _WIDTH:
+            return short
+    inner = indent + _INDENT
+    if isinstance(value, Mapping):
+        lines = ["{"]
+        for key, member in value.items():  # pyright: ignore
+            lines += _comment(comments.get(below + key, ""), inner)  # pyright: ignore
+            lines.append(f"{inner}{_name(key)}: {_value(member, inner, below + key, comments)},")  # pyright: ignore
+        return "\n".join([*lines, f"{indent}}}"])
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        elements = [f"{inner}{_value(element, inner, path, {})}," for element in value]  # pyright: ignore
+        return "\n".join(["[", *elements, f"{indent}]"])
+    return _short(value)
+
+
+def _short(value: object) -> str:
+    if isinstance(value, Mapping):
+        members = [f"{_name(key)}: {_short(member)}" for key, member in value.items()]  # pyright: ignore
+        return f"{{ {', '.join(members)} }}" if members else "{}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return f"[{', '.join(_short(element) for element in value)}]"  # pyright: ignore
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _name(key: str) -> str:
+    return key if _BARE_NAME.fullmatch(key) else json.dumps(key)

@@ -58,9 +58,9 @@ class McapFile:
         with open_errors(path) as file:
             self.size = file.size
             try:
-                self._index = index = Summary(file).index(read_header(file)[0])
+                self._index = index = Summary(file).index()
             except CorruptData:
-                self._index = index = Scan(file).index()
+                self._index = index = Scan(file).index
         self.profile, self.library = index.header.profile, index.header.library
         self._channels: dict[int, Channel] = {}
         for number, channel in index.channels.items():

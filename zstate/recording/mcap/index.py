@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -13,6 +14,7 @@ from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 from zstate.recording.mcap.records import (
     HEAD,
     MAGIC,
+    MESSAGE,
     BoundedFile,
     CorruptData,
     decompress,
@@ -36,10 +38,10 @@ class DataRange(NamedTuple):
     kind: Literal["chunk", "cut chunk", "bare"]
     offset: int
     end: int
-    first: int
-    last: int
-    channels: frozenset[int] | None
-    compression: str
+    first: int = 0
+    last: int = 0
+    channels: frozenset[int] | None = None
+    compression: str = ""
 
     def content(self, file: BoundedFile) -> bytes:
         """Its records, decompressed. Raises CorruptData if they are not whole."""
@@ -102,66 +104,71 @@ def read_footer(file: BoundedFile) -> Footer:
     return parse_record(Footer, file.body(at, end))
 
 
+class RecordContents:
+    """What the records in ``data`` declare, and the counts and log times (0 if none) of their messages."""
+
+    def __init__(self, data: bytes) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.chunks: list[ChunkIndex] = []
+        self.statistics: Statistics | None = None
+        self.counts: Counter[int] = Counter()
+        times: list[int] = []
+        for opcode, start, end in iter_records(data):
+            if opcode == Opcode.MESSAGE:
+                number, _, log_time, _ = MESSAGE.unpack_from(data, start)
+                self.counts[number] += 1
+                times.append(log_time)
+            elif opcode == Opcode.SCHEMA:
+                schema = parse_record(Schema, data[start:end])
+                self.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = parse_record(Channel, data[start:end])
+                self.channels[channel.id] = channel
+            elif opcode == Opcode.CHUNK_INDEX:
+                self.chunks.append(parse_record(ChunkIndex, data[start:end]))
+            elif opcode == Opcode.STATISTICS:
+                self.statistics = parse_record(Statistics, data[start:end])
+        self.first, self.last = min(times, default=0), max(times, default=0)
+
+
 class Summary:
     """The summary section between the data and the footer. Raises CorruptData without a reliable one."""
 
     def __init__(self, file: BoundedFile) -> None:
         footer = read_footer(file)
         self.start = footer.summary_start
-        self._data_start = read_header(file)[1]
+        self._header, self._data_start = read_header(file)
         if not self._data_start <= self.start <= file.size - len(MAGIC) - _FOOTER_SIZE:
             raise CorruptData("it has no summary")
         text = file.read(self.start, file.size - len(MAGIC) - _CRC_SIZE - self.start)
         if footer.summary_crc and zlib.crc32(text) != footer.summary_crc:
             raise CorruptData("the checksum of its summary is wrong")
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.chunks: list[ChunkIndex] = []
-        self.statistics: Statistics | None = None
-        text = text[: -(_FOOTER_SIZE - _CRC_SIZE)]
-        for opcode, start, end in iter_records(text):
-            body = text[start:end]
-            if opcode == Opcode.SCHEMA:
-                schema = parse_record(Schema, body)
-                self.schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL:
-                channel = parse_record(Channel, body)
-                self.channels[channel.id] = channel
-            elif opcode == Opcode.CHUNK_INDEX:
-                self.chunks.append(parse_record(ChunkIndex, body))
-            elif opcode == Opcode.STATISTICS:
-                self.statistics = parse_record(Statistics, body)
+        self.contents = RecordContents(text[: -(_FOOTER_SIZE - _CRC_SIZE)])
 
-    def index(self, header: Header) -> Index:
+    def index(self) -> Index:
         """The index. Raises CorruptData if the summary leaves something out."""
-        found = self.statistics
-        if found is None or len(self.chunks) != found.chunk_count:
+        schemas, channels, chunks = self.contents.schemas, self.contents.channels, self.contents.chunks
+        found = self.contents.statistics
+        if found is None or len(chunks) != found.chunk_count:
             raise CorruptData("its summary leaves out chunks")
         counts, span = found.channel_message_counts, None
         if sum(counts.values()) != found.message_count:
             raise CorruptData("its summary counts its messages in two ways, which differ")
         if found.message_count:
-            if not self.chunks:
+            if not chunks:
                 raise CorruptData("its messages stand outside of chunks")
             span = (found.message_start_time, found.message_end_time)
-        if not set(counts) <= set(self.channels):
+        if not set(counts) <= set(channels):
             raise CorruptData("its summary leaves out channels")
-        if not {c.schema_id for c in self.channels.values()} <= {0, *self.schemas}:
+        if not {channel.schema_id for channel in channels.values()} <= {0, *schemas}:
             raise CorruptData("its summary leaves out schemas")
-        ranges = tuple(self._ranges())
-        return Index(header, self.schemas, self.channels, counts, span, ranges, complete=True)
-
-    def _ranges(self) -> Iterator[DataRange]:
-        for chunk in self.chunks:
-            end = chunk.chunk_start_offset + chunk.chunk_length
-            if chunk.chunk_start_offset < self._data_start or end > self.start:
+        ranges: list[DataRange] = []
+        for chunk in chunks:
+            start, end = chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length
+            if start < self._data_start or end > self.start:
                 raise CorruptData("its summary names a chunk where none can be")
-            yield DataRange(
-                "chunk",
-                chunk.chunk_start_offset,
-                end,
-                chunk.message_start_time,
-                chunk.message_end_time,
-                frozenset(chunk.message_index_offsets) or None,
-                chunk.compression,
-            )
+            occurring = frozenset(chunk.message_index_offsets) or None
+            times = chunk.message_start_time, chunk.message_end_time
+            ranges.append(DataRange("chunk", start, end, *times, occurring, chunk.compression))
+        return Index(self._header, schemas, channels, counts, span, tuple(ranges), complete=True)

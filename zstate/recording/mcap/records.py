@@ -116,15 +116,6 @@ def iter_records(content: bytes) -> Iterator[tuple[int, int, int]]:
         yield opcode, start, at
 
 
-def complete_prefix(content: bytes) -> bytes:
-    """``content`` up to the end of its last whole record."""
-    end = 0
-    with suppress(CorruptData):
-        for _, _, stop in iter_records(content):
-            end = stop
-    return content[:end]
-
-
 def parse_record(kind: type[R], body: bytes) -> R:
     """The record of type ``kind`` with this body."""
     try:
@@ -208,4 +199,8 @@ def decompress_prefix(chunk: Chunk) -> bytes:
             data = chunk.data
     except _UNREADABLE:
         return b""
-    return complete_prefix(data)
+    end = 0
+    with suppress(CorruptData):
+        for _, _, stop in iter_records(data):
+            end = stop
+    return data[:end]

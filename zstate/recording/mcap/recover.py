@@ -60,7 +60,7 @@ def recover(
         if target.exists() and target.samefile(source):
             raise RecordingError(f"{str(source)!r} cannot be recovered into itself", path=str(source))
         scan = Scan(file)
-        index = scan.index()
+        index = scan.index
         library = f"{LIBRARY}, recovered from {index.header.library}"
         output = McapOutput(target, overwrite=overwrite, profile=index.header.profile, library=library)
         try:
@@ -75,7 +75,7 @@ def recover(
 
 def _copy(file: BoundedFile, scan: Scan, output: McapOutput) -> Counter[str]:
     """Copy everything; the number of messages by topic."""
-    index, writer = scan.index(), output.writer
+    index, writer = scan.index, output.writer
     for metadata in scan.metadata:
         writer.add_metadata(metadata.name, metadata.metadata)
     schemas = {
@@ -99,7 +99,7 @@ def _copy(file: BoundedFile, scan: Scan, output: McapOutput) -> Counter[str]:
                 payload = data[start + MESSAGE.size : stop]
                 writer.add_message(copied[number], log_time, payload, publish_time, sequence)
                 counts[index.channels[number].topic] += 1
-        output.flush()
+        output.write_chunk()
     for attachment in scan.attachments:
         created, logged = attachment.create_time, attachment.log_time
         writer.add_attachment(created, logged, attachment.name, attachment.media_type, attachment.data)

@@ -13,16 +13,22 @@ from contextlib import suppress
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema
 
-from zstate.recording.mcap.index import DataLoss, DataRange, Index, Summary, read_footer, read_header
+from zstate.recording.mcap.index import (
+    DataLoss,
+    DataRange,
+    Index,
+    RecordContents,
+    Summary,
+    read_footer,
+    read_header,
+)
 from zstate.recording.mcap.records import (
     FIRST_PRIVATE_OPCODE,
     HEAD,
-    MESSAGE,
     BoundedFile,
     CorruptData,
     check_message_index,
     decompress,
-    iter_records,
     parse_chunk,
     parse_record,
 )
@@ -37,34 +43,15 @@ _WINDOW = 1 << 22
 _OVERLAP = 8
 
 
-class ChunkContents:
-    """Schemas, channels and message counts in ``data``, with its first and last log time (0 if empty)."""
-
-    def __init__(self, data: bytes) -> None:
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.counts: Counter[int] = Counter()
-        times: list[int] = []
-        for opcode, start, end in iter_records(data):
-            if opcode == Opcode.MESSAGE:
-                number, _, log_time, _ = MESSAGE.unpack_from(data, start)
-                self.counts[number] += 1
-                times.append(log_time)
-            elif opcode == Opcode.SCHEMA:
-                schema = parse_record(Schema, data[start:end])
-                self.schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL:
-                channel = parse_record(Channel, data[start:end])
-                self.channels[channel.id] = channel
-        self.first, self.last = min(times, default=0), max(times, default=0)
-
-
 class Scan:
-    """Contents of a file. Raises CorruptData if not even its header can be read."""
+    """Contents of a file: its rebuilt ``index``, ``metadata`` and ``attachments``.
+
+    Raises CorruptData if not even its header can be read.
+    """
 
     def __init__(self, file: BoundedFile) -> None:
         self._file = file
-        self._header, at = read_header(file)
+        header, at = read_header(file)
         self._end = file.size
         self._summary: Summary | None = None
         with suppress(CorruptData):
@@ -82,27 +69,24 @@ class Scan:
         while at < self._end and not self._has_data_end:
             at = self._step(at)
         self._add_bare_range(at)
+        schemas, channels = self._schemas, self._channels
         if self._summary is not None:  # its copy describes the channels whose chunk is lost
-            self._schemas = {**self._summary.schemas, **self._schemas}
-            self._channels = {**self._summary.channels, **self._channels}
+            schemas = {**self._summary.contents.schemas, **schemas}
+            channels = {**self._summary.contents.channels, **channels}
         for number, count in self._counts.items():
-            if number not in self._channels:
+            if number not in channels:
                 reason = f"{count} messages of channel {number}, whose description is lost"
                 self._losses.append(DataLoss(self._ranges[0].offset, 0, reason))
-
-    def index(self) -> Index:
-        """The rebuilt index."""
-        counts = {number: count for number, count in self._counts.items() if number in self._channels}
-        complete = self._has_data_end and not self._losses
-        if complete:
-            try:
-                read_footer(self._file)
-            except CorruptData:
-                complete = False
+        counts = {number: count for number, count in self._counts.items() if number in channels}
         ranges = tuple(one for one in self._ranges if one.channels)
         span = (min(one.first for one in ranges), max(one.last for one in ranges)) if ranges else None
+        complete = False
+        if self._has_data_end and not self._losses:
+            with suppress(CorruptData):
+                read_footer(file)
+                complete = True
         losses = tuple(self._losses)
-        return Index(self._header, self._schemas, self._channels, counts, span, ranges, complete, losses)
+        self.index = Index(header, schemas, channels, counts, span, ranges, complete, losses)
 
     def _step(self, at: int) -> int:
         """Read the record at ``at``; the offset to continue at."""
@@ -135,7 +119,7 @@ class Scan:
             self._has_data_end = True
         elif opcode == Opcode.CHUNK:
             chunk = parse_chunk(body)
-            self._add(DataRange("chunk", at, end, 0, 0, None, chunk.compression), decompress(chunk))
+            self._add(DataRange("chunk", at, end, compression=chunk.compression), decompress(chunk))
         elif opcode == Opcode.METADATA:
             self.metadata.append(parse_record(Metadata, body))
         elif opcode == Opcode.ATTACHMENT:
@@ -151,12 +135,12 @@ class Scan:
             return
         start, self._bare_start = self._bare_start, None
         try:
-            self._add(DataRange("bare", start, end, 0, 0, None, ""), self._file.read(start, end - start))
+            self._add(DataRange("bare", start, end), self._file.read(start, end - start))
         except CorruptData as damage:
             self._losses.append(DataLoss(start, end - start, str(damage)))
 
     def _add(self, data_range: DataRange, data: bytes) -> None:
-        contents = ChunkContents(data)
+        contents = RecordContents(data)
         for number, schema in contents.schemas.items():
             self._schemas.setdefault(number, schema)
         for number, channel in contents.channels.items():
@@ -171,7 +155,7 @@ class Scan:
         if found is None and opcode == Opcode.CHUNK:
             # The file ends within this chunk; its beginning may be readable.
             before = self._counts.total()
-            cut = DataRange("cut chunk", at, self._end, 0, 0, None, "")
+            cut = DataRange("cut chunk", at, self._end)
             with suppress(CorruptData):
                 self._add(cut, cut.content(self._file))
             reason = f"{reason}, but for {self._counts.total() - before} messages"

@@ -67,9 +67,9 @@ class RecordedMessage(NamedTuple):
 
 
 class _ChunkBuffer(io.BytesIO):
-    """Output of MCAP's writer, written to the file in one go: whole chunks, or nothing of them.
+    """Output stream of MCAP's writer, written to the file in one go: whole chunks, or nothing of them.
 
-    The writer calls ``tell`` for the offsets in its index.
+    The writer calls ``tell`` for the offsets in its index, and ``flush`` at the end of its own.
     """
 
     def __init__(self, file: io.FileIO) -> None:
@@ -98,14 +98,16 @@ class _ChunkBuffer(io.BytesIO):
 class McapOutput:
     """An MCAP file being written. After a failure it is closed, and ends with a whole chunk.
 
-    ``writer`` is MCAP's own; its output is in memory until ``flush``. Its public ``flush`` (since mcap 1.5)
-    ends the chunk in progress, which its ``chunk_size`` does also.
+    ``writer`` is MCAP's own; its output is in memory until ``write_chunk``. Its public ``flush`` (since mcap
+    1.5) ends the chunk in progress, which its ``chunk_size`` does also.
     """
 
     def __init__(self, path: Path, *, overwrite: bool, profile: str = "ros2", library: str = LIBRARY) -> None:
-        self.path = path
-        with self._errors():
+        self._path = path
+        try:
             self._file = io.FileIO(path, "w" if overwrite else "x")
+        except OSError as error:
+            raise _disk_error(path, error) from error
         self._buffer = _ChunkBuffer(self._file)
         self.writer = Writer(self._buffer, compression=CompressionType.ZSTD)
         self.writer.start(profile, library)
@@ -116,11 +118,11 @@ class McapOutput:
         return self._buffer.file_size
 
     @property
-    def has_waiting(self) -> bool:
+    def has_whole_chunk(self) -> bool:
         """Whether a whole chunk is in memory."""
         return self._buffer.tell() > self._buffer.file_size
 
-    def flush(self) -> None:
+    def write_chunk(self) -> None:
         """End the chunk in progress and write it to the system, where ``kill -9`` cannot lose it."""
         with self._close_on_failure():
             self.writer.flush()
@@ -140,63 +142,52 @@ class McapOutput:
     @contextmanager
     def _close_on_failure(self) -> Generator[None, None, None]:
         try:
-            with self._errors():
-                yield
-        except RecordingError:
-            self.abandon()
-            raise
-
-    @contextmanager
-    def _errors(self) -> Generator[None, None, None]:
-        name = repr(str(self.path))
-        try:
             yield
-        except FileExistsError as error:
-            text = f"{name} exists; choose another name, or pass overwrite=True"
-            raise RecordingError(text, path=str(self.path)) from error
         except OSError as error:
-            text = f"{name} cannot be written: {error.strerror}"
-            if error.errno in _FULL:
-                text = (
-                    f"{name} cannot grow: {error.strerror}; free some space. What was written before "
-                    "stays readable, and `zstate recover` makes a complete file of it"
-                )
-            elif error.errno == errno.ENOENT:
-                text = f"{name} cannot be written: there is no folder {str(self.path.parent)!r}"
-            raise RecordingError(text, path=str(self.path)) from error
+            self.abandon()
+            raise _disk_error(self._path, error) from error
+
+
+def _disk_error(path: Path, error: OSError) -> RecordingError:
+    text = f"{str(path)!r} cannot be written: {error.strerror}"
+    if isinstance(error, FileExistsError):
+        text = f"{str(path)!r} exists; choose another name, or pass overwrite=True"
+    elif error.errno in _FULL:
+        text = (
+            f"{str(path)!r} cannot grow: {error.strerror}; free some space. What was written before "
+            "stays readable, and `zstate recover` makes a complete file of it"
+        )
+    elif error.errno == errno.ENOENT:
+        text = f"{str(path)!r} cannot be written: there is no folder {str(path.parent)!r}"
+    return RecordingError(text, path=str(path))
 
 
 class SplitFile:
     """One file of a recording: its channels, and groups of chunks that begin with the latched messages."""
 
     def __init__(self, path: Path, *, overwrite: bool, recording: str, part: int) -> None:
-        self._output = McapOutput(path, overwrite=overwrite)
-        self._output.writer.add_metadata(IDENTITY, {"id": recording, "part": str(part)})
-        self._output.flush()
+        self.output = McapOutput(path, overwrite=overwrite)
+        self.output.writer.add_metadata(IDENTITY, {"id": recording, "part": str(part)})
+        self.output.write_chunk()
         self._schemas: dict[str, int] = {}
         self._numbers: dict[ChannelKey, int] = {}
         self._number_of: dict[ChannelId, int] = {}
-        self._waiting = 0
-        self._opening = 0
+        # Bytes of the chunk in progress, without compression, and of all that precedes the first message.
+        self._chunk_size = self._head_size = 0
         self._first: int | None = None
         self._group = 0
 
     @property
-    def size(self) -> int:
-        """Bytes in the file."""
-        return self._output.size
-
-    @property
-    def channel_count(self) -> int:
-        """Channels in the file."""
-        return len(self._numbers)
+    def is_full(self) -> bool:
+        """Whether the file has all the channels that MCAP can number."""
+        return len(self._numbers) >= MAX_CHANNELS
 
     def declare(self, channel: ChannelId, declaration: ChannelDeclaration) -> None:
         """Add a channel, unless the file has an equal one."""
         key = declaration.key
         if key not in self._numbers:
             topic, kind, metadata = declaration
-            writer = self._output.writer
+            writer = self.output.writer
             if kind.name not in self._schemas:
                 text = kind.definition.encode()
                 self._schemas[kind.name] = writer.register_schema(kind.name, "ros2msg", text)
@@ -207,40 +198,35 @@ class SplitFile:
         """Whether a message of that log time belongs into the next file."""
         if self._first is None:
             return False
-        grown = self.size + self._waiting - self._opening
+        grown = self.output.size + self._chunk_size - self._head_size
         return grown >= max_bytes or abs(log_time - self._first) >= max_ns
 
-    def group_is_over(self, log_time: int) -> bool:
-        """Whether a message of that log time starts a group."""
-        return self._first is None or abs(log_time - self._group) >= GROUP_NS
-
-    def start_group(self, log_time: int, latched: Iterable[RecordedMessage]) -> None:
-        """Start a chunk, with the latched messages under this log time."""
-        self.flush()
+    def start_group_if_due(self, log_time: int, latched: Iterable[RecordedMessage]) -> bool:
+        """Start a chunk with the latched messages, under this log time; False while the last group lasts."""
+        if self._first is not None and abs(log_time - self._group) < GROUP_NS:
+            return False
+        self.write_chunk()
         self._group = log_time
         for message in latched:
             self.add(message._replace(log_time=log_time))
         if self._first is None:
             self._first = log_time
-            self._opening = self.size + self._waiting
+            self._head_size = self.output.size + self._chunk_size
+        return True
 
     def add(self, message: RecordedMessage) -> None:
         """Write it: into memory, until the chunk is full."""
         channel, payload, log_time, publish_time, sequence = message
         number = self._number_of[channel]
-        self._output.writer.add_message(number, log_time, payload, publish_time, sequence & _SEQUENCE)
-        self._waiting += len(payload) + _MESSAGE_SIZE
-        if self._output.has_waiting:
-            self.flush()
+        self.output.writer.add_message(number, log_time, payload, publish_time, sequence & _SEQUENCE)
+        self._chunk_size += len(payload) + _MESSAGE_SIZE
+        if self.output.has_whole_chunk:
+            self.write_chunk()
 
-    def flush(self) -> None:
+    def write_chunk(self) -> None:
         """End the chunk, and write it to the system."""
-        self._output.flush()
-        self._waiting = 0
-
-    def finish(self) -> None:
-        """Write the index, and close."""
-        self._output.finish()
+        self.output.write_chunk()
+        self._chunk_size = 0
 
 
 class RecordingWriter(Closeable):
@@ -297,7 +283,7 @@ class RecordingWriter(Closeable):
     @property
     def size(self) -> int:
         """Bytes in all files so far, without unflushed ones."""
-        return self._finished_bytes + self._split.size
+        return self._finished_bytes + self._split.output.size
 
     def channel(
         self, topic: str, type: RosType, qos: Qos, metadata: Mapping[str, str] | None = None
@@ -306,12 +292,12 @@ class RecordingWriter(Closeable):
         facts = {"offered_qos_profiles": qos.to_rosbag_yaml(), "topic_type_hash": type.hash}
         declaration = ChannelDeclaration(topic, type, {**facts, **(metadata or {})})
         key = declaration.key
-        with self._lock, self._close_on_failure():
+        with self._writing():
             self._check_open()
             known = self._ids.get(key)
             if known is not None:
                 return known
-            if self._split.channel_count >= MAX_CHANNELS:
+            if self._split.is_full:
                 self._start_split()
             self._id += 1
             channel = self._ids[key] = ChannelId(self._id)
@@ -330,29 +316,31 @@ class RecordingWriter(Closeable):
         self, channel: ChannelId, payload: bytes, log_time: int, publish_time: int, *, sequence: int = 0
     ) -> None:
         """Write a message. Log times [ns] need not increase; ``sequence`` is cut to 32 bits."""
-        message = self._checked(RecordedMessage(channel, payload, log_time, publish_time, sequence))
-        with self._lock, self._close_on_failure():
-            self._make_room(log_time)
-            self._split.add(message)
+        self._write(RecordedMessage(channel, payload, log_time, publish_time, sequence))
 
-    def latch(
-        self,
-        channel: ChannelId,
-        key: str,
-        payload: bytes,
-        log_time: int,
-        publish_time: int,
-        *,
-        sequence: int = 0,
-    ) -> None:
+    def latch(self, channel: ChannelId, key: str, payload: bytes, log_time: int, publish_time: int) -> None:
         """Write a message that is repeated, in the following files too, until the next of this ``key``.
 
         A repetition carries the log time of the message it precedes, and its own publish time.
         """
-        message = self._checked(RecordedMessage(channel, bytes(payload), log_time, publish_time, sequence))
-        with self._lock, self._close_on_failure():
-            self._latched[channel, key] = message
-            if not self._make_room(log_time):
+        self._write(RecordedMessage(channel, bytes(payload), log_time, publish_time, 0), key)
+
+    def _write(self, message: RecordedMessage, latched_as: str | None = None) -> None:
+        # MCAP's writer would notice half way through a record, or not at all.
+        if message.channel not in self._declared:
+            text = f"{message.channel} is no channel of {str(self._first)!r}; declare it with channel()"
+            raise InvalidInput(text)
+        for time in (message.log_time, message.publish_time):
+            if not 0 <= time < _END_OF_TIME:
+                raise InvalidInput(f"a time is {time}; give nanoseconds since 1970, below 2**63")
+        with self._writing():
+            self._check_open()
+            if latched_as is not None:
+                self._latched[message.channel, latched_as] = message
+            if self._split.is_over(message.log_time, self._max_bytes, self._max_ns):
+                self._start_split()
+            is_repeated = self._split.start_group_if_due(message.log_time, self._latched.values())
+            if latched_as is None or not is_repeated:
                 self._split.add(message)
 
     def unlatch(self, channel: ChannelId, key: str) -> None:
@@ -362,29 +350,19 @@ class RecordingWriter(Closeable):
 
     def flush(self) -> None:
         """Write everything to the operating system, in a chunk of its own."""
-        with self._lock, self._close_on_failure():
+        with self._writing():
             if self._is_open:
-                self._split.flush()
+                self._split.write_chunk()
 
     def close(self) -> None:
         with self._lock:
             if self._is_open:
                 self._is_open = False
-                self._split.finish()
-
-    def _make_room(self, log_time: int) -> bool:
-        """Start the file or the group that this log time belongs into; whether a group was started."""
-        self._check_open()
-        if self._split.is_over(log_time, self._max_bytes, self._max_ns):
-            self._start_split()
-        if not self._split.group_is_over(log_time):
-            return False
-        self._split.start_group(log_time, self._latched.values())
-        return True
+                self._split.output.finish()
 
     def _start_split(self) -> None:
-        self._split.finish()
-        self._finished_bytes += self._split.size
+        self._split.output.finish()
+        self._finished_bytes += self._split.output.size
         self._split = self._new_split()
 
     def _new_split(self) -> SplitFile:
@@ -397,23 +375,14 @@ class RecordingWriter(Closeable):
         return split
 
     @contextmanager
-    def _close_on_failure(self) -> Generator[None, None, None]:
-        """Close the recording after a disk error."""
-        try:
-            yield
-        except RecordingError:
-            self._is_open = False
-            raise
-
-    def _checked(self, message: RecordedMessage) -> RecordedMessage:
-        # MCAP's writer would notice half way through a record, or not at all.
-        if message.channel not in self._declared:
-            text = f"{message.channel} is no channel of {str(self._first)!r}; declare it with channel()"
-            raise InvalidInput(text)
-        for time in (message.log_time, message.publish_time):
-            if not 0 <= time < _END_OF_TIME:
-                raise InvalidInput(f"a time is {time}; give nanoseconds since 1970, below 2**63")
-        return message
+    def _writing(self) -> Generator[None, None, None]:
+        """Hold the lock; a disk error closes the recording."""
+        with self._lock:
+            try:
+                yield
+            except RecordingError:
+                self._is_open = False
+                raise
 
     def _check_open(self) -> None:
         if not self._is_open:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from html import escape
+from itertools import chain, repeat
 
 from zstate.se3 import rpy_from_quaternion
 
@@ -47,8 +48,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], colors: Sequen
     cell = "padding:0.1em 0.5em 0.1em 0;vertical-align:top;overflow-wrap:anywhere"
     head = "".join(f'<th style="{cell};{_MUTED};text-align:left">{escape(text)}</th>' for text in headings)
     lines: list[str] = []
-    for number, row in enumerate(rows):
-        color = colors[number] if number < len(colors) else ""
+    for row, color in zip(rows, chain(colors, repeat("")), strict=False):
         style = f' style="color:{color}"' if color else ""
         cells = "".join(f'<td style="{cell}">{escape(text)}</td>' for text in row)
         lines.append(f"<tr{style}>{cells}</tr>")

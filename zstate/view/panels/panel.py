@@ -1,4 +1,4 @@
-"""Panel interface, the context of an update, and widgets with two-way binding."""
+"""Panel interface, the context of an update, and widgets that the user and the program change."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import viser
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FramePoses
-from zstate.errors import format_duration
 
 T = TypeVar("T")
 
@@ -32,10 +31,6 @@ class PanelContext(NamedTuple):
     def at(self) -> int | None:
         """The stamp for lookups in the buffer: None if live."""
         return None if self.is_live else self.snapshot.stamp
-
-    def age_text(self, stamp: int | None) -> str:
-        """The age of a stamp; "-" if it is not known."""
-        return "-" if stamp is None or self.now is None else format_duration(self.now - stamp)
 
 
 class Panel(Protocol):
@@ -73,30 +68,26 @@ class BoundWidget(Generic[T]):
             self._handle.value = self._last = value
 
 
-class FrameDropdown:
+class FrameDropdown(BoundWidget[str]):
     """Dropdown of frame names that come and go; ``placeholder`` is its text without a selection."""
 
     def __init__(self, gui: viser.GuiApi, label: str, placeholder: str, hint: str | None = None) -> None:
         self._placeholder = placeholder
         self._list: viser.GuiDropdownHandle[str] = gui.add_dropdown(label, (placeholder,), hint=hint)
-        self._bound = BoundWidget[str](self._list)
+        super().__init__(self._list)
 
     @property
     def frame(self) -> str | None:
         """The selected name."""
-        value = self._bound.value
-        return None if value == self._placeholder else value
+        return None if self.value == self._placeholder else self.value
 
     def poll_change(self) -> str | None:
-        """The name that the user has selected since the last call; None if unchanged."""
-        value = self._bound.poll_change()
+        value = super().poll_change()
         return None if value == self._placeholder else value
-
-    def show(self, name: str) -> None:
-        """Select ``name``, which is one of the options."""
-        self._bound.show(name)
 
     def set_options(self, names: Sequence[str], selected: str | None) -> None:
         """Offer ``names``, and select one of them or none."""
-        self._list.options = tuple(names) if selected is not None else (self._placeholder, *names)
-        self._bound.show(self._placeholder if selected is None else selected)
+        options = tuple(names) if selected is not None else (self._placeholder, *names)
+        if options != self._list.options:
+            self._list.options = options
+        self.show(self._placeholder if selected is None else selected)

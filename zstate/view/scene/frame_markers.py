@@ -1,15 +1,16 @@
-"""Markers of frames: axes, lines to parents, labels with names or with the age of stale robots, trails."""
+"""Markers of frames: axes, lines to parents, labels and trails."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate.buffer.snapshot import FramePoses, FrameTable, Mask, Poses, Rows
+from zstate.buffer.snapshot import FramePoses, Mask, Poses, Rows
 from zstate.view.scene.frame_nodes import FrameNodes, set_instances, wxyzs
 
 _AXIS_LENGTH_M = 0.1
@@ -48,21 +49,22 @@ class Axes:
 
     def show(self, on: bool, placed: Poses, shown: Mask) -> None:
         """Draw axes at each shown pose (N, 7), if ``on``."""
-        if not on or not shown.any():
-            if self._handle is not None:
-                self._handle.visible = False
-            return
-        poses = placed[shown].astype(np.float32)
-        if self._handle is None or len(self._drawn) != len(poses):
+        is_visible = on and bool(shown.any())
+        if self._handle is not None:
+            self._handle.visible = is_visible
+        if is_visible:
+            poses = placed[shown].astype(np.float32)
+            if self._handle is None or len(self._drawn) != len(poses):
+                self._handle = self._scene.add_batched_axes(
+                    "/axes",
+                    wxyzs(poses),
+                    poses[:, :3],
+                    axes_length=_AXIS_LENGTH_M,
+                    axes_radius=_AXIS_RADIUS_M,
+                )
+            elif not np.array_equal(poses, self._drawn):
+                set_instances(self._handle, poses[:, :3], wxyzs(poses))
             self._drawn = poses
-            self._handle = self._scene.add_batched_axes(
-                "/axes", wxyzs(poses), poses[:, :3], axes_length=_AXIS_LENGTH_M, axes_radius=_AXIS_RADIUS_M
-            )
-            return
-        self._handle.visible = True
-        if not np.array_equal(poses, self._drawn):
-            self._drawn = poses
-            set_instances(self._handle, poses[:, :3], wxyzs(poses))
 
 
 class ParentLines:
@@ -75,17 +77,15 @@ class ParentLines:
     def show(self, on: bool, placed: Poses, shown: Mask, parents: Rows) -> None:
         """Draw a line to each shown pose (N, 7) from a shown parent, if ``on``."""
         rows = np.flatnonzero(shown & (parents >= 0) & shown[parents]) if on else parents[:0]
-        if not len(rows):
-            if self._handle is not None:
-                self._handle.visible = False
-            return
         points = np.stack([placed[parents[rows], :3], placed[rows, :3]], axis=1).astype(np.float32)
-        if self._handle is None:
+        if self._handle is None and len(rows):
             self._handle = self._scene.add_line_segments(
                 "/lines", points, _LINE_COLOR, thickness=_LINE_WIDTH_PX, thickness_units="screen"
             )
-        self._handle.visible = True
-        self._handle.points = points
+        if self._handle is not None:
+            self._handle.visible = bool(len(rows))
+            if len(rows):
+                self._handle.points = points
 
 
 class NodeLabels:
@@ -102,19 +102,17 @@ class NodeLabels:
     ) -> None:
         """Show ``texts``, by frame, and no others."""
         for frame, (path, label) in list(self._labels.items()):
-            if nodes.paths.get(frame) != path:
-                del self._labels[frame]  # it was removed with its node
-            elif frame not in texts:
+            is_on_node = nodes.paths.get(frame) == path  # else it was removed with its node
+            if is_on_node and frame not in texts:
                 label.remove()
+            if not is_on_node or frame not in texts:
                 del self._labels[frame]
         for frame, text in texts.items():
             path = nodes.paths.get(frame)
-            if path is None:
-                continue
             if frame in self._labels:
                 label = self._labels[frame][1]
                 label.text, label.font_size_mode = text, size
-            else:
+            elif path is not None:
                 label = self._scene.add_label(
                     f"{path}/{self._name}", text, font_size_mode=size, **self._options
                 )
@@ -166,64 +164,13 @@ def _texts(snapshot: FramePoses, shown: Mask, joined: Mask) -> dict[str, str]:
     return {names[row]: "\n".join(texts) for row, texts in lines.items()}
 
 
-class StaleLabels:
-    """The text of each stale robot, on a label at its first frame."""
-
-    def __init__(self, scene: viser.SceneApi) -> None:
-        self._labels = NodeLabels(scene, "stale", anchor="top-center")
-        self._texts: dict[str, str] = {}
-        self._tree: FrameTable | None = None
-        self._first_frames: dict[str, str] = {}
-
-    def set(self, robot: str, text: str | None) -> None:
-        """Set the text of a stale robot; None if it is not stale."""
-        if text is None:
-            self._texts.pop(robot, None)
-        else:
-            self._texts[robot] = text
-
-    def is_stale(self, robot: str) -> bool:
-        """Whether the robot has a text."""
-        return robot in self._texts
-
-    def frames(self, tree: FrameTable) -> frozenset[str]:
-        """The frames that carry labels: the first of each stale robot, since parents come first."""
-        if tree is not self._tree:
-            self._tree, self._first_frames = tree, {}
-            for name in tree.names:
-                self._first_frames.setdefault(name.partition("/")[0], name)
-        return frozenset(self._first_frames[robot] for robot in self._texts if robot in self._first_frames)
-
-    def show(self, nodes: FrameNodes) -> None:
-        """Draw the labels."""
-        first = self._first_frames
-        texts = {first[robot]: f"{robot}: {text}" for robot, text in self._texts.items() if robot in first}
-        self._labels.show(texts, nodes)
-
-
+@dataclass
 class _Trail:
     """The last positions of one frame, as a fixed number of segments that start at one point."""
 
-    def __init__(self, handle: viser.LineSegmentsHandle, position: NDArray[np.float64], stamp: int) -> None:
-        self.handle = handle
-        self._points = np.broadcast_to(position, (_TRAIL_SEGMENTS, 2, 3)).astype(np.float32)
-        self._stamp = stamp
-
-    def continues_at(self, stamp: int) -> bool:
-        """Whether a position at that stamp continues the trail: time has not jumped."""
-        return 0 <= stamp - self._stamp < _MAX_GAP_NS
-
-    def add(self, position: NDArray[np.float64], stamp: int) -> None:
-        """Append a position, unless it is too soon or too near."""
-        last = self._points[-1, 1]
-        near = float(np.linalg.norm(position - last)) < _MIN_STEP_M
-        if near or stamp - self._stamp < _TRAIL_PERIOD_NS:
-            self._stamp = stamp if near else self._stamp
-            return
-        self._points = np.roll(self._points, -1, axis=0)
-        self._points[-1] = (last, position)
-        self._stamp = stamp
-        self.handle.points = self._points
+    handle: viser.LineSegmentsHandle
+    points: NDArray[np.float32]
+    stamp: int
 
 
 class Trails:
@@ -232,7 +179,7 @@ class Trails:
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
         self._trails: dict[str, _Trail | None] = {}
-        self._colors: dict[str, int] = {}
+        self._numbers: dict[str, int] = {}
         self._fixed = ""
 
     def set_trail(self, frame: str, on: bool) -> None:
@@ -244,33 +191,41 @@ class Trails:
             del self._trails[frame]
 
     def show(self, snapshot: FramePoses, fixed: str, placed: Poses) -> None:
-        """Append the current positions."""
+        """Append the current positions, unless they are too soon or too near."""
         if fixed != self._fixed:
             self._fixed = fixed
             for frame in self._trails:
                 self._clear(frame)
-        for frame in self._trails:
-            row = snapshot.tree.index.get(frame)
-            if row is None or snapshot.stamp is None or not np.isfinite(placed[row, 0]):
+        for frame, trail in self._trails.items():
+            row, stamp = snapshot.tree.index.get(frame), snapshot.stamp
+            if row is None or stamp is None or not np.isfinite(placed[row, 0]):
                 continue
-            trail, position = self._trails[frame], placed[row, :3]
-            if trail is not None and trail.continues_at(snapshot.stamp):
-                trail.add(position, snapshot.stamp)
-            else:
-                line = self._add_line(frame, position)
-                self._trails[frame] = _Trail(line, position, snapshot.stamp)
+            position = placed[row, :3]
+            if trail is None or not 0 <= stamp - trail.stamp < _MAX_GAP_NS:
+                self._trails[frame] = self._new_trail(frame, position, stamp)
+                continue
+            last = trail.points[-1, 1]
+            if float(np.linalg.norm(position - last)) < _MIN_STEP_M:
+                trail.stamp = stamp
+            elif stamp - trail.stamp >= _TRAIL_PERIOD_NS:
+                points = np.roll(trail.points, -1, axis=0)
+                points[-1] = (last, position)
+                trail.points, trail.stamp = points, stamp
+                trail.handle.points = points
 
-    def _add_line(self, frame: str, position: NDArray[np.float64]) -> viser.LineSegmentsHandle:
-        number = self._colors.setdefault(frame, len(self._colors))
+    def _new_trail(self, frame: str, position: NDArray[np.float64], stamp: int) -> _Trail:
+        number = self._numbers.setdefault(frame, len(self._numbers))
+        points = np.broadcast_to(position, (_TRAIL_SEGMENTS, 2, 3)).astype(np.float32)
         fade = np.linspace(0.0, 1.0, 2 * _TRAIL_SEGMENTS)[:, None] ** 0.5
         colors = (1.0 - fade) * _BACKGROUND + fade * np.array(_TRAIL_COLORS[number % len(_TRAIL_COLORS)])
-        return self._scene.add_line_segments(
+        handle = self._scene.add_line_segments(
             f"/trails/{number}",
-            np.broadcast_to(position, (_TRAIL_SEGMENTS, 2, 3)).astype(np.float32),
+            points,
             colors.reshape(_TRAIL_SEGMENTS, 2, 3).astype(np.uint8),
             thickness=_TRAIL_WIDTH_PX,
             thickness_units="screen",
         )
+        return _Trail(handle, points, stamp)
 
     def _clear(self, frame: str) -> None:
         trail = self._trails[frame]

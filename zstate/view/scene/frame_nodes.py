@@ -2,9 +2,9 @@
 
 A moving joint is one message, whatever its link carries; another fixed frame moves only the root.
 
-The setters here bypass those of viser, which compare each pose with numpy's ``allclose`` and check the types
-of arrays: that costs more than the rest of sending, and the callers here have compared already. For talos at
-30 Hz it is a third of the drawing.
+Poses are sent without the setters of viser, which compare each pose with numpy's ``allclose`` and check the
+types of arrays: that costs more than the rest of sending, and the callers here have compared already. For
+talos at 30 Hz it is a third of the drawing.
 """
 
 # pyright: reportPrivateUsage=false
@@ -12,7 +12,6 @@ of arrays: that costs more than the rest of sending, and the callers here have c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
 
 import numpy as np
 import viser
@@ -21,10 +20,6 @@ from viser import _messages as messages
 
 from zstate.buffer.snapshot import FramePoses, FrameTable, Mask, Poses, Rows
 from zstate.se3 import IDENTITY, to_matrix
-
-_Float = TypeVar("_Float", np.float32, np.float64)
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 
 _TOP = "/frames"
 # Smaller changes are rounding errors of products of poses, and are not sent [m, and parts of a quaternion].
@@ -59,7 +54,12 @@ class FrameNodes:
             self._rebuild(snapshot.tree)
         shown = np.isfinite(placed[:, 0])
         if not np.array_equal(shown, self.shown):
-            self._set_visible(snapshot.tree, shown)
+            self.shown = shown
+            self.version += 1
+            # A node without a pose is visible if a descendant has one.
+            visible = _with_ancestors(shown, snapshot.tree)[self._rows].tolist()
+            for handle, is_visible in zip(self._node_handles, visible, strict=True):
+                handle.visible = is_visible
         # Poses in the node of the parent, which is at the fixed frame if its own pose is unknown.
         parents = snapshot.tree.parents
         on_shown = (parents >= 0) & shown[parents]
@@ -72,7 +72,13 @@ class FrameNodes:
         return self.tree is not None and frame in self.paths and bool(self.shown[self.tree.row(frame)])
 
     def _rebuild(self, tree: FrameTable) -> None:
-        paths = self._paths(tree)
+        """Short names, because every message contains one; the number of a frame never changes."""
+        carriers = np.array([name in self._carriers for name in tree.names], dtype=np.bool_)
+        paths: dict[str, str] = {}
+        for row in np.flatnonzero(_with_ancestors(carriers, tree)).tolist():
+            name, parent = tree.names[row], int(tree.parents[row])
+            above = _TOP if parent < 0 else paths[tree.names[parent]]
+            paths[name] = f"{above}/{self._ids.setdefault(name, len(self._ids))}"
         removed = self._handles.keys() - set(paths.values())
         for path in removed:
             handle = self._handles.pop(path)
@@ -88,45 +94,34 @@ class FrameNodes:
         self.tree, self.paths = tree, paths
         self.version += 1
 
-    def _paths(self, tree: FrameTable) -> dict[str, str]:
-        """Short names, because every message contains one; the number of a frame never changes."""
-        kept = np.array([name in self._carriers for name in tree.names], dtype=np.bool_)
-        for row in range(len(kept) - 1, -1, -1):
-            kept[tree.parents[row]] |= kept[row] and tree.parents[row] >= 0
-        paths: dict[str, str] = {}
-        for row in np.flatnonzero(kept).tolist():
-            name, parent = tree.names[row], int(tree.parents[row])
-            above = _TOP if parent < 0 else paths[tree.names[parent]]
-            paths[name] = f"{above}/{self._ids.setdefault(name, len(self._ids))}"
-        return paths
-
-    def _set_visible(self, tree: FrameTable, shown: Mask) -> None:
-        """Hide nodes without a pose, unless a descendant has one."""
-        passed = shown.copy()
-        for row in range(len(shown) - 1, -1, -1):
-            parent = int(tree.parents[row])
-            if passed[row] and parent >= 0:
-                passed[parent] = True
-        for handle, visible in zip(self._node_handles, passed[self._rows].tolist(), strict=True):
-            handle.visible = visible
-        self.shown = shown
-        self.version += 1
-
     def _move(self, poses: Poses) -> None:
         with np.errstate(invalid="ignore"):
             changed = ~(np.abs(poses - self._poses) <= _INVISIBLE)
         moved, turned = changed[:, :3].any(axis=1), changed[:, 3:].any(axis=1)
         for row in np.flatnonzero(moved).tolist():
             x, y, z = poses[row, :3].tolist()
-            set_position(self._node_handles[row], (x, y, z))
+            node = self._node_handles[row]._impl
+            node.position[:] = (x, y, z)
+            node.api._queue_scene_message(messages.SetPositionMessage(node.name, (x, y, z)))
         for row in np.flatnonzero(turned).tolist():
             qx, qy, qz, qw = poses[row, 3:].tolist()
-            set_rotation(self._node_handles[row], (qw, qx, qy, qz))
+            node = self._node_handles[row]._impl
+            node.wxyz[:] = (qw, qx, qy, qz)
+            node.api._queue_scene_message(messages.SetOrientationMessage(node.name, (qw, qx, qy, qz)))
         self._poses[moved, :3] = poses[moved, :3]
         self._poses[turned, 3:] = poses[turned, 3:]
 
 
-def wxyzs(poses: NDArray[_Float]) -> NDArray[_Float]:
+def _with_ancestors(frames: Mask, tree: FrameTable) -> Mask:
+    """The frames of a mask and all frames above them; parents come first."""
+    marked = frames.copy()
+    for row in range(len(marked) - 1, -1, -1):
+        if marked[row] and tree.parents[row] >= 0:
+            marked[tree.parents[row]] = True
+    return marked
+
+
+def wxyzs(poses: NDArray[np.float32]) -> NDArray[np.float32]:
     """The quaternions of poses (..., 7) in the order of viser (..., 4)."""
     return poses[..., [6, 3, 4, 5]]
 
@@ -135,20 +130,6 @@ def in_frame(pose: Sequence[float], points: NDArray[np.float64]) -> NDArray[np.f
     """Transform ``points`` (N, 3) by a pose."""
     matrix = to_matrix(pose)
     return points @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def set_position(handle: viser.SceneNodeHandle, position: Vector) -> None:
-    """Set the position of a node in its parent [m]."""
-    node = handle._impl
-    node.position[:] = position
-    node.api._queue_scene_message(messages.SetPositionMessage(node.name, position))
-
-
-def set_rotation(handle: viser.SceneNodeHandle, wxyz: Quaternion) -> None:
-    """Set the rotation of a node in its parent."""
-    node = handle._impl
-    node.wxyz[:] = wxyz
-    node.api._queue_scene_message(messages.SetOrientationMessage(node.name, wxyz))
 
 
 def set_instances(

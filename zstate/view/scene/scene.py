@@ -1,11 +1,13 @@
-"""The scene of the page: robots, frames, trails and labels."""
+"""The scene of the page: robots, frames, trails and labels, and where unconnected robots are placed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from itertools import chain
+import math
+import re
+from collections.abc import Sequence
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 import viser
@@ -15,55 +17,56 @@ from zstate.buffer.snapshot import FramePoses, FrameTable, Poses
 from zstate.model.findings import Finding
 from zstate.model.geometry import Shape, read_shapes
 from zstate.model.robot import RobotModel
-from zstate.view.mesh_loader import MeshLoader
-from zstate.view.mesh_paths import MissingFile
-from zstate.view.meshes import Meshes
-from zstate.view.scene.frame_markers import Axes, FrameLabels, ParentLines, StaleLabels, Trails
+from zstate.view.meshes import Meshes, MeshLoader
+from zstate.view.scene.frame_markers import Axes, FrameLabels, NodeLabels, ParentLines, Trails
 from zstate.view.scene.frame_nodes import FrameNodes, in_frame
-from zstate.view.scene.robot_meshes import InstancedMeshes, RenderStyle, RobotMeshes
-from zstate.view.scene.tree_layout import TreeLayout
-
-# Identical robots have the same shapes, and the same folder of the URDF file if the user named one.
-_Kind: TypeAlias = tuple[tuple[Shape, ...], Path | None]
+from zstate.view.scene.robot_meshes import InstancedMeshes, RenderStyle, RobotKind, RobotMeshes
 
 _MIN_INSTANCES = 4  # identical robots that are drawn by instances
+_GAP_M = 0.3
+_MARGIN_M = 0.12  # of meshes around their frames
+# Width of the layout divided by its depth: pictures are wider than high.
+_ASPECT = 1.6
+
+Offset = tuple[float, float, float]
 
 
 class Scene:
     """Draws robots and frames at one instant after the other.
 
     Attributes, used by the next ``show``: ``visuals`` and ``collisions`` of robots (the latter translucent),
-    and ``axes``, ``names`` and ``parent_lines`` of frames. Meshes are loaded in the background; the scene is
-    ``busy`` until all are drawn. To be used by one thread.
+    and ``axes``, ``names`` and ``parent_lines`` of frames. ``layout`` places unconnected trees. Meshes are
+    loaded in the background; the scene is ``busy`` until all are drawn. To be used by one thread.
     """
 
-    def __init__(self, server: viser.ViserServer, meshes: Meshes | None = None) -> None:
+    def __init__(self, server: viser.ViserServer) -> None:
         self.visuals = True
         self.collisions = False
         self.axes = True
         self.names = False
         self.parent_lines = False
-        self._scene = server.scene
-        self._loader = MeshLoader(meshes or Meshes())
-        self._robots = _Robots(server.scene, self._loader)
-        self._faults: dict[str, tuple[tuple[str, str], ...]] = {}
-        self._nodes = FrameNodes(server.scene)
-        self._axes = Axes(server.scene)
-        self._names = FrameLabels(server.scene)
-        self._lines = ParentLines(server.scene)
-        self._trails = Trails(server.scene)
-        self._stale_labels = StaleLabels(server.scene)
-        self._layout = TreeLayout(server.scene)
+        scene = self._scene = server.scene
+        self._loader = MeshLoader(Meshes())
+        self._single: dict[str, RobotMeshes] = {}
+        self._instanced: dict[RobotKind, InstancedMeshes] = {}
+        self._instanced_count = 0
+        self._faults: dict[str, list[tuple[str, str]]] = {}
+        self._stale: dict[str, str] = {}
+        self._tree: FrameTable | None = None
+        self._first_frames: dict[str, str] = {}
+        self._nodes = FrameNodes(scene)
+        self._axes = Axes(scene)
+        self._names = FrameLabels(scene)
+        self._lines = ParentLines(scene)
+        self._trails = Trails(scene)
+        self.layout = TreeLayout()
+        self._stale_labels = NodeLabels(scene, "stale", anchor="top-center")
+        self._tree_labels = NodeLabels(scene, "tree", anchor="bottom-center")
 
     @property
     def busy(self) -> bool:
         """Whether meshes are still being loaded."""
-        return self._loader.busy
-
-    @property
-    def layout_version(self) -> int:
-        """Grows when trees that are not connected to the fixed frame are moved."""
-        return self._layout.version
+        return any(meshes.pending for meshes in self._meshes())
 
     def set_robot(
         self, name: str, model: RobotModel, shapes: Sequence[Shape] | None = None, base: Path | None = None
@@ -73,21 +76,46 @@ class Scene:
         ``shapes`` default to those of its model. ``base`` is the folder of its URDF file, if the user named
         one: then every file in it can be loaded, otherwise only those in packages.
         """
-        faults: tuple[Finding, ...] = ()
+        faults: Sequence[Finding] = ()
         if shapes is None:
             shapes, faults = read_shapes(model)
-        self._faults[name] = tuple((f"{name}, line {one.line}", one.message) for one in faults)
-        self._robots.set(name, tuple(shapes), self._nodes, base)
+        self._remove_meshes(name)
+        self._faults[name] = [(f"{name}, line {one.line}", one.message) for one in faults]
+        kind = RobotKind(tuple(shapes), base)
+        alike = [robot for robot, meshes in self._single.items() if meshes.kind == kind]
+        if kind not in self._instanced and len(alike) + 1 < _MIN_INSTANCES:
+            self._single[name] = RobotMeshes(self._scene, self._loader, kind, name)
+            return
+        for robot in alike:
+            self._single.pop(robot).remove(self._nodes)
+        if kind not in self._instanced:
+            self._instanced_count += 1
+            path = f"/instanced/{self._instanced_count}"
+            self._instanced[kind] = InstancedMeshes(self._scene, self._loader, kind, path)
+        self._instanced[kind].robots |= dict.fromkeys([*alike, name])
 
     def remove_robot(self, name: str) -> None:
         """Remove a robot, if it exists."""
-        self._robots.remove(name, self._nodes)
+        self._remove_meshes(name)
         self._faults.pop(name, None)
-        self._stale_labels.set(name, None)
+        self._stale.pop(name, None)
+
+    def _remove_meshes(self, name: str) -> None:
+        single = self._single.pop(name, None)
+        if single is not None:
+            single.remove(self._nodes)
+        for kind, group in list(self._instanced.items()):
+            group.robots.pop(name, None)
+            if not group.robots:
+                group.remove()
+                del self._instanced[kind]
 
     def set_stale(self, robot: str, text: str | None) -> None:
         """Draw a stale robot in translucent grey, with ``text`` at its root; with None, as usual."""
-        self._stale_labels.set(robot, text)
+        if text is None:
+            self._stale.pop(robot, None)
+        else:
+            self._stale[robot] = text
 
     def set_trail(self, frame: str, on: bool) -> None:
         """Start or remove the trail of a frame."""
@@ -95,8 +123,8 @@ class Scene:
 
     def missing_meshes(self, robot: str) -> tuple[tuple[str, str], ...]:
         """Files of a robot that cannot be drawn: the name in the URDF, and the reason."""
-        missing = tuple((one.uri, one.why) for one in self._robots.missing(robot))
-        return self._faults.get(robot, ()) + missing
+        missing = chain.from_iterable(meshes.missing for meshes in self._meshes() if robot in meshes.robots)
+        return (*self._faults.get(robot, ()), *((one.uri, one.why) for one in missing))
 
     def show(self, snapshot: FramePoses, fixed: str) -> Poses:
         """Draw everything at one instant, relative to the frame ``fixed``.
@@ -104,98 +132,155 @@ class Scene:
         Returns the pose of each frame, as ``snapshot.poses_in(fixed)``; trees that are not connected to the
         fixed frame have the poses at which they are drawn. Raises UnknownFrame.
         """
-        placed = self._layout.placed(snapshot, fixed)
-        frames = self._robots.frames | self._stale_labels.frames(snapshot.tree) | self._layout.frames
-        self._nodes.show(snapshot, placed, frozenset(snapshot.tree.names) if self.names else frames)
+        tree = snapshot.tree
+        if tree is not self._tree:
+            self._tree = tree
+            # Parents come first.
+            self._first_frames = {name.partition("/")[0]: name for name in reversed(tree.names)}
+        first = self._first_frames
+        stale = {first[robot]: f"{robot}: {text}" for robot, text in self._stale.items() if robot in first}
+        placed = self.layout.placed(snapshot, fixed)
+        on_links = (meshes.frames for meshes in self._single.values())
+        carriers = tree.names if self.names else chain(stale, self.layout.labels, *on_links)
+        self._nodes.show(snapshot, placed, frozenset(carriers))
         shown = self._nodes.shown
-        self._robots.show(self._nodes, snapshot.tree, placed, self._styles)
+        for name, meshes in self._single.items():
+            meshes.show(self._nodes, self._styles(name))
+        for group in self._instanced.values():
+            group.show(tree, placed, {name: self._styles(name) for name in group.robots})
         self._axes.show(self.axes, placed, shown)
-        self._lines.show(self.parent_lines, placed, shown, snapshot.tree.parents)
+        self._lines.show(self.parent_lines, placed, shown, tree.parents)
         self._names.show(self.names, snapshot, self._nodes)
         self._trails.show(snapshot, fixed, placed)
-        self._stale_labels.show(self._nodes)
-        self._layout.show(self._nodes)
+        self._stale_labels.show(stale, self._nodes)
+        self._tree_labels.show(self.layout.labels, self._nodes)
         return placed
 
     def corners(self, tree: FrameTable, placed: Poses) -> NDArray[np.float64]:
         """The corners of the bounding boxes of all loaded visuals with a known pose: (N, 3) [m]."""
         boxes = [np.empty((0, 3))]
-        for frame, corners in self._robots.corners():
+        for frame, corners in chain.from_iterable(meshes.corners() for meshes in self._meshes()):
             row = tree.index.get(frame)
             if row is not None and np.isfinite(placed[row, 0]):
                 boxes.append(in_frame(placed[row].tolist(), corners))
         return np.concatenate(boxes)
 
+    def _meshes(self) -> chain[RobotMeshes | InstancedMeshes]:
+        return chain(self._single.values(), self._instanced.values())
+
     def _styles(self, robot: str) -> set[RenderStyle]:
         styles: set[RenderStyle] = {"collision"} if self.collisions else set()
         if self.visuals:
-            styles.add("stale" if self._stale_labels.is_stale(robot) else "visual")
+            styles.add("stale" if robot in self._stale else "visual")
         return styles
 
 
-class _Robots:
-    """The meshes of all robots. ``frames`` are those whose nodes carry some."""
+class _Box(NamedTuple):
+    """The space of a tree around its root [m]: centre and half size along x, y; lowest z."""
 
-    def __init__(self, scene: viser.SceneApi, loader: MeshLoader) -> None:
-        self._scene = scene
-        self._loader = loader
-        self._single: dict[str, RobotMeshes] = {}
-        self._instanced: dict[_Kind, InstancedMeshes] = {}
-        self._instanced_count = 0
-        self.frames: frozenset[str] = frozenset()
+    middle: NDArray[np.float64]
+    half: NDArray[np.float64]
+    low: float
 
-    def set(self, name: str, shapes: tuple[Shape, ...], nodes: FrameNodes, base: Path | None = None) -> None:
-        """Add or replace a robot; ``base`` as for RobotMeshes."""
-        self.remove(name, nodes)
-        kind = shapes, base
-        alike = [robot for robot, meshes in self._single.items() if (meshes.shapes, meshes.base) == kind]
-        if kind in self._instanced or len(alike) + 1 >= _MIN_INSTANCES:
-            for robot in alike:
-                self._single.pop(robot).remove(nodes)
-            if kind not in self._instanced:
-                self._instanced_count += 1
-                path = f"/instanced/{self._instanced_count}"
-                self._instanced[kind] = InstancedMeshes(self._scene, self._loader, shapes, path, base)
-            self._instanced[kind].robots |= dict.fromkeys([*alike, name])
-        else:
-            self._single[name] = RobotMeshes(self._scene, self._loader, name, shapes, base)
-        self._find_frames()
 
-    def remove(self, name: str, nodes: FrameNodes) -> None:
-        """Remove a robot, if it exists."""
-        meshes = self._single.pop(name, None)
-        if meshes is not None:
-            meshes.remove(nodes)
-        for kind, group in list(self._instanced.items()):
-            group.robots.pop(name, None)
-            if not group.robots:
-                group.remove()
-                del self._instanced[kind]
-        self._find_frames()
+class TreeLayout:
+    """Places trees that are not connected to the fixed frame next to it; their relative poses are unknown.
 
-    def missing(self, name: str) -> Sequence[MissingFile]:
-        """Files of a robot that cannot be drawn."""
-        if name in self._single:
-            return self._single[name].meshes.missing
-        groups = [group for group in self._instanced.values() if name in group.robots]
-        return groups[0].meshes.missing if groups else ()
+    They stand in rows, on one floor, as far apart as their robots reach; ``labels`` mark them, by root. A
+    tree keeps its place while robots move. The layout is computed again, and ``version`` grows, when a tree
+    appears or disappears, or more of its frames have a pose.
+    """
 
-    def show(
-        self, nodes: FrameNodes, tree: FrameTable, placed: Poses, styles: Callable[[str], set[RenderStyle]]
-    ) -> None:
-        """Draw each robot in its styles, with the meshes loaded since."""
-        for loaded in self._loader.fetch():
-            any(one.meshes.receive(loaded) for one in chain(self._single.values(), self._instanced.values()))
-        for name, meshes in self._single.items():
-            meshes.show(nodes, styles(name))
-        for group in self._instanced.values():
-            group.show(tree, placed, {name: styles(name) for name in group.robots})
+    def __init__(self) -> None:
+        self._laid_out_for: tuple[FrameTable, int, int] | None = None
+        # By root: the frames of the tree, the number of them with a pose, and their box.
+        self._boxes: dict[str, tuple[list[str], int, _Box]] = {}
+        self._offsets: dict[str, Offset] = {}
+        self.labels: dict[str, str] = {}
+        self.version = 0
 
-    def corners(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
-        """The frame of each loaded visual, with the corners of its bounding box in it (8, 3) [m]."""
-        return chain.from_iterable(
-            one.corners() for one in (*self._single.values(), *self._instanced.values())
-        )
+    def placed(self, snapshot: FramePoses, fixed: str) -> Poses:
+        """As ``snapshot.poses_in(fixed)``, with poses for every tree. Raises UnknownFrame."""
+        tree = snapshot.tree
+        root = int(tree.roots[tree.row(fixed)])
+        laid_out_for = tree, root, int(np.count_nonzero(snapshot.known))
+        if laid_out_for != self._laid_out_for:
+            self._laid_out_for = laid_out_for
+            self._lay_out(snapshot, root)
+        if not self._offsets:
+            return snapshot.poses_in(fixed)
+        offsets = {tree.index[name]: offset for name, offset in self._offsets.items()}
+        return snapshot.poses_side_by_side(fixed, offsets)
 
-    def _find_frames(self) -> None:
-        self.frames = frozenset(chain.from_iterable(meshes.frames for meshes in self._single.values()))
+    def _lay_out(self, snapshot: FramePoses, first: int) -> None:
+        names = snapshot.tree.names
+        members: dict[int, list[int]] = {}
+        for row, root in enumerate(snapshot.tree.roots.tolist()):
+            members.setdefault(root, []).append(row)
+        others = sorted((row for row in members if row != first), key=lambda row: _natural(names[row]))
+        ordered = [first, *others]
+        self._boxes = {names[row]: self._box(snapshot, row, members[row]) for row in ordered}
+        offsets = _in_rows([box for _, _, box in self._boxes.values()])
+        named = {names[row]: offset for row, offset in zip(others, offsets[1:], strict=True)}
+        self.version += named != self._offsets
+        self._offsets = named
+        self.labels = {}
+        for row in ordered if others else ():
+            robots = {names[k].partition("/")[0] for k in members[row] if "/" in names[k]}
+            title = robots.pop() if len(robots) == 1 else names[row]
+            self.labels[names[row]] = title if row == first else f"{title} (position unknown)"
+
+    def _box(self, snapshot: FramePoses, root: int, rows: list[int]) -> tuple[list[str], int, _Box]:
+        """The largest box of the tree so far: it does not shrink while samples are missing."""
+        names = [snapshot.tree.names[row] for row in rows]
+        tops, poses = snapshot.tops
+        known = [row for row in rows if tops[row] == root]
+        before = self._boxes.get(names[0])
+        if before is not None and before[0] == names and before[1] >= len(known):
+            return before
+        box = _bounding_box([snapshot.tree.names[row] for row in known], poses[known, :3])
+        return names, len(known), box
+
+
+def _bounding_box(names: Sequence[str], points: NDArray[np.float64]) -> _Box:
+    """The box that the robots can reach in all directions; other frames count only without a robot."""
+    robots: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        robots.setdefault(name.partition("/")[0] if "/" in name else "", []).append(row)
+    if len(robots) > 1:
+        robots.pop("", None)
+    corners: list[NDArray[np.float64]] = []
+    for rows in robots.values():
+        reach = float(np.linalg.norm(points[rows] - points[rows[0]], axis=1).max()) + _MARGIN_M
+        corners += [points[rows[0], :2] - reach, points[rows[0], :2] + reach]
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    return _Box(0.5 * (low + high), 0.5 * (high - low), min(0.0, float(points[:, 2].min())))
+
+
+def _in_rows(boxes: Sequence[_Box]) -> list[Offset]:
+    """The offset of each box in a layout of rows along y on one floor; the first is not moved."""
+    columns = math.ceil(math.sqrt(_ASPECT * len(boxes)))
+    widths = [max(float(box.half[1]) for box in boxes[k::columns]) for k in range(min(columns, len(boxes)))]
+    starts = range(0, len(boxes), columns)
+    depths = [max(float(box.half[0]) for box in boxes[start : start + columns]) for start in starts]
+    across, behind = _middles(widths), _middles(depths)
+    first = boxes[0]
+    offsets: list[Offset] = []
+    for k, box in enumerate(boxes):
+        x = first.middle[0] - behind[k // columns] - box.middle[0]
+        y = first.middle[1] + across[k % columns] - box.middle[1]
+        offsets.append((float(x), float(y), first.low - box.low))
+    return offsets
+
+
+def _middles(halves: Sequence[float]) -> list[float]:
+    """The centres of adjacent intervals, relative to the first."""
+    middles = [0.0]
+    for before, half in pairwise(halves):
+        middles.append(middles[-1] + before + _GAP_M + half)
+    return middles
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sort key that puts bot2 before bot10."""
+    return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", name[:200])]

@@ -1,9 +1,11 @@
-"""Decoder of ROS 2 topics into zstate's messages."""
+"""Decoder of ROS 2 topics into zstate's messages: JointState, TFMessage, String, Clock."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from hashlib import blake2b
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +13,7 @@ from zstate.errors import MessageError
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     ClockMessage,
+    Edges,
     JointState,
     Message,
     RobotDescription,
@@ -20,10 +23,18 @@ from zstate.wire.messages import (
     poses_from_block,
     to_block,
 )
-from zstate.wire.ros2.cdr import decode_clock, decode_string
+from zstate.wire.ros2.cdr import (
+    STAMP_BYTES,
+    CdrReader,
+    TemplateCache,
+    decode_clock,
+    decode_string,
+    unpack_stamps,
+)
 from zstate.wire.ros2.frame_names import FrameNames
-from zstate.wire.ros2.joint_state import JointStateDecoder
-from zstate.wire.ros2.tf_message import TfMessageDecoder
+from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
+
+_POSE_NUMBERS = 7
 
 
 class RosDecoder:
@@ -83,3 +94,130 @@ def _checked_stamp(stamp: int) -> int:
             reason="no stamp",
         )
     return stamp
+
+
+class RosJointState(NamedTuple):
+    """A decoded JointState: ``stamp`` [ns], and blocks with one number for each of ``names``.
+
+    Payloads that differ only in numbers have the same ``names`` object.
+    """
+
+    stamp: int
+    frame_id: str
+    names: tuple[str, ...]
+    positions: bytes
+    velocities: bytes | None = None
+    efforts: bytes | None = None
+
+
+class JointStateDecoder:
+    """Decodes payloads of any number of writers; after the first of its template, in one step."""
+
+    def __init__(self) -> None:
+        self._templates: TemplateCache[RosJointState] = TemplateCache()
+
+    def decode(self, payload: bytes) -> RosJointState:
+        """The message in ``payload``.
+
+        Raises MessageError with the reason "truncated", "malformed", or "no positions" if joints are named
+        but have only velocities or efforts. Does not check that numbers are finite.
+        """
+        found = self._templates.find(payload)
+        if found is None:
+            reader = CdrReader(payload, JOINT_STATE.name)
+            state = read_joint_state(reader)
+            self._templates.add(reader, state)
+            return state
+        (_, frame_id, names, _, velocities, efforts), numbers = found
+        size = 8 * len(names)
+        end = STAMP_BYTES + size
+        (stamp,) = unpack_stamps(numbers[:STAMP_BYTES])
+        positions = numbers[STAMP_BYTES:end]
+        if velocities is not None:
+            velocities = numbers[end : end + size]
+            end += size
+        if efforts is not None:
+            efforts = numbers[end:]
+        return RosJointState(stamp, frame_id, names, positions, velocities, efforts)
+
+
+def read_joint_state(reader: CdrReader) -> RosJointState:
+    """A JointState, read value by value. Raises MessageError."""
+    stamp, frame_id = reader.stamp(), reader.text()
+    names = tuple(reader.text() for _ in range(reader.count()))
+    positions, velocities, efforts = blocks = reader.sequence(), reader.sequence(), reader.sequence()
+    if names and not positions:
+        raise MessageError(
+            f"a {JOINT_STATE.name} without positions of {', '.join(map(repr, names))}: velocities alone "
+            "place no link; let its writer publish positions, or leave those joints out",
+            reason="no positions",
+        )
+    counts = [len(block) // 8 for block in blocks]
+    if counts[0] != len(names) or not {counts[1], counts[2]} <= {0, len(names)}:
+        text = f"{len(names)} names, {counts[0]} positions, {counts[1]} velocities, {counts[2]} efforts"
+        raise reader.malformed(f"its counts do not agree: {text}")
+    if len(set(names)) != len(names):
+        raise reader.malformed(duplicate_text(names))
+    return RosJointState(stamp, frame_id, names, positions, velocities or None, efforts or None)
+
+
+def duplicate_text(names: Sequence[str]) -> str:
+    """The first of ``names`` that is not unique, for an error."""
+    counts = Counter(names)
+    name = next(name for name in names if counts[name] > 1)
+    return f"the joint {name!r} comes {counts[name]} times among {len(names)} names"
+
+
+class RosTransforms(NamedTuple):
+    """A decoded TFMessage: row i of ``poses`` is ``parent_from_child`` of ``edges[i]``.
+
+    ``poses`` is a block of x y z [m], qx qy qz qw. ``stamps`` [ns] has one for each edge; ``stamp`` is
+    their common value, or None if they differ or there are none. Payloads that differ only in numbers have
+    the same ``edges`` object.
+    """
+
+    stamp: int | None
+    stamps: tuple[int, ...]
+    edges: Edges
+    poses: bytes
+
+
+class TfMessageDecoder:
+    """Decodes payloads of any number of writers; after the first of its template, in one step."""
+
+    def __init__(self) -> None:
+        self._templates: TemplateCache[Edges] = TemplateCache()
+
+    def decode(self, payload: bytes) -> RosTransforms:
+        """The message in ``payload``.
+
+        Raises MessageError with the reason "truncated" or "malformed". Does not check that numbers are
+        finite, quaternions have length 1 and frames form a tree.
+        """
+        found = self._templates.find(payload)
+        if found is None:
+            reader = CdrReader(payload, TF_MESSAGE.name)
+            transforms = read_tf_message(reader)
+            self._templates.add(reader, transforms.edges)
+            return transforms
+        edges, numbers = found
+        count = len(edges)
+        times, poses = numbers[: STAMP_BYTES * count], numbers[STAMP_BYTES * count :]
+        first = times[:STAMP_BYTES]
+        if not count or times != first * count:
+            return RosTransforms(None, unpack_stamps(times), edges, poses)
+        (stamp,) = unpack_stamps(first)
+        return RosTransforms(stamp, (stamp,) * count, edges, poses)
+
+
+def read_tf_message(reader: CdrReader) -> RosTransforms:
+    """A TFMessage, read value by value. Raises MessageError."""
+    stamps: list[int] = []
+    edges: list[tuple[str, str]] = []
+    poses: list[bytes] = []
+    for _ in range(reader.count()):
+        stamps.append(reader.stamp())
+        edges.append((reader.text(), reader.text()))
+        poses.append(reader.numbers(_POSE_NUMBERS))
+    shared = stamps[0] if len(set(stamps)) == 1 else None
+    return RosTransforms(shared, tuple(stamps), tuple(edges), b"".join(poses))

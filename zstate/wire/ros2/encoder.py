@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
 from zstate.errors import InvalidInput
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import Stream
 from zstate.wire.messages import (
+    POSE_BYTES,
     ClockMessage,
     Edges,
     JointState,
@@ -21,35 +22,33 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.ros2.attachment import pack
-from zstate.wire.ros2.cdr import encode_clock, encode_string
+from zstate.wire.ros2.cdr import CdrReader, CdrTemplate, CdrWriter, encode_clock, encode_string, pack_stamp
+from zstate.wire.ros2.decoder import duplicate_text, read_joint_state, read_tf_message
 from zstate.wire.ros2.frame_names import FrameNames
-from zstate.wire.ros2.joint_state import JointStateEncoder
-from zstate.wire.ros2.tf_message import TfMessageEncoder
-
-
-@dataclass(frozen=True)
-class TopicAddress:
-    """The key and liveliness token of one writer of a topic; ``gid`` is None if the wire sends none."""
-
-    key: str
-    token: str
-    gid: bytes | None
+from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
 
 class RosStreamEncoder:
-    """Encodes one stream of one writer as ROS 2 messages."""
+    """Encodes one stream of one writer as ROS 2 messages.
+
+    ``key`` and ``token`` are those of the topic and of its writer; ``gid`` is None if the wire sends none.
+    """
 
     encoding = ""
     can_withdraw = False  # ROS nodes log a Zenoh delete as a malformed message
 
     def __init__(
-        self, stream: Stream, address: TopicAddress, names: FrameNames, sample_names: SampleLayout
+        self,
+        names: FrameNames,
+        sample_names: SampleLayout,
+        key: str = "",
+        token: str = "",
+        gid: bytes | None = None,
     ) -> None:
-        self.key = address.key
-        self.token: str | None = address.token
-        self._gid = address.gid
+        self.key = key
+        self.token: str | None = token
+        self._gid = gid
         self._seq = 0
-        self._stream = stream
         self._names = names
         self._sample_names = sample_names
         self._joints: tuple[tuple[str, ...], JointStateEncoder] | None = None
@@ -106,3 +105,98 @@ def _checked_stamp(stamp: int) -> int:
     if not stamp:
         raise InvalidInput("the stamp is 0, which means no stamp in ROS; give the time of the sample")
     return stamp
+
+
+class JointStateEncoder:
+    """Encodes joint states of ``names``; blocks are in their order.
+
+    Raises InvalidInput for a duplicate name and for a name that is no text for ROS 2.
+    """
+
+    def __init__(self, names: Sequence[str], frame_id: str = "") -> None:
+        if len(set(names)) != len(names):
+            raise InvalidInput(duplicate_text(names))
+        self._count = len(names)
+        self._size = 8 * len(names)
+        self._prefix_blocks = {
+            sent: _prefix_blocks(names, frame_id, *sent) for sent in product((False, True), repeat=2)
+        }
+
+    def encode(
+        self, stamp: int, positions: bytes, velocities: bytes | None = None, efforts: bytes | None = None
+    ) -> bytes:
+        """The payload of one instant.
+
+        Raises InvalidInput for a block without one number for each name, and for a ``stamp`` [ns] outside
+        the years 1901 to 2038.
+        """
+        size = self._size
+        if (
+            len(positions) != size
+            or (velocities is not None and len(velocities) != size)
+            or (efforts is not None and len(efforts) != size)
+        ):
+            blocks = (positions, velocities, efforts)
+            sizes = ", ".join("none" if block is None else f"{len(block)} bytes" for block in blocks)
+            raise InvalidInput(
+                f"{self._count} names need blocks of {size} bytes, 8 for each number; "
+                f"positions, velocities, efforts: {sizes}"
+            )
+        head, names, second, third = self._prefix_blocks[velocities is not None, efforts is not None]
+        time = pack_stamp(stamp)
+        return b"".join((head, time, names, positions, second, velocities or b"", third, efforts or b""))
+
+
+def _prefix_blocks(
+    names: Sequence[str], frame_id: str, has_velocities: bool, has_efforts: bool
+) -> tuple[bytes, bytes, bytes, bytes]:
+    """The bytes before the stamp, the positions, the velocities and the efforts."""
+    writer = CdrWriter()
+    writer.stamp(0)
+    writer.text(frame_id)
+    writer.count(len(names))
+    for name in names:
+        writer.text(name)
+    zeros = bytes(8 * len(names))
+    for is_sent in (True, has_velocities, has_efforts):
+        writer.sequence(zeros if is_sent else b"")
+    payload = writer.payload()
+    reader = CdrReader(payload, JOINT_STATE.name)
+    read_joint_state(reader)
+    (stamp, stamp_end), (first, first_end), (second, second_end), (third, _) = *reader.stamps, *reader.blocks
+    return payload[:stamp], payload[stamp_end:first], payload[first_end:second], payload[second_end:third]
+
+
+class TfMessageEncoder:
+    """Encodes the poses of ``edges`` at one instant.
+
+    Raises InvalidInput for a frame name that is no text for ROS 2.
+    """
+
+    def __init__(self, edges: Edges) -> None:
+        self._count = len(edges)
+        writer = CdrWriter()
+        writer.count(len(edges))
+        for parent, child in edges:
+            writer.stamp(0)
+            writer.text(parent)
+            writer.text(child)
+            writer.numbers(bytes(POSE_BYTES))
+        reader = CdrReader(writer.payload(), TF_MESSAGE.name)
+        read_tf_message(reader)
+        self._template = CdrTemplate(reader)
+        self._fixed, _ = self._template.split(reader.payload)
+
+    def encode(self, stamp: int, poses: bytes) -> bytes:
+        """The payload of one instant; ``poses`` is a block of ``parent_from_child``, pose7 for each edge.
+
+        Raises InvalidInput for a block without one pose for each edge, and for a ``stamp`` [ns] outside the
+        years 1901 to 2038.
+        """
+        count = self._count
+        if len(poses) != POSE_BYTES * count:
+            raise InvalidInput(
+                f"{count} edges need a block of {POSE_BYTES * count} bytes, {POSE_BYTES} for each pose, "
+                f"not {len(poses)}"
+            )
+        return self._template.join(self._fixed, pack_stamp(stamp) * count + poses)

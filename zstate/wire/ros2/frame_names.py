@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 
 from zstate.wire.keys import wire_name
 from zstate.wire.messages import Edges
@@ -37,8 +38,8 @@ class FrameNames:
         self._robot = robot
         # With robots in a namespace, SHARED is the owner of the tf topic that all of them publish on.
         self._prefix = "" if robot == SHARED and options.namespace else options.robot_frame_prefix(robot)
-        self.edges_to_ros = lru_cache(_CACHED_ORDERS)(self._edges_to_ros)
-        self.edges_to_zstate = lru_cache(_CACHED_ORDERS)(self._edges_to_zstate)
+        self.edges_to_ros = lru_cache(_CACHED_ORDERS)(partial(_renamed, self.to_ros))
+        self.edges_to_zstate = lru_cache(_CACHED_ORDERS)(partial(_renamed, self.to_zstate))
 
     def to_ros(self, name: str) -> str:
         """The name in ROS of the frame that this robot calls ``name``."""
@@ -60,8 +61,6 @@ class FrameNames:
             return wire_name(self._robot, local)
         return name if "/" in name else f"{SHARED}/{name}"
 
-    def _edges_to_ros(self, edges: Edges) -> Edges:
-        return tuple((self.to_ros(parent), self.to_ros(child)) for parent, child in edges)
 
-    def _edges_to_zstate(self, edges: Edges) -> Edges:
-        return tuple((self.to_zstate(parent), self.to_zstate(child)) for parent, child in edges)
+def _renamed(rename: Callable[[str], str], edges: Edges) -> Edges:
+    return tuple((rename(parent), rename(child)) for parent, child in edges)

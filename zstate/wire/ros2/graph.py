@@ -52,43 +52,45 @@ class NodeToken:
     @property
     def key(self) -> str:
         """The liveliness key."""
+        return self.prefix(self.nid, _NODE)
+
+    def prefix(self, number: int, kind: str) -> str:
+        """The first nine chunks of the key of this node, or of its endpoint ``number``."""
         names = (_mangled(part) for part in (self.enclave, self.namespace, self.name))
-        return "/".join([_ADMIN, str(self.domain), self.zid, *[str(self.nid)] * 2, _NODE, *names])
+        return "/".join([_ADMIN, str(self.domain), self.zid, str(self.nid), str(number), kind, *names])
 
 
 @dataclass(frozen=True)
 class EndpointToken:
-    """A publisher, subscription, service or client of a node, numbered ``eid`` in its session.
+    """A publisher, subscription, service or client of ``node``, numbered ``eid`` in its session.
 
     ``topic`` is the full name with its leading slash; ``dds_type`` as in keys, for instance
-    "std_msgs::msg::dds_::String_". One counter gives out ``nid`` and ``eid``.
+    "std_msgs::msg::dds_::String_". One counter gives out the numbers of nodes and endpoints.
     """
 
-    domain: int
-    zid: str
-    nid: int
+    node: NodeToken
     eid: int
     kind: Kind
-    enclave: str
-    namespace: str
-    node: str
     topic: str
     dds_type: str
     hash: str
     qos: Qos
 
     @property
+    def zid(self) -> str:
+        """The id of the node's Zenoh session."""
+        return self.node.zid
+
+    @property
     def full_name(self) -> str:
         """The name of the node with its namespace."""
-        return f"{self.namespace.rstrip('/')}/{self.node}"
+        return self.node.full_name
 
     @property
     def key(self) -> str:
         """The liveliness key, the input of ``gid``."""
-        names = (_mangled(part) for part in (self.enclave, self.namespace, self.node, self.topic))
-        numbers = (str(self.nid), str(self.eid))
-        what = (self.dds_type, self.hash, self.qos.encode_rmw())
-        return "/".join([_ADMIN, str(self.domain), self.zid, *numbers, self.kind, *names, *what])
+        what = (_mangled(self.topic), self.dds_type, self.hash, self.qos.encode_rmw())
+        return "/".join([self.node.prefix(self.eid, self.kind), *what])
 
 
 @dataclass(frozen=True)
@@ -146,29 +148,17 @@ def parse_token(key: str) -> NodeToken | EndpointToken | None:
         return None
     if not all(_NUMBER.fullmatch(chunks[place]) for place in (1, 3, 4)):
         return None
-    enclave, namespace, name, *_ = names = [chunk.replace("%", "/") for chunk in chunks[6:10]]
+    enclave, namespace, name, *topic = (chunk.replace("%", "/") for chunk in chunks[6:10])
+    node = NodeToken(int(chunks[1]), chunks[2], int(chunks[3]), enclave, namespace, name)
     if chunks[5] == _NODE:
-        return NodeToken(int(chunks[1]), chunks[2], int(chunks[3]), enclave, namespace, name)
+        return node
     if chunks[5] not in _KINDS or len(chunks) < 13:
         return None
     try:
         qos = Qos.parse_rmw(chunks[12])
     except MessageError:
         return None
-    return EndpointToken(
-        domain=int(chunks[1]),
-        zid=chunks[2],
-        nid=int(chunks[3]),
-        eid=int(chunks[4]),
-        kind=chunks[5],
-        enclave=enclave,
-        namespace=namespace,
-        node=name,
-        topic=names[3],
-        dds_type=chunks[10],
-        hash=chunks[11],
-        qos=qos,
-    )
+    return EndpointToken(node, int(chunks[4]), chunks[5], topic[0], chunks[10], chunks[11], qos)
 
 
 def parse_dds_token(key: str) -> DdsToken | None:

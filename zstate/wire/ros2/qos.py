@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.keys import Stream, shortened
@@ -21,15 +21,33 @@ History = Literal["keep_last", "keep_all"]
 RMW_DEPTH = 42
 """Default depth of rmw_zenoh_cpp."""
 
+
+class _Encoding(NamedTuple):
+    """The numbers of the policies, the ``depth`` that an empty one means, and a plain publisher's QoS."""
+
+    reliability: dict[Reliability, int]
+    durability: dict[Durability, int]
+    history: dict[History, int]
+    depth: int
+    example: str
+
+
+_RMW = _Encoding(
+    {"reliable": 1, "best_effort": 2},
+    {"transient_local": 1, "volatile": 2},
+    {"keep_last": 1, "keep_all": 2},
+    RMW_DEPTH,
+    "::,10:,:,:,,",
+)
+_DDS = _Encoding(
+    {"best_effort": 0, "reliable": 1},
+    {"volatile": 0, "transient_local": 1},
+    {"keep_last": 0, "keep_all": 1},
+    1,
+    ":1:0:0,10",
+)
+
 Policy = TypeVar("Policy", bound=str)
-
-_RELIABILITY: dict[Reliability, int] = {"reliable": 1, "best_effort": 2}
-_DURABILITY: dict[Durability, int] = {"transient_local": 1, "volatile": 2}
-_HISTORY: dict[History, int] = {"keep_last": 1, "keep_all": 2}
-
-_DDS_RELIABILITY: dict[Reliability, int] = {"best_effort": 0, "reliable": 1}
-_DDS_DURABILITY: dict[Durability, int] = {"volatile": 0, "transient_local": 1}
-_DDS_HISTORY: dict[History, int] = {"keep_last": 0, "keep_all": 1}
 
 _DEPTH = re.compile(r"(-?[0-9]{1,10})?")
 _FOREVER = "\n    sec: 9223372036\n    nsec: 854775807"  # RMW_DURATION_INFINITE
@@ -56,47 +74,30 @@ class Qos:
 
         ``rel:dur:hist,depth:deadline:lifespan:liveliness``; ``::,10:,:,:,,`` is a plain publisher.
         """
-        reliability = "" if self.reliability == "reliable" else _RELIABILITY[self.reliability]
-        durability = "" if self.durability == "volatile" else _DURABILITY[self.durability]
-        history = "" if self.history == "keep_last" else _HISTORY[self.history]
+        reliability = "" if self.reliability == "reliable" else _RMW.reliability[self.reliability]
+        durability = "" if self.durability == "volatile" else _RMW.durability[self.durability]
+        history = "" if self.history == "keep_last" else _RMW.history[self.history]
         depth = "" if self.depth in (0, RMW_DEPTH) else self.depth
         return f"{reliability}:{durability}:{history},{depth}:,:,:,,"
 
     @classmethod
     def parse_rmw(cls, text: str) -> Qos:
         """The QoS that ``encode_rmw`` or a ROS node wrote. Raises MessageError ("malformed")."""
-        parts = text.split(":")
-        try:
-            history, depth = parts[2].split(",")
-            return cls(
-                _parse_policy(_RELIABILITY, parts[0], "reliable"),
-                _parse_policy(_DURABILITY, parts[1], "volatile"),
-                *_parse_history(_parse_policy(_HISTORY, history, "keep_last"), depth, RMW_DEPTH),
-            )
-        except (LookupError, ValueError):
-            raise _malformed_error(text, "'::,10:,:,:,,'") from None
+        return _parse(text, text.split(":")[:3], _RMW)
 
     def encode_dds(self) -> str:
         """The same in zenoh-plugin-ros2dds, without a type hash: ``:rel:dur:hist,depth``."""
         depth = self.depth or -1
         return (
-            f":{_DDS_RELIABILITY[self.reliability]}:{_DDS_DURABILITY[self.durability]}"
-            f":{_DDS_HISTORY[self.history]},{depth}"
+            f":{_DDS.reliability[self.reliability]}:{_DDS.durability[self.durability]}"
+            f":{_DDS.history[self.history]},{depth}"
         )
 
     @classmethod
     def parse_dds(cls, text: str) -> Qos:
         """The QoS of ``encode_dds`` or a bridge, before any suffix. Raises MessageError ("malformed")."""
-        parts = text.split(":")
-        try:
-            history, depth = parts[3].split(",") if parts[3] else ("", "")
-            return cls(
-                _parse_policy(_DDS_RELIABILITY, parts[1], "reliable"),
-                _parse_policy(_DDS_DURABILITY, parts[2], "volatile"),
-                *_parse_history(_parse_policy(_DDS_HISTORY, history, "keep_last"), depth, 1),
-            )
-        except (LookupError, ValueError):
-            raise _malformed_error(text, "':1:0:0,10'") from None
+        chunks = text.split(":")[1:4]
+        return _parse(text, [*chunks[:2], *(kept or "," for kept in chunks[2:])], _DDS)
 
     def to_rosbag_yaml(self) -> str:
         """The ``offered_qos_profiles`` of a recording: a YAML list of this one.
@@ -104,10 +105,10 @@ class Qos:
         Policies are numbers, which every version of rosbag2 reads; names are read since Jazzy.
         """
         return (
-            f"- history: {_HISTORY[self.history]}\n"
+            f"- history: {_RMW.history[self.history]}\n"
             f"  depth: {self.depth}\n"
-            f"  reliability: {_RELIABILITY[self.reliability]}\n"
-            f"  durability: {_DURABILITY[self.durability]}\n"
+            f"  reliability: {_RMW.reliability[self.reliability]}\n"
+            f"  durability: {_RMW.durability[self.durability]}\n"
             f"  deadline:{_FOREVER}\n"
             f"  lifespan:{_FOREVER}\n"
             "  liveliness: 1\n"
@@ -132,13 +133,27 @@ def _parse_policy(numbers: dict[Policy, int], text: str, default: Policy) -> Pol
     return {str(number): policy for policy, number in numbers.items()}[text] if text else default
 
 
-def _parse_history(history: History, depth: str, default: int) -> tuple[History, int]:
-    if not _DEPTH.fullmatch(depth):
-        raise ValueError(depth)
-    return history, 0 if history == "keep_all" else int(depth or default)
+def _parse_depth(text: str) -> int | None:
+    if not _DEPTH.fullmatch(text):
+        raise ValueError(text)
+    return int(text) if text else None
 
 
-def _malformed_error(text: str, example: str) -> MessageError:
-    return MessageError(
-        f"a malformed QoS {shortened(text)!r}; expected a form like {example}", reason="malformed"
-    )
+def _parse(text: str, chunks: list[str], encoding: _Encoding) -> Qos:
+    """The QoS in the three ``chunks`` of ``text``: reliability, durability, and history with depth."""
+    try:
+        reliability, durability, kept = chunks
+        first, second = kept.split(",")
+        history: History = _parse_policy(encoding.history, first, "keep_last")
+        depth = _parse_depth(second)
+        return Qos(
+            _parse_policy(encoding.reliability, reliability, "reliable"),
+            _parse_policy(encoding.durability, durability, "volatile"),
+            history,
+            0 if history == "keep_all" else encoding.depth if depth is None else depth,
+        )
+    except (LookupError, ValueError):
+        raise MessageError(
+            f"a malformed QoS {shortened(text)!r}; expected a form like {encoding.example!r}",
+            reason="malformed",
+        ) from None

@@ -12,8 +12,6 @@ clock                rosgraph_msgs/Clock     ``/clock``
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from zstate.errors import InvalidInput
 from zstate.wire.keys import ANY, Stream
 from zstate.wire.ros2.options import Ros2Options
@@ -43,93 +41,67 @@ def ros_type(stream: Stream) -> RosType:
     return _TYPES[stream]
 
 
-class TopicKeys(Protocol):
-    """Maps the streams of robots to topics and Zenoh keys."""
+class RmwKeys:
+    """The topics of robots, and their keys in rmw_zenoh_cpp: ``<domain>/<topic>/<type>/<hash>``."""
+
+    def __init__(self, options: Ros2Options) -> None:
+        self._options = options
 
     def topic(self, robot: str, stream: Stream) -> str:
         """The full ROS name of the topic, with its leading slash."""
-        ...
+        return self._topic(self._options.robot_namespace(robot), stream)
 
     def key(self, robot: str, stream: Stream) -> str:
         """The Zenoh key of ``stream``. Raises InvalidInput for a name that ROS does not allow."""
-        ...
+        kind = ros_type(stream)
+        type_hash = kind.hash if self._options.hash == "iron" else HUMBLE_HASH
+        return f"{self._options.domain}{self.topic(robot, stream)}/{kind.dds}/{type_hash}"
 
     def expression(self, robot: str, stream: Stream) -> str:
         """The key expression of ``stream``; robot ``"*"`` means all robots in the namespace.
 
         With ``namespace=*`` these are all robots in a namespace of one token.
         """
-        ...
+        return f"{self._options.domain}{self._topic_pattern(robot, stream)}/{ros_type(stream).dds}/*"
 
     def robot_from_key(self, key: str) -> str:
         """The robot of ``key``: the last token of its namespace, SHARED in the root.
 
         Raises InvalidInput for a key that is not of this layout.
         """
-        ...
-
-
-class RmwKeys:
-    """The keys of rmw_zenoh_cpp: ``<domain>/<topic>/<type>/<hash>``."""
-
-    def __init__(self, options: Ros2Options) -> None:
-        self._options = options
-
-    def topic(self, robot: str, stream: Stream) -> str:
-        return f"/{self._path(self._options.robot_namespace(robot), stream)}"
-
-    def key(self, robot: str, stream: Stream) -> str:
-        kind = ros_type(stream)
-        type_hash = kind.hash if self._options.hash == "iron" else HUMBLE_HASH
-        return f"{self._options.domain}{self.topic(robot, stream)}/{kind.dds}/{type_hash}"
-
-    def expression(self, robot: str, stream: Stream) -> str:
-        path = self._path(_namespace_pattern(self._options, robot), stream)
-        return f"{self._options.domain}/{path}/{ros_type(stream).dds}/*"
-
-    def robot_from_key(self, key: str) -> str:
         _domain, *path = key.split("/")
         if len(path) < 3:
             raise InvalidInput(f"the key {key!r} is not of the form '<domain>/<topic>/<type>/<hash>'")
         return robot_from_topic("/".join(path[:-2]))
 
-    def _path(self, namespace: str, stream: Stream) -> str:
+    def _topic_pattern(self, robot: str, stream: Stream) -> str:
+        return self._topic(self._options.namespace, stream) if robot == ANY else self.topic(robot, stream)
+
+    def _topic(self, namespace: str, stream: Stream) -> str:
         ros_type(stream)
         is_global = stream == "clock" or (stream.startswith("tf") and self._options.tf == "global")
-        return stream if is_global else _joined(namespace, stream)
+        return f"/{namespace}/{stream}" if namespace and not is_global else f"/{stream}"
 
 
-class DdsKeys:
-    """The keys of zenoh-plugin-ros2dds: the name of the topic, without its leading slash.
+class DdsKeys(RmwKeys):
+    """The same in zenoh-plugin-ros2dds: a key is the name of the topic, without its leading slash.
 
     A bridge puts its namespace before every topic, before /tf and /clock too. Its keys have no
     domain and no type hash.
     """
 
-    def __init__(self, options: Ros2Options) -> None:
-        self._options = options
-
-    def topic(self, robot: str, stream: Stream) -> str:
-        return f"/{self.key(robot, stream)}"
-
     def key(self, robot: str, stream: Stream) -> str:
-        ros_type(stream)
-        return _joined(self._options.robot_namespace(robot), stream)
+        return self.topic(robot, stream)[1:]
 
     def expression(self, robot: str, stream: Stream) -> str:
-        ros_type(stream)
-        return _joined(_namespace_pattern(self._options, robot), stream)
+        return self._topic_pattern(robot, stream)[1:]
 
     def robot_from_key(self, key: str) -> str:
         return robot_from_topic(key)
 
-
-def _namespace_pattern(options: Ros2Options, robot: str) -> str:
-    return options.namespace if robot == ANY else options.robot_namespace(robot)
-
-
-def _joined(namespace: str, name: str) -> str:
-    return f"{namespace}/{name}" if namespace else name
+    def _topic(self, namespace: str, stream: Stream) -> str:
+        ros_type(stream)
+        return f"/{namespace}/{stream}" if namespace else f"/{stream}"
 
 
 def robot_from_topic(topic: str) -> str:

@@ -11,13 +11,12 @@ from typing import Literal
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import ANY, Stream
 from zstate.wire.messages import Message, check_edges, check_size
-from zstate.wire.protocol import EntityId, SerializedSample
+from zstate.wire.protocol import SerializedSample, WriterNode
 from zstate.wire.ros2.attachment import session_from_gid, unpack
 from zstate.wire.ros2.decoder import RosDecoder
-from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
+from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.graph import (
     DDS_GRAPH_EXPRESSION,
@@ -31,7 +30,7 @@ from zstate.wire.ros2.graph import (
 )
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
-from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, TopicKeys, robot_from_topic, ros_type
+from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, robot_from_topic, ros_type
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 
@@ -46,7 +45,8 @@ class Ros2Wire:
     name = "ros2"
     shared: frozenset[Stream] = frozenset({"tf", "tf_static"})
     transforms: Stream = "tf"
-    _topic_keys: Callable[[Ros2Options], TopicKeys] = RmwKeys
+    _topic_keys = RmwKeys
+    _has_gids = True
 
     def __init__(self, options: Ros2Options | None = None) -> None:
         self.options = options or Ros2Options()
@@ -54,28 +54,20 @@ class Ros2Wire:
         self._decoder = RosDecoder()
         self._frame_names = lru_cache(64)(partial(FrameNames, self.options))
 
-    def node_token(self, robot: str, writer: WriterId, node: EntityId) -> str | None:
-        self._frame_names(robot)  # raises InvalidInput before anything is declared
-        return self._node_token(self._node(robot, writer.program, node))
+    def node_token(self, node: WriterNode) -> str | None:
+        self._frame_names(node.robot)  # raises InvalidInput before anything is declared
+        return self._node(node).key
 
     def stream_encoder(
-        self,
-        robot: str,
-        writer: WriterId,
-        stream: Stream,
-        *,
-        node: EntityId,
-        number: int,
-        sample_names: SampleLayout,
-        name: str = "",
+        self, node: WriterNode, stream: Stream, number: int, name: str = ""
     ) -> RosStreamEncoder:
-        token = self._endpoint_token(self._node(robot, writer.program, node), robot, stream, "MP", number)
-        address = TopicAddress(self._keys.key(robot, stream), token, self._gid(token))
-        return RosStreamEncoder(stream, address, self._frame_names(robot), sample_names)
+        token = self._endpoint_token(node, stream, "MP", number)
+        names, key = self._frame_names(node.robot), self._keys.key(node.robot, stream)
+        return RosStreamEncoder(names, node.sample_names, key, token, gid(token) if self._has_gids else None)
 
-    def _node(self, robot: str, program: str, node: EntityId) -> NodeToken:
-        namespace = f"/{self.options.robot_namespace(robot)}"
-        name = self.options.node or re.sub(r"\W|^(?=\d|$)", "_", program, flags=re.ASCII)
+    def _node(self, node: WriterNode) -> NodeToken:
+        namespace = f"/{self.options.robot_namespace(node.robot)}"
+        name = self.options.node or re.sub(r"\W|^(?=\d|$)", "_", node.writer.program, flags=re.ASCII)
         return NodeToken(self.options.domain, node.zid, node.number, "/", namespace, name)
 
     def reader_tokens(
@@ -85,34 +77,18 @@ class Ros2Wire:
             if self.options.namespace == ANY:
                 return ()  # a subscription in the graph has one topic; these are any number of topics
             robot = SHARED
-        node = self._node(robot, reader.program, EntityId(zid, number()))
-        endpoints = [self._endpoint_token(node, robot, stream, "MS", number()) for stream in streams]
-        return tuple(token for token in (self._node_token(node), *endpoints) if token is not None)
-
-    def _node_token(self, node: NodeToken) -> str | None:
-        return node.key
+        node = WriterNode(robot, reader, zid, number())
+        endpoints = [self._endpoint_token(node, stream, "MS", number()) for stream in streams]
+        return tuple(token for token in (self.node_token(node), *endpoints) if token is not None)
 
     def _endpoint_token(
-        self, node: NodeToken, robot: str, stream: Stream, kind: Literal["MP", "MS"], number: int
+        self, node: WriterNode, stream: Stream, kind: Literal["MP", "MS"], number: int
     ) -> str:
         """The token of ``node`` as publisher ("MP") or subscriber ("MS") of ``stream``."""
-        return EndpointToken(
-            domain=node.domain,
-            zid=node.zid,
-            nid=node.nid,
-            eid=number,
-            kind=kind,
-            enclave=node.enclave,
-            namespace=node.namespace,
-            node=node.name,
-            topic=self._keys.topic(robot, stream),
-            dds_type=ros_type(stream).dds,
-            hash=self._keys.key(robot, stream).rpartition("/")[2],
-            qos=STREAM_QOS[stream],
-        ).key
-
-    def _gid(self, token: str) -> bytes | None:
-        return gid(token)
+        topic, dds_type = self._keys.topic(node.robot, stream), ros_type(stream).dds
+        type_hash = self._keys.key(node.robot, stream).rpartition("/")[2]
+        token = EndpointToken(self._node(node), number, kind, topic, dds_type, type_hash, STREAM_QOS[stream])
+        return token.key
 
     def expression(self, robot: str, stream: Stream) -> str:
         return self._keys.expression(robot, stream)
@@ -170,24 +146,21 @@ class Ros2DdsWire(Ros2Wire):
 
     name = "ros2dds"
     _topic_keys = DdsKeys
+    _has_gids = False  # its messages have no attachment
 
     def __init__(self, options: Ros2Options | None = None) -> None:
         super().__init__(options)
         self._received: Counter[str] = Counter()
 
-    def _node_token(self, node: NodeToken) -> None:
-        """None: the bridges announce no nodes."""
+    def node_token(self, node: WriterNode) -> None:
+        """None, because the bridges announce no nodes. Raises InvalidInput as above."""
+        super().node_token(node)
 
     def _endpoint_token(
-        self, node: NodeToken, robot: str, stream: Stream, kind: Literal["MP", "MS"], number: int
+        self, node: WriterNode, stream: Stream, kind: Literal["MP", "MS"], number: int
     ) -> str:
-        ros = ros_type(stream)
-        return DdsToken(
-            node.zid, kind, self._keys.key(robot, stream), ros.name, STREAM_QOS[stream], ros.hash
-        ).key
-
-    def _gid(self, token: str) -> None:
-        """None: their messages have no attachment."""
+        ros, topic = ros_type(stream), self._keys.key(node.robot, stream)
+        return DdsToken(node.zid, kind, topic, ros.name, STREAM_QOS[stream], ros.hash).key
 
     def _origin(self, arrival: SerializedSample) -> tuple[int, int]:
         self._received[arrival.key] += 1

@@ -1,4 +1,4 @@
-"""What the tests with other implementations have: a router process, and a session of ours at it."""
+"""Fixtures of the tests with other implementations: a router process, and a zstate session at it."""
 
 from __future__ import annotations
 
@@ -29,5 +29,5 @@ def session(router: str) -> Iterator[Session]:
 @pytest.fixture
 def peer(request: pytest.FixtureRequest, spawn: Spawn) -> Peer:
     """The peer that the test is parametrized with."""
-    interpreter(request.param)  # before the router is started for nothing
+    interpreter(request.param)  # skips before a router is started
     return start_peer(request.param, spawn, request.getfixturevalue("router"))

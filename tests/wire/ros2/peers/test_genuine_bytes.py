@@ -27,8 +27,8 @@ from ros_messages import (
 from zstate.wire.messages import to_block
 from zstate.wire.ros2 import types
 from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string
-from zstate.wire.ros2.joint_state import JointStateDecoder, JointStateEncoder
-from zstate.wire.ros2.tf_message import TfMessageDecoder, TfMessageEncoder
+from zstate.wire.ros2.decoder import JointStateDecoder, TfMessageDecoder
+from zstate.wire.ros2.encoder import JointStateEncoder, TfMessageEncoder
 
 pytestmark = [pytest.mark.heavy, pytest.mark.processes]
 

@@ -53,7 +53,9 @@ def publish_edges(peer: Peer) -> None:
 def test_peer_receives_joint_states_as_published(peer: Peer, session: Session):
     peer.subscribe("/joint_states", JOINT_STATE)
     with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)) as publisher:
-        received = peer.hears("/joint_states", lambda: publisher.publish(POSITIONS, VELOCITIES, stamp=STAMP))
+        received = peer.receive(
+            "/joint_states", lambda: publisher.publish(POSITIONS, VELOCITIES, stamp=STAMP)
+        )
     assert received == joint_state(STAMP, RRBOT.joint_names, POSITIONS, VELOCITIES)
 
 
@@ -61,7 +63,7 @@ def test_peer_receives_joint_states_as_published(peer: Peer, session: Session):
 def test_peer_receives_the_moving_edges_of_a_robot(peer: Peer, session: Session):
     peer.subscribe("/tf", TF_MESSAGE)
     with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)) as publisher:
-        received = peer.hears("/tf", lambda: publisher.publish(POSITIONS, stamp=STAMP))
+        received = peer.receive("/tf", lambda: publisher.publish(POSITIONS, stamp=STAMP))
         moving = publisher.description().moving_edges
     assert {edge["header"]["stamp"]["nanosec"] for edge in received["transforms"]} == {STAMP % SECOND}
     assert set(edges_of(received)) == set(moving)
@@ -73,9 +75,9 @@ def test_peer_receives_the_moving_edges_of_a_robot(peer: Peer, session: Session)
 def test_late_peer_receives_the_model_and_the_fixed_edges(peer: Peer, session: Session):
     with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)):
         peer.subscribe("/robot_description", STRING, latched=True)
-        assert peer.hears("/robot_description") == {"data": RRBOT.urdf}
+        assert peer.receive("/robot_description") == {"data": RRBOT.urdf}
         peer.subscribe("/tf_static", TF_MESSAGE, latched=True)
-        received = peer.hears("/tf_static")
+        received = peer.receive("/tf_static")
     assert edges_of(received)
     for (parent, child), matrix in edges_of(received).items():
         assert np.allclose(matrix, kinematic_pose(RRBOT, POSITIONS, parent, child), rtol=0, atol=1e-12)
@@ -86,7 +88,7 @@ def test_late_peer_receives_a_static_edge(peer: Peer, session: Session):
     with StaticPublisher(session, "r1", "camera_mount", wires=WIRE) as statics:
         statics.set(Transform.from_pose7("tool", "camera", TURN))
         peer.subscribe("/tf_static", TF_MESSAGE, latched=True)
-        assert peer.hears("/tf_static") == tf_message(transform_stamped(0, "tool", "camera", TURN))
+        assert peer.receive("/tf_static") == tf_message(transform_stamped(0, "tool", "camera", TURN))
 
 
 @every_peer
@@ -153,5 +155,5 @@ def test_peer_publishes_and_subscribes_in_a_namespace(peer: Peer, session: Sessi
         StatePublisher(session, RRBOT, "r1", wires=(wire,)) as publisher,
         TransformListener(session, "*", wire=wire) as listener,
     ):
-        assert peer.hears("/r1/joint_states", lambda: publisher.publish(POSITIONS, stamp=STAMP)) == state
+        assert peer.receive("/r1/joint_states", lambda: publisher.publish(POSITIONS, stamp=STAMP)) == state
         repeat_until(lambda: peer.publish("/r2/joint_states", state), lambda: "r2" in listener.robots())

@@ -77,7 +77,7 @@ def test_we_find_what_a_peer_publishes_and_subscribes(peer: Peer, session: Sessi
     until(lambda: {"MP", "MS"} <= set(endpoints(session)))
     published, subscribed = (endpoints(session)[kind] for kind in ("MP", "MS"))
     (node,) = {token.name for token in theirs(session) if isinstance(token, NodeToken)}
-    assert {token.node for token in (published, subscribed)} == {node}
+    assert {token.node.name for token in (published, subscribed)} == {node}
     assert (published.topic, published.dds_type) == ("/r1/joint_states", dds_type(JOINT_STATE))
     assert (subscribed.topic, subscribed.dds_type) == ("/tf", dds_type(TF_MESSAGE))
     assert published.qos == subscribed.qos == Qos(depth=10)
@@ -99,7 +99,7 @@ def test_a_peer_would_write_our_tokens_and_gids_as_we_do(peer: Peer, session: Se
             type_name, qos = OURS[what.topic]
             described = {"name": what.topic, "dds_type": dds_type(type_name), "hash": what.hash, **identity}
             wanted = {"latched": qos.durability == "transient_local", "depth": qos.depth}
-            ids = (what.nid, what.eid)
+            ids = (what.node.nid, what.eid)
             assert token == peer.ask(
                 "endpoint_token", kind="MP", ids=ids, node_name="zstate", **described, **wanted
             )

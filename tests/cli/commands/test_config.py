@@ -17,16 +17,16 @@ def _bare_environment(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(variable, raising=False)
 
 
-def told(*arguments: str, code: int = 0) -> tuple[dict[str, tuple[Any, str]], list[str]]:
+def effective_config(*arguments: str, code: int = 0) -> tuple[dict[str, tuple[Any, str]], list[str]]:
     """Each setting with its origin, and the problems."""
     ended = zstate("config", *arguments, "--json")
     assert ended.returncode == code, ended.stderr
-    said = json.loads(ended.stdout)
-    return {one["name"]: (one["value"], one["origin"]) for one in said["settings"]}, said["problems"]
+    output = json.loads(ended.stdout)
+    return {one["name"]: (one["value"], one["origin"]) for one in output["settings"]}, output["problems"]
 
 
 def test_without_options_every_setting_is_a_default():
-    settings, problems = told()
+    settings, problems = effective_config()
     assert settings["mode"] == ("peer", "default")
     addresses = "127.0.0.1:7450 127.0.0.1:7451 127.0.0.1:7452"
     assert settings["rendezvous"] == (addresses, "default")
@@ -38,13 +38,13 @@ def test_without_options_every_setting_is_a_default():
 def test_options_precede_the_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_MODE", "lan")
     monkeypatch.setenv("ZSTATE_CLOCK", "sim")
-    settings, _ = told("--mode", "peer")
+    settings, _ = effective_config("--mode", "peer")
     assert settings["mode"] == ("peer", "option --mode")
     assert settings["clock"] == ("sim", "environment ZSTATE_CLOCK")
 
 
 def test_implied_setting_names_the_option_that_implies_it():
-    settings, _ = told("--connect", "tcp/10.0.0.1:7447")
+    settings, _ = effective_config("--connect", "tcp/10.0.0.1:7447")
     assert settings["mode"] == ("client", "option --connect, which alone means a router")
     assert settings["connect"] == (["tcp/10.0.0.1:7447"], "option --connect")
     assert "rendezvous" not in settings
@@ -54,7 +54,7 @@ def test_zenoh_configuration_applies_without_options(tmp_path: Path, monkeypatch
     file = tmp_path / "zenoh.json5"
     file.write_text('{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}}')
     monkeypatch.setenv("ZENOH_CONFIG", str(file))
-    settings, _ = told("--connect", "tcp/10.0.0.2:7447")
+    settings, _ = effective_config("--connect", "tcp/10.0.0.2:7447")
     assert settings["config"] == (str(file), "environment ZENOH_CONFIG")
     assert settings["mode"] == ("client", f"file {file}")
     assert settings["connect"] == (["tcp/10.0.0.2:7447"], "option --connect")
@@ -63,8 +63,8 @@ def test_zenoh_configuration_applies_without_options(tmp_path: Path, monkeypatch
 
 def test_ros_domain_of_the_wire_precedes_the_environment(monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
-    assert told("--wire", "ros2")[0]["ros domain"] == (7, "environment ROS_DOMAIN_ID")
-    assert told("--wire", "ros2:domain=3")[0]["ros domain"] == (3, "option --wire")
+    assert effective_config("--wire", "ros2")[0]["ros domain"] == (7, "environment ROS_DOMAIN_ID")
+    assert effective_config("--wire", "ros2:domain=3")[0]["ros domain"] == (3, "option --wire")
 
 
 def test_a_password_is_never_shown(monkeypatch: pytest.MonkeyPatch):
@@ -77,9 +77,9 @@ def test_a_password_is_never_shown(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_zenoh_settings_are_listed():
-    said = json.loads(zstate("config", "--zenoh", "--json", "--connect", "tcp/10.0.0.1:7447").stdout)
-    assert said["mode"] == "client"
-    assert said["connect/endpoints"] == ["tcp/10.0.0.1:7447"]
+    output = json.loads(zstate("config", "--zenoh", "--json", "--connect", "tcp/10.0.0.1:7447").stdout)
+    assert output["mode"] == "client"
+    assert output["connect/endpoints"] == ["tcp/10.0.0.1:7447"]
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_zenoh_settings_are_listed():
 )
 def test_problems_of_the_environment_are_reported(monkeypatch, variable: str, value: str, problem: str):
     monkeypatch.setenv(variable, value)
-    _, problems = told(code=1)
+    _, problems = effective_config(code=1)
     assert len(problems) == 1
     assert problem in problems[0]
     assert problem in zstate("config").stderr.decode()
@@ -102,7 +102,7 @@ def test_problems_of_the_environment_are_reported(monkeypatch, variable: str, va
 
 def test_every_option_can_be_set_in_the_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_TF_RATE", "5")
-    assert told()[1] == []
+    assert effective_config()[1] == []
 
 
 def test_missing_file_is_wrong_usage():

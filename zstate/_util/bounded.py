@@ -1,4 +1,4 @@
-"""Queue bounded in items and bytes."""
+"""Dictionary and queue of bounded size, for what comes from the network."""
 
 from __future__ import annotations
 
@@ -6,7 +6,22 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Generic, TypeVar
 
+K = TypeVar("K")
+V = TypeVar("V")
 T = TypeVar("T")
+
+MAX_ENTRIES = 4096
+
+
+class BoundedDict(dict[K, V]):
+    """A dict of the 4096 newest entries. Assigning to a key makes its entry the newest."""
+
+    def __setitem__(self, key: K, value: V) -> None:
+        if key in self:
+            del self[key]
+        elif len(self) >= MAX_ENTRIES:
+            del self[next(iter(self))]
+        dict.__setitem__(self, key, value)  # pyright: ignore[reportUnknownMemberType]  # faster than super()
 
 
 class BoundedQueue(Generic[T]):

@@ -1,4 +1,4 @@
-"""Snapshots: the state of robots at one instant in a TOML or JSON file; capture, load and publish them."""
+"""Snapshot files: the state of robots at one instant as TOML or JSON; how it is captured and published."""
 
 from __future__ import annotations
 
@@ -130,7 +130,6 @@ class StaticTransformSnapshot(_Table, frozen=True):
         self.transform()
 
     def transform(self) -> Transform:
-        """The edge."""
         return Transform(self.target, self.source, self.xyz, self.quat_xyzw)
 
 
@@ -162,7 +161,6 @@ class Snapshot(_Table, frozen=True):
         )
 
     def as_json(self) -> str:
-        """The text of a JSON file."""
         return json.dumps(_without_empty(msgspec.to_builtins(self)), indent=2) + "\n"
 
     def as_toml(self) -> str:
@@ -187,18 +185,14 @@ def read_snapshot(path: Path) -> Snapshot:
     """The snapshot in a TOML or JSON file. Raises ConfigError with the file and the position in it."""
     file = None if path.suffix == ".json" else TomlFile(path)
     try:
-        return msgspec.convert(_json_document(path) if file is None else file.tables, Snapshot)
+        document = json.loads(path.read_bytes()) if file is None else file.tables
+        return msgspec.convert(document, Snapshot)
     except msgspec.ValidationError as error:
         text, _, place = str(error).partition(" - at `$")
         place = place.strip("`.")
         if file is not None:
             raise file.error(place, text) from None
         raise ConfigError(f"{path}: {place}{': ' * bool(place)}{text}", path=place) from None
-
-
-def _json_document(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
     except OSError as error:
         raise ConfigError(f"{str(path)!r} cannot be read: {error.strerror}", path=str(path)) from None
     except ValueError as error:
@@ -227,18 +221,13 @@ def capture(
         for one in captures:
             for text in one.missing():
                 print_status(f"{one.info.name}: {text} within {timeout_s:g} s", robot=one.info.name)
+        saved = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+        config = network.config if isinstance(network.config, str) else None
+        endpoints = (network.connect, network.listen, config)
         return Snapshot(
             FORMAT,
-            datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
-            Configuration(
-                __version__,
-                socket.gethostname(),
-                network.joins_as,
-                wire,
-                network.connect,
-                network.listen,
-                network.config if isinstance(network.config, str) else None,
-            ),
+            saved,
+            Configuration(__version__, socket.gethostname(), network.joins_as, wire, *endpoints),
             tuple(robot for one in captures if (robot := one.robot()) is not None),
             tuple(edge for one in captures for edge in one.static_edges()),
         )
@@ -249,10 +238,8 @@ class _RobotCapture(Closeable):
 
     def __init__(self, session: Session, info: RobotInfo, wire: str, waiter: ConditionWaiter) -> None:
         self.info = info
-        self._session = session
-        self._waiter = waiter
-        self._wire_name = wire
-        self._wire = get_wire(wire)
+        self._session, self._waiter = session, waiter
+        self._wire_name, self._wire = wire, get_wire(wire)
         self._model: RobotModel | None = None
         self._source: JointStateListener | None = None
         self._reading: JointReading | None = None
@@ -295,7 +282,6 @@ class _RobotCapture(Closeable):
         self._waiter.notify()
 
     def missing(self) -> list[str]:
-        """What is announced and has not arrived."""
         streams = {stream for stream, _ in self.info.writers}
         if self._source is not None:
             self._reading = self._source.read(0) or self._reading
@@ -308,17 +294,15 @@ class _RobotCapture(Closeable):
         return [text for text, is_missing in conditions.items() if is_missing]
 
     def robot(self) -> RobotSnapshot | None:
-        """The robot; None without a description."""
         model, reading = self._model, self._reading
         if model is None:
             return None
         writers = tuple(sorted(f"{stream}: {writer}" for stream, writer in self.info.writers))
+        snapshot = RobotSnapshot(name=self.info.name, urdf=model.urdf, writers=writers)
         if reading is None:
-            return RobotSnapshot(name=self.info.name, urdf=model.urdf, writers=writers)
-        return RobotSnapshot(
-            name=self.info.name,
-            urdf=model.urdf,
-            writers=writers,
+            return snapshot
+        return msgspec.structs.replace(
+            snapshot,
             stamp=reading.stamp,
             positions=_by_joint(model, reading.positions, POSITION_COUNTS),
             velocities=_by_joint(model, reading.velocities, VELOCITY_COUNTS),
@@ -353,65 +337,50 @@ def _by_joint(model: RobotModel, numbers: Any, counts: Mapping[JointType, int]) 
     return named
 
 
-class SnapshotPublisher(Closeable):
-    """Publishes the robots and static edges of a snapshot; ``run`` repeats the joint states."""
+def publish_snapshot(
+    session: Session,
+    robots: Sequence[RobotSnapshot],
+    edges: Sequence[StaticTransformSnapshot],
+    wires: Sequence[str],
+    *,
+    takeover: bool,
+    rate_hz: float,
+    seconds: float | None,
+) -> None:
+    """Publish ``robots`` and ``edges`` for ``seconds``, or until a signal; joint states at ``rate_hz``."""
+    stop = threading.Event()
+    publishers: list[tuple[StatePublisher, RobotSnapshot]] = []
 
-    def __init__(
-        self,
-        session: Session,
-        robots: Sequence[RobotSnapshot],
-        edges: Sequence[StaticTransformSnapshot],
-        wires: Sequence[str],
-        *,
-        takeover: bool,
-    ) -> None:
-        self._stop = threading.Event()
-        self._publishers: list[tuple[StatePublisher, RobotSnapshot]] = []
-        with ExitStack() as opening:
-            for robot in robots:
-                # A robot saved without joint states is only described.
-                streams = STREAMS if robot.positions else ("robot_description", "tf_static")
-                publisher = opening.enter_context(
-                    StatePublisher(
-                        session, robot.model(), robot.name, wires, streams=streams, takeover=takeover
-                    )
-                )
-                joints = count_text(len(robot.positions), "joint")
-                state = f"{joints} standing still" if robot.positions else "no joint states"
-                print_result(f"{robot.name}: its model, {state}; until Ctrl-C")
-                if robot.positions:
-                    self._publishers.append((publisher, robot))
-                else:
-                    print_status(f"{robot.name}: the snapshot has no joint states for it", robot=robot.name)
-            for name, writer in dict.fromkeys((edge.robot, edge.writer) for edge in edges):
-                written = [edge for edge in edges if (edge.robot, edge.writer) == (name, writer)]
-                static = opening.enter_context(
-                    StaticPublisher(session, name, writer, wires, takeover=takeover)
-                )
-                for edge in written:
-                    static.set(edge.transform())
-                print_result(f"{name}: {count_text(len(written), 'static edge')} of {writer}")
-            self._opened = opening.pop_all()
+    def publish() -> None:
+        for now in Rate(rate_hz, SystemClock(), stop, seconds):
+            for publisher, robot in publishers:
+                publisher.publish(robot.positions, stamp=now)
 
-    def close(self) -> None:
-        self._stop.set()
-        self._opened.close()
-
-    def run(self, rate_hz: float, seconds: float | None) -> None:
-        """Publish the joint states at ``rate_hz`` for ``seconds``, or until a signal.
-
-        A signal interrupts only the calling thread, which waits, so that the loop ends in order.
-        """
-
-        def publish() -> None:
-            for now in Rate(rate_hz, SystemClock(), self._stop, seconds):
-                for publisher, robot in self._publishers:
-                    publisher.publish(robot.positions, stamp=now)
-
+    with ExitStack() as opened:
+        for robot in robots:
+            # A robot saved without joint states is only described.
+            streams = STREAMS if robot.positions else ("robot_description", "tf_static")
+            publisher = opened.enter_context(
+                StatePublisher(session, robot.model(), robot.name, wires, streams=streams, takeover=takeover)
+            )
+            joints = count_text(len(robot.positions), "joint")
+            state = f"{joints} standing still" if robot.positions else "no joint states"
+            print_result(f"{robot.name}: its model, {state}; until Ctrl-C")
+            if robot.positions:
+                publishers.append((publisher, robot))
+            else:
+                print_status(f"{robot.name}: the snapshot has no joint states for it", robot=robot.name)
+        for name, writer in dict.fromkeys((edge.robot, edge.writer) for edge in edges):
+            written = [edge for edge in edges if (edge.robot, edge.writer) == (name, writer)]
+            static = opened.enter_context(StaticPublisher(session, name, writer, wires, takeover=takeover))
+            for edge in written:
+                static.set(edge.transform())
+            print_result(f"{name}: {count_text(len(written), 'static edge')} of {writer}")
+        # A signal interrupts only this thread, which waits, so that the loop ends in order.
         call = BackgroundCall("zstate snapshot", publish)
         try:
             call.result()
         except SystemExit:
-            self._stop.set()
+            stop.set()
             call.result(1.0)
             raise

@@ -11,7 +11,7 @@ import pytest
 from helpers.cli_runner import RRBOT, failure, published_robot, zstate
 
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
-from zstate.cli.plot import joint_series, path_series
+from zstate.cli.commands.plot import joint_series, path_series
 from zstate.errors import InvalidInput
 
 SECOND = 1_000_000_000
@@ -33,7 +33,7 @@ def needs_matplotlib() -> None:
 
 
 def texts(file: Path) -> str:
-    """What stands in a picture, which Matplotlib has as comments beside the outlines of the letters."""
+    """The texts of a picture, which Matplotlib writes as comments next to the outlines of the letters."""
     ElementTree.parse(file)
     return file.read_text()
 

@@ -9,8 +9,8 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock
 from zstate.transform import Transform
 from zstate.view.data_source import ViewSource
-from zstate.view.panels.layout import PanelLayout
 from zstate.view.scene.scene import Scene
+from zstate.view.view import PanelLayout
 
 
 @pytest.fixture
@@ -31,11 +31,11 @@ def test_empty_layout_gets_its_first_frame(page):
     ):
         snapshot = source.snapshot(layout.stamp)
         layout.update(snapshot)
-        assert layout.fixed_frame(snapshot) == ""
+        assert layout.fixed.resolve(snapshot.tree) == ""
         buffer.insert_static(Transform("map", "camera", [1, 0, 0], [0, 0, 0, 1]))
         snapshot = source.snapshot(layout.stamp)
         layout.update(snapshot)
-        assert layout.fixed_frame(snapshot) == "map"
+        assert layout.fixed.resolve(snapshot.tree) == "map"
 
 
 def test_paused_recording_is_shown_at_the_cursor_and_not_at_its_end(page, buffer):

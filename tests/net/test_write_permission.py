@@ -4,14 +4,13 @@ import pickle
 from collections.abc import Iterator
 
 import pytest
+from helpers.access_routers import join, router_with_users, write_users
 from helpers.processes import find_free_port
 from helpers.robots import RRBOT
 
 from zstate import StatePublisher, StaticPublisher, connect, discover
 from zstate.errors import AccessDenied
-from zstate.net.security.acl import AclRoles, access_control
-from zstate.net.security.credentials import Credentials
-from zstate.net.session import Session
+from zstate.net.security.acl import AclRoles
 
 USERS = ("r1", "r2", "desk", "stranger")
 
@@ -19,25 +18,11 @@ USERS = ("r1", "r2", "desk", "stranger")
 @pytest.fixture
 def endpoint(tmp_path) -> Iterator[str]:
     """The endpoint of a router with the robots r1 and r2, and the viewer desk."""
-    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
-    users = tmp_path / "users.txt"
-    users.write_text("".join(f"{name}:secret\n" for name in USERS))
-    settings = {
-        "mode": "router",
-        "listen": {"endpoints": [endpoint]},
-        "scouting": {"multicast": {"enabled": False}},
-        "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
-        "access_control": access_control(AclRoles(("r1", "r2"), ("desk",))),
-    }
-    with connect(settings):
+    with router_with_users(tmp_path, AclRoles(("r1", "r2"), ("desk",)), USERS) as endpoint:
         yield endpoint
 
 
-def join(endpoint: str, user: str) -> Session:
-    return connect(mode="client", endpoints=endpoint, credentials=Credentials(user=user, password="secret"))
-
-
-def test_a_robot_may_write_itself(endpoint: str):
+def test_robot_may_write_its_own_keys(endpoint: str):
     with (
         join(endpoint, "r1") as session,
         StatePublisher(session, RRBOT, "r1"),
@@ -75,12 +60,10 @@ def test_session_without_credentials_has_no_probe():
 
 def test_writer_is_not_refused_after_its_router_closed(tmp_path):
     endpoint = f"tcp/127.0.0.1:{find_free_port()}"
-    users = tmp_path / "users.txt"
-    users.write_text("r1:secret\n")
     settings = {
         "mode": "router",
         "listen": {"endpoints": [endpoint]},
-        "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
+        "transport": {"auth": {"usrpwd": {"dictionary_file": str(write_users(tmp_path, ["r1"]))}}},
     }
     router = connect(settings)
     with join(endpoint, "r1") as session:

@@ -34,19 +34,21 @@ from zstate.wire.messages import RobotDescription
 IDENTITY = pose()
 
 
-def description(model=RRBOT, session: int = 1) -> RobotDescription:
-    return RobotDescription(session, model.urdf, model.digest, model.joint_names, ())
+def live_buffer() -> tuple[TransformBuffer, JointStateIngest]:
+    """The buffer of a listener that knows the model of "arm", and its ingest."""
+    live = TransformBuffer()
+    ingest = JointStateIngest("arm", FrameOwnership(live, Counters()))
+    ingest.describe(RobotDescription(1, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, ()))
+    return live, ingest
 
 
 def test_lookups_are_bit_identical_to_a_live_buffer(tmp_path: Path):
-    live = TransformBuffer()
-    ingest = JointStateIngest("arm", FrameOwnership(live, Counters()))
-    ingest.describe(description())
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    live, ingest = live_buffer()
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(1500):
             seconds = n / 100
-            state = tale.joints(
+            state = builder.joints(
                 "arm", START + n * 10 * MS + n % 7, swing_positions(seconds), swing_velocities(seconds)
             )
             ingest.insert_sample(state, overflowed=False)
@@ -62,10 +64,10 @@ def test_lookups_are_bit_identical_to_a_live_buffer(tmp_path: Path):
 
 
 def test_long_recording_is_kept_entirely(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(200):
-            tale.joints("arm", START + n * 60 * S, swing_positions(n))
+            builder.joints("arm", START + n * 60 * S, swing_positions(n))
     buffer = recorded_buffer(tmp_path / "r.mcap")
     first = buffer.lookup("world", "tool", START)
     (tool,) = (n for n, link in enumerate(RRBOT.links) if link == "tool")
@@ -85,35 +87,33 @@ def test_samples_recorded_before_their_description_are_not_lost(tmp_path: Path):
 
 
 def test_restarted_writer_continues_the_same_history(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(10):
-            tale.joints("arm", START + n * S, swing_positions(n), session=1 + n // 5)
+            builder.joints("arm", START + n * S, swing_positions(n), session=1 + n // 5)
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.can_lookup("world", "tool", START)
     assert buffer.can_lookup("world", "tool", START + 9 * S)
 
 
 def test_new_writer_with_an_earlier_clock_starts_a_new_history(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(10):
-            tale.joints("arm", 5 * S + n * MS, swing_positions(n), session=1, log_time=START + n)
+            builder.joints("arm", 5 * S + n * MS, swing_positions(n), session=1, log_time=START + n)
         for n in range(10):
-            tale.joints("arm", 3 * S + n * MS, swing_positions(n), session=2, log_time=START + S + n)
+            builder.joints("arm", 3 * S + n * MS, swing_positions(n), session=2, log_time=START + S + n)
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.latest("world", "tool") == 3 * S + 9 * MS
     assert not buffer.can_lookup("world", "tool", 5 * S)
 
 
 def test_second_sample_of_a_clock_set_back_starts_a_new_history_as_live(tmp_path: Path):
-    live = TransformBuffer()
-    ingest = JointStateIngest("arm", FrameOwnership(live, Counters()))
-    ingest.describe(description())
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    live, ingest = live_buffer()
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for number, stamp in enumerate([100 * S, 101 * S, 5 * S, 6 * S, 7 * S]):
-            state = tale.joints("arm", stamp, swing_positions(number), log_time=START + number)
+            state = builder.joints("arm", stamp, swing_positions(number), log_time=START + number)
             ingest.insert_sample(state, overflowed=False)
     buffer = recorded_buffer(tmp_path / "r.mcap")
     for known in (live, buffer):
@@ -126,31 +126,31 @@ def test_second_sample_of_a_clock_set_back_starts_a_new_history_as_live(tmp_path
 
 
 def test_single_old_sample_changes_nothing(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for number, stamp in enumerate([100 * S, 101 * S, 5 * S, 102 * S, 6 * S, 103 * S]):
-            tale.joints("arm", stamp, swing_positions(number), log_time=START + number)
+            builder.joints("arm", stamp, swing_positions(number), log_time=START + number)
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.can_lookup("world", "tool", 100 * S)
     assert not buffer.can_lookup("world", "tool", 50 * S)
 
 
 def test_late_sample_is_sorted_in(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for number, second in enumerate([0, 2, 1, 3]):
-            tale.joints("arm", START + second * S, swing_positions(second), log_time=START + number * S)
+            builder.joints("arm", START + second * S, swing_positions(second), log_time=START + number * S)
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("world", "tool", START + S).kind == "exact"
 
 
 def test_edges_outside_the_model_come_from_tf(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(10):
             stamp = START + n * 10 * MS
-            tale.joints("arm", stamp, swing_positions(n))
-            tale.edges("arm", stamp, {("odom", "world"): pose(n), ("base", "upper"): IDENTITY})
+            builder.joints("arm", stamp, swing_positions(n))
+            builder.edges("arm", stamp, {("odom", "world"): pose(n), ("base", "upper"): IDENTITY})
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("odom", "world", START + 45 * MS).translation[0] == 4.5
     # The model defines its links; transforms on tf do not override it.
@@ -159,9 +159,11 @@ def test_edges_outside_the_model_come_from_tf(tmp_path: Path):
 
 
 def test_robot_without_a_description_comes_from_tf(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "cart") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "cart") as builder:
         for n in range(10):
-            tale.edges("cart", START + n * 10 * MS, {("odom", "base"): pose(n), ("base", "mast"): pose(z=n)})
+            builder.edges(
+                "cart", START + n * 10 * MS, {("odom", "base"): pose(n), ("base", "mast"): pose(z=n)}
+            )
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("odom", "mast", START + 30 * MS).translation.tolist() == [3.0, 0.0, 3.0]
 
@@ -189,31 +191,31 @@ def test_edges_of_a_clock_set_back_restart_and_others_stay(tmp_path: Path):
 
 
 def test_new_writer_of_an_edge_continues_its_history(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "cart") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "cart") as builder:
         for n in range(10):
             edges = {("odom", "base"): pose(n)}
-            tale.edges("cart", START + n * 10 * MS, edges, session=10 + n // 5)
+            builder.edges("cart", START + n * 10 * MS, edges, session=10 + n // 5)
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.can_lookup("odom", "base", START)
     assert buffer.can_lookup("odom", "base", START + 90 * MS)
 
 
 def test_static_edges_of_all_writers_are_loaded(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
-        tale.statics("arm", START, {("tool", "camera"): pose(z=0.1)}, writer="camera")
-        tale.statics("arm", START, {("tool", "gripper"): pose(z=0.2)}, writer="gripper", session=4)
-        tale.statics("arm", START, {("world", "base"): IDENTITY}, writer=MODEL_WRITER, session=1)
-        tale.joints("arm", START, swing_positions(0))
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
+        builder.statics("arm", START, {("tool", "camera"): pose(z=0.1)}, writer="camera")
+        builder.statics("arm", START, {("tool", "gripper"): pose(z=0.2)}, writer="gripper", session=4)
+        builder.statics("arm", START, {("world", "base"): IDENTITY}, writer=MODEL_WRITER, session=1)
+        builder.joints("arm", START, swing_positions(0))
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert np.allclose(buffer.lookup("camera", "gripper").translation, [0, 0, 0.1])
 
 
 def test_withdrawn_edges_stay_until_the_frame_is_placed_again(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.statics("arm", START, {("table", "cup"): pose(x=1.0), ("table", "plate"): pose(x=2.0)})
-        tale.encoder.withdraw("arm", "camera", START + S)
-        tale.statics("arm", START + 2 * S, {("tray", "cup"): pose(x=3.0)}, writer="other", session=9)
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.statics("arm", START, {("table", "cup"): pose(x=1.0), ("table", "plate"): pose(x=2.0)})
+        builder.encoder.withdraw("arm", "camera", START + S)
+        builder.statics("arm", START + 2 * S, {("tray", "cup"): pose(x=3.0)}, writer="other", session=9)
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("table", "plate").translation[0] == 2.0
     assert buffer.lookup("tray", "cup").translation[0] == 3.0
@@ -223,10 +225,10 @@ def test_withdrawn_edges_stay_until_the_frame_is_placed_again(tmp_path: Path):
 
 def test_repeated_static_value_does_not_return(tmp_path: Path):
     # Latched values are written again every ten seconds, for those who read from the middle.
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.statics("arm", START, {("table", "cup"): pose(x=1.0)})
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.statics("arm", START, {("table", "cup"): pose(x=1.0)})
         for second in range(1, 30):
-            tale.edges("arm", START + second * S, {("table", "cup"): pose(x=second)})
+            builder.edges("arm", START + second * S, {("table", "cup"): pose(x=second)})
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("table", "cup", START + 15 * S).translation[0] == 15.0
 
@@ -267,10 +269,10 @@ def test_whole_robot_of_a_bag_is_loaded(tmp_path: Path, storage: StoragePlugin):
 
 
 def test_robot_is_selected_by_name(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
         for robot in ("r1", "r2"):
-            tale.describe(robot)
-            tale.joints(robot, START, swing_positions(0))
+            builder.describe(robot)
+            builder.joints(robot, START, swing_positions(0))
     both = recorded_buffer(tmp_path / "r.mcap")
     one = recorded_buffer(tmp_path / "r.mcap", "r2")
     assert both.can_lookup("r1/world", "r1/tool", START)
@@ -280,24 +282,24 @@ def test_robot_is_selected_by_name(tmp_path: Path):
 
 
 def test_unknown_robot_error_lists_the_recorded_ones(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        builder.describe("arm")
     with pytest.raises(InvalidInput, match="no robot 'leg'; its robots: 'arm'"):
         recorded_buffer(tmp_path / "r.mcap", "leg")
 
 
-def test_file_that_is_no_recording_is_refused(tmp_path: Path):
+def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):
     (tmp_path / "x.mcap").write_text("hello")
     with pytest.raises(RecordingError, match="not a recording"):
         recorded_buffer(tmp_path / "x.mcap")
 
 
 def test_clock_set_back_by_less_than_ten_seconds_starts_a_new_history(tmp_path: Path):
-    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
         for number, second in enumerate([10, 11, 12, 6, 7]):
-            tale.joints("arm", START + second * S, swing_positions(number), log_time=START + number * S)
-            tale.edges(
+            builder.joints("arm", START + second * S, swing_positions(number), log_time=START + number * S)
+            builder.edges(
                 "cart", START + second * S, {("floor", "cart"): pose(number)}, log_time=START + number * S
             )
     buffer = recorded_buffer(tmp_path / "r.mcap")

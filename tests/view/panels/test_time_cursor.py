@@ -6,7 +6,7 @@ import pytest
 
 from zstate.buffer.snapshot import TimeSpan
 from zstate.errors import InvalidInput
-from zstate.view.panels.time_panel import TimeCursor
+from zstate.view.panels.control_panels import TimeCursor
 
 SECOND = 1_000_000_000
 

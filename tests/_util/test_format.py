@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from zstate._util.suggestions import did_you_mean, suggestion_text
+from zstate._util.format import did_you_mean, suggestion_text
 
 
 def test_similar_names_are_suggested_and_others_are_not():
@@ -9,6 +9,6 @@ def test_similar_names_are_suggested_and_others_are_not():
     assert did_you_mean("arm_1", ["arm_2", "arm_3", "hand"], count=2) == "; did you mean 'arm_3' or 'arm_2'?"
 
 
-def test_no_name_is_no_suggestion():
+def test_nothing_is_suggested_without_known_names():
     assert not suggestion_text()
     assert not suggestion_text(None)

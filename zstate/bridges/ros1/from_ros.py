@@ -1,0 +1,171 @@
+"""One direction of the bridge to ROS 1: publishes a robot of ROS in zstate."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import ExitStack
+from typing import Any
+
+from zstate._util.closeable import Closeable
+from zstate._util.refusals import Refusals
+from zstate.bridges.ros1.messages import (
+    JointStateReader,
+    Ros1FrameNames,
+    get_stamp,
+    pose_from_ros,
+    refusal_reason,
+)
+from zstate.bridges.ros1.node import NAME, Node, sender
+from zstate.errors import Closed, InvalidInput, MessageError, SecondWriter
+from zstate.model.robot import RobotModel
+from zstate.net.session import Session
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.transform import Transform
+
+# Each node's /tf may come a thousand times a second; one message per period is decoded.
+_TF_CHECK_PERIOD_S = 1.0
+
+
+class Ros1ToNative(Closeable):
+    """Publishes a robot of ROS 1, whose ``model`` is known, in zstate.
+
+    ``joint_states`` become joint states at their own stamps, and zstate computes the kinematics; the edges
+    on ``/tf_static`` that are not the model's become static edges. Moving edges on ``/tf`` that are not the
+    model's are only logged. ``at_once`` publishes the model at once, not with the first joint state.
+    ``carried`` counts samples. Messages of bridges are skipped.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        node: Node,
+        model: RobotModel,
+        names: Ros1FrameNames,
+        refusals: Refusals,
+        *,
+        at_once: bool,
+    ) -> None:
+        self.carried = 0
+        self._session = session
+        self._node = node
+        self._model = model
+        self._names = names
+        self._refusals = refusals
+        # With both directions the user expects writers on both sides.
+        self._takeover = not at_once
+        self._links = frozenset(model.links)
+        self._model_children = frozenset(joint.child for joint in model.joints)
+        self._reader = JointStateReader(model)
+        self._lock = threading.Lock()
+        self._closed = False
+        self._opened = ExitStack()
+        self._states: StatePublisher | None = None
+        self._statics: StaticPublisher | None = None
+        self._edges: dict[str, tuple[str, tuple[float, ...]]] = {}
+        self._joint_names: list[str] = []
+        self._tf_checked_at: dict[str, float] = {}
+        self._not_carried: set[tuple[str, str]] = set()
+        if at_once:
+            self._publisher()
+        node.subscribe("joint_states", node.ros.JointState, self._on_joints)
+        node.subscribe("/tf_static", node.ros.TFMessage, self._on_statics)
+        node.subscribe("/tf", node.ros.rospy.AnyMsg, self._on_transforms)
+
+    def wrote(self, session: int, writer: str) -> bool:
+        """Whether a zstate message of this session, or static edges of this writer, came from here."""
+        states, statics = self._states, self._statics
+        if states is not None and session == states.description().session:
+            return True
+        return statics is not None and writer == statics.writer
+
+    def _publisher(self) -> StatePublisher:
+        with self._lock:
+            if self._closed:
+                raise Closed("the bridge is closed")
+            if self._states is None:
+                self._states = self._opened.enter_context(
+                    StatePublisher(self._session, self._model, self._names.robot, takeover=self._takeover)
+                )
+            return self._states
+
+    def _is_of_a_bridge(self, message: Any) -> bool:
+        writer = sender(message)
+        if writer == self._node.name:
+            return True
+        if writer.rpartition("/")[2].startswith(f"{NAME}_"):
+            self._refusals.count("another bridge", f"{writer!r} is a bridge too; its messages are zstate's")
+            return True
+        return False
+
+    def _on_joints(self, message: Any) -> None:
+        if self._is_of_a_bridge(message):
+            return
+        try:
+            stamp = get_stamp(message.header)
+            if message.name != self._joint_names:
+                self._joint_names = message.name
+                if unknown := ", ".join(map(repr, self._reader.unknown(message))):
+                    self._refusals.count("unknown joints", f"{self._model.name!r} has no {unknown}, left out")
+            self._publisher().publish(*self._reader.read(message), stamp)
+            self.carried += 1
+        except (MessageError, InvalidInput, SecondWriter) as error:
+            self._refusals.count(refusal_reason(error), f"joint_states of {sender(message)!r}: {error}")
+        except Closed:
+            pass  # received while closing
+
+    def _on_statics(self, message: Any) -> None:
+        if self._is_of_a_bridge(message):
+            return
+        for transform in message.transforms:
+            if self._names.bare(transform.child_frame_id) not in self._model_children:
+                try:
+                    self._publish_static(transform)
+                except (InvalidInput, SecondWriter) as error:
+                    self._refusals.count(refusal_reason(error), f"/tf_static of {sender(message)!r}: {error}")
+                except Closed:
+                    return
+
+    def _publish_static(self, transform: Any) -> None:
+        parent = self._names.in_zstate(transform.header.frame_id, self._links)
+        child = self._names.in_zstate(transform.child_frame_id, self._links)
+        edge = (parent, pose_from_ros(transform.transform))
+        with self._lock:
+            before = self._edges.get(child)
+            if before == edge:
+                return
+            if self._closed:
+                raise Closed("the bridge is closed")
+            if self._statics is None:
+                self._statics = self._opened.enter_context(StaticPublisher(self._session, self._names.robot))
+            if before is not None and before[0] != parent:
+                # In ROS the newest parent wins.
+                self._statics.withdraw(child)
+                del self._edges[child]
+            self._statics.set(Transform.from_pose7(parent, child, edge[1]))
+            self._edges[child] = edge
+
+    def _on_transforms(self, raw: Any) -> None:
+        """Decode one /tf message per node and second, to log moving edges that are not carried."""
+        now, writer = time.monotonic(), sender(raw)
+        checked_at = self._tf_checked_at.get(writer, -_TF_CHECK_PERIOD_S)
+        if now - checked_at < _TF_CHECK_PERIOD_S or self._is_of_a_bridge(raw):
+            return
+        self._tf_checked_at[writer] = now
+        message = self._node.ros.TFMessage()
+        message.deserialize(raw._buff)  # rospy has no public name for the bytes
+        for transform in message.transforms:
+            edge = (transform.header.frame_id, transform.child_frame_id)
+            if edge not in self._not_carried and self._names.bare(edge[1]) not in self._model_children:
+                self._not_carried.add(edge)
+                self._refusals.count(
+                    "not carried",
+                    f"{edge[0]!r} -> {edge[1]!r} of {writer!r} moves on /tf and is not a joint of the model",
+                )
+
+    def close(self) -> None:
+        """Stop, and withdraw what was published in zstate. A second call does nothing."""
+        with self._lock:
+            self._closed = True
+            self._opened.close()
