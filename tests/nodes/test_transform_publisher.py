@@ -11,7 +11,7 @@ from helpers.robots import RRBOT
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
 from zstate.net.presence import discover
-from zstate.net.status import watch_status
+from zstate.net.status import StatusSubscriber
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
@@ -236,7 +236,7 @@ def test_status_reports_the_rate(sessions):
     writer, reader = sessions
     received: list[tuple[str, Status]] = []
     with (
-        watch_status(reader, "r1", lambda robot, status: received.append((robot, status))),
+        StatusSubscriber(reader, "r1", lambda robot, status: received.append((robot, status))),
         TransformPublisher(writer, "r1", "odometry", program="wheels.py") as odometry,
     ):
         odometry.publish([pose("odom", "base_link")])

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Protocol
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.buffer.buffer import TransformBuffer

@@ -64,19 +64,19 @@ class JointStateReader:
     def _trajectory(self, states: Sequence[JointState]) -> Iterator[JointTrajectory]:
         """The trajectory of samples with the same columns; none if a joint is missing in them."""
         try:
-            columns = self._order.columns(states[0])
+            columns, rate_columns = self._order.columns(states[0])
         except MessageError as error:
             for _ in states:
                 self._refuse(error.reason, f"{self._robot!r}: {error}")
             return
-        velocities = _rows([state.velocities for state in states], columns.velocities)
-        efforts = _rows([state.efforts for state in states], columns.velocities)
+        velocities = _rows([state.velocities for state in states], rate_columns)
+        efforts = _rows([state.efforts for state in states], rate_columns)
         yield JointTrajectory(
             self.joint_names,
             self.coordinates,
             self.velocity_coordinates,
             np.array([state.stamp for state in states], dtype=np.int64),
-            _stacked([state.positions for state in states], columns.positions),
+            _stacked([state.positions for state in states], columns),
             velocities,
             efforts,
         )
