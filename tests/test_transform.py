@@ -283,3 +283,34 @@ def test_a_twist_names_its_frame_and_its_axes() -> None:
     assert repr(twist).startswith("<twist of hand in map: linear [1.0000, 2.0000, 3.0000] m/s")
     with pytest.raises(ValueError, match="read-only"):
         twist.linear[0] = 9.0
+
+
+def test_covariance_is_kept_and_cannot_be_written():
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    covariance[0, 5] = covariance[5, 0] = 0.5
+    transform = Transform("a", "b", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), 5)
+    uncertain = transform.with_covariance(covariance)
+    assert np.array_equal(uncertain.covariance, covariance)
+    assert not uncertain.covariance.flags.writeable
+    assert transform.covariance is None
+    assert uncertain == transform
+    copied = pickle.loads(pickle.dumps(uncertain))
+    assert np.array_equal(copied.covariance, covariance)
+    assert (copied.stamp, copied.kind) == (5, "exact")
+    assert uncertain.inverse().covariance is None
+
+
+@pytest.mark.parametrize(
+    ("covariance", "match"),
+    [
+        (np.eye(3), r"shape \(6, 6\); got \(3, 3\)"),
+        (np.full((6, 6), np.nan), "must be finite"),
+        (np.triu(np.ones((6, 6))), "symmetric; got 1 in row 0, column 1, and 0"),
+        (-np.eye(6), "no negative eigenvalue; got -1"),
+        (np.eye(6) + 2 * np.eye(6)[::-1], "no negative eigenvalue; got -1"),
+    ],
+)
+def test_matrix_that_is_no_covariance_is_refused(covariance, match):
+    transform = Transform("a", "b", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))
+    with pytest.raises(InvalidInput, match=match):
+        transform.with_covariance(covariance)

@@ -7,7 +7,7 @@ is ``a_from_b``: the pose of frame b in frame a, which also maps coordinates in 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, cast, overload
 
 import numpy as np
@@ -101,6 +101,10 @@ if TYPE_CHECKING or kernel == "reference":
 
 else:
     from zstate._kernel import TransformFields
+
+
+UPPER_TRIANGLE = np.triu_indices(6)
+"""The places of the 21 numbers of a covariance, row by row."""
 
 
 class Transform(TransformFields):
@@ -207,6 +211,19 @@ class Transform(TransformFields):
     def pose7(self) -> Array:
         """x y z qx qy qz qw: (7,)."""
         return _frozen(self._pose)
+
+    @property
+    def covariance(self) -> Array | None:
+        """The covariance of the pose: (6, 6), or None if it is not known.
+
+        In the order x y z [m], rotation about the fixed axes x y z of ``target`` [rad], as in ROS
+        (geometry_msgs/PoseWithCovariance). Inverses and products have none.
+        """
+        return None
+
+    def with_covariance(self, covariance: ArrayLike) -> Transform:
+        """The same transform with a covariance, (6, 6). Raises InvalidInput unless it can be one."""
+        return PoseWithCovariance.of_pose(self, check_covariance(covariance))
 
     @property
     def matrix(self) -> Array:
@@ -329,6 +346,57 @@ class Transform(TransformFields):
             f"<pose of {self.source} in {self.target} {when}: xyz [{x:.4f}, {y:.4f}, {z:.4f}] m, "
             f"quaternion xyzw [{quaternion}], {how or self.kind}>"
         )
+
+
+class PoseWithCovariance(Transform):
+    """A Transform whose covariance is known. Made by ``Transform.with_covariance`` and by lookups."""
+
+    __slots__ = ("_covariance",)
+
+    @classmethod
+    def of_pose(cls, transform: Transform, triangle: Sequence[float]) -> PoseWithCovariance:
+        """``transform`` with the covariance that has this upper triangle, 21 numbers row by row."""
+        pose = cls.trusted(*Transform.__reduce__(transform)[1])
+        object.__setattr__(pose, "_covariance", tuple(triangle))
+        return pose
+
+    @property
+    def covariance(self) -> Array:
+        """As ``Transform.covariance``."""
+        matrix = np.empty((6, 6))
+        matrix[UPPER_TRIANGLE] = matrix.T[UPPER_TRIANGLE] = self._covariance
+        matrix.flags.writeable = False
+        return matrix
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (PoseWithCovariance.of_pose, (Transform.trusted(*super().__reduce__()[1]), self._covariance))
+
+
+def check_covariance(covariance: ArrayLike) -> list[float]:
+    """The upper triangle of a covariance, (6, 6): 21 numbers row by row.
+
+    Raises InvalidInput unless it is finite, symmetric within 1e-6 of its largest number, and positive
+    semidefinite.
+    """
+    matrix = real_numbers(covariance, "a covariance")
+    if matrix.shape != (6, 6):
+        raise InvalidInput(f"the covariance of a pose has shape (6, 6); got {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise InvalidInput("the covariance of a pose must be finite; leave it out if it is not known")
+    tolerance = 1e-6 * float(np.abs(matrix).max())
+    if np.abs(matrix - matrix.T).max() > tolerance:
+        row, column = np.unravel_index(np.abs(matrix - matrix.T).argmax(), (6, 6))
+        raise InvalidInput(
+            f"the covariance of a pose is symmetric; got {matrix[row, column]:g} in row {row}, column "
+            f"{column}, and {matrix[column, row]:g} in row {column}, column {row}"
+        )
+    smallest = float(np.linalg.eigvalsh(matrix)[0])
+    if smallest < -tolerance:
+        raise InvalidInput(
+            f"the covariance of a pose has no negative eigenvalue; got {smallest:g}. Variances (the "
+            "diagonal, in m^2 and rad^2) are not negative, and bound the numbers beside them"
+        )
+    return matrix[UPPER_TRIANGLE].tolist()
 
 
 def _frozen(numbers: ArrayLike) -> Array:

@@ -16,7 +16,15 @@ from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreeSnapshot
 from zstate.buffer.history import HistoryView, insert_together, keep_only_around
 from zstate.buffer.path import TrackUse, TransformPath, compile_path
-from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, check_poses, second_writer
+from zstate.buffer.pose_tracks import (
+    EdgeNames,
+    Poses,
+    PoseTrackTable,
+    TooOld,
+    check_covariances,
+    check_poses,
+    second_writer,
+)
 from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack, Track, TrackOwner
 from zstate.buffer.waiting import WaiterRegistry
 from zstate.checks import check_names, name_problem
@@ -26,7 +34,7 @@ from zstate.errors import (
     InvalidInput,
 )
 from zstate.model.robot import RobotModel
-from zstate.transform import Transform
+from zstate.transform import UPPER_TRIANGLE, Transform
 
 # The number of pairs of frames whose paths are cached; more than any program uses on purpose.
 _MAX_CACHED_PATHS = 4096
@@ -237,37 +245,56 @@ class BufferCore:
         if transform.stamp is None:
             text = f"{edge[0]!r} -> {edge[1]!r} has no stamp; use insert_static for an edge that never moves"
             raise InsertRefused(text, reason="no stamp", edge=edge)
-        return self._insert_poses((edge,), transform.stamp, transform.pose7[None], writer)
+        covariance = transform.covariance
+        triangle = None if covariance is None else covariance[UPPER_TRIANGLE][None]
+        return self._insert_poses((edge,), transform.stamp, transform.pose7[None], triangle, writer)
 
     def insert_many(
-        self, edges: Sequence[EdgeNames], stamp: int, poses: ArrayLike, *, writer: str | None = None
+        self,
+        edges: Sequence[EdgeNames],
+        stamp: int,
+        poses: ArrayLike,
+        covariances: ArrayLike | None = None,
+        *,
+        writer: str | None = None,
     ) -> bool:
         """One instant of many moving edges, all or nothing: row i is ``parent_from_child`` of edges[i].
 
-        ``poses`` is (N, 7), x y z [m], qx qy qz qw. Otherwise as ``insert``.
+        ``poses`` is (N, 7), x y z [m], qx qy qz qw. ``covariances``, if known, is (N, 21): the upper triangle
+        of ``Transform.covariance`` row by row, or a row of NaN. Otherwise as ``insert``.
         """
         try:
             names = tuple((parent, child) for parent, child in edges)
         except (TypeError, ValueError):
             raise InvalidInput(f"edges are pairs (parent, child) of frame names; got {edges!r}") from None
-        return self._insert_poses(names, check_stamp(stamp), check_poses(names, poses), writer)
+        triangles = None if covariances is None else check_covariances(names, covariances)
+        return self._insert_poses(names, check_stamp(stamp), check_poses(names, poses), triangles, writer)
 
     def _insert_poses(
-        self, names: tuple[EdgeNames, ...], stamp: int, poses: Poses, writer: str | None
+        self,
+        names: tuple[EdgeNames, ...],
+        stamp: int,
+        poses: Poses,
+        covariances: NDArray[np.float64] | None,
+        writer: str | None,
     ) -> bool:
         with self._lock:
             try:
                 parts = self._pose_tracks.track_rows(names, stamp, writer)
             except TooOld:
                 return self._count(inserted=False)
+            values: list[NDArray[np.float64]] = []
+            for track, rows in parts:
+                had_covariances = track.has_covariances
+                values.append(track.row(poses[rows], None if covariances is None else covariances[rows]))
+                if track.has_covariances != had_covariances:
+                    self._tree.invalidate(track)
             if len(parts) == 1:
-                track, rows = parts[0]
-                track.history.insert(stamp, poses[rows].ravel())
+                parts[0][0].history.insert(stamp, values[0])
             else:
                 # Odd while tracks disagree: a reader that sees it reads again under the lock.
                 self._writes += 1
-                histories = tuple(track.history for track, _ in parts)
-                insert_together(histories, stamp, tuple(poses[rows].ravel() for _, rows in parts))
+                insert_together(tuple(track.history for track, _ in parts), stamp, tuple(values))
                 self._writes += 1
         return self._count(*(track for track, _ in parts), inserted=True)
 

@@ -226,9 +226,10 @@ class FrameTree:
             self._removed[child] = (time.monotonic(), edge.names, edge.writer)
         self._place(child, None)
 
-    def invalidate(self, track: JointTrack) -> None:
-        """Make paths over a robot's edges compile again, because the columns of its samples have changed."""
-        for _, child in map(track.edge, track.forms):
+    def invalidate(self, track: Track) -> None:
+        """Make paths over a track's edges compile again, because the columns of its samples have changed."""
+        edges = track.edges if isinstance(track, PoseTrack) else map(track.edge, track.forms)
+        for _, child in edges:
             edge = self.frames.get(child)
             if edge is not None and edge.track is track:
                 self._place(child, replace(edge))

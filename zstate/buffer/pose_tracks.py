@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.frame_tree import Edge, FrameTree
-from zstate.buffer.tracks import PoseTrack, TrackOwner
+from zstate.buffer.tracks import COVARIANCE_NUMBERS, PoseTrack, TrackOwner
 from zstate.checks import real_numbers
 from zstate.errors import InsertRefused, InvalidInput
 from zstate.transform import QUATERNION_TOLERANCE
@@ -22,6 +22,10 @@ EdgeNames: TypeAlias = tuple[str, str]
 Poses: TypeAlias = NDArray[np.float64]
 TrackRows: TypeAlias = list[tuple[PoseTrack, list[int]]]
 """Tracks, each with the rows of a sample that go into it, in the order of the track's edges."""
+
+
+# The places of the six variances in an upper triangle, row by row.
+_VARIANCES = [0, 6, 11, 15, 18, 20]
 
 
 class TooOld(Exception):
@@ -120,6 +124,28 @@ def second_writer(parent: str, child: str, existing: Edge, writer: str | None) -
     refused = f"; refused: {writer}" if writer else ""
     text = f"{parent!r} -> {child!r} is written by {existing.writer or 'hand'} already{refused}"
     return InsertRefused(f"{text}; one edge has one writer", reason="second writer", edge=(parent, child))
+
+
+def check_covariances(edges: Sequence[EdgeNames], covariances: ArrayLike) -> NDArray[np.float64]:
+    """``covariances`` as (N, 21). Raises InvalidInput or InsertRefused for a variance that cannot be one."""
+    array = real_numbers(covariances, "covariances")
+    if array.shape != (len(edges), COVARIANCE_NUMBERS):
+        raise InvalidInput(
+            f"{len(edges)} edges take covariances of shape ({len(edges)}, {COVARIANCE_NUMBERS}), the upper "
+            f"triangles row by row; got {array.shape}"
+        )
+    # NaN is not below zero: it marks a covariance that is not known.
+    is_wrong = (array[:, _VARIANCES] < 0.0).any(axis=1) | np.isinf(array).any(axis=1)
+    if is_wrong.any():
+        first = int(is_wrong.argmax())
+        parent, child = edges[first]
+        raise InsertRefused(
+            f"{parent!r} -> {child!r}: variances are finite and not negative; got "
+            f"{array[first, _VARIANCES].tolist()}",
+            reason="not a covariance",
+            edge=(parent, child),
+        )
+    return array
 
 
 def check_poses(edges: Sequence[EdgeNames], poses: ArrayLike) -> Poses:

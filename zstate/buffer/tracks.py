@@ -119,10 +119,15 @@ class JointTrack:
         return self.history.insert(stamp, np.concatenate((positions, velocities)))
 
 
+COVARIANCE_NUMBERS = 21
+"""The upper triangle of a covariance of a pose, row by row."""
+
+
 class PoseTrack:
     """Poses of one or several moving edges that one publisher always sends together.
 
-    Columns 7 i to 7 i + 7 of a row are ``parent_from_child`` of ``edges[i]``.
+    Columns 7 i to 7 i + 7 of a row are ``parent_from_child`` of ``edges[i]``. From the first sample with
+    covariances on, 21 columns for each edge follow all poses, NaN where the covariance is not known.
     """
 
     def __init__(self, edges: tuple[tuple[str, str], ...], span_ns: int, writer: str | None) -> None:
@@ -140,14 +145,42 @@ class PoseTrack:
         first, more = " -> ".join(self.edges[0]), len(self.edges) - 1
         return f"{first} and {more} more" if more else first
 
+    @property
+    def has_covariances(self) -> bool:
+        """Whether rows have columns for covariances."""
+        return self.history.width > 7 * len(self.edges)
+
+    def covariance_columns(self, index: int) -> slice:
+        """The columns of the covariance of ``edges[index]``."""
+        first = 7 * len(self.edges) + COVARIANCE_NUMBERS * index
+        return slice(first, first + COVARIANCE_NUMBERS)
+
+    def row(self, poses: NDArray[np.float64], covariances: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """A row of the history: ``poses`` (N, 7), and ``covariances`` (N, 21) if they are known."""
+        if covariances is not None and not self.has_covariances:
+            old = self.history.view
+            missing = np.full((old.size, COVARIANCE_NUMBERS * len(self.edges)), np.nan)
+            wider = History((7 + COVARIANCE_NUMBERS) * len(self.edges), self.history.span_ns)
+            wider.replace(old.kept_stamps(), np.hstack((old.kept_rows(), missing)))
+            self.history = wider
+        if not self.has_covariances:
+            return poses.ravel()
+        if covariances is None:
+            covariances = np.full((len(self.edges), COVARIANCE_NUMBERS), np.nan)
+        return np.concatenate((poses.ravel(), covariances.ravel()))
+
     def split(self) -> list[PoseTrack]:
         """The same samples as one track for each edge."""
         view = self.history.view
+        rows = view.kept_rows()
         singles: list[PoseTrack] = []
         for index, edge in enumerate(self.edges):
             single = PoseTrack((edge,), self.history.span_ns, self.writer)
-            rows = view.kept_rows()[:, 7 * index : 7 * index + 7]
-            single.history.replace(view.kept_stamps(), rows)
+            columns = rows[:, 7 * index : 7 * index + 7]
+            if self.has_covariances:
+                columns = np.hstack((columns, rows[:, self.covariance_columns(index)]))
+                single.history = History(columns.shape[1], self.history.span_ns)
+            single.history.replace(view.kept_stamps(), columns)
             singles.append(single)
         return singles
 

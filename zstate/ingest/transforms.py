@@ -19,6 +19,7 @@ from zstate.wire.messages import (
     Sample,
     StaticTransforms,
     TransformSample,
+    from_block,
     order_digest,
     poses_from_block,
 )
@@ -112,13 +113,18 @@ class TransformIngest(StreamIngest):
 
     def _insert_admitted(self, sample: TransformSample, edges: Edges, admitted: Admitted) -> bool:
         poses = poses_from_block(sample.poses)
+        covariances = None
+        if sample.covariances is not None:
+            covariances = from_block(sample.covariances).reshape(len(poses), -1)
         if admitted.refusal is None:
-            return self._buffer.insert_many(edges, sample.stamp, poses, writer=self.writer)
+            return self._buffer.insert_many(edges, sample.stamp, poses, covariances, writer=self.writer)
         if not admitted.rows:
             raise admitted.refusal.with_traceback(None)  # it is raised for each sample
         self._count_refusal(admitted.refusal)
-        chosen = [edges[row] for row in admitted.rows]
-        return self._buffer.insert_many(chosen, sample.stamp, poses[list(admitted.rows)], writer=self.writer)
+        rows = list(admitted.rows)
+        chosen = [edges[row] for row in rows]
+        covariances = None if covariances is None else covariances[rows]
+        return self._buffer.insert_many(chosen, sample.stamp, poses[rows], covariances, writer=self.writer)
 
     def _advance(self, sample: Sample) -> bool:
         # One writer may stamp one edge later than another, for instance one from a slow camera.

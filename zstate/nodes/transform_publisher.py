@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Protocol
 
+import numpy as np
+
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
@@ -24,7 +26,7 @@ from zstate.net.writer import SampleWriter, WireWriter
 from zstate.nodes.publisher_status import PublisherStats, StatusReporter, StreamStats
 from zstate.nodes.static_publisher import edge_writer_name
 from zstate.rate import Rate, RateReport
-from zstate.transform import Transform
+from zstate.transform import UPPER_TRIANGLE, Transform
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import Stream, check_robot, full_name
 from zstate.wire.messages import Edges, TransformSample, order_digest, to_block
@@ -139,8 +141,9 @@ class TransformPublisher(Closeable):
     def publish(self, transforms: Sequence[Transform], stamp: int | None = None) -> None:
         """Publish one sample: each transform places its ``source`` on its ``target``, at ``stamp`` [ns].
 
-        The default stamp is that of the transforms, or now if they have none. The first sample with an edge
-        takes some round trips, in which the edge is compared with those of other writers.
+        The default stamp is that of the transforms, or now if they have none. Covariances, if known
+        (``Transform.with_covariance``), are published on the native wire. The first sample with an edge takes
+        some round trips, in which the edge is compared with those of other writers.
 
         Raises InvalidInput for no transforms, for two of one child, and for transforms with different stamps;
         InsertRefused for a self edge, a loop or a second parent among this writer's edges, on the native wire
@@ -150,6 +153,7 @@ class TransformPublisher(Closeable):
         try:
             stamp = self._stamp(transforms) if stamp is None else check_stamp(stamp)
             poses = to_block([transform.pose7 for transform in transforms])
+            covariances = _covariance_block(transforms)
             names = tuple([(transform.target, transform.source) for transform in transforms])
             with self._lock:
                 if self._stop.is_set():
@@ -159,7 +163,7 @@ class TransformPublisher(Closeable):
                 if order is None:
                     order = self._orders[names] = self._place(names)
                 head = (stamp, self._seq, self._session_id)
-                sample = TransformSample(*head, order, poses, names)
+                sample = TransformSample(*head, order, poses, names, covariances)
                 # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
                 payloads = [(writer, writer.encoder.encode(sample)) for writer in self._writers.values()]
                 self._seq += 1
@@ -235,3 +239,12 @@ class TransformPublisher(Closeable):
         self._stop.set()
         with self._lock:
             self._opened.close()
+
+
+def _covariance_block(transforms: Sequence[Transform]) -> bytes | None:
+    """The covariances of a sample, NaN where one is not known; None if none is."""
+    known = [transform.covariance for transform in transforms]
+    if all(covariance is None for covariance in known):
+        return None
+    missing = np.full((6, 6), np.nan)
+    return to_block([(missing if one is None else one)[UPPER_TRIANGLE] for one in known])
