@@ -96,9 +96,15 @@ class InstrumentedBuffer(TransformBuffer):
         return inserted
 
     def insert_many(
-        self, edges: Sequence[tuple[str, str]], stamp: int, poses: ArrayLike, *, writer: str | None = None
+        self,
+        edges: Sequence[tuple[str, str]],
+        stamp: int,
+        poses: ArrayLike,
+        covariances: ArrayLike | None = None,
+        *,
+        writer: str | None = None,
     ) -> bool:
-        inserted = super().insert_many(edges, stamp, poses, writer=writer)
+        inserted = super().insert_many(edges, stamp, poses, covariances, writer=writer)
         self._on_sample(self.domain.robot_placing(edges[0][1]), stamp)
         return inserted
 
