@@ -118,6 +118,17 @@ def test_sample_older_than_the_history_counts_as_late(case: IngestCase):
     assert (stats.received, stats.late, stats.refused) == (1, 1, {})
 
 
+def test_live_samples_that_the_history_overtook_are_no_clock_set_back(case: IngestCase):
+    case.ingest.describe(description())
+    second = 1_000_000_000
+    samples = [case.sample(seq, [0, 0.1 * seq], stamp=(10 + seq) * second) for seq in range(6)]
+    case.receive(samples[0])
+    case.ingest.insert_history(samples)  # while samples 1 to 5 wait in the queue of a busy reader
+    case.receive(*samples[1:])
+    assert case.counters.stats().recalled == 5
+    assert all(case.elbow_is([0, 0.1 * seq], at=(10 + seq) * second) for seq in range(6))
+
+
 def test_second_sample_of_a_clock_set_back_starts_a_new_epoch(case: IngestCase):
     case = IngestCase(type(case.ingest), TransformBuffer(history_s=1e-6))
     case.ingest.describe(description())

@@ -47,6 +47,7 @@ class StreamIngest(ABC):
         self._ended_sessions: BoundedDict[int, None] = BoundedDict()
         self._next_seq: int | None = None
         self._newest: int | None = None
+        self._newest_recalled_seq = -1
         self._last_late: Sample | None = None
         self._missing = MissingSamples()
         self._early: BoundedQueue[Sample] = BoundedQueue(_EARLY, EARLY_BYTES)
@@ -142,6 +143,7 @@ class StreamIngest(ABC):
             return not is_full and len(self._early_history) < _EARLY_HISTORY
         if inserted:
             self._advance(sample)
+            self._newest_recalled_seq = max(self._newest_recalled_seq, sample.seq)
         self._counters.count("recalled", int(inserted))
         return inserted
 
@@ -221,6 +223,8 @@ class StreamIngest(ABC):
         A single old sample may have a wrong stamp or have been delayed; two consecutive ones show that the
         clock was set back.
         """
+        if sample.seq <= self._newest_recalled_seq:
+            return False  # the history overtook this sample, which waited in a queue; the clock is right
         before, self._last_late = self._last_late, sample
         if before is None or sample.seq != before.seq + 1 or not before.stamp < sample.stamp:
             return False
@@ -259,6 +263,7 @@ class StreamIngest(ABC):
             self._missing = MissingSamples()
             self._next_seq = None
             self._last_late = self._newest = None
+            self._newest_recalled_seq = -1
             if self._update_domain():
                 self._drop_history()  # stamps of two clocks cannot be compared
             self._on_writer_changed()
