@@ -390,11 +390,11 @@ class Ratchet:
 RATCHETS = (
     Ratchet("dialect words", dialect_words, 4, 150),
     Ratchet("banned methods", banned_methods, 1, 0),
-    Ratchet("single importers", single_importers, 38, 25),
+    Ratchet("single importers", single_importers, 28, 25),
     Ratchet("modules in largest folder", modules_in_largest_folder, 17, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
-    Ratchet("modules", lambda: len(modules()), 247, 270),
-    Ratchet("lines", lines, 42_300, 36_000),
+    Ratchet("modules", lambda: len(modules()), 227, 270),
+    Ratchet("lines", lines, 40_100, 36_000),
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
 

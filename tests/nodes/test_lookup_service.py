@@ -81,7 +81,7 @@ def test_replies_equal_lookups_in_the_buffer(sessions: tuple[Session, Session]):
             assert_pose(answer, expected.matrix)
             assert (answer.stamp, answer.kind) == (expected.stamp, expected.kind)
         until(lambda: service.answered == 5)
-        assert service.overflows == 0
+        assert service.full_batches == 0
 
 
 @pytest.mark.parametrize(
