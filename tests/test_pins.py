@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,15 @@ import zenoh
 from helpers.processes import Child, repeated, until
 
 import zstate.errors
-from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, load_model
+from zstate import (
+    StatePublisher,
+    StaticPublisher,
+    Transform,
+    TransformListener,
+    TransformPublisher,
+    connect,
+    load_model,
+)
 from zstate.cli.main import group
 from zstate.extension import REVISION
 from zstate.net.session import Session
@@ -112,8 +120,12 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
         StaticPublisher(writer, "r1", "camera", (wire,), program="driver") as statics,
         ClockPublisher(writer, (wire,)) as clock,
         TransformListener(reader, "r1", wire=wire, history_on_join=False),
+        ExitStack() as opened,
     ):
         statics.set(Transform("tool", "lens", (0.0, 0.0, 0.1), UPRIGHT))
+        if wire == "native":
+            odometry = opened.enter_context(TransformPublisher(writer, "r1", "odometry", program="driver"))
+            odometry.publish([Transform("odom", "world", (1.0, 0.0, 0.0), UPRIGHT)])
 
         def publish() -> None:
             publisher.publish([0.0, 0.0])

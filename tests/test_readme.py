@@ -52,7 +52,14 @@ def start() -> Iterator[Callable[[list[str]], subprocess.Popen[str]]]:
 
 
 def test_every_python_block_is_a_program_tested_here() -> None:
-    assert set(PROGRAMS) == {"publish.py", "lookup.py", "driver.py", "buffer.py", "recording.py"}
+    assert set(PROGRAMS) == {
+        "publish.py",
+        "lookup.py",
+        "driver.py",
+        "odometry.py",
+        "buffer.py",
+        "recording.py",
+    }
 
 
 def test_publisher_and_lookup_connect_from_two_processes(
@@ -76,6 +83,12 @@ def test_driver_keeps_its_rate(spawn: Callable[..., Child]) -> None:
     driver = spawn(PROGRAMS["driver.py"])
     assert "commanded_hz=500.0" in driver.line()
     assert driver.wait() == 0, driver.stderr
+
+
+def test_odometry_is_looked_up_from_another_process(spawn: Callable[..., Child]) -> None:
+    spawn(PROGRAMS["odometry.py"])
+    with connect() as session, TransformListener(session, "rover") as listener:
+        assert listener.buffer.lookup("odom", "base_link", timeout_s=DEADLINE_S).translation[2] == 0.0
 
 
 def test_buffer_works_without_a_network(spawn: Callable[..., Child]) -> None:

@@ -54,7 +54,7 @@ def test_covariances_stay_with_their_edges_when_a_track_is_split():
     buffer = TransformBuffer()
     edges = [("odom", "base"), ("base", "arm"), ("base", "mast")]
     rows = [diagonal(1, 1, 1, 1, 1, 1), NAN_ROW, diagonal(3, 3, 3, 3, 3, 3)]
-    buffer.insert_many(edges, S, [POSE] * 3, rows)
+    buffer.insert_many(edges, S, [POSE] * 3, covariances=rows)
     buffer.insert_many(edges[1:2], 2 * S, [POSE])
     assert np.array_equal(buffer.lookup("odom", "base", S).covariance, np.eye(6))
     assert buffer.lookup("base", "arm", S).covariance is None
@@ -65,7 +65,7 @@ def test_paths_of_several_edges_have_the_same_poses_with_covariances():
     plain, uncertain = TransformBuffer(), TransformBuffer()
     edges, poses = [("odom", "base"), ("base", "arm")], [POSE, (1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.0)]
     plain.insert_many(edges, S, poses)
-    uncertain.insert_many(edges, S, poses, [diagonal(1, 2, 3, 4, 5, 6), NAN_ROW])
+    uncertain.insert_many(edges, S, poses, covariances=[diagonal(1, 2, 3, 4, 5, 6), NAN_ROW])
     for target, source in (("odom", "arm"), ("arm", "odom"), ("base", "arm")):
         assert uncertain.lookup(target, source) == plain.lookup(target, source)
 
@@ -82,5 +82,5 @@ def test_paths_of_several_edges_have_the_same_poses_with_covariances():
 def test_bad_covariances_are_refused_and_change_nothing(covariances, error, match):
     buffer = TransformBuffer()
     with pytest.raises(error, match=match):
-        buffer.insert_many([("odom", "base"), ("base", "arm")], S, [POSE] * 2, covariances)
+        buffer.insert_many([("odom", "base"), ("base", "arm")], S, [POSE] * 2, covariances=covariances)
     assert buffer.frames() == ()

@@ -254,8 +254,8 @@ class BufferCore:
         edges: Sequence[EdgeNames],
         stamp: int,
         poses: ArrayLike,
-        covariances: ArrayLike | None = None,
         *,
+        covariances: ArrayLike | None = None,
         writer: str | None = None,
     ) -> bool:
         """One instant of many moving edges, all or nothing: row i is ``parent_from_child`` of edges[i].

@@ -117,14 +117,18 @@ class TransformIngest(StreamIngest):
         if sample.covariances is not None:
             covariances = from_block(sample.covariances).reshape(len(poses), -1)
         if admitted.refusal is None:
-            return self._buffer.insert_many(edges, sample.stamp, poses, covariances, writer=self.writer)
+            return self._buffer.insert_many(
+                edges, sample.stamp, poses, covariances=covariances, writer=self.writer
+            )
         if not admitted.rows:
             raise admitted.refusal.with_traceback(None)  # it is raised for each sample
         self._count_refusal(admitted.refusal)
         rows = list(admitted.rows)
         chosen = [edges[row] for row in rows]
         covariances = None if covariances is None else covariances[rows]
-        return self._buffer.insert_many(chosen, sample.stamp, poses[rows], covariances, writer=self.writer)
+        return self._buffer.insert_many(
+            chosen, sample.stamp, poses[rows], covariances=covariances, writer=self.writer
+        )
 
     def _advance(self, sample: Sample) -> bool:
         # One writer may stamp one edge later than another, for instance one from a slow camera.

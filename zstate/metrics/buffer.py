@@ -100,11 +100,11 @@ class InstrumentedBuffer(TransformBuffer):
         edges: Sequence[tuple[str, str]],
         stamp: int,
         poses: ArrayLike,
-        covariances: ArrayLike | None = None,
         *,
+        covariances: ArrayLike | None = None,
         writer: str | None = None,
     ) -> bool:
-        inserted = super().insert_many(edges, stamp, poses, covariances, writer=writer)
+        inserted = super().insert_many(edges, stamp, poses, covariances=covariances, writer=writer)
         self._on_sample(self.domain.robot_placing(edges[0][1]), stamp)
         return inserted
 

@@ -37,6 +37,7 @@ from zstate.wire.keys import (
     frame_owner,
     full_name,
     parse_edge_key,
+    stream_expression,
     stream_key,
 )
 from zstate.wire.messages import Edges, RobotDescription, Sample, StaticTransforms
@@ -60,6 +61,9 @@ _CHECK_PERIOD_S = 0.05
 
 _STARTUP_S = 1.0
 """Each sample checks for this long: by then the tokens of writers that opened at the same time are here."""
+
+_ALL_TRANSFORM_HISTORIES = f"{stream_expression(ANY, 'transforms')}?session=0"
+"""A query that each transform publisher receives, and to which none has samples."""
 
 _Handler: TypeAlias = "zenoh.handlers.Handler[zenoh.Sample]"
 
@@ -270,6 +274,8 @@ def claim_edges(
         # check received tokens: a peer that has replied has received ours, and we have received its tokens.
         if not session.zenoh.info.routers_zid():
             check_edges(session, writer, edges, allowed)
+            for _ in query(session.zenoh, _ALL_TRANSFORM_HISTORIES, ANSWER_WITHIN_S):
+                pass
         for edge in edges:
             _wait_for_rival_claims(session, writer, edge[1], allowed)
         check_edges(session, writer, edges, allowed)

@@ -35,6 +35,8 @@ from zstate.wire.registry import as_wire_names, get_wire
 # Edges of a sample for which the cache has room for 2000 samples.
 _TYPICAL_EDGES = 16
 
+_NEWEST_ONLY_S = 1e-9
+
 _IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -58,8 +60,9 @@ class TransformPublisher(Closeable):
     another active writer has the same name, and by ``publish`` if another writer of any robot places the
     same frame. The ROS wires publish on /tf, where every node may write.
 
-    On the native wire the last ``cache_s`` seconds of samples are cached for joining listeners (0 for none),
-    and the status is published once a second while it has a reader. A context manager; safe from any thread.
+    On the native wire the last ``cache_s`` seconds of samples are cached for joining listeners (0: only the
+    newest sample), and the status is published once a second while it has a reader. A context manager; safe
+    from any thread.
     """
 
     def __init__(
@@ -110,17 +113,12 @@ class TransformPublisher(Closeable):
             if native is not None:
                 status = StatusReporter(identity, lambda: self.stats).status
                 opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
-                if cache_s:
-                    self._cache = SampleCache(cache_s, _TYPICAL_EDGES * 28, self._session_id)
-                    service = serve_history(
-                        session,
-                        self.robot,
-                        "transforms",
-                        self._cache,
-                        native.encoder.encode,
-                        writer=self.writer,
-                    )
-                    opening.enter_context(service)
+                # Its queryable is also how writers that claim edges at the same time find each other.
+                self._cache = SampleCache(cache_s or _NEWEST_ONLY_S, _TYPICAL_EDGES * 28, self._session_id)
+                encode, name = native.encoder.encode, self.writer
+                opening.enter_context(
+                    serve_history(session, self.robot, "transforms", self._cache, encode, writer=name)
+                )
             opening.enter_context(self._edge_tokens)
             self._opened = opening.pop_all()
 
