@@ -167,8 +167,9 @@ def test_of_two_writers_that_start_an_edge_at_once_one_is_refused(sessions):
 
 def test_link_of_an_announced_model_is_refused(sessions):
     writer, reader = sessions
-    child = RRBOT.joints[0].child
+    child = RRBOT.joints[1].child
     with StatePublisher(writer, RRBOT, "r1"), TransformPublisher(reader, "r1", "tracker") as tracker:
+        until(lambda: len(discover(reader)) == 1)
         with pytest.raises(InsertRefused, match="by the model of 'r1'"):
             tracker.publish([pose("odom", child)])
         assert (tracker.stats.sent, tracker.stats.refused) == (0, 1)
