@@ -133,6 +133,7 @@ class Fuzz:
                 numbers = numbers.tobytes()[self.pick(0, 0, 0, 1, 8) :]
             history.try_insert(self.stamp(), numbers, rates, count)
             self.kernel.block_of(numbers, count)
+            history.try_insert_poses(self.stamp(), numbers)
         history.reaches(self.stamp())
 
     def replace(self) -> None:

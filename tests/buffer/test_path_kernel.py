@@ -18,7 +18,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.history import History, ReferenceHistory, insert_together
 from zstate.buffer.path import CompiledPath, TransformPath
 from zstate.buffer.tracks import JointTrack
-from zstate.errors import LookupFailed
+from zstate.errors import InvalidInput, LookupFailed
 from zstate.extension import kernel
 from zstate.model.load import load_model
 from zstate.nodes.publisher import block_of
@@ -210,6 +210,47 @@ def test_unusual_input_falls_back_to_the_reference() -> None:
     assert history.try_insert(2, row.tobytes(), None, 3) is True
     assert history.try_insert(-(2**63), row, None, 3) is False
     assert len(history.view.kept_rows()) == 2
+
+
+def test_poses_as_a_block_are_inserted_as_in_the_reference() -> None:
+    """The same bits, whether the extension inserts a block or the checks in Python do."""
+    edges = (("odom", "base"), ("base", "arm"))
+    by_block, by_array = TransformBuffer(), TransformBuffer()
+    random = np.random.default_rng(7)
+    for stamp in range(200):
+        poses = random.normal(size=(2, 7))
+        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+        poses[:, 3:] *= 1.0 + random.uniform(-9e-4, 9e-4, size=(2, 1))  # is normalised
+        by_block.insert_many(edges, stamp, poses.tobytes())
+        by_array.insert_many(edges, stamp, poses)
+    stamps = np.arange(200)
+    for target, source in edges:
+        of_blocks, _ = by_block.lookup_many(target, source, stamps)
+        of_arrays, _ = by_array.lookup_many(target, source, stamps)
+        assert of_blocks.tobytes() == of_arrays.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("block", "match"),
+    [
+        (b"", "shape"),
+        (bytes(55), "shape"),
+        (np.array([0, 0, 0, 0, 0, 0, 1.0, 0]).tobytes(), "shape"),
+        (np.array([np.nan, 0, 0, 0, 0, 0, 1.0]).tobytes(), "seven finite numbers"),
+        (np.array([0, 0, 0, 0, 0, 0, 1.01]).tobytes(), "length 1"),
+        (np.array([0, 0, 0, 1e200, 0, 0, 1e200]).tobytes(), "length 1"),
+    ],
+    ids=["empty", "cut off", "eight numbers", "NaN", "not a unit quaternion", "overflow"],
+)
+def test_block_that_holds_no_pose_is_refused(block: bytes, match: str) -> None:
+    buffer = TransformBuffer()
+    edges, good = (("odom", "base"),), np.array([0, 0, 0, 0, 0, 0, 1.0]).tobytes()
+    buffer.insert_many(edges, 1, good)  # the second sample takes the short way
+    with pytest.raises(InvalidInput, match=match):
+        buffer.insert_many(edges, 2, block)
+    assert buffer.latest("odom", "base") == 1
+    with pytest.raises(InvalidInput, match="stamp"):
+        buffer.insert_many(edges, 2.5, good)  # type: ignore[arg-type]
 
 
 def test_block_of_accepts_plain_numbers_and_nothing_else() -> None:

@@ -260,9 +260,24 @@ class BufferCore:
     ) -> bool:
         """One instant of many moving edges, all or nothing: row i is ``parent_from_child`` of edges[i].
 
-        ``poses`` is (N, 7), x y z [m], qx qy qz qw. ``covariances``, if known, is (N, 21): the upper triangle
-        of ``Transform.covariance`` row by row, or a row of NaN. Otherwise as ``insert``.
+        ``poses`` is (N, 7), x y z [m], qx qy qz qw; or a block: the same as float64, little-endian, in
+        bytes. ``covariances``, if known, is (N, 21): the upper triangle of ``Transform.covariance`` row by
+        row, or a row of NaN. Otherwise as ``insert``.
         """
+        if covariances is None and isinstance(poses, bytes) and isinstance(edges, tuple):
+            with self._lock:
+                track = self._pose_tracks.whole_track(edges)
+                inserted = None if track is None else track.history.try_insert_poses(stamp, poses)
+                if inserted and track is not None:
+                    track.writer = writer or track.writer
+            if inserted and track is not None:
+                self._waiters.notify(track)
+                return True
+            if inserted is not None:
+                return self._count(inserted=False)
+        if isinstance(poses, bytes):
+            numbers = np.frombuffer(poses, "<f8", len(poses) // 8)
+            poses = numbers if len(poses) % 56 else numbers.reshape(-1, 7)
         try:
             names = tuple((parent, child) for parent, child in edges)
         except (TypeError, ValueError):

@@ -99,6 +99,9 @@ class ReferenceHistory:
     ) -> bool | None:
         """Insert unchecked input if it can be checked and inserted in one call. None here: it never can."""
 
+    def try_insert_poses(self, stamp: object, block: object) -> bool | None:
+        """The same for a block of poses, quaternions normalised and further columns NaN. None here."""
+
     def insert(self, stamp: int, row: NDArray[np.float64]) -> bool:
         """Insert a sample; False if it is older than the history reaches."""
         view = self.view

@@ -40,12 +40,18 @@ class PoseTrackTable:
         self._owner = owner
         self._span_ns = span_ns
         self._cache: dict[tuple[EdgeNames, ...], TrackRows] = {}
+        # Samples whose edges are those of one track, in its order: nearly all.
+        self._whole: dict[tuple[EdgeNames, ...], PoseTrack] = {}
         self._version = -1
+
+    def whole_track(self, names: tuple[EdgeNames, ...]) -> PoseTrack | None:
+        """The track of exactly these edges, in this order, if such a sample was inserted before."""
+        return self._whole.get(names) if self._version == self._tree.version else None
 
     def track_rows(self, names: tuple[EdgeNames, ...], stamp: int, writer: str | None) -> TrackRows:
         """The tracks for a sample of these edges. Raises InsertRefused, or TooOld for too old a stamp."""
         if self._version != self._tree.version:
-            self._cache.clear()
+            self._clear()
         try:
             found = self._cache.get(names)
         except TypeError:  # of a list, which has no hash and is no name
@@ -54,14 +60,20 @@ class PoseTrackTable:
             with self._tree.transaction():
                 found = self._assign(names, stamp, writer)
             if self._version != self._tree.version:
-                self._cache.clear()
+                self._clear()
             self._cache[names] = found
+            if len(found) == 1 and found[0][1] == list(range(len(names))):
+                self._whole[names] = found[0][0]
             self._version = self._tree.version
         _check_reached((track for track, _ in found), stamp)
         if writer is not None:
             for track, _ in found:
                 track.writer = writer
         return found
+
+    def _clear(self) -> None:
+        self._cache.clear()
+        self._whole.clear()
 
     def _assign(self, names: tuple[EdgeNames, ...], stamp: int, writer: str | None) -> TrackRows:
         edges = [self.check_edge(parent, child, writer) for parent, child in names]
@@ -154,8 +166,9 @@ def check_poses(edges: Sequence[EdgeNames], poses: ArrayLike) -> Poses:
     if not edges or array.shape != (len(edges), 7):
         count = len(edges)
         raise InvalidInput(f"{count} edges take poses of shape ({count}, 7), at least one; got {array.shape}")
-    # einsum, as numpy warns of an overflow in a sum of squares, and the check below refuses that anyway
-    norms: Poses = np.sqrt(np.einsum("ij,ij->i", array[:, 3:], array[:, 3:]))
+    with np.errstate(over="ignore", invalid="ignore"):  # the check below refuses the result
+        x, y, z, w = (array[:, 3:] * array[:, 3:]).T
+        norms: Poses = np.sqrt(x + y + z + w)  # in this order, as in the extension
     valid = np.isfinite(array).all(axis=1) & (np.abs(norms - 1.0) <= QUATERNION_TOLERANCE)
     if not valid.all():
         first = int(valid.argmin())

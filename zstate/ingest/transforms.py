@@ -42,7 +42,8 @@ class TransformIngest(StreamIngest):
         # By the edges that samples name: their full names, and which of those are admitted.
         self._full_names: BoundedDict[Edges, Edges] = BoundedDict()
         self._admitted: BoundedDict[Edges, Admitted] = BoundedDict()
-        self._last: tuple[Edges, Admitted] = (), Admitted()
+        # The full names of edges that are all admitted, by their digest: nearly all samples.
+        self._all_admitted: BoundedDict[bytes, Edges] = BoundedDict()
         self._version = -1
 
     def describe(self, description: RobotDescription) -> None:
@@ -67,6 +68,13 @@ class TransformIngest(StreamIngest):
 
     def _insert(self, sample: Sample) -> bool | None:
         assert isinstance(sample, TransformSample)
+        if self._version == self._ownership.version and sample.covariances is None:
+            edges = self._all_admitted.get(sample.order)
+            if edges is not None:
+                try:
+                    return self._buffer.insert_many(edges, sample.stamp, sample.poses, writer=self.writer)
+                except InsertRefused:
+                    self._all_admitted.clear()  # it is decided again below
         edges, source = self._edges, self._described
         if sample.edges is not None:
             edges, source = self._named_edges(sample.edges), self._undescribed
@@ -96,22 +104,21 @@ class TransformIngest(StreamIngest):
     def _admit(self, source: EdgeSource, edges: Edges) -> Admitted:
         """The admitted rows of ``edges``, decided again if the decision may have changed."""
         if self._version == self._ownership.version:
-            if edges is self._last[0]:
-                return self._last[1]
             known = self._admitted.get(edges)
             if known is not None:
-                self._last = edges, known
                 return known
         source.name, source.session = self.writer or "", self._session or 0
         admitted = self._ownership.admit(source, edges)
         if self._version != self._ownership.version:
             self._admitted.clear()
+            self._all_admitted.clear()
             self._version = self._ownership.version
         self._admitted[edges] = admitted
-        self._last = edges, admitted
         return admitted
 
     def _insert_admitted(self, sample: TransformSample, edges: Edges, admitted: Admitted) -> bool:
+        if admitted.refusal is None:
+            self._all_admitted[sample.order] = edges
         poses = poses_from_block(sample.poses)
         covariances = None
         if sample.covariances is not None:
@@ -154,7 +161,7 @@ class TransformIngest(StreamIngest):
         self._ownership.release(source)
         self._full_names.clear()
         self._admitted.clear()
-        self._last = (), Admitted()
+        self._all_admitted.clear()
 
     def _may_restart_epoch(self) -> bool:
         return not any(map(self._ownership.others_move, (self._described, self._undescribed)))

@@ -332,6 +332,61 @@ history_try_insert(History *self, PyObject *const *args, Py_ssize_t count)
     return inserted < 0 ? NULL : PyBool_FromLong(inserted);
 }
 
+/* As in zstate/transform.py. */
+#define QUATERNION_TOLERANCE 1e-3
+
+/* As check_poses in zstate/buffer/pose_tracks.py, with the same order of operations. */
+static bool
+are_poses(const char *block, Py_ssize_t count)
+{
+    for (Py_ssize_t i = 0; i < count; i += 7) {
+        double pose[7];
+        memcpy(pose, block + i * (Py_ssize_t)sizeof(double), sizeof pose);
+        for (int k = 0; k < 7; k++)
+            if (!isfinite(pose[k]))
+                return false;
+        double *q = pose + 3;
+        double norm = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        if (!(fabs(norm - 1.0) <= QUATERNION_TOLERANCE))
+            return false;
+    }
+    return true;
+}
+
+static PyObject *
+history_try_insert_poses(History *self, PyObject *const *args, Py_ssize_t count)
+{
+    int64_t stamp;
+    Slot slot;
+    if (count != 2) {
+        PyErr_SetString(PyExc_TypeError, "try_insert_poses(stamp, block)");
+        return NULL;
+    }
+    if (!PyBytes_CheckExact(args[1]) || !plain_stamp(args[0], &stamp))
+        Py_RETURN_NONE;
+    Py_ssize_t numbers = PyBytes_GET_SIZE(args[1]) / (Py_ssize_t)sizeof(double);
+    bool fits = PyBytes_GET_SIZE(args[1]) % (Py_ssize_t)(7 * sizeof(double)) == 0 && numbers > 0 &&
+                (numbers == self->width || (numbers < self->width && numbers * 4 == self->width));
+    if (!fits || !are_poses(PyBytes_AS_STRING(args[1]), numbers))
+        Py_RETURN_NONE;
+    if (!history_reaches(self, stamp))
+        Py_RETURN_FALSE;
+    if (slot_for(self, stamp, &slot) < 0)
+        return NULL;
+    double *row = slot_write_stamp(&slot, stamp);
+    memcpy(row, PyBytes_AS_STRING(args[1]), (size_t)PyBytes_GET_SIZE(args[1]));
+    for (Py_ssize_t i = 0; i < numbers; i += 7) {
+        double *q = row + i + 3;
+        double norm = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        for (int k = 0; k < 4; k++)
+            q[k] /= norm;
+    }
+    for (Py_ssize_t i = numbers; i < self->width; i++)
+        row[i] = Py_NAN;
+    slot_publish(self, &slot);
+    Py_RETURN_TRUE;
+}
+
 static bool
 ascending(const int64_t *stamps, Py_ssize_t count)
 {
@@ -411,6 +466,9 @@ static PyMethodDef history_methods[] = {
      "try_insert(stamp, positions, velocities, position_count): as insert, of arrays, positions "
      "also as "
      "a block; None for what is not plain."},
+    {"try_insert_poses", (PyCFunction)(void (*)(void))history_try_insert_poses, METH_FASTCALL,
+     "try_insert_poses(stamp, block): as insert, of a block of poses, quaternions normalised and "
+     "further columns NaN; None for what is not plain."},
     {"replace", (PyCFunction)(void (*)(void))history_replace, METH_FASTCALL,
      "replace(stamps, rows): replace all samples by copies of these."},
     {"reaches", (PyCFunction)history_reaches_stamp, METH_O,
