@@ -14,7 +14,7 @@ from zstate.cli.waiting import ConditionWaiter
 from zstate.ingest.events import WriterEvent
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.clock_offset import MeasuredOffset
-from zstate.net.presence import RobotInfo
+from zstate.net.presence import RobotInfo, discover
 from zstate.net.queryable import query
 from zstate.net.session import Session
 from zstate.net.status import StatusSubscriber
@@ -209,16 +209,22 @@ class RobotProbe(Closeable):
     def find_unresponsive(self) -> None:
         """Query the writers that have not reported their clocks, and collect those that do not reply.
 
-        A stopped process receives the query and lets it time out. Where a router denies the query, it ends
-        at once without a reply, which is not counted.
+        A stopped process receives the query and lets it time out, or its lease ended after it was found, and
+        it is not announced any more. Where a router denies the query, it ends at once without a reply, which
+        is not counted.
         """
         known = {offset.writer.session for offset in self.offsets}
         for writer in {writer for _, writer in self.info.writers if writer.session not in known}:
             began, key = time.monotonic(), clock_key(self.info.name, writer.identity)
             replies = list(query(self._session.zenoh, key, _REPLY_WITHIN_S))
             has_timed_out = time.monotonic() - began > 0.9 * _REPLY_WITHIN_S
-            if has_timed_out and all(reply.ok is None for reply in replies):
+            has_replied = any(reply.ok is not None for reply in replies)
+            if not has_replied and (has_timed_out or not self._is_announced(writer)):
                 self.unresponsive.add(writer)
+
+    def _is_announced(self, writer: WriterId) -> bool:
+        robots = discover(self._session, _REPLY_WITHIN_S)
+        return any(writer == one for robot in robots for _, one in robot.writers)
 
 
 def wait_for_probes(probes: Sequence[RobotProbe], waiter: ConditionWaiter, timeout_s: float) -> None:
