@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -10,8 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.cli_runner import published_robot
 from helpers.deployment import DEPLOY
-from helpers.processes import find_free_port
+from helpers.processes import Child, find_free_port, until
+
+from zstate.recording.info import read_info
 
 UNITS = sorted(path.name for path in DEPLOY.glob("*.service"))
 
@@ -70,8 +74,49 @@ def test_programs_of_the_units_connect_and_exit_as_expected(spawn: Any, tmp_path
         assert str(child.wait()) == unit(name)["Service"]["SuccessExitStatus"]
 
 
-def test_environment_file_in_the_readme_has_the_variables_of_the_unit():
+@pytest.mark.processes
+def test_recorder_that_is_killed_and_started_again_makes_a_second_file(spawn: Any, tmp_path: Path):
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
+    service = unit("zstate-record.service")["Service"]
+    assert service["WorkingDirectory"] == f"/var/lib/{service['StateDirectory']}"
+    arguments = shlex.split(service["ExecStart"])[1:]
+    code = (
+        "import os, sys; os.chdir(sys.argv.pop())\n"
+        f"os.environ['ZSTATE_CONNECT'] = {endpoint!r}\n"
+        "from zstate.cli.main import main; main()"
+    )
+
+    def start() -> Child:
+        values = {"${KEEP_RECORDINGS}": "50GB"}
+        return spawn(code, *(values.get(word, word) for word in arguments), str(tmp_path))
+
+    def record() -> Child:
+        recorder = start()
+        until(lambda: recorder.line().endswith("  rrbot"))
+        return recorder
+
+    router = spawn("from zstate.cli.main import main; main()", "router", "--listen", endpoint)
+    router.line()
+    with published_robot(router=endpoint):
+        record().kill()
+        (first,) = tmp_path.iterdir()
+        before = first.read_bytes()
+        recorder = record()
+        os.kill(recorder.process.pid, signal.SIGTERM)
+        assert str(recorder.wait()) == service["SuccessExitStatus"]
+    assert first.read_bytes() == before
+    assert read_info(first).robots == ("rrbot",)
+    (second,) = set(tmp_path.iterdir()) - {first}
+    assert re.fullmatch(r"rec-\d{8}-\d{6}\.mcap", second.name)
+    assert read_info(second).complete
+
+
+@pytest.mark.parametrize(
+    ("name", "variable"),
+    [("zstate-publish@.service", "ROBOT_MODEL"), ("zstate-record.service", "KEEP_RECORDINGS")],
+)
+def test_environment_files_in_the_readme_have_the_variables_of_the_units(name: str, variable: str):
     text = (DEPLOY / "README.md").read_text()
-    environment = text.partition("```ini\n")[2].partition("```")[0]
-    assert "ROBOT_MODEL=" in environment
-    assert "${ROBOT_MODEL}" in unit("zstate-publish@.service")["Service"]["ExecStart"]
+    environments = re.findall(r"```ini\n(.*?)```", text, re.DOTALL)
+    assert f"${{{variable}}}" in unit(name)["Service"]["ExecStart"]
+    assert sum(f"{variable}=" in environment for environment in environments) == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import queue
+import shutil
 import socket
 import subprocess
 import sys
@@ -15,6 +16,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+import pytest
 
 DEADLINE_S = 15.0
 SOON_S = 3.0
@@ -68,6 +71,23 @@ def repeated(action: Callable[[], object], every_s: float = 0.01) -> Iterator[No
     finally:
         stop.set()
         thread.join()
+
+
+@contextmanager
+def mounted_disk(place: Path, size: str) -> Iterator[Path]:
+    """A disk of that size ("256k") at ``place``; skips the test if it cannot be mounted."""
+    place.mkdir()
+    options = ["-t", "tmpfs", "-o", f"size={size}", "zstate-test", str(place)]
+    if (
+        os.geteuid()
+        or not shutil.which("mount")
+        or subprocess.run(["mount", *options], check=False).returncode
+    ):
+        pytest.skip("needs root, to mount a small disk")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", str(place)], check=True)
 
 
 class SteppingClock:

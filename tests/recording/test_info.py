@@ -17,6 +17,7 @@ def test_info_has_the_facts_of_the_writer(tmp_path: Path):
     info = read_info(path)
     assert (info.path, info.files, info.size) == (path, (path,), path.stat().st_size)
     assert (info.formats, info.profiles, info.compressions) == (("mcap",), ("ros2",), ("zstd",))
+    assert info.bytes_per_s == info.size / 1.0
     assert info.libraries[0].startswith("zstate ")
     assert (info.first, info.last, info.duration_s) == (START, START + S, 1.0)
     assert {c.topic: (c.type_name, c.count) for c in info.channels} == {
@@ -45,6 +46,11 @@ def test_info_of_a_truncated_recording_is_incomplete(tmp_path: Path):
     (loss,) = info.losses
     assert loss.startswith("run.mcap: ")
     assert "cut off" in loss
+
+
+def test_recording_of_one_instant_has_no_growth(tmp_path: Path):
+    write_run(tmp_path / "run.mcap", [])
+    assert read_info(tmp_path / "run.mcap").bytes_per_s is None
 
 
 def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):

@@ -48,6 +48,11 @@ class RecordingInfo:
         return 0.0 if self.first is None or self.last is None else (self.last - self.first) / 1e9
 
     @property
+    def bytes_per_s(self) -> float | None:
+        """Mean growth of its files; None without a duration."""
+        return self.size / self.duration_s if self.duration_s > 0.0 else None
+
+    @property
     def message_count(self) -> int:
         return sum(channel.count for channel in self.channels)
 

@@ -44,6 +44,7 @@ def test_info_agrees_with_rosbags(run: Path):
         counts = {name: topic.msgcount for name, topic in reader.topics.items()}
     (robot,) = info["robots"]
     assert {stream["topic"]: stream["count"] for stream in robot["streams"]} == counts
+    assert info["bytes_per_s"] == info["size"] / info["duration_s"]
     assert (info["size"], info["complete"], info["losses"]) == (run.stat().st_size, True, [])
     assert info["files"] == [str(run)]
 
@@ -70,7 +71,10 @@ def test_text_has_the_same_facts_as_json(run: Path):
     assert re.fullmatch(rf"{re.escape(str(run))}: [\d.]+ kB \(mcap, zstd\) by zstate \S+", head)
     assert start.split()[-1] == str(info["start"])
     assert end.split()[-1] == str(info["end"])
-    assert f"\n{info['messages']} messages in {info['duration_s']:.3f} s\ncomplete\n" in text
+    assert re.search(
+        rf"\n{info['messages']} messages in {info['duration_s']:.3f} s\n.+ a second, .+ a day\ncomplete\n",
+        text,
+    )
     links, joints = len(RRBOT.links), len(RRBOT.joints)
     assert f"r1: model '{RRBOT.name}', {links} links, {joints} joints (2 driven)" in text
     assert re.search(

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
 import re
+import time
+from datetime import datetime
 from pathlib import Path
 
 import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.processes import mounted_disk, until
 
 from zstate import StatePublisher, connect, load_model
 from zstate.recording.info import read_info
@@ -108,4 +111,117 @@ def test_invalid_limits_and_names_are_refused(tmp_path: Path):
             assert option in failure("record", path, option, value, code=2)
     assert "'a/b'" in failure("record", path, "a/b")
     assert "no folder" in failure("record", str(tmp_path / "nowhere" / "run.mcap"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_disk_that_fills_within_a_day_is_a_single_warning(spawn: Spawn, tmp_path: Path):
+    # 100 samples a second need at least 100 bytes each; in a day that is 800 MB.
+    with published_robot(), mounted_disk(tmp_path / "disk", "64m") as disk:
+        command = started(spawn, "record", str(disk / "run.mcap"))
+        until(lambda: command.line().startswith("21 s"), 40.0)  # two checks, every 10 s
+        interrupted(command)
+        assert command.stderr.count(f"the disk of '{disk}/run.mcap' is full in ") == 1
+        assert "or bound recordings with --keep and --split-size" in command.stderr
+
+
+def test_disk_that_recordings_cannot_fill_is_no_warning(spawn: Spawn, tmp_path: Path):
+    with published_robot(), mounted_disk(tmp_path / "disk", "64m") as disk:
+        file = str(disk / "%Y%m%d-%H%M%S.mcap")
+        command = started(spawn, "record", file, "--split-size", "1", "--keep", "20MB")
+        until(lambda: command.line().startswith("11 s"), 30.0)
+        interrupted(command)
+        assert "is full" not in command.stderr
+
+
+def test_start_times_replace_directives_and_a_second_start_makes_a_second_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    with published_robot():
+        before = datetime.now().replace(microsecond=0)
+        first = zstate("record", "--duration", "1.2")
+        contents = {path: path.read_bytes() for path in tmp_path.iterdir()}
+        assert zstate("record", "--duration", "1.2").returncode == 0
+        after = datetime.now()
+    one, two = sorted(path.name for path in tmp_path.iterdir())
+    assert [path.name for path in contents] == [one]
+    assert (tmp_path / one).read_bytes() == contents[Path(tmp_path / one)]
+    starts = [datetime.strptime(name, "rec-%Y%m%d-%H%M%S.mcap") for name in (one, two)]
+    assert before <= starts[0] < starts[1] <= after
+    assert f"recording into '{one}'" in first.stderr.decode()
+
+
+def test_files_of_a_split_recording_have_the_time_of_its_start(tmp_path: Path):
+    pattern = str(tmp_path / "%%-%Y-%j.mcap")
+    with published_robot():
+        today = datetime.now()
+        ended = zstate("record", pattern, "--duration", "1.5", "--split-seconds", "1")
+    assert ended.returncode == 0, ended.stderr
+    first = f"%-{today:%Y-%j}"
+    assert {path.name for path in tmp_path.iterdir()} == {f"{first}.mcap", f"{first}_1.mcap"}
+
+
+def test_name_of_a_start_that_exists_is_refused_with_a_better_pattern(tmp_path: Path):
+    (tmp_path / f"{datetime.now():%Y}.mcap").write_text("mine")
+    message = failure("record", str(tmp_path / "%Y.mcap"))
+    assert "exists; choose another name" in message
+    assert "each start has a file of its own if FILE has the seconds" in message
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_unknown_directives_are_refused(tmp_path: Path):
+    message = failure("record", str(tmp_path / "rec-%B.mcap"), code=2)
+    assert "FILE: the file name 'rec-%B.mcap' has '%B'; write %Y" in message
+
+
+def test_keep_deletes_the_oldest_recordings_at_the_start_and_after_each_split(tmp_path: Path):
+    old = tmp_path / "rec-20200101-000000.mcap"
+    notes = tmp_path / "rec-20200102-000000.mcap"
+    other = tmp_path / "run.mcap"
+    with published_robot():
+        for path in (old, other):
+            assert zstate("record", str(path), "--duration", "1").returncode == 0
+        notes.write_text("not a recording")
+        # A second of this robot has more than 1 kB, so only the file being written stays.
+        ended = zstate(
+            *("record", str(tmp_path / "rec-%Y%m%d-%H%M%S.mcap"), "--duration", "3.5"),
+            *("--split-seconds", "1", "--keep", "1kB"),
+        )
+    assert ended.returncode == 0, ended.stderr
+    (last,) = set(tmp_path.iterdir()) - {notes, other}
+    assert last.name.endswith("_3.mcap")
+    assert read_info(last).complete
+    log = ended.stderr.decode()
+    assert f"deleted '{old}' (" in log
+    assert log.count("deleted ") == log.count(": --keep 1kB") == 4
+    assert "; deleted 4 files (" in ended.stdout.decode()
+
+
+def test_keep_deletes_by_age(tmp_path: Path):
+    pattern = str(tmp_path / "rec-%Y%m%d-%H%M%S.mcap")
+    with published_robot():
+        assert zstate("record", pattern, "--duration", "1").returncode == 0
+        (first,) = tmp_path.iterdir()
+        ended = zstate("record", pattern, "--duration", "1", "--keep", "1h")
+        assert first.exists()
+        assert "--keep deletes recordings at this start only" in ended.stderr.decode()
+        written = first.stat().st_mtime
+        ended = zstate("record", pattern, "--duration", "1", "--keep", f"{time.time() - written:.3f}s")
+    assert not first.exists()
+    assert "; deleted 1 file (" in ended.stdout.decode()
+
+
+def test_keep_is_refused_where_it_cannot_work(tmp_path: Path):
+    pattern = str(tmp_path / "rec-%Y%m%d.mcap")
+    assert "put the time into it, such as rec-%Y" in failure(
+        "record", str(tmp_path / "run"), "--keep", "7d", code=2
+    )
+    by_size = failure("record", pattern, "--keep", "50MB", "--split-size", "60", code=2)
+    assert "--keep 50MB is less than one file of --split-size 60 MB" in by_size
+    by_time = failure("record", pattern, "--keep", "1min", "--split-seconds", "90", code=2)
+    assert "--keep 1min is less than one file of --split-seconds 90" in by_time
+    for bound in ("50", "7w", "0d"):
+        assert "kB, MB, GB, TB of files in total, or s, min, h, d" in failure(
+            "record", pattern, "--keep", bound, code=2
+        )
     assert not list(tmp_path.iterdir())

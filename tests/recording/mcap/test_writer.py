@@ -276,6 +276,28 @@ def test_full_disk_error_says_so():
     assert caught.value.path == "/dev/full"
 
 
+REPEATED_STARTS_ON_A_FULL_DISK = """
+import os, resource, signal, sys
+from zstate.errors import RecordingError
+from zstate.recording.mcap.writer import RecordingWriter
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))
+for attempt in range(3):
+    try:
+        RecordingWriter(os.path.join(sys.argv[1], f"run-{attempt}.mcap"))
+    except RecordingError as error:
+        print(error)
+"""
+
+
+def test_start_on_a_full_disk_leaves_no_file(spawn: Callable[..., Child], tmp_path: Path):
+    child = spawn(REPEATED_STARTS_ON_A_FULL_DISK, str(tmp_path))
+    for attempt in range(3):
+        assert f"run-{attempt}.mcap' cannot grow" in child.line()
+    assert child.wait() == 0
+    assert not list(tmp_path.iterdir())
+
+
 def test_existing_file_is_not_overwritten_by_default(tmp_path: Path):
     path = tmp_path / "run.mcap"
     path.write_text("mine")

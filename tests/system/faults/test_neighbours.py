@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import signal
 import statistics
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from helpers.fault_processes import SLACK, Start, client
-from helpers.processes import until
+from helpers.processes import mounted_disk, until
 
 from zstate.recording.reader import RecordingReader
 
@@ -113,17 +110,8 @@ def test_twenty_readers_of_one_robot_receive_all_samples_and_latched_values(star
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    place = tmp_path / "disk"
-    place.mkdir()
-    options = ["-t", "tmpfs", "-o", "size=256k", "zstate-test", str(place)]
-    if (
-        os.geteuid()
-        or not shutil.which("mount")
-        or subprocess.run(["mount", *options], check=False).returncode
-    ):
-        pytest.skip("needs root, to mount a small disk")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], check=True)
+    with mounted_disk(tmp_path / "disk", "256k") as place:
+        yield place
 
 
 def test_recorder_with_a_full_disk_reports_it_and_others_are_unaffected(

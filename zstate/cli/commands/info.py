@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from zstate.recording.info import RecordedRobot, RecordingInfo
 
 _HEADINGS = ("stream", "topic", "type", "count", "rate", "writer")
+_DAY_S = 86_400.0
 _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of what can be read"
 
 
@@ -34,7 +35,8 @@ def info_command(file: str, as_json: bool) -> None:
     """Show the contents of the recording FILE: robots, streams, models, times and counts.
 
     FILE is an MCAP file, the first of several split files, or a ROS 2 bag. Rates are means over the whole
-    recording. Latched messages (robot_description, tf_static) are written again every 10 s, and counted.
+    recording. Latched messages (robot_description, tf_static) are written again every 10 s, and counted. The
+    size a second and a day is that of the files, compressed.
     """
     from zstate.recording.info import mean_rate, other_channels, read_info, recorded_robots
 
@@ -64,6 +66,8 @@ def _head(info: RecordingInfo) -> Iterator[str]:
         ends = (("start", info.first), ("end", info.last))
         yield from in_columns([(end, _time_text(stamp), str(stamp)) for end, stamp in ends])
     yield f"{count_text(info.message_count, 'message')} in {info.duration_s:.3f} s"
+    if info.bytes_per_s is not None:
+        yield f"{size_text(info.bytes_per_s)} a second, {size_text(info.bytes_per_s * _DAY_S)} a day"
     yield "complete" if info.complete else "not complete"
     yield from (f"  {loss}" for loss in info.losses)
     yield from (_ADVICE.format(name) for name in _recoverable(info))
@@ -112,6 +116,7 @@ def _facts(info: RecordingInfo, robots: Sequence[RecordedRobot]) -> dict[str, An
         "start": info.first,
         "end": info.last,
         "duration_s": info.duration_s,
+        "bytes_per_s": info.bytes_per_s,
         "messages": info.message_count,
         "robots": [robot.facts() for robot in robots],
         "others": [

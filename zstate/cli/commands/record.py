@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 import click
@@ -12,27 +13,26 @@ import click
 from zstate.cli import options
 from zstate.cli.metrics import recorder_collector, serve_metrics, writer_collector
 from zstate.cli.output.console import (
-    count_text,
     fail,
-    files_text,
     is_terminal,
     print_status,
     print_wrapped,
-    size_text,
 )
+from zstate.cli.record_progress import RecordProgress
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
+    from zstate.errors import RecordingError
     from zstate.metrics.endpoint import BindAddress
-    from zstate.recording.recorder import Recorder, RecorderStats
+    from zstate.recording.recorder import Recorder
+    from zstate.recording.retention import FilePattern, Keep, Retention
 
 _LINE_S = 1.0
 _REFRESH_S = 0.25
 _INDEX_WITHIN_S = 10.0
-# Discovery takes less.
-_DISCOVERY_S = 0.5
+_DEFAULT_FILE = "rec-%Y%m%d-%H%M%S.mcap"
 
 
 def _at_least(least: float, unit: str) -> Callable[[float], float]:
@@ -44,8 +44,14 @@ def _at_least(least: float, unit: str) -> Callable[[float], float]:
     return check
 
 
+def _parse_keep(text: str) -> Keep:
+    from zstate.recording.retention import Keep
+
+    return Keep.parse(text)
+
+
 @click.command("record")
-@click.argument("file")
+@click.argument("file", default=_DEFAULT_FILE)
 @click.argument("robots", metavar="[ROBOT]...", nargs=-1)
 @options.wire_option
 @click.option("--duration", type=options.SECONDS, help="Stop after S seconds.")
@@ -59,6 +65,12 @@ def _at_least(least: float, unit: str) -> Callable[[float], float]:
     type=options.number("S", _at_least(1.0, "s")),
     help="Start a new file every S seconds, at least 1.",
 )
+@click.option(
+    "--keep",
+    type=options.Checked("SIZE|AGE", _parse_keep),
+    help="Delete the oldest recordings that match FILE beyond this size, such as 50GB, or age, such as 7d, "
+    "when a file starts.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing FILE.")
 @options.metrics_option
 @options.session_options
@@ -70,6 +82,7 @@ def record_command(
     duration: float | None,
     split_size: float | None,
     split_seconds: float | None,
+    keep: Keep | None,
     overwrite: bool,
     metrics: BindAddress | None,
     network: SessionOptions,
@@ -80,22 +93,31 @@ def record_command(
     recording is complete by itself: the model and the fixed edges are written at its start and every 10 s.
     After a crash all but the last 0.5 s is in the file; `zstate recover` makes a complete file of it.
 
+    FILE may have the start time in its name: %Y %m %d %H %M %S are replaced by the local time (also %y and
+    %j; %% is a percent sign). The default, rec-%Y%m%d-%H%M%S.mcap in the working directory, gives each start
+    a file of its own. --keep deletes files with such a name that zstate recorded, a split recording file by
+    file, and never one that is being written.
+
     \b
+    zstate record
     zstate record run.mcap
     zstate record run.mcap panda --duration 60
     zstate record run.mcap --wire ros2:domain=5 --split-size 500
+    zstate record rec-%Y%m%d-%H%M%S.mcap --split-size 500 --keep 50GB
     """
     from zstate.errors import RecordingError
     from zstate.recording.recorder import Recorder
 
-    if not file.endswith(".mcap"):
-        file = f"{file}.mcap"
-        print_status(f"recording into {file!r}")
+    pattern = _file_pattern(file)
+    retention = None if keep is None else _retention(pattern, keep, split_size, split_seconds)
+    path = pattern.path_at(datetime.now())
+    if str(path) != file:
+        print_status(f"recording into {str(path)!r}")
     with open_session(network, (wire,)) as session:
         try:
             recorder = Recorder(
                 session,
-                file,
+                path,
                 robots,
                 wire=wire,
                 max_bytes=None if split_size is None else round(split_size * 1e6),
@@ -103,18 +125,19 @@ def record_command(
                 overwrite=overwrite,
             )
         except RecordingError as error:
-            fail(str(error).replace("overwrite=True", "--overwrite"))
+            fail(_refusal_text(error, pattern))
         with (
             recorder,
             RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as directory,
             serve_metrics(metrics, recorder_collector(recorder), writer_collector(directory)),
         ):
-            progress = RecordProgress(recorder, directory, robots)
+            progress = RecordProgress(recorder, directory, robots, retention)
             try:
                 _show(recorder, progress, duration)
             finally:
                 recorder.close()
                 recorder.wait(_INDEX_WITHIN_S)  # the index of a large file takes its time on a busy machine
+                progress.watch_disk()
                 print_wrapped(progress.summary())
             if recorder.failure is not None:
                 raise recorder.failure
@@ -122,8 +145,55 @@ def record_command(
                 fail(f"nothing was recorded: {progress.no_message_text}")
 
 
+def _file_pattern(file: str) -> FilePattern:
+    from zstate.recording.retention import FilePattern
+
+    try:
+        return FilePattern(file if file.endswith(".mcap") else f"{file}.mcap")
+    except InvalidInput as error:
+        raise click.BadParameter(str(error), param_hint="FILE") from None
+
+
+def _retention(
+    pattern: FilePattern, keep: Keep, split_size: float | None, split_seconds: float | None
+) -> Retention:
+    """What ``--keep`` asks for. Raises UsageError if it cannot work with the other options."""
+    from zstate.recording.retention import Retention
+
+    if not pattern.has_time:
+        raise click.UsageError(
+            f"--keep deletes older recordings that match FILE, and {str(pattern)!r} is the name of one; put "
+            f"the time into it, such as {_DEFAULT_FILE}"
+        )
+    if split_size is not None and split_size * 1e6 > keep.max_bytes:
+        raise click.UsageError(
+            f"--keep {keep.text} is less than one file of --split-size {split_size:g} MB; raise --keep, or "
+            "split into smaller files"
+        )
+    if split_seconds is not None and split_seconds > keep.max_age_s:
+        raise click.UsageError(
+            f"--keep {keep.text} is less than one file of --split-seconds {split_seconds:g}; raise --keep, "
+            "or split into shorter files"
+        )
+    if split_size is None and split_seconds is None:
+        print_status(
+            "--keep deletes recordings at this start only, since this recording is one file; --split-size or "
+            "--split-seconds bounds it, too"
+        )
+    return Retention(pattern, keep, is_split=split_size is not None or split_seconds is not None)
+
+
+def _refusal_text(error: RecordingError, pattern: FilePattern) -> str:
+    """Why the recording cannot start, in terms of the command line."""
+    text = str(error).replace("overwrite=True", "--overwrite")
+    if isinstance(error.__cause__, FileExistsError) and pattern.has_time:
+        text += f"; each start has a file of its own if FILE has the seconds, as in {_DEFAULT_FILE}"
+    return text
+
+
 def _show(recorder: Recorder, progress: RecordProgress, duration: float | None) -> None:
     """Show progress until the recording has ended, or for ``duration`` seconds."""
+    progress.watch_disk()
     until = math.inf if duration is None else time.monotonic() + duration
 
     def is_over(pause_s: float) -> bool:
@@ -131,6 +201,7 @@ def _show(recorder: Recorder, progress: RecordProgress, duration: float | None) 
 
     if not is_terminal():
         while not is_over(_LINE_S):
+            progress.watch_disk()
             for change in progress.changes():
                 print_status(change)
             print_wrapped(progress.line())
@@ -140,75 +211,7 @@ def _show(recorder: Recorder, progress: RecordProgress, duration: float | None) 
 
     with Live(auto_refresh=False, transient=True) as live:
         while not is_over(_REFRESH_S):
+            progress.watch_disk()
             for change in progress.changes():
                 live.console.print(change, markup=False, highlight=False, soft_wrap=True)
             live.update(Text(progress.line()), refresh=True)
-
-
-class RecordProgress:
-    """Progress of a recorder: its streams, its rate, and the robots it waits for."""
-
-    def __init__(self, recorder: Recorder, directory: RobotDirectory, robots: Sequence[str]) -> None:
-        self._recorder, self._directory, self._robots = recorder, directory, robots
-        self._listed: set[tuple[str, str]] = set()
-        self._waiting = ""
-        self._start = time.monotonic()
-        self._before = (self._start, 0)
-
-    def line(self) -> str:
-        """Duration, messages, rate since the last call, size and robots."""
-        stats, now = self._recorder.stats, time.monotonic()
-        count, (before, count_before) = sum(stats.messages.values()), self._before
-        self._before = (now, count)
-        rate = (count - count_before) / max(now - before, 1e-9)
-        robots, lost = ", ".join(_robots(stats)) or "no robot yet", _lost(stats)
-        size, took = size_text(stats.bytes), f"{now - self._start:.0f} s"
-        return f"{took}  {count} messages  {rate:.1f}/s  {size}  {robots}{f'  lost {lost}' if lost else ''}"
-
-    def changes(self) -> Iterator[str]:
-        """Streams recorded since the last call, and robots that are missing."""
-        streams = set(self._recorder.stats.messages)
-        for robot in sorted({robot for robot, _ in streams - self._listed}):
-            new = sorted(stream for name, stream in streams - self._listed if name == robot)
-            yield "recording the clock" if new == ["clock"] else f"recording {robot}: {', '.join(new)}"
-        self._listed |= streams
-        waiting = self._missing({robot for robot, stream in streams if stream != "clock"})
-        if waiting and waiting != self._waiting and time.monotonic() - self._start > _DISCOVERY_S:
-            yield f"waiting: {waiting}"
-            self._waiting = waiting
-
-    @property
-    def no_message_text(self) -> str:
-        """The reason why nothing was recorded, as far as it can be determined here."""
-        announced = self._directory.robots()
-        return self._missing(set()) or f"{self._directory.messages.announced(announced)}, but no message came"
-
-    def _missing(self, recorded: set[str]) -> str:
-        announced, messages = self._directory.robots(), self._directory.messages
-        if not self._robots:
-            return "" if recorded or announced else messages.announced(announced)
-        missing = set(self._robots) - recorded - {info.name for info in announced}
-        return "; ".join(messages.unknown(robot, announced) for robot in sorted(missing))
-
-    def summary(self) -> str:
-        stats, took = self._recorder.stats, time.monotonic() - self._start
-        messages = count_text(sum(stats.messages.values()), "message")
-        robots = f" of {', '.join(_robots(stats))}" if _robots(stats) else ""
-        where = f"{files_text(stats.files)} ({size_text(stats.bytes)})"
-        lost = f"lost {_lost(stats)}" if _lost(stats) else "nothing lost"
-        return f"recorded {messages}{robots} in {took:.1f} s into {where}; {lost}"
-
-
-def _robots(stats: RecorderStats) -> list[str]:
-    return sorted({robot for robot, stream in stats.messages if stream != "clock"})
-
-
-def _lost(stats: RecorderStats) -> str:
-    reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
-    parts = (
-        (stats.dropped, "dropped here"),
-        (stats.missed, "missed on the way"),
-        (stats.unwritten, "without a description that fits"),
-        (sum(stats.refused.values()), f"refused ({reasons})"),
-    )
-    return ", ".join(f"{count} {what}" for count, what in parts if count)

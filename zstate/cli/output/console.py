@@ -108,7 +108,7 @@ def count_text(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
-def size_text(size: int) -> str:
+def size_text(size: float) -> str:
     """A number of bytes with a unit."""
     amount = float(size)
     for unit in ("B", "kB", "MB"):

@@ -143,11 +143,11 @@ def split_files(first: Path) -> tuple[list[Path], list[str]]:
 
     ``first`` alone if it is not the first part of a recording by zstate.
     """
-    identity = _identity(first)
+    identity = read_identity(first)
     if identity is None or identity[1] != "0":
         return [first], []
     later = [
-        (part, path) for part, path in later_splits(first) if _identity(path) == (identity[0], str(part))
+        (part, path) for part, path in later_splits(first) if read_identity(path) == (identity[0], str(part))
     ]
     present = {part for part, _ in later}
     missing = [
@@ -156,7 +156,8 @@ def split_files(first: Path) -> tuple[list[Path], list[str]]:
     return [first, *(path for _, path in later)], missing
 
 
-def _identity(path: Path) -> tuple[str, str] | None:
+def read_identity(path: Path) -> tuple[str, str] | None:
+    """The id of the recording and the number of the part; None if zstate did not record the file."""
     try:
         with BoundedFile(path) as file:
             if not file.has_mcap_magic:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import io
 import math
 import os
@@ -108,6 +109,9 @@ class McapOutput:
             self._file = io.FileIO(path, "w" if overwrite else "x")
         except OSError as error:
             raise _disk_error(path, error) from error
+        # Marks the file as being written, for other processes; not all file systems have locks.
+        with suppress(OSError):
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._buffer = _ChunkBuffer(self._file)
         self.writer = Writer(self._buffer, compression=CompressionType.ZSTD)
         self.writer.start(profile, library)
@@ -168,7 +172,12 @@ class SplitFile:
     def __init__(self, path: Path, *, overwrite: bool, recording: str, part: int) -> None:
         self.output = McapOutput(path, overwrite=overwrite)
         self.output.writer.add_metadata(IDENTITY, {"id": recording, "part": str(part)})
-        self.output.write_chunk()
+        try:
+            self.output.write_chunk()
+        except RecordingError:
+            if not overwrite:  # on a full disk, repeated starts must not leave many empty files
+                path.unlink()
+            raise
         self._schemas: dict[str, int] = {}
         self._numbers: dict[ChannelKey, int] = {}
         self._number_of: dict[ChannelId, int] = {}
