@@ -52,7 +52,7 @@ def start() -> Iterator[Callable[[list[str]], subprocess.Popen[str]]]:
 
 
 def test_every_python_block_is_a_program_tested_here() -> None:
-    assert set(PROGRAMS) == {"publish.py", "lookup.py", "driver.py", "buffer.py", "recording.py"}
+    assert set(PROGRAMS) == {"publish.py", "lookup.py", "driver.py", "buffer.py", "recording.py", "joints.py"}
 
 
 def test_publisher_and_lookup_connect_from_two_processes(
@@ -164,6 +164,9 @@ def test_recording_commands_record_describe_look_up_and_replay(
     assert lookup.line().startswith("<pose of panda_hand in panda_link0 at ")
     assert lookup.line() == "(1000, 7)"
     assert lookup.wait() == 0, lookup.stderr
+    joints = spawn(PROGRAMS["joints.py"])
+    assert joints.line().startswith("panda_joint1 (")
+    assert joints.wait() == 0, joints.stderr
     replayed = start(replay)
     assert replayed.wait(DEADLINE_S) == 0, replayed.communicate()[1]
 
