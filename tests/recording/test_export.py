@@ -11,6 +11,7 @@ from helpers.recording_builder import (
     MS,
     RRBOT,
     START,
+    Bag,
     RecordingBuilder,
     S,
     pose,
@@ -94,6 +95,7 @@ def test_stamps_may_be_in_any_order_and_rows_outside_of_the_recording_are_nan(ru
     first, second = swing_positions(1.0)[0], swing_positions(1.01)[0]
     assert columns[POSITIONS[0]][1] == pytest.approx(first + 0.3 * (second - first), abs=1e-12)
     assert report.unknown_joints == 2
+    assert (report.first, report.last) == (START - 1, START + 10 * S)
 
 
 @pytest.mark.parametrize("options", [{}, {"rate_hz": 100.0}])
@@ -166,6 +168,15 @@ def test_recording_without_a_usable_sample_is_refused_with_the_reasons(tmp_path:
     with Recording(tmp_path / "r.mcap") as recording, pytest.raises(InvalidInput, match="bad numbers 1"):
         Exporter(recording).write(tmp_path / "r.csv", "csv")
     assert not (tmp_path / "r.csv").exists()
+
+
+def test_robot_without_a_model_is_exported_as_recorded_only(tmp_path: Path):
+    with Bag(tmp_path / "bag") as bag:
+        bag.joints(START, {"left": 0.25}, "/gripper/joint_states")
+    columns, _ = export(tmp_path / "bag")
+    assert columns == {"stamp": [START], "position.left": [0.25]}
+    with Recording(tmp_path / "bag") as recording, pytest.raises(InvalidInput, match="robot_description"):
+        Exporter(recording, rate_hz=10.0)
 
 
 def test_parquet_without_pyarrow_names_the_extra(run: Path, monkeypatch: pytest.MonkeyPatch):

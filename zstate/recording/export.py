@@ -58,7 +58,7 @@ _ROW_GROUP = 32_768
 
 @dataclass
 class ExportReport:
-    """What was exported: ``rows`` from the stamp ``first`` to ``last`` [ns], with these kinds of numbers.
+    """What was exported: ``rows`` with stamps from ``first`` to ``last`` [ns], and the kinds of numbers.
 
     ``kinds`` are "position", "velocity" and "effort". ``unknown_joints`` counts the rows without interpolated
     positions, ``unknown_poses`` those without each pose, ``refused`` the samples left out, by reason.
@@ -84,6 +84,7 @@ class Exporter:
 
     Samples as recorded are streamed in bounded memory. Interpolated samples and poses need a buffer, whose
     memory grows with the number of rows. ``on_progress(read, recorded)`` is called with numbers of samples.
+    Raises InvalidInput for an unknown robot, and for interpolation without a model of the robot.
     """
 
     def __init__(
@@ -102,7 +103,17 @@ class Exporter:
         self._poses = tuple(dict.fromkeys(poses))
         self._on_progress = on_progress
         self._refusals = Refusals("recorded joint_states")
-        self.robot = recording.joint_state_reader(robot, self._refusals.count).robot
+        reader = recording.joint_state_reader(robot, self._refusals.count)
+        self.robot = reader.robot
+        if not (self._is_as_recorded or reader.has_model):
+            raise InvalidInput(
+                f"positions of {self.robot!r} are interpolated by its model, and the recording has no "
+                "robot_description that fits its joint states; export the samples as recorded"
+            )
+
+    @property
+    def _is_as_recorded(self) -> bool:
+        return self._rate_hz is None and self._stamps is None
 
     def write(self, path: Path, kind: TableFormat, *, overwrite: bool = False) -> ExportReport:
         """Write the table. The file appears when it is complete.
@@ -129,13 +140,13 @@ class Exporter:
         return report
 
     def _write(self, table: Table) -> ExportReport:
-        if self._rate_hz is None and self._stamps is None and not self._poses:
+        if self._is_as_recorded and not self._poses:
             return self._write_samples(table, None)
         stamps = self._instants()
         buffer = self._recording.buffer(stamps)
         for target, source in self._poses:
             buffer.path(target, source)  # raises before anything is written
-        if self._rate_hz is None and self._stamps is None:
+        if self._is_as_recorded:
             return self._write_samples(table, buffer)
         return self._write_interpolated(table, buffer, stamps)
 
@@ -222,9 +233,9 @@ class Exporter:
             columns |= {f"{target}.{source}.{name}": poses[:, number] for number, name in enumerate(_POSE)}
             report.unknown_poses[target, source] += int((~valid).sum())
         table.write(columns)
-        if not report.rows:
-            report.first = int(trajectory.stamps[0])
-        report.last = int(trajectory.stamps[-1])
+        first, last = int(trajectory.stamps.min()), int(trajectory.stamps.max())
+        report.first = min(first, report.first) if report.rows else first
+        report.last = max(last, report.last) if report.rows else last
         report.rows += len(trajectory)
         report.joint_count = len(trajectory.joint_names)
         report.kinds = ("position", *sorted(trajectory.kinds, reverse=True))

@@ -70,6 +70,11 @@ class JointStateReader:
         self._epoch = _Epoch()
 
     @property
+    def has_model(self) -> bool:
+        """Whether the recording has a model that fits the joint states."""
+        return self._model is not None
+
+    @property
     def count(self) -> int:
         """The number of recorded samples, usable or not."""
         writers = self._recording.writers.items()
