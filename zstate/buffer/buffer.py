@@ -37,7 +37,6 @@ from zstate.errors import (
     as_timeout,
 )
 from zstate.model.joint_trajectory import JointTrajectory
-from zstate.model.robot import coordinate_names, velocity_columns_by_position
 from zstate.transform import Transform, Twist
 
 S = TypeVar("S")
@@ -391,22 +390,8 @@ class TransformBuffer(BufferCore):
 
         Raises InvalidInput as ``joint_positions``.
         """
-        track = self._robot_track(robot)
-        model, view = track.model, track.history.view
-        stamps = view.kept_stamps()
-        first = 0 if start is None else int(stamps.searchsorted(check_stamp(start)))
-        last = len(stamps) if end is None else int(stamps.searchsorted(check_stamp(end)))
-        rows = view.kept_rows()[first:last].copy()
-        coordinates = coordinate_names(model)
-        velocities = rows[:, track.position_count :]
-        return JointTrajectory(
-            model.joint_names,
-            coordinates,
-            tuple(coordinates[column] for column in velocity_columns_by_position(model)),
-            stamps[first:last].copy(),
-            rows[:, : track.position_count],
-            None if np.isnan(velocities).all() else velocities,
-        )
+        start, end = (None if stamp is None else check_stamp(stamp) for stamp in (start, end))
+        return self._robot_track(robot).samples(start, end)
 
     def link_poses(self, robot: str, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """Every link of a robot at a stamp, and that stamp: (L, 7), rows as the ``links`` of its model.
