@@ -58,6 +58,7 @@ HOMES = {
     "cryptography": "net",
     "xxhash": "wire",
     "mcap": "recording",
+    "pyarrow": "recording",  # `zstate export`
     "lz4": "recording",
     "pyarrow": "recording",
     "zstandard": "recording",

@@ -99,7 +99,7 @@ def test_integers_and_floats_of_any_width_are_accepted_in_any_sequence(numbers) 
     buffer = TransformBuffer()
     track = buffer.add_robot(MODEL)
     assert buffer.insert_joints(track, 0, numbers, numbers)
-    assert buffer.joint_positions(track)[0].tolist() == [1.0, 2.0]
+    assert buffer.joint_positions(MODEL.name)[0].tolist() == [1.0, 2.0]
 
 
 def test_stamps_of_numpy_s_dates_are_exact() -> None:

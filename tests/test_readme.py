@@ -59,6 +59,7 @@ def test_every_python_block_is_a_program_tested_here() -> None:
         "odometry.py",
         "buffer.py",
         "recording.py",
+        "joints.py",
     }
 
 
@@ -177,6 +178,9 @@ def test_recording_commands_record_describe_look_up_and_replay(
     assert lookup.line().startswith("<pose of panda_hand in panda_link0 at ")
     assert lookup.line() == "(1000, 7)"
     assert lookup.wait() == 0, lookup.stderr
+    joints = spawn(PROGRAMS["joints.py"])
+    assert joints.line().startswith("panda_joint1 (")
+    assert joints.wait() == 0, joints.stderr
     replayed = start(replay)
     assert replayed.wait(DEADLINE_S) == 0, replayed.communicate()[1]
 

@@ -21,10 +21,10 @@ def test_link_poses_follow_the_interpolated_joints() -> None:
     first, second = np.full(model.position_count, 0.01), np.full(model.position_count, 0.03)
     buffer.insert_joints(track, 0, first)
     buffer.insert_joints(track, 10 * MS, second)
-    positions, stamp = buffer.joint_positions(track, 5 * MS)
+    positions, stamp = buffer.joint_positions("left", 5 * MS)
     assert stamp == 5 * MS
     np.testing.assert_allclose(positions, np.full(model.position_count, 0.02), atol=1e-15)
-    poses, stamp = buffer.link_poses(track, 5 * MS)
+    poses, stamp = buffer.link_poses("left", 5 * MS)
     assert stamp == 5 * MS
     np.testing.assert_allclose(poses, Kinematics(model).link_poses(positions), atol=1e-15)
 
@@ -35,7 +35,7 @@ def test_link_poses_agree_with_lookups_link_by_link() -> None:
     track = buffer.add_robot(model)
     for k in range(3):
         buffer.insert_joints(track, k * 10 * MS, np.full(model.position_count, 0.01 * k))
-    poses, stamp = buffer.link_poses(track)
+    poses, stamp = buffer.link_poses("gripper")
     assert stamp == 20 * MS
     for link, pose in zip(model.links, poses, strict=True):
         looked_up = buffer.lookup(model.root, link, 20 * MS)
@@ -48,13 +48,13 @@ def test_link_poses_outside_the_history_raise_as_lookup() -> None:
     buffer = TransformBuffer()
     track = buffer.add_robot(model)
     with pytest.raises(NoData):
-        buffer.joint_positions(track)
+        buffer.joint_positions("rrbot")
     buffer.insert_joints(track, 10, np.zeros(2))
     with pytest.raises(InPast) as past:
-        buffer.link_poses(track, 9)
+        buffer.link_poses("rrbot", 9)
     assert past.value.edge == ("base", "upper")
     with pytest.raises(InFuture):
-        buffer.link_poses(track, 11)
+        buffer.link_poses("rrbot", 11)
 
 
 def test_error_names_the_failing_track() -> None:
@@ -83,8 +83,6 @@ def calls_on(buffer: TransformBuffer, track: JointTrack) -> dict[str, Callable[[
         "insert_joints of a block": lambda: buffer.insert_joints(track, 5, zeros.tobytes()),
         "insert_joints with velocities": lambda: buffer.insert_joints(track, 5, zeros, zeros),
         "restart": lambda: buffer.restart(track),
-        "joint_positions": lambda: buffer.joint_positions(track),
-        "link_poses": lambda: buffer.link_poses(track),
         "remove_robot": lambda: buffer.remove_robot(track),
     }
 

@@ -414,14 +414,14 @@ def test_joints_between_huge_positions_raise_not_finite_and_no_python_error() ->
         lambda: buffer.lookup("body", "lift", S // 2),
         lambda: buffer.twist("follower", "body", S // 2),
         lambda: buffer.twist("lift", "body", S // 2),
-        lambda: buffer.joint_positions(track, S // 2),
-        lambda: buffer.link_poses(track, S // 2),
+        lambda: buffer.joint_positions(track.name, S // 2),
+        lambda: buffer.link_poses(track.name, S // 2),
     ):
         with pytest.raises(NotFinite) as caught:
             call()
         assert caught.value.edge is not None
     with pytest.raises(NotFinite, match="pose of 'follower' in 'root'"):
-        buffer.link_poses(track, 0)
+        buffer.link_poses(track.name, 0)
     assert not buffer.lookup_many("body", "follower", [0, S // 2, S])[1].any()
 
 

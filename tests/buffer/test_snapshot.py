@@ -1,4 +1,4 @@
-"""Snapshots: the poses of all frames in any other, their edges, the span, and the history of joints."""
+"""Snapshots: the poses of all frames in any other, their edges, and the span."""
 
 from __future__ import annotations
 
@@ -58,21 +58,6 @@ def test_robot_silent_for_long_does_not_extend_the_span():
     buffer = filled(history_s=10.0)
     buffer.insert(Transform("map", "odom", [0, 0, 0], [0, 0, 0, 1], stamp=100 * SECOND))
     assert buffer.span() == TimeSpan(90 * SECOND, 100 * SECOND)
-
-
-def test_joint_history_ends_at_the_requested_instant():
-    buffer = filled(seconds=3.0)
-    history = buffer.joint_history(buffer.frame_table().robots["r1"], 2 * SECOND, 1.0, points=1000)
-    assert (history.stamps[0], history.stamps[-1]) == (1 * SECOND, 2 * SECOND)
-    np.testing.assert_allclose(history.positions[:, 0], history.stamps / SECOND)
-    assert not history.positions[:, 1].any()
-
-
-def test_joint_history_is_reduced_to_the_requested_points():
-    buffer = filled(seconds=9.0)
-    history = buffer.joint_history(buffer.frame_table().robots["r1"], 9 * SECOND, 8.0, points=100)
-    assert 80 <= len(history.stamps) <= 101
-    assert len(set(np.diff(history.stamps).tolist())) == 1
 
 
 def shifted(x: float, stamp: int) -> Transform:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.core import BufferCore
 from zstate.buffer.path import Plan, TransformPath, joints_path
-from zstate.buffer.snapshot import FramePoses, FrameTable, JointHistory, SnapshotReader, TimeSpan
+from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader, TimeSpan
 from zstate.buffer.tracks import JointTrack, Track
 from zstate.buffer.waiting import MessageFilter, RequiredStamps, TransformWatch, Waiter, WakeCondition
 from zstate.checks import check_names
@@ -36,6 +36,7 @@ from zstate.errors import (
     UnknownFrame,
     as_timeout,
 )
+from zstate.model.joint_trajectory import JointTrajectory
 from zstate.transform import Transform, Twist
 
 S = TypeVar("S")
@@ -357,26 +358,48 @@ class TransformBuffer(BufferCore):
         check_duration("timeout_s", timeout_s)
         return MessageFilter(self.wait_async, samples, target, frame=frame, stamp=stamp, timeout_s=timeout_s)
 
-    def joint_positions(self, track: JointTrack, at: int | None = None) -> tuple[NDArray[np.float64], int]:
-        """All joints of one robot at a stamp, and that stamp: (nq,) as ``track.model.joint_names``.
+    def joint_positions(self, robot: str, at: int | None = None) -> tuple[NDArray[np.float64], int]:
+        """All joints of a robot at a stamp, and that stamp: (nq,) in the order of its model's joint_names.
 
-        ``at=None`` is the robot's newest sample. Between samples joints are interpolated as in lookups.
-        Raises NoData, InPast, InFuture or NotFinite, and InsertRefused as ``insert_joints``.
+        ``robot`` is the prefix of its frames, or the name of its model if it has no prefix. ``at=None`` is
+        its newest sample. Between samples joints are interpolated as in lookups. Raises NoData, InPast,
+        InFuture or NotFinite, and InvalidInput for an unknown robot, with near misses.
         """
-        self._check_owned(track)
-        path = joints_path(track, self._read_views)
-        values, stamp, *_ = path.read(None if at is None else check_stamp(at))
-        positions = np.hstack([np.empty(0), *values[0]])
-        if not np.isfinite(positions).all():
-            raise path.not_finite(values, stamp)
-        return positions, stamp
+        return self._joint_positions(self._robot_track(robot), None if at is None else check_stamp(at))
 
-    def link_poses(self, track: JointTrack, at: int | None = None) -> tuple[NDArray[np.float64], int]:
-        """Every link of one robot at a stamp, and that stamp: (L, 7), rows as ``track.model.links``.
+    def joint_positions_many(
+        self, robot: str, stamps: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """``joint_positions`` at each stamp: (T, nq), and which are valid: (T,).
+
+        Rows without positions are NaN. Raises InvalidInput as ``joint_positions``.
+        """
+        instants = check_stamps(stamps)
+        track = self._robot_track(robot)
+        values, valid = joints_path(track, self._read_views).values_at(instants)
+        positions = np.full((len(instants), track.position_count), np.nan)
+        columns = [column for value in values[0] for column in np.atleast_2d(value)] if values else []
+        if columns:
+            positions[valid] = np.stack(columns, axis=-1)
+        unusable = ~np.isfinite(positions).all(axis=1)
+        positions[unusable] = np.nan
+        return positions, valid & ~unusable
+
+    def joint_states(self, robot: str, start: int | None = None, end: int | None = None) -> JointTrajectory:
+        """The samples of a robot that are kept, with stamps in [start, end): copies; efforts are not kept.
+
+        Raises InvalidInput as ``joint_positions``.
+        """
+        start, end = (None if stamp is None else check_stamp(stamp) for stamp in (start, end))
+        return self._robot_track(robot).samples(start, end)
+
+    def link_poses(self, robot: str, at: int | None = None) -> tuple[NDArray[np.float64], int]:
+        """Every link of a robot at a stamp, and that stamp: (L, 7), rows as the ``links`` of its model.
 
         Row i is ``root_from_link``: x y z [m], qx qy qz qw. Raises as ``joint_positions``.
         """
-        positions, stamp = self.joint_positions(track, at)
+        track = self._robot_track(robot)
+        positions, stamp = self._joint_positions(track, None if at is None else check_stamp(at))
         poses = track.kinematics.link_poses(positions)
         unknown = ~np.isfinite(poses).all(axis=1)
         if unknown.any():
@@ -384,17 +407,13 @@ class TransformBuffer(BufferCore):
             raise NotFinite(track.frame(track.model.root), track.frame(link), requested=stamp)
         return poses, stamp
 
-    def joint_history(
-        self, track: JointTrack, until: int, duration_s: float, points: int = 240
-    ) -> JointHistory:
-        """The samples of ``duration_s`` up to ``until`` [ns]; every n-th of more than ``points``."""
-        view = track.history.view
-        stamps, rows = view.kept_stamps(), view.kept_rows()
-        first, end = np.searchsorted(stamps, (until - round(duration_s * 1e9), until + 1)).tolist()
-        step = max(1, -(-(end - first) // points))
-        # Counted from the first sample kept, so that consecutive plots choose the same samples.
-        chosen = slice(first + (-first) % step, end, step)
-        return JointHistory(stamps[chosen], rows[chosen, : track.model.position_count])
+    def _joint_positions(self, track: JointTrack, at: int | None) -> tuple[NDArray[np.float64], int]:
+        path = joints_path(track, self._read_views)
+        values, stamp, *_ = path.read(at)
+        positions = np.hstack([np.empty(0), *values[0]])
+        if not np.isfinite(positions).all():
+            raise path.not_finite(values, stamp)
+        return positions, stamp
 
     def snapshot(
         self, at: int | None = None, *, robots: Collection[str] = (), hold_s: float = 0.0
@@ -404,7 +423,7 @@ class TransformBuffer(BufferCore):
         ``robots`` restricts it to the frames of these, and those above them. A track is still read at its
         newest sample for ``hold_s`` after that. Beyond its samples poses are not known, with a reason.
         """
-        return self._snapshot_reader(robots).read(self.joint_positions, at, round(hold_s * 1e9))
+        return self._snapshot_reader(robots).read(self._joint_positions, at, round(hold_s * 1e9))
 
     def frame_table(self, robots: Collection[str] = ()) -> FrameTable:
         """The frames that ``snapshot`` reads; the same object while neither the tree nor a writer changes."""

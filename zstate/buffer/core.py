@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate._util.fork_safe import fork_safe
+from zstate._util.format import did_you_mean
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreeSnapshot
 from zstate.buffer.history import HistoryView, insert_together, keep_only_around
@@ -224,6 +225,19 @@ class BufferCore:
             (track.name, track.frame(track.model.root)) if isinstance(track, JointTrack) else track.edges[0]
         )
         raise InsertRefused(text, reason=reason, edge=edge)
+
+    def _robot_track(self, robot: str) -> JointTrack:
+        """The track of a robot by its name. Raises InvalidInput, which names the most similar ones."""
+        check_names(robot)
+        with self._lock:
+            track = self._tree.find_robot(robot)
+            if track is None:
+                names = self._tree.robot_names()
+                known = f"its robots: {', '.join(map(repr, names))}" if names else "it has no robot"
+                raise InvalidInput(
+                    f"there is no robot {robot!r} in this buffer{did_you_mean(robot, names)} ({known})"
+                )
+        return track
 
     def restart(self, track: JointTrack | PoseTrack) -> None:
         """Begin a new epoch: remove the samples of one track, because its writer or its clock restarted.

@@ -316,6 +316,21 @@ class FrameTree:
         robots = {name: track for name, track in self.robots.items() if track is not None}
         return TreeSnapshot(self.version, dict(self.frames), robots)
 
+    def find_robot(self, name: str) -> JointTrack | None:
+        """The robot with this prefix, else the one without a prefix whose model has this name."""
+        track = self.robots.get(name)
+        return track or next((one for one in self._unprefixed_robots() if one.name == name), None)
+
+    def robot_names(self) -> list[str]:
+        """The names of all robots with a model."""
+        prefixed = [name for name, track in self.robots.items() if name and track is not None]
+        return prefixed + [track.name for track in self._unprefixed_robots()]
+
+    def _unprefixed_robots(self) -> list[JointTrack]:
+        # ``robots`` has the last of them only, and a model of a single link has no edge.
+        tracks = [self.robots.get(""), *(edge.robot for edge in self.frames.values() if edge is not None)]
+        return list(dict.fromkeys(track for track in tracks if track is not None and not track.prefix))
+
     def resolve_for_insert(self, name: str) -> str:
         """The frame that a name of an insert means: the one of that name, or a robot's by its bare name."""
         if name in self.frames:

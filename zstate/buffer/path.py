@@ -151,23 +151,32 @@ class TransformPath:
             raise self.not_finite(values, at)
         return motion, at
 
-    def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """The pose at each stamp: (T, 7), NaN where it is not known, and (T,) where it is."""
+    def values_at(self, stamps: Stamps) -> tuple[Values, NDArray[np.bool_]]:
+        """The values of each track at the stamps that all of them cover, and (T,) which these are."""
         views = self.read_views(self.uses)
-        valid = np.ones(len(stamps), dtype=np.bool_)
+        covered = np.ones(len(stamps), dtype=np.bool_)
         for view in views:
-            valid &= (stamps >= view.oldest) & (stamps <= view.newest) if view.size else False
-        known = stamps[valid]
-        poses = np.full((len(stamps), 7), np.nan)
+            covered &= (stamps >= view.oldest) & (stamps <= view.newest) if view.size else False
+        known = stamps[covered]
         if not len(known):
-            return poses, valid
+            return [], covered
+        brackets = (brackets_at(view, known) for view in views)
         with np.errstate(over="ignore", invalid="ignore"):
             values = [
                 [one.value(now) for one in use.interpolators]
-                for use, now in zip(self.uses, (brackets_at(view, known) for view in views), strict=True)
+                for use, now in zip(self.uses, brackets, strict=True)
             ]
+        return values, covered
+
+    def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """The pose at each stamp: (T, 7), NaN where it is not known, and (T,) where it is."""
+        values, valid = self.values_at(stamps)
+        poses = np.full((len(stamps), 7), np.nan)
+        if not valid.any():
+            return poses, valid
+        with np.errstate(over="ignore", invalid="ignore"):
             pose = se3.normalize(self._pose(values, se3.ARRAYS), se3.ARRAYS)
-        found = np.stack(np.broadcast_arrays(*pose, known)[:7], axis=-1)
+        found = np.stack(np.broadcast_arrays(*pose, stamps[valid])[:7], axis=-1)
         found[~np.isfinite(found).all(axis=1)] = np.nan
         poses[valid] = found
         valid[valid] = ~np.isnan(found[:, 0])

@@ -21,7 +21,7 @@ from zstate.buffer.frame_tree import Edge, TreeSnapshot
 from zstate.buffer.history import HistoryView
 from zstate.buffer.interpolation import rows_around
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
-from zstate.errors import InPast, InvalidInput, UnknownFrame, format_duration
+from zstate.errors import InPast, UnknownFrame, format_duration
 
 Poses: TypeAlias = NDArray[np.float64]
 Rows: TypeAlias = NDArray[np.intp]
@@ -29,7 +29,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 Duals: TypeAlias = NDArray[np.float64]
 """(N, 8): the rotation's quaternion x y z w, then the dual part in the same order."""
 JointReader: TypeAlias = Callable[[JointTrack, int], tuple[NDArray[np.float64], int]]
-"""``joint_positions`` of a buffer."""
+"""The joint positions of a track at a stamp, and that stamp, as ``TransformBuffer.joint_positions``."""
 
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -39,13 +39,6 @@ class TimeSpan(NamedTuple):
 
     oldest: int
     newest: int
-
-
-class JointHistory(NamedTuple):
-    """``positions[i]`` at ``stamps[i]`` [ns]: (T, nq), in the order of the model's ``joint_names``."""
-
-    stamps: NDArray[np.int64]
-    positions: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +260,7 @@ def _edge_poses(joint_positions: JointReader, track: Track, view: HistoryView, s
         return np.stack(se3.normalize(se3.interpolate(first, second, ratio, se3.ARRAYS), se3.ARRAYS), axis=-1)
     try:
         positions, _ = joint_positions(track, stamp)
-    except (InPast, InvalidInput):  # since then the history has moved on, or the robot was removed
+    except InPast:  # since then the history has moved on
         positions = view.rows[view.first, : track.model.position_count]
     return track.kinematics.edge_poses(positions)
 

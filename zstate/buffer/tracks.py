@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.history import History, HistoryView
 from zstate.clock import ClockOffset
+from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.joint_transforms import JointTransform, JointTransforms
 from zstate.model.kinematics import Kinematics
-from zstate.model.robot import RobotModel
+from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 
 Interpolation = Literal["linear", "hermite"]
 ClockOffsets: TypeAlias = dict[str, Callable[[], ClockOffset | None]]
@@ -117,6 +118,23 @@ class JointTrack:
         if velocities is None:
             velocities = np.full(self.model.velocity_count, np.nan)
         return self.history.insert(stamp, np.concatenate((positions, velocities)))
+
+    def samples(self, start: int | None, end: int | None) -> JointTrajectory:
+        """Copies of the samples kept with stamps in [start, end) [ns]; None is no limit."""
+        view, coordinates = self.history.view, coordinate_names(self.model)
+        stamps = view.kept_stamps()
+        first = 0 if start is None else int(stamps.searchsorted(start))
+        last = len(stamps) if end is None else int(stamps.searchsorted(end))
+        rows = view.kept_rows()[first:last].copy()
+        positions, velocities = rows[:, : self.position_count], rows[:, self.position_count :]
+        return JointTrajectory(
+            self.model.joint_names,
+            coordinates,
+            tuple(coordinates[column] for column in velocity_columns_by_position(self.model)),
+            stamps[first:last].copy(),
+            positions,
+            None if np.isnan(velocities).all() else velocities,
+        )
 
 
 COVARIANCE_NUMBERS = 21

@@ -47,6 +47,7 @@ _COMMANDS = {
     "replay": ("Record", "Publish a recording again."),
     "recover": ("Record", "A complete file of a recording that was cut off."),
     "info": ("Record", "The contents of a recording."),
+    "export": ("Record", "The joint states and poses of a recording as a table."),
     "snapshot": ("Record", "Save the state of robots to a file, and publish it again."),
     "bridge": ("Run", "Carry robots between zstate and ROS 2, both ways."),
     "router": ("Run", "A Zenoh router."),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,10 @@ class JointTrajectory:
     """The joints of one robot at T instants: row i of each array is of ``stamps[i]``.
 
     ``stamps`` (T,) [ns] ascend. ``positions`` (T, nq) [rad] or [m] has a column for each of ``coordinates``:
-    the joint's name, or "base.x", "base.y", ... of a joint with several numbers. ``velocities`` (T, nv) per
-    second and ``efforts`` (T, nv) [Nm] or [N] have a column for each of ``velocity_coordinates``; NaN in rows
-    where they are not known, None if no row has them. ``joint_names`` are the driven joints.
+    the joint's name, or "base.x", "base.y" ... of a joint with several numbers. ``velocities`` (T, nv), per
+    second, and ``efforts`` (T, nv) [Nm] or [N] have a column for each of ``velocity_coordinates``; they are
+    NaN in rows where they are not known, and None if they are known in no row. ``joint_names`` are the driven
+    joints.
     """
 
     joint_names: tuple[str, ...]
@@ -34,25 +35,42 @@ class JointTrajectory:
         return len(self.stamps)
 
     def __repr__(self) -> str:
-        count, joints = len(self.stamps), len(self.joint_names)
-        lasting = f" over {(int(self.stamps[-1]) - int(self.stamps[0])) * 1e-9:.3f} s" if count else ""
-        return f"<JointTrajectory of {joints} joints: {count} samples{lasting}>"
+        joints = len(self.joint_names)
+        return f"<JointTrajectory of {joints} joints: {len(self)} samples in {self.duration_s:.3f} s>"
+
+    @property
+    def duration_s(self) -> float:
+        """The time from the first instant to the last [s]."""
+        return int(self.stamps[-1] - self.stamps[0]) * 1e-9 if len(self) else 0.0
+
+    @property
+    def kinds(self) -> set[str]:
+        """Of "velocity" and "effort" those that are known in any row."""
+        blocks = {"velocity": self.velocities, "effort": self.efforts}
+        return {kind for kind, block in blocks.items() if block is not None}
+
+    def with_kinds(self, kinds: Set[str]) -> JointTrajectory:
+        """The same with arrays of these ``kinds`` too: NaN if they are not known."""
+        unknown = np.full((len(self), len(self.velocity_coordinates)), np.nan)
+        return replace(
+            self,
+            velocities=unknown if "velocity" in kinds - self.kinds else self.velocities,
+            efforts=unknown if "effort" in kinds - self.kinds else self.efforts,
+        )
 
     def select(self, rows: NDArray[np.intp] | slice) -> JointTrajectory:
-        """The instants ``rows``, which ascend."""
-        return JointTrajectory(
-            self.joint_names,
-            self.coordinates,
-            self.velocity_coordinates,
-            self.stamps[rows],
-            self.positions[rows],
-            None if self.velocities is None else self.velocities[rows],
-            None if self.efforts is None else self.efforts[rows],
+        """The instants ``rows``, which ascend; a slice shares the memory of this trajectory."""
+        return replace(
+            self,
+            stamps=self.stamps[rows],
+            positions=self.positions[rows],
+            velocities=None if self.velocities is None else self.velocities[rows],
+            efforts=None if self.efforts is None else self.efforts[rows],
         )
 
 
-def concatenated(parts: Sequence[JointTrajectory]) -> JointTrajectory:
-    """The instants of ``parts``, at least one, of the same robot, in ascending order of stamps.
+def concatenate(parts: Sequence[JointTrajectory]) -> JointTrajectory:
+    """The instants of ``parts``, at least one, of the same joints, in ascending order of stamps.
 
     Of two rows with one stamp the later one counts, as in a buffer.
     """
@@ -64,8 +82,8 @@ def concatenated(parts: Sequence[JointTrajectory]) -> JointTrajectory:
         first.velocity_coordinates,
         stamps,
         np.concatenate([part.positions for part in parts]),
-        _stacked([part.velocities for part in parts], parts),
-        _stacked([part.efforts for part in parts], parts),
+        _stacked([part.velocities for part in parts], stamps, parts),
+        _stacked([part.efforts for part in parts], stamps, parts),
     )
     if (np.diff(stamps) > 0).all():
         return whole
@@ -74,11 +92,17 @@ def concatenated(parts: Sequence[JointTrajectory]) -> JointTrajectory:
     return whole.select(order[is_last])
 
 
-def _stacked(blocks: Sequence[Floats | None], parts: Sequence[JointTrajectory]) -> Floats | None:
-    width = next((block.shape[1] for block in blocks if block is not None), None)
-    if width is None:
+def _stacked(
+    blocks: Sequence[Floats | None], stamps: NDArray[np.int64], parts: Sequence[JointTrajectory]
+) -> Floats | None:
+    """Velocities or efforts of all parts, NaN for those that have none."""
+    known = next((block for block in blocks if block is not None), None)
+    if known is None:
         return None
-    missing = [np.full((len(part), width), np.nan) for part in parts]
-    return np.concatenate(
-        [gap if block is None else block for block, gap in zip(blocks, missing, strict=True)]
-    )
+    stacked = np.full((len(stamps), known.shape[1]), np.nan)
+    first = 0
+    for block, part in zip(blocks, parts, strict=True):
+        if block is not None:
+            stacked[first : first + len(part)] = block
+        first += len(part)
+    return stacked

@@ -72,7 +72,8 @@ class JointTransforms:
         self.forms = edge_forms(model)
         self._rest = np.array([(*form.t0, *form.q_cos) for form in self.forms]).reshape(-1, 7)
         self._floats = [form for form in self.forms if form.kind == "floating"]
-        self._quaternions = np.array([range(form.column + 3, form.column + 7) for form in self._floats])
+        quaternions = [range(form.column + 3, form.column + 7) for form in self._floats]
+        self._quaternions = np.array(quaternions, dtype=np.intp).reshape(-1, 4)
         self._writes: list[_Write] = []
         for make, kinds in (
             (_rotations, ("revolute", "planar")),
@@ -106,6 +107,11 @@ class JointTransforms:
         """Whether there are floating joints, whose quaternions need a check."""
         return bool(self._floats)
 
+    def has_unit_quaternions(self, positions: Floats) -> NDArray[np.bool_]:
+        """Of each row (N, nq): whether ``normalised`` accepts its quaternions."""
+        off = np.abs(self._norms(positions) - 1.0).max(axis=(1, 2), initial=0.0)
+        return np.asarray(off) <= NORM_TOLERANCE
+
     def normalised(self, positions: Floats) -> Floats:
         """``positions`` with the quaternions of floating joints at unit length.
 
@@ -113,8 +119,7 @@ class JointTransforms:
         """
         if not self._floats:
             return positions
-        quaternions = positions[..., self._quaternions]
-        norms: Floats = np.sqrt(np.square(quaternions).sum(axis=-1, keepdims=True))
+        norms = self._norms(positions)
         if not np.all(np.abs(norms - 1.0) <= NORM_TOLERANCE):
             worst = int(np.abs(norms - 1.0).argmax())
             form = self._floats[worst % len(self._floats)]
@@ -123,8 +128,13 @@ class JointTransforms:
                 f"{norms.item(worst):.6g}; its last four numbers are qx qy qz qw of length 1"
             )
         unit = positions.copy()
-        unit[..., self._quaternions] = quaternions / norms
+        unit[..., self._quaternions] = positions[..., self._quaternions] / norms
         return unit
+
+    def _norms(self, positions: Floats) -> Floats:
+        """The lengths of the quaternions, (..., floating joints, 1)."""
+        norms: Floats = np.sqrt(np.square(positions[..., self._quaternions]).sum(axis=-1, keepdims=True))
+        return norms
 
 
 def _rotations(edges: _Rows) -> _Write:

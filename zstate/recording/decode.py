@@ -15,7 +15,7 @@ from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.recording.encode import StaticAccumulator
 from zstate.recording.reader import RecordingReader
-from zstate.recording.storage import ROBOT, Channel
+from zstate.recording.storage import ROBOT, Channel, Record
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms
 from zstate.wire.ros2.decoder import RosDecoder
@@ -83,6 +83,14 @@ class DecodedMessage(NamedTuple):
     log_time: int
 
 
+class UndecodedRecord(NamedTuple):
+    """One record, the decoder of its channel, and the sequence number of its message."""
+
+    channel: ChannelDecoder
+    record: Record
+    seq: int
+
+
 class DecodedRecording:
     """The messages of a recording by zstate, or of a bag of ROS 2.
 
@@ -93,7 +101,7 @@ class DecodedRecording:
     def __init__(self, reader: RecordingReader, refuse: Callable[[str, str], None]) -> None:
         self._reader = reader
         self._refuse = refuse
-        self._known: dict[Channel, _ChannelDecoder | None] = {}
+        self._known: dict[Channel, ChannelDecoder | None] = {}
         self._counts: Counter[RecordedWriter] = Counter()
         self._topics: dict[str, set[RecordedWriter]] = {}
         self.ignored: tuple[Channel, ...] = ()
@@ -137,39 +145,60 @@ class DecodedRecording:
         end: int | None = None,
     ) -> Iterator[DecodedMessage]:
         """The messages of ``writers_of(robots)`` on ``streams``, by log time in [begin, end)."""
+        for undecoded in self.records(robots, streams, begin, end):
+            yield from self.decode(undecoded)
+
+    def decode(self, undecoded: UndecodedRecord) -> Iterator[DecodedMessage]:
+        """The messages of one record; none if it cannot be decoded."""
+        channel, record, seq = undecoded
+        writer = channel.writer
+        try:
+            messages = channel.ros.messages(writer.stream, record.payload, writer.session, seq, channel.names)
+        except MessageError as error:
+            self._refuse(error.reason, f"{record.topic}: {error}")
+            return
+        for message in messages:
+            yield DecodedMessage(writer, message, record.log_time)
+
+    def records(
+        self,
+        robots: Collection[str] | None = None,
+        streams: Collection[Stream] = STREAMS,
+        begin: int | None = None,
+        end: int | None = None,
+    ) -> Iterator[UndecodedRecord]:
+        """The records of ``messages``, for readers that decode many together."""
         selected = {writer for writer in self.writers_of(robots) if writer.stream in streams}
         topics = {topic for topic, writers in self._topics.items() if writers & selected}
         counts: Counter[RecordedWriter] = Counter()
+        last: Channel | None = None
+        decoder: ChannelDecoder | None = None
         # Without topics there is nothing to read, while None would mean all.
         for record in self._reader.records(topics, begin, end) if topics else ():
-            decoder = self._decoder(record.channel)
-            if decoder is None or decoder.writer not in selected:
+            if record.channel is not last:  # the hash of a channel costs as much as its record
+                last, decoder = record.channel, self._decoder(record.channel)
+                if decoder is not None and decoder.writer not in selected:
+                    decoder = None
+            if decoder is None:
                 continue
-            writer = decoder.writer
-            counts[writer] += 1
-            seq = counts[writer] if writer.foreign else record.sequence
-            try:
-                messages = decoder.ros.messages(
-                    writer.stream, record.payload, writer.session, seq, decoder.names
-                )
-            except MessageError as error:
-                self._refuse(error.reason, f"{record.topic}: {error}")
-                continue
-            for message in messages:
-                yield DecodedMessage(writer, message, record.log_time)
+            seq = record.sequence
+            if decoder.writer.foreign:
+                counts[decoder.writer] += 1
+                seq = counts[decoder.writer]
+            yield UndecodedRecord(decoder, record, seq)
 
-    def _decoder(self, channel: Channel) -> _ChannelDecoder | None:
+    def _decoder(self, channel: Channel) -> ChannelDecoder | None:
         if channel not in self._known:
             writer = RecordedWriter.from_channel(channel)
             decoder = None
             if writer is not None:
                 options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))
-                decoder = _ChannelDecoder(writer, FrameNames(options, writer.robot or SHARED), RosDecoder())
+                decoder = ChannelDecoder(writer, FrameNames(options, writer.robot or SHARED), RosDecoder())
             self._known[channel] = decoder
         return self._known[channel]
 
 
-class _ChannelDecoder(NamedTuple):
+class ChannelDecoder(NamedTuple):
     """The writer of a channel, and the decoder of its messages."""
 
     writer: RecordedWriter
@@ -232,6 +261,18 @@ def check_has_robot(recording: DecodedRecording, robot: str) -> str:
         names = ", ".join(map(repr, recording.robots)) or "none"
         raise InvalidInput(f"the recording has no robot {robot!r}; its robots: {names}")
     return robot
+
+
+def robot_with_joint_states(recording: DecodedRecording, robot: str | None) -> str:
+    """``robot``, or the only one with joint states. Raises InvalidInput, which names those that have some."""
+    robots = sorted({writer.robot for writer in recording.writers if writer.stream == "joint_states"})
+    if robot in robots:
+        return robot
+    if robot is None and len(robots) == 1:
+        return robots[0]
+    there = ", ".join(map(repr, robots)) or "none"
+    what = f"joint_states of {robot!r}" if robot else "the joint_states of one robot"
+    raise InvalidInput(f"the recording does not hold {what}; it has those of {there}")
 
 
 def first_descriptions(

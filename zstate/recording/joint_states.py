@@ -1,101 +1,316 @@
-"""Joint states of a recording as arrays."""
+"""Joint states of a recording as arrays, in parts, by the rules of a buffer.
+
+``Recording.buffer`` inserts samples one by one. Here the records of a channel that differ only in numbers are
+decoded together, in a fraction of the time; the samples kept are the same, and efforts are kept too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.errors import MessageError
-from zstate.model.joint_trajectory import JointTrajectory
-from zstate.model.robot import coordinate_names, velocity_columns_by_position
-from zstate.recording.decode import DecodedRecording, first_descriptions, joint_order, recorded_model
+from zstate.clock import SET_BACK_NS
+from zstate.errors import MessageError, ModelError
+from zstate.ingest.joint_states import joint_order
+from zstate.model.joint_trajectory import JointTrajectory, concatenate
+from zstate.model.joint_transforms import JointTransforms
+from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.model.urdf import parse_urdf
+from zstate.recording.decode import (
+    DecodedRecording,
+    UndecodedRecord,
+    first_descriptions,
+    recorded_model,
+)
 from zstate.wire.joint_order import JointOrder
-from zstate.wire.messages import JointState, from_block
+from zstate.wire.messages import JointState, RobotDescription, from_block
+from zstate.wire.ros2.decoder import RosJointStates
 
-_ROWS = 8192
-"""Samples of one part: some megabytes for a humanoid."""
+DELAYED_NS = 10_000_000_000
+"""A sample may be this late and still belong to its epoch, as with the history of a listener."""
+
+_ROWS = 4096
+"""Samples decoded together: some megabytes for a humanoid."""
+
+Refuse = Callable[[str, str], None]
+
+
+class JointStatePart(NamedTuple):
+    """Consecutive samples. With ``restarts`` they begin a new history, and earlier parts do not count."""
+
+    trajectory: JointTrajectory
+    restarts: bool
+
+
+class _Batch(NamedTuple):
+    """Joint states of one session with their sequence numbers."""
+
+    states: RosJointStates
+    session: int
+    seqs: NDArray[np.int64]
 
 
 class JointStateReader:
-    """Reads the joint states of ``robot`` in the order of its model, or of its first message without one.
+    """Reads the joint states of ``robot`` once, in the order of its model, or else of its first message.
 
-    Samples that do not have all joints are left out, and ``refuse(reason, text)`` is called for each.
+    Samples that a buffer would refuse are left out, and ``refuse(reason, text)`` is called for each.
     """
 
-    def __init__(self, recording: DecodedRecording, robot: str, refuse: Callable[[str, str], None]) -> None:
+    def __init__(self, recording: DecodedRecording, robot: str, refuse: Refuse) -> None:
+        self.robot = robot
         self._recording = recording
-        self._robot = robot
         self._refuse = refuse
         described = first_descriptions(recording, (robot,)).get(robot)
-        model = None if described is None else recorded_model(recording, described, refuse)
-        if model is not None:
-            self.joint_names = tuple(model.joint_names)
-            self.coordinates = coordinate_names(model)
-            slots = velocity_columns_by_position(model)
-            self._order = joint_order(model)
-        else:
-            messages = recording.messages((robot,), ("joint_states",))
-            first = next((one.message for one in islice(messages, 1)), None)
-            names = first.names or () if isinstance(first, JointState) else ()
-            self.joint_names = self.coordinates = names
-            slots = tuple(range(len(names)))
-            self._order = JointOrder(names)
-        self.velocity_coordinates = tuple(self.coordinates[slot] for slot in slots)
+        self._model = None if described is None else recorded_model(recording, described, refuse)
+        names = self._first_names() if self._model is None else ()
+        self._layout = JointLayout(names) if self._model is None else JointLayout.of_model(self._model)
+        self._epoch = _Epoch()
 
-    def parts(self, begin: int | None = None, end: int | None = None) -> Iterator[JointTrajectory]:
-        """The samples recorded in [begin, end) [ns], as recorded: at most 8192 in each part.
+    @property
+    def has_model(self) -> bool:
+        """Whether the recording has a model that fits the joint states."""
+        return self._model is not None
 
-        Stamps may go back, within a part and between parts.
+    @property
+    def count(self) -> int:
+        """The number of recorded samples, usable or not."""
+        writers = self._recording.writers.items()
+        return sum(count for one, count in writers if (one.robot, one.stream) == (self.robot, "joint_states"))
+
+    def _first_names(self) -> tuple[str, ...]:
+        for decoded in self._recording.messages((self.robot,), ("joint_states",)):
+            assert isinstance(decoded.message, JointState)
+            return decoded.message.names or ()
+        return ()
+
+    def all(self) -> JointTrajectory:
+        """All samples."""
+        parts: list[JointTrajectory] = []
+        for trajectory, restarts in self.parts():
+            if restarts:
+                parts.clear()
+            parts.append(trajectory)
+        return concatenate(parts) if parts else self._layout.empty()
+
+    def parts(self) -> Iterator[JointStatePart]:
+        """All samples in order of their stamps, which ascend across parts too.
+
+        A sample is passed on once another is 10 s newer. Of two samples with one stamp the later one counts.
         """
-        part: list[JointState] = []
-        for decoded in self._recording.messages((self._robot,), ("joint_states",), begin, end):
-            state = decoded.message
-            assert isinstance(state, JointState)
-            if part and (len(part) == _ROWS or not _has_same_columns(state, part[0])):
-                yield from self._trajectory(part)
-                part = []
-            part.append(state)
-        if part:
-            yield from self._trajectory(part)
+        pending: JointTrajectory | None = None
+        restarts = False
+        for trajectory, is_new in self._as_recorded():
+            pending = concatenate((trajectory,) if pending is None or is_new else (pending, trajectory))
+            restarts |= is_new
+            settled = np.count_nonzero(pending.stamps < pending.stamps[-1] - DELAYED_NS)
+            if settled:
+                yield JointStatePart(pending.select(slice(settled)), restarts)
+                pending, restarts = pending.select(slice(settled, None)), False
+        if pending is not None:
+            yield JointStatePart(pending, restarts)
 
-    def _trajectory(self, states: Sequence[JointState]) -> Iterator[JointTrajectory]:
-        """The trajectory of samples with the same columns; none if a joint is missing in them."""
+    def _as_recorded(self) -> Iterator[JointStatePart]:
+        """The samples that a buffer keeps, as they were recorded: stamps may go back."""
+        is_new = False
+        for batch in self._batches():
+            if isinstance(batch, RobotDescription):
+                is_new |= self._replace_model(batch)
+                continue
+            trajectory, usable = self._layout.read(batch.states, self.robot, self._refuse)
+            kept, restarts = self._epoch.keep(batch.session, trajectory.stamps, batch.seqs[usable])
+            is_new |= restarts
+            if len(kept):
+                yield JointStatePart(trajectory.select(kept), is_new)
+                is_new = False
+
+    def _replace_model(self, description: RobotDescription) -> bool:
+        """Use the model of ``description`` from now on; False if it is the same, or cannot be used."""
+        if self._model is None or description.digest == self._model.digest:
+            return False
         try:
-            columns, rate_columns = self._order.columns(states[0])
-        except MessageError as error:
-            for _ in states:
-                self._refuse(error.reason, f"{self._robot!r}: {error}")
+            self._model = parse_urdf(description.urdf, f"the URDF of {self.robot!r}")
+        except ModelError as error:
+            self._refuse("robot description", f"{self.robot!r}: {error}")
+            return False
+        self._layout = JointLayout.of_model(self._model)
+        return True
+
+    def _batches(self) -> Iterator[_Batch | RobotDescription]:
+        """The joint states, and the descriptions that differ from the one before, as recorded."""
+        records: list[UndecodedRecord] = []
+        description = b""
+        for undecoded in self._recording.records((self.robot,), ("joint_states", "robot_description")):
+            channel, record, _ = undecoded
+            if channel.writer.stream == "robot_description":
+                if record.payload == description:
+                    continue  # it is written again every 10 s
+                description = record.payload
+                yield from self._decode(records)
+                records = []
+                messages = (decoded.message for decoded in self._recording.decode(undecoded))
+                yield from (message for message in messages if isinstance(message, RobotDescription))
+                continue
+            if records and (len(records) == _ROWS or not _is_alike(undecoded, records[0])):
+                yield from self._decode(records)
+                records = []
+            records.append(undecoded)
+        yield from self._decode(records)
+
+    def _decode(self, records: Sequence[UndecodedRecord]) -> Iterator[_Batch]:
+        """The joint states of records of one channel and length: together, or else one by one."""
+        if not records:
             return
-        velocities = _rows([state.velocities for state in states], rate_columns)
-        efforts = _rows([state.efforts for state in states], rate_columns)
-        yield JointTrajectory(
-            self.joint_names,
-            self.coordinates,
-            self.velocity_coordinates,
-            np.array([state.stamp for state in states], dtype=np.int64),
-            _stacked([state.positions for state in states], columns),
-            velocities,
-            efforts,
-        )
+        channel = records[0].channel
+        states = channel.ros.joint_states([one.record.payload for one in records])
+        if states is not None:
+            seqs = np.array([one.seq for one in records], dtype=np.int64)
+            yield _Batch(states, channel.writer.session, seqs)
+            return
+        for undecoded in records:
+            for decoded in self._recording.decode(undecoded):
+                assert isinstance(decoded.message, JointState)
+                seqs = np.array([undecoded.seq], dtype=np.int64)
+                yield _Batch(_single(decoded.message), channel.writer.session, seqs)
 
 
-def _rows(blocks: Sequence[bytes | None], columns: NDArray[np.intp]) -> NDArray[np.float64] | None:
-    """One row for each block; None if they are None, or if no number is known."""
-    known = [block for block in blocks if block is not None]
-    rows = _stacked(known, columns) if known else None
-    return None if rows is None or np.isnan(rows).all() else rows
+def _is_alike(one: UndecodedRecord, other: UndecodedRecord) -> bool:
+    return one.channel is other.channel and len(one.record.payload) == len(other.record.payload)
 
 
-def _stacked(blocks: Sequence[bytes], columns: NDArray[np.intp]) -> NDArray[np.float64]:
-    return from_block(b"".join(blocks)).reshape(len(blocks), -1)[:, columns]
-
-
-def _has_same_columns(one: JointState, other: JointState) -> bool:
-    return (
-        one.order == other.order
-        and (one.velocities is None) == (other.velocities is None)
-        and (one.efforts is None) == (other.efforts is None)
+def _single(state: JointState) -> RosJointStates:
+    """One joint state as arrays of one row."""
+    positions, velocities, efforts = (
+        None if block is None else from_block(block)[None]
+        for block in (state.positions, state.velocities, state.efforts)
     )
+    assert positions is not None
+    stamps = np.array([state.stamp], dtype=np.int64)
+    return RosJointStates(stamps, state.names or (), positions, velocities, efforts)
+
+
+class JointLayout:
+    """The columns of a robot's trajectories, by its joint ``names`` or its model."""
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        coordinates: tuple[str, ...] = (),
+        slots: Sequence[int] = (),
+        order: JointOrder | None = None,
+        transforms: JointTransforms | None = None,
+    ) -> None:
+        self._names = names
+        self._coordinates = coordinates or names
+        self._velocity_coordinates = tuple(coordinates[slot] for slot in slots) or names
+        self._order = order or JointOrder(names)
+        self._transforms = transforms
+
+    @classmethod
+    def of_model(cls, model: RobotModel) -> JointLayout:
+        """The columns of a robot with this model."""
+        slots, transforms = velocity_columns_by_position(model), JointTransforms(model)
+        return cls(model.joint_names, coordinate_names(model), slots, joint_order(model), transforms)
+
+    def empty(self) -> JointTrajectory:
+        """A trajectory without samples."""
+        no_stamps, no_positions = np.empty(0, np.int64), np.empty((0, len(self._coordinates)))
+        return self._trajectory(no_stamps, no_positions, None, None)
+
+    def read(
+        self, states: RosJointStates, robot: str, refuse: Refuse
+    ) -> tuple[JointTrajectory, NDArray[np.intp]]:
+        """The trajectory of the usable ``states``, and their rows. ``refuse`` is called for the others."""
+        try:
+            columns, rate_columns = self._order.columns_by_name(states.names)
+        except MessageError as error:
+            for _ in range(len(states.stamps)):
+                refuse(error.reason, f"{robot!r}: {error}")
+            return self.empty(), np.empty(0, np.intp)
+        positions = states.positions[:, columns]
+        is_usable = np.isfinite(positions).all(axis=1)
+        if self._transforms is not None:
+            is_usable &= self._transforms.has_unit_quaternions(positions)
+        for row in np.flatnonzero(~is_usable).tolist():
+            refuse("bad numbers", f"{robot!r}: the positions at {states.stamps[row]} are {positions[row]}")
+        rows = np.flatnonzero(is_usable)
+        positions = positions[rows]
+        if self._transforms is not None:
+            positions = self._transforms.normalised(positions)
+        velocities, efforts = (
+            None if block is None else _known(block[np.ix_(rows, rate_columns)])
+            for block in (states.velocities, states.efforts)
+        )
+        return self._trajectory(states.stamps[rows], positions, velocities, efforts), rows
+
+    def _trajectory(
+        self,
+        stamps: NDArray[np.int64],
+        positions: NDArray[np.float64],
+        velocities: NDArray[np.float64] | None,
+        efforts: NDArray[np.float64] | None,
+    ) -> JointTrajectory:
+        names = self._names, self._coordinates, self._velocity_coordinates
+        return JointTrajectory(*names, stamps, positions, velocities, efforts)
+
+
+def _known(block: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """``block``; None if all of its numbers are NaN, which is ROS for unknown."""
+    return None if np.isnan(block).all() else block
+
+
+class _Epoch:
+    """The samples that a buffer keeps: ``RecordedJointStateIngest`` states the same rules for one sample."""
+
+    def __init__(self) -> None:
+        self._session: int | None = None
+        self._ended_sessions: set[int] = set()
+        self._newest: int | None = None
+        self._next_seq = 0
+        self._last_late: tuple[int, int] | None = None
+
+    def keep(
+        self, session: int, stamps: NDArray[np.int64], seqs: NDArray[np.int64]
+    ) -> tuple[NDArray[np.intp], bool]:
+        """The rows to keep of samples in the order of the recording; and whether they begin a new history."""
+        newest = self._newest
+        is_next = session == self._session and newest is not None and len(stamps) > 0
+        if is_next and stamps[0] >= newest and (np.diff(stamps) >= 0).all():
+            self._newest = int(stamps[-1])
+            self._next_seq = max(self._next_seq, int(seqs.max()) + 1)
+            return np.arange(len(stamps)), False
+        kept: list[int] = []
+        is_new = False
+        for row, (stamp, seq) in enumerate(zip(stamps.tolist(), seqs.tolist(), strict=True)):
+            is_kept, restarts = self._add(session, stamp, seq)
+            if restarts:
+                kept, is_new = [], True
+            if is_kept:
+                kept.append(row)
+        return np.array(kept, dtype=np.intp), is_new
+
+    def _add(self, session: int, stamp: int, seq: int) -> tuple[bool, bool]:
+        """Whether a sample is kept, and whether it begins a new history."""
+        restarts = False
+        if session != self._session:
+            if session in self._ended_sessions:
+                return False, False
+            if self._session is not None:
+                self._ended_sessions.add(self._session)
+                restarts = self._newest is not None and stamp <= self._newest
+            self._session, self._newest, self._next_seq, self._last_late = session, None, 0, None
+        is_in_order = seq >= self._next_seq - 1
+        self._next_seq = max(self._next_seq, seq + 1)
+        if self._newest is None or stamp >= self._newest:
+            self._newest = stamp
+            return True, restarts
+        is_kept = stamp >= self._newest - DELAYED_NS
+        if not is_kept or (is_in_order and stamp < self._newest - SET_BACK_NS):
+            # One old sample may have been delayed; two in a row show that the clock was set back.
+            before, self._last_late = self._last_late, (seq, stamp)
+            if before is not None and seq == before[0] + 1 and before[1] < stamp:
+                self._newest, self._last_late = stamp, None
+                return True, True
+        return is_kept, False

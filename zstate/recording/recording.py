@@ -16,7 +16,7 @@ a withdrawn static edge                     the edge, until another writer place
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest, TransformIngest
+from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import (
     DecodedMessage,
@@ -41,8 +42,10 @@ from zstate.recording.decode import (
     check_has_robot,
     first_descriptions,
     recorded_model,
+    robot_with_joint_states,
 )
 from zstate.recording.info import RecordingInfo, read_info
+from zstate.recording.joint_states import DELAYED_NS, JointStateReader
 from zstate.recording.reader import RecordingReader
 from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import (
@@ -59,8 +62,6 @@ from zstate.wire.messages import (
 _HISTORY_S = 9e8
 # The buffer drops unneeded samples after every so many messages, at least.
 _BATCH = 4096
-# A sample may be this late and still belong to its epoch, as with the history of a listener.
-_DELAYED_NS = 10_000_000_000
 _UNNAMED = "a ROS node"
 
 
@@ -88,24 +89,34 @@ class Recording(Closeable):
         robots = ", ".join(map(repr, self.robots)) or "none"
         return f"<Recording {str(self.info.path)!r}: {self.info.duration_s:g} s, robots {robots}>"
 
-    def buffer(self) -> TransformBuffer:
-        """A buffer with all of the recording, or with all of ``robot``."""
-        return self._load()
+    def joint_states(self, robot: str | None = None) -> JointTrajectory:
+        """All joint states of ``robot``, by default of the only one: those of its last history, see above.
 
-    def lookup_many(
-        self, target: str, source: str, stamps: ArrayLike
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """The result of ``buffer().lookup_many``: pose7 at each stamp, (T, 7), and which are valid, (T,).
-
-        Reads the recording once from beginning to end, and keeps only the samples around the stamps [ns],
-        which may be in any order: memory grows with their number, not with the recording.
-        Raises UnknownFrame, AmbiguousFrame and Disconnected.
+        Of samples with one stamp the later one counts. Samples without a finite position of every joint
+        are left out; the first of each reason is logged. Raises InvalidInput for another robot, and
+        without ``robot`` if several have joint states.
         """
-        instants = check_stamps(stamps)
-        return self._load(instants).lookup_many(target, source, instants)
+        return self.joint_state_reader(robot).all()
 
-    def _load(self, around: NDArray[np.int64] | None = None) -> TransformBuffer:
-        """A buffer with everything, or with what lookups at the stamps ``around`` [ns] need."""
+    def joint_state_reader(
+        self, robot: str | None = None, refuse: Callable[[str, str], None] | None = None
+    ) -> JointStateReader:
+        """Reader of ``joint_states(robot)`` in parts, for a recording that does not fit into memory.
+
+        ``refuse(reason, text)`` is called for each sample left out; by default the first of each reason is
+        logged.
+        """
+        refuse = refuse or Refusals("recorded joint_states").count
+        decoded = DecodedRecording(self._reader, refuse)
+        return JointStateReader(decoded, robot_with_joint_states(decoded, robot or self.robot), refuse)
+
+    def buffer(self, around: ArrayLike | None = None) -> TransformBuffer:
+        """A buffer with all of the recording, or with all of ``robot``.
+
+        With ``around``, stamps [ns] in any order, only with the samples that lookups there need: memory
+        grows with their number, not with the recording. Reads the recording once from beginning to end.
+        """
+        stamps = None if around is None else np.unique(check_stamps(around))
         buffer, counters = TransformBuffer(_HISTORY_S), Counters()
         buffer.is_recording = True
         recording = DecodedRecording(self._reader, counters.count_refusal)
@@ -119,13 +130,21 @@ class Recording(Closeable):
             model = recorded_model(recording, description, counters.count_refusal)
             if model is not None:
                 loader.add_model(description, model)
-        stamps = None if around is None else np.unique(around)
         batch = _BATCH if stamps is None else max(_BATCH, len(stamps))
         for count, decoded in enumerate(recording.messages(robots), 1):
             loader.insert(decoded)
             if stamps is not None and not count % batch:
                 buffer.keep_only_around(stamps)
         return buffer
+
+    def lookup_many(
+        self, target: str, source: str, stamps: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """``buffer(around=stamps).lookup_many``: pose7 at each stamp, (T, 7), and which are valid, (T,).
+
+        Raises UnknownFrame, AmbiguousFrame and Disconnected.
+        """
+        return self.buffer(stamps).lookup_many(target, source, stamps)
 
     def close(self) -> None:
         """Close the file. A second call does nothing."""
@@ -243,7 +262,7 @@ class RecordedJointStateIngest(JointStateIngest):
 
     def _insert(self, sample: Sample) -> bool | None:
         is_described = self._track is not None
-        if is_described and self._newest is not None and sample.stamp < self._newest - _DELAYED_NS:
+        if is_described and self._newest is not None and sample.stamp < self._newest - DELAYED_NS:
             return False
         return super()._insert(sample)
 
@@ -298,7 +317,7 @@ class EdgeEpochs:
 
     def is_delayed(self, sample: Sample, children: list[str]) -> bool:
         """Whether it is a single old sample, after which stamps may continue as before."""
-        limit = sample.stamp + _DELAYED_NS
+        limit = sample.stamp + DELAYED_NS
         if not any(limit < self._newest.get(child, limit) for child in children):
             self._delayed.pop(children[0], None)
             return False
@@ -314,7 +333,7 @@ class EdgeEpochs:
             newest = self._newest.get(child)
             if newest is not None and sample.stamp <= newest:
                 is_new_writer = (sample.session, child) not in self._sessions
-                if is_new_writer or sample.stamp < newest - _DELAYED_NS:
+                if is_new_writer or sample.stamp < newest - DELAYED_NS:
                     return True
         return False
 

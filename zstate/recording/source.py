@@ -8,7 +8,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.robot import RobotModel
-from zstate.recording.decode import DecodedMessage, DecodedRecording
+from zstate.recording.decode import DecodedMessage, DecodedRecording, robot_with_joint_states
 from zstate.recording.reader import RecordingReader
 from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.wire.joint_order import JointNumbers
@@ -36,7 +36,7 @@ class RecordedSource(Closeable):
         self._reader = RecordingReader(path)
         try:
             recording = DecodedRecording(self._reader, self._refusals.count)
-            self.robot = _only_robot(recording, robot)
+            self.robot = robot_with_joint_states(recording, robot)
         except BaseException:
             self.close()
             raise
@@ -112,14 +112,3 @@ class _StampShift:
 def _stamp(decoded: DecodedMessage) -> int:
     assert isinstance(decoded.message, JointState)
     return decoded.message.stamp
-
-
-def _only_robot(recording: DecodedRecording, robot: str | None) -> str:
-    robots = sorted({writer.robot for writer in recording.writers if writer.stream == "joint_states"})
-    if robot in robots:
-        return robot
-    if robot is None and len(robots) == 1:
-        return robots[0]
-    there = ", ".join(map(repr, robots)) or "none"
-    what = f"joint_states of {robot!r}" if robot else "the joint_states of one robot"
-    raise InvalidInput(f"the recording does not hold {what}; it has those of {there}")

@@ -73,6 +73,10 @@ class JointOrder:
                 "a joint state in an order of another model; do both sides use the same URDF?",
                 reason="other joint order",
             )
+        return self.columns_by_name(names)
+
+    def columns_by_name(self, names: tuple[str, ...]) -> tuple[_Indices, _Indices]:
+        """``columns`` of states with these ``names``. Raises MessageError if any is missing."""
         found = self._permutations.get(names)
         if found is None:
             missing = [name for name in self._coordinates if name not in names]

@@ -253,3 +253,42 @@ def test_names_and_stamps_that_ros_2_cannot_represent_are_refused():
         JointStateEncoder(["a\0"])
     with pytest.raises(InvalidInput, match=f"{2**62}"):
         JointStateEncoder(["a"]).encode(2**62, bytes(8))
+
+
+@pytest.mark.parametrize(("has_velocities", "has_efforts"), PRESENT)
+@pytest.mark.parametrize("count", [0, 1, 7, 30])
+def test_many_messages_of_the_same_joints_are_read_together(
+    count: int, has_velocities: bool, has_efforts: bool
+):
+    dice, names = random.Random(2), names_of(count)
+    payloads: list[bytes] = []
+    stamps = [-(2**31) * 10**9, -1, 0, STAMP, 2**31 * 10**9 - 1]
+    for row, stamp in enumerate(stamps):
+        values = joint_state(stamp, "base", names, *sequences_of(row, count, has_velocities, has_efforts))
+        payloads.append(cdr(values, fill=dice.randbytes) + dice.randbytes(3))
+    states = JointStateDecoder().decode_many(payloads)
+    assert states is not None
+    assert (states.stamps.tolist(), states.names) == (stamps, names)
+    one_by_one = [JointStateDecoder().decode(payload) for payload in payloads]
+    assert [block.tobytes() for block in states.positions] == [state.positions for state in one_by_one]
+    for block, has_block, name in (
+        (states.velocities, has_velocities and count, "velocities"),
+        (states.efforts, has_efforts and count, "efforts"),
+    ):
+        assert (block is not None) == bool(has_block)
+        if block is not None:
+            assert [row.tobytes() for row in block] == [getattr(state, name) for state in one_by_one]
+
+
+def sequences_of(row: int, count: int, has_velocities: bool, has_efforts: bool) -> list[list[float]]:
+    return [[row + number for number in block] for block in sequences(count, has_velocities, has_efforts)]
+
+
+def test_messages_that_differ_in_more_than_numbers_are_not_read_together():
+    first = cdr(joint_state(STAMP, "base", ("a", "b"), [1.0, 2.0]))
+    swapped = cdr(joint_state(STAMP, "base", ("b", "a"), [1.0, 2.0]))
+    wrong_time = first[:8] + struct.pack("<I", 10**9) + first[12:]
+    assert len(first) == len(swapped) == len(wrong_time)
+    assert JointStateDecoder().decode_many([first, swapped]) is None
+    assert JointStateDecoder().decode_many([first, wrong_time]) is None
+    assert JointStateDecoder().decode_many([first[:20], first[:20]]) is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime
 
 import numpy as np
@@ -27,6 +28,7 @@ _UNITS: tuple[str, ...] = ("rad", "deg")
 _NO_ROBOT: tuple[str, ...] = ("(none)",)
 _ALL = "all joints"
 _PLOT_S = 10.0
+_PLOT_INTERVAL_NS = round(_PLOT_S * 1e9) // 240
 _PLOT_HEIGHT = 180
 _PLOT_EVERY = 3
 """A plot is redrawn with every third update: it costs more than any other panel."""
@@ -177,8 +179,10 @@ class PlotsPanel:
             self._plot = None
         is_due = self._plot is None or self._updates % _PLOT_EVERY == 0
         if track is not None and stamp is not None and drawn and is_due:
-            history = context.buffer.joint_history(track, stamp, _PLOT_S)
-            self._draw(drawn, ((history.stamps - stamp) / 1e9, *history.positions[:, columns].T))
+            with suppress(InvalidInput):  # the robot has been removed since the snapshot
+                states = context.buffer.joint_states(robot, stamp - round(_PLOT_S * 1e9), stamp + 1)
+                shown = states.select(plotted_rows(states.stamps))
+                self._draw(drawn, ((shown.stamps - stamp) / 1e9, *shown.positions[:, columns].T))
         self._drawn = drawn
 
     def _draw(self, names: tuple[str, ...], data: tuple[NDArray[np.float64], ...]) -> None:
@@ -194,6 +198,12 @@ class PlotsPanel:
             self._plot = self._gui.add_uplot(
                 data, series, scales=_SCALES, legend=_LEGEND, height=_PLOT_HEIGHT
             )
+
+
+def plotted_rows(stamps: NDArray[np.int64]) -> NDArray[np.intp]:
+    """The first of the ``stamps`` [ns] in each interval of a plot: the same ones in consecutive plots."""
+    intervals = stamps // _PLOT_INTERVAL_NS
+    return np.flatnonzero(np.diff(intervals, prepend=intervals[:1] - 1))
 
 
 class TimeCursor:

@@ -13,10 +13,12 @@ whole, the numbers behind them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from struct import Struct
 from typing import Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.ros2.types import CLOCK, STRING
@@ -28,8 +30,8 @@ BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
 M = TypeVar("M")
 Span = tuple[int, int]  # first byte, and the one after the last
 
-_SECOND = 1_000_000_000
-_EARLIEST, _LATEST = -(2**31) * _SECOND, 2**31 * _SECOND - 1
+SECOND_NS = 1_000_000_000
+_EARLIEST, _LATEST = -(2**31) * SECOND_NS, 2**31 * SECOND_NS - 1
 _TIME = Struct("<iI")
 _DOUBLE_BYTES = 8
 _COUNT_BYTES = 4
@@ -58,16 +60,16 @@ def to_time(stamp: int) -> tuple[int, int]:
             f"ROS 2 cannot represent the stamp {stamp}: its seconds are an int32, which ends in 1901 and in "
             "2038; stamps are nanoseconds since 1970"
         )
-    return divmod(stamp, _SECOND)
+    return divmod(stamp, SECOND_NS)
 
 
 def from_time(sec: int, nanosec: int) -> int:
     """The stamp [ns] of a time. Raises MessageError if ``nanosec`` is a second or more."""
-    if nanosec >= _SECOND:
+    if nanosec >= SECOND_NS:
         raise MessageError(
-            f"a time of {sec} s and {nanosec} ns: the nanoseconds are below {_SECOND}", reason="malformed"
+            f"a time of {sec} s and {nanosec} ns: the nanoseconds are below {SECOND_NS}", reason="malformed"
         )
-    return sec * _SECOND + nanosec
+    return sec * SECOND_NS + nanosec
 
 
 def pack_stamp(stamp: int) -> bytes:
@@ -234,6 +236,15 @@ class CdrTemplate:
         data = (words & self._mask).tobytes()
         return data[: self._fixed_bytes], data[self._fixed_bytes :]
 
+    def split_many(self, payloads: Sequence[bytes]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+        """``split`` of each of ``payloads``, of one length: a row of 32-bit words each, in both arrays."""
+        rows = np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), -1)
+        words = np.ascontiguousarray(rows[:, : self._count * _UINT32.itemsize]).view(_UINT32)
+        words = words.take(self._order, axis=1)
+        words &= self._mask
+        fixed = self._fixed_bytes // _UINT32.itemsize
+        return words[:, :fixed], words[:, fixed:]
+
     def join(self, fixed: bytes, numbers: bytes) -> bytes:
         """The payload that ``split`` takes apart into these."""
         return np.frombuffer(fixed + numbers, _UINT32).take(self._places).tobytes()
@@ -259,6 +270,19 @@ class TemplateCache(Generic[M]):
             value = values.get(fixed)
             if value is not None:
                 return value, numbers
+        return None
+
+    def find_many(self, payloads: Sequence[bytes]) -> tuple[M, NDArray[np.uint32]] | None:
+        """``find`` for payloads of one length: their common value, and a row of numbers for each.
+
+        None if their values are not known, or differ. Numbers are in 32-bit words.
+        """
+        for template, values in self._by_length.get(len(payloads[0]), ()):
+            fixed, _ = template.split(payloads[0])
+            value = values.get(fixed)
+            if value is not None:
+                all_fixed, numbers = template.split_many(payloads)
+                return (value, numbers) if (all_fixed == np.frombuffer(fixed, _UINT32)).all() else None
         return None
 
     def add(self, reader: CdrReader, value: M) -> None:

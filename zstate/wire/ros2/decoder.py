@@ -8,6 +8,7 @@ from hashlib import blake2b
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zstate.errors import MessageError
 from zstate.wire.keys import Stream
@@ -24,6 +25,7 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.ros2.cdr import (
+    SECOND_NS,
     STAMP_BYTES,
     CdrReader,
     TemplateCache,
@@ -35,6 +37,7 @@ from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
 _POSE_NUMBERS = 7
+_STAMP_WORDS = STAMP_BYTES // 4
 
 
 class RosDecoder:
@@ -66,6 +69,14 @@ class RosDecoder:
             digest = blake2b(urdf.encode(), digest_size=8).hexdigest()
             return (RobotDescription(session, urdf, digest, joint_names=(), moving_edges=(), clock=""),)
         return (ClockMessage(decode_clock(payload), seq, session),)
+
+    def joint_states(self, payloads: Sequence[bytes]) -> RosJointStates | None:
+        """The joint states in ``payloads``, of one length and channel, decoded together.
+
+        None unless they differ only in numbers and all have a stamp: ``messages`` then decodes each.
+        """
+        states = self._joints.decode_many(payloads)
+        return states if states is not None and states.stamps.all() else None
 
     def _transform_samples(
         self, payload: bytes, session: int, seq: int, names: FrameNames
@@ -110,6 +121,19 @@ class RosJointState(NamedTuple):
     efforts: bytes | None = None
 
 
+class RosJointStates(NamedTuple):
+    """Decoded JointStates of the same joints: row i of each array is of message i.
+
+    ``stamps`` (N,) [ns]; the blocks are (N, n) with a column for each of ``names``.
+    """
+
+    stamps: NDArray[np.int64]
+    names: tuple[str, ...]
+    positions: NDArray[np.float64]
+    velocities: NDArray[np.float64] | None
+    efforts: NDArray[np.float64] | None
+
+
 class JointStateDecoder:
     """Decodes payloads of any number of writers; after the first of its template, in one step."""
 
@@ -139,6 +163,31 @@ class JointStateDecoder:
         if efforts is not None:
             efforts = numbers[end:]
         return RosJointState(stamp, frame_id, names, positions, velocities, efforts)
+
+    def decode_many(self, payloads: Sequence[bytes]) -> RosJointStates | None:
+        """The messages in ``payloads``, of one length; None unless they differ only in numbers."""
+        try:
+            self.decode(payloads[0])  # adds its template
+        except MessageError:
+            return None
+        found = self._templates.find_many(payloads)
+        if found is None:
+            return None
+        (_, _, names, _, velocities, efforts), numbers = found
+        times, blocks = numbers[:, :_STAMP_WORDS], numbers[:, _STAMP_WORDS:]
+        seconds, nanoseconds = times[:, 0].astype(np.int32).astype(np.int64), times[:, 1].astype(np.int64)
+        if (nanoseconds >= SECOND_NS).any():
+            return None
+        columns = np.ascontiguousarray(blocks).view("<f8")
+        size = len(names)
+        first_effort = size if velocities is None else 2 * size
+        return RosJointStates(
+            seconds * SECOND_NS + nanoseconds,
+            names,
+            columns[:, :size],
+            None if velocities is None else columns[:, size : 2 * size],
+            None if efforts is None else columns[:, first_effort:],
+        )
 
 
 def read_joint_state(reader: CdrReader) -> RosJointState:

@@ -1,0 +1,24 @@
+"""Rows of a plot: few, and the same ones while it scrolls."""
+
+import numpy as np
+
+from zstate.view.panels.control_panels import plotted_rows
+
+S = 1_000_000_000
+
+
+def test_plot_has_at_most_one_sample_for_each_of_its_intervals():
+    stamps = 1_700_000_000 * S + np.arange(0, 10 * S, S // 1000)
+    rows = plotted_rows(stamps)
+    assert 240 <= len(rows) <= 241
+    assert plotted_rows(stamps[::100]).tolist() == list(range(100))
+    assert plotted_rows(stamps[:0]).tolist() == []
+
+
+def test_consecutive_plots_choose_the_same_samples():
+    stamps = 1_700_000_000 * S + np.arange(0, 12 * S, S // 997)
+    first, second = stamps[:9970], stamps[123:10_093]
+    before, after = set(first[plotted_rows(first)].tolist()), set(second[plotted_rows(second)].tolist())
+    common = range(int(second[0]), int(first[-1]) + 1)
+    # The first row of a plot may be in the middle of an interval.
+    assert {one for one in after ^ before if one in common} <= {int(second[0])}

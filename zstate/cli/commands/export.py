@@ -1,0 +1,138 @@
+"""zstate export: a recording as a table."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from zstate.cli import options
+from zstate.cli.output.console import count_text, fail, print_status, print_wrapped, size_text
+from zstate.errors import InvalidInput
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from zstate.recording.export import ExportReport, TableFormat
+
+_LINE_S = 2.0
+_INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
+
+
+def _read_stamps(file: str) -> NDArray[np.int64]:
+    from zstate.clock import check_stamp, check_stamps
+
+    try:
+        lines = Path(file).read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInput(f"{file!r} cannot be read: {error}") from None
+    for number, line in enumerate(lines, 1):
+        if not all(_INTEGER.fullmatch(word) for word in line.split()):
+            text = f"line {number} of {file!r} is {line.strip()!r}; stamps are integers of nanoseconds"
+            raise InvalidInput(text)
+    stamps = [int(word) for line in lines for word in line.split()]
+    if not stamps:
+        raise InvalidInput(f"{file!r} has no stamp")
+    return check_stamps([check_stamp(stamp) for stamp in stamps])
+
+
+@click.command("export")
+@click.argument("file", metavar="RECORDING")
+@click.option("--robot", metavar="NAME", help="The robot; default: the only one with joint states.")
+@click.option(
+    "--pose",
+    "poses",
+    nargs=2,
+    multiple=True,
+    metavar="TARGET SOURCE",
+    help="Also the pose of frame SOURCE in frame TARGET; may be repeated.",
+)
+@click.option(
+    "--rate",
+    type=options.RATE,
+    help="A row HZ times a second, interpolated; default: the samples as recorded.",
+)
+@click.option(
+    "--stamps",
+    type=options.Checked("FILE", _read_stamps),
+    help="A row for each stamp in FILE, integers of nanoseconds, interpolated.",
+)
+@click.option("--csv", "kind", flag_value="csv", help="Write comma-separated values.")
+@click.option("--parquet", "kind", flag_value="parquet", help="Write Parquet.")
+@click.option("--output", metavar="FILE", help="Default: RECORDING with the suffix of the format.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing output.")
+def export_command(
+    *,
+    file: str,
+    robot: str | None,
+    poses: tuple[tuple[str, str], ...],
+    rate: float | None,
+    stamps: NDArray[np.int64] | None,
+    kind: TableFormat | None,
+    output: str | None,
+    overwrite: bool,
+) -> None:
+    """Write the joint states of RECORDING, and poses of frames, as a table with one row for each instant.
+
+    Columns are stamp [ns], position.JOINT, velocity.JOINT and effort.JOINT as far as recorded, and
+    TARGET.SOURCE.x to .qw of each --pose; numbers that are not known are NaN. At --rate or --stamps,
+    positions are interpolated as in lookups, and velocities and efforts are left out.
+    Parquet needs pyarrow: pip install 'zstate[export]'.
+
+    \b
+    zstate export run.mcap --parquet                         # run.parquet
+    zstate export run.mcap --csv --rate 50 --pose panda_link0 panda_hand
+    zstate export run.mcap --parquet --stamps images.txt --output images.parquet
+    """
+    if kind is None:
+        raise click.UsageError("Missing option '--csv' or '--parquet'.")
+    if rate is not None and stamps is not None:
+        raise click.UsageError("--rate and --stamps exclude each other: both choose the rows")
+    from zstate.errors import RecordingError
+    from zstate.recording.export import Exporter
+    from zstate.recording.recording import Recording
+
+    path = Path(output) if output else Path(file).with_suffix(f".{kind}")
+    start = time.monotonic()
+    with Recording(file, None if poses else robot) as recording:  # frames may be of other robots
+        exporter = Exporter(
+            recording, robot, rate_hz=rate, stamps=stamps, poses=poses, on_progress=ExportProgress()
+        )
+        try:
+            report = exporter.write(path, kind, overwrite=overwrite)
+        except RecordingError as error:
+            fail(str(error).replace("overwrite=True", "--overwrite"))
+    print_wrapped(summary(report, path, time.monotonic() - start))
+
+
+class ExportProgress:
+    """Prints a status line every two seconds."""
+
+    def __init__(self) -> None:
+        self._due = time.monotonic() + _LINE_S
+
+    def __call__(self, read: int, recorded: int) -> None:
+        if time.monotonic() >= self._due:
+            print_status(f"read {read} of {count_text(recorded, 'sample')}")
+            self._due = time.monotonic() + _LINE_S
+
+
+def summary(report: ExportReport, path: Path, took_s: float) -> str:
+    """What was exported, and what is missing in it."""
+    columns = f"{' and '.join(report.kinds)} of {count_text(report.joint_count, 'joint')}"
+    if report.unknown_poses:
+        columns += f", {count_text(len(report.unknown_poses), 'pose')}"
+    duration_s = (report.last - report.first) * 1e-9
+    where = f"{path} ({size_text(path.stat().st_size)})"
+    missing = {f"{source!r} in {target!r}": count for (target, source), count in report.unknown_poses.items()}
+    missing["interpolated joints"] = report.unknown_joints
+    losses = [f"{count_text(count, 'row')} without {what}" for what, count in missing.items() if count]
+    losses += [
+        f"{count_text(count, 'sample')} left out ({reason})" for reason, count in report.refused.items()
+    ]
+    text = f"exported {count_text(report.rows, 'row')} of {report.robot} over {duration_s:.3f} s"
+    return f"{text} in {took_s:.1f} s into {where}: {columns}; {', '.join(losses) or 'nothing missing'}"
