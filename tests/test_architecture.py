@@ -60,7 +60,6 @@ HOMES = {
     "mcap": "recording",
     "pyarrow": "recording",  # `zstate export`
     "lz4": "recording",
-    "pyarrow": "recording",
     "zstandard": "recording",
     "rospy": "bridges",
     "geometry_msgs": "bridges",
