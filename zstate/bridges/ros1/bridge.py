@@ -7,10 +7,9 @@ from contextlib import ExitStack
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
-from zstate.bridges.ros1.from_ros import Ros1ToNative
+from zstate.bridges.ros1.directions import NativeToRos1, Ros1ToNative
 from zstate.bridges.ros1.messages import Ros1FrameNames
 from zstate.bridges.ros1.node import Node
-from zstate.bridges.ros1.to_ros import NativeToRos1
 from zstate.errors import InvalidInput, NetworkError, Unreachable
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
