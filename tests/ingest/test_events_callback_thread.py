@@ -8,7 +8,8 @@ import threading
 import pytest
 from helpers.processes import until
 
-from zstate._util.callback_thread import QUEUE_SIZE, CallbackThread
+from zstate.ingest.events import _QUEUE_SIZE as QUEUE_SIZE
+from zstate.ingest.events import CallbackThread
 
 
 def idle(_: float) -> float:
