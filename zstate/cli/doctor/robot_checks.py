@@ -274,8 +274,7 @@ def poses_check(probe: RobotProbe, model: RobotModel | None) -> Check:
     roots = sorted(frame.name for frame in frames if frame.parent is None)
     if len(roots) > 1:
         return _trees_check(probe, {frame.name for frame in frames}, roots)
-    is_placed = any(frame.kind == "pose" for frame in frames)
-    has_samples = is_placed or bool(probe.samples.statistics.count)
+    has_samples = bool(probe.sample_count)
     is_driven = "joint_states" in probe.streams and model is not None
     if not (has_samples or is_driven or (model is not None and not model.joint_names)):
         return skipped("poses", "no joint positions")

@@ -205,10 +205,14 @@ class RobotProbe(Closeable):
     @property
     def is_silent(self) -> bool:
         """Whether nothing has arrived except announcements."""
-        frames = any(frame.kind in ("static", "pose") for frame in self.listener.buffer.frames())
-        return not (
-            self.description or self.samples.statistics.count or self.statuses or self.offsets or frames
-        )
+        frames = any(frame.kind == "static" for frame in self.listener.buffer.frames())
+        return not (self.description or self.sample_count or self.statuses or self.offsets or frames)
+
+    @property
+    def sample_count(self) -> int:
+        """How many samples of the followed stream and of transforms have arrived."""
+        transforms = 0 if self.transforms is None else self.transforms.statistics.count
+        return self.samples.statistics.count + transforms
 
     @property
     def has_only_transforms(self) -> bool:
