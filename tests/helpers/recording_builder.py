@@ -97,12 +97,14 @@ class RecordingBuilder:
         poses: dict[Edge, Sequence[float]],
         *,
         session: int = 2,
+        writer: str | None = None,
         log_time: int | None = None,
     ) -> TransformSample:
         names = tuple(poses)
         block = to_block(list(poses.values()))
         sample = TransformSample(stamp, self._seq(robot, session), session, order_digest(names), block, names)
-        self.encoder.write_message(robot, sample, stamp + LATENCY if log_time is None else log_time)
+        at = stamp + LATENCY if log_time is None else log_time
+        self.encoder.write_message(robot, sample, at, writer)
         return sample
 
     def statics(

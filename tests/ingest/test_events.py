@@ -8,14 +8,17 @@ import pytest
 from helpers.processes import until
 
 from zstate._util.bounded import MAX_ENTRIES
+from zstate.errors import InsertRefused
 from zstate.ingest.events import KEPT, EventLog, StaticEdgeOwners, WriterEvent
+from zstate.ingest.frame_ownership import EdgeSource
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream
 
-SUBSCRIBED: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states")
+SUBSCRIBED: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "transforms")
 ROS_SHARED: tuple[Stream, ...] = ("tf", "tf_static")
 DRIVER = WriterId("driver", "jetson", 412, 5, 7)
 RESTARTED = WriterId("driver", "jetson", 413, 6, 8)
+REFUSAL = InsertRefused("refused", reason="second writer", edge=("r1/tool", "r1/camera"))
 OTHER = WriterId("simulator", "laptop", 9, 6, 9)
 
 
@@ -116,11 +119,31 @@ def test_two_static_writers_that_place_one_frame_conflict_once():
         events.set_static_children("r1", "mount", frozenset({"r1/camera", "r1/laser"}))
         for _ in range(50):
             events.set_static_children("r1", "room", frozenset({"r1/camera"}))
-            events.add_second_edge("r1", "room", "r1/camera", "refused")
+            events.add_second_edge("tf_static", EdgeSource("r1", "room"), REFUSAL)
         assert kinds(events) == ["joined", "joined", "conflict"]
         conflict = events.recent()[-1]
     assert (conflict.writer, conflict.stream) == (OTHER, "tf_static")
     assert conflict.text == "'room' of 'r1' places 'r1/camera', and so does 'mount' of 'r1'"
+
+
+def test_second_writer_of_a_moving_edge_conflicts_once_and_its_stream_is_transforms():
+    with quiet() as events:
+        events.on_writer(announced(DRIVER, "transforms", "odometry"), alive=True)
+        events.on_writer(announced(OTHER, "transforms", "lidar"), alive=True)
+        for _ in range(50):
+            events.add_second_edge("transforms", EdgeSource("r1", "any text", OTHER.session), REFUSAL)
+        conflicts = [event for event in events.recent() if event.kind == "conflict"]
+    assert [(one.writer, one.stream, one.text) for one in conflicts] == [(OTHER, "transforms", str(REFUSAL))]
+
+
+def test_departed_transform_writer_leaves_static_edges_of_its_name():
+    with quiet() as events:
+        for stream in ("tf_static", "transforms"):
+            events.on_writer(announced(DRIVER, stream, "mount"), alive=True)
+        events.set_static_children("r1", "mount", frozenset({"r1/camera"}))
+        events.on_writer(announced(DRIVER, "transforms", "mount"), alive=False)
+        events.set_static_children("r1", "room", frozenset({"r1/camera"}))
+        assert "conflict" in kinds(events)
 
 
 def test_departed_static_writer_conflicts_with_none():

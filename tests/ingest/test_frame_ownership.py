@@ -48,7 +48,9 @@ class Network:
             TransformBuffer(),
             Counters(),
             placers=placers,
-            on_conflict=lambda robot, writer, child, _: self.conflicts.append((robot, writer, child)),
+            on_conflict=lambda _, source, refusal: self.conflicts.append(
+                (source.robot, source.name, refusal.edge[1])
+            ),
         )
         self.buffer = self.ownership.buffer
         self._follow = follow

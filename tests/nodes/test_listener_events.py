@@ -7,13 +7,15 @@ import threading
 from collections.abc import Callable, Iterator
 
 import pytest
-from helpers.processes import Child, until
+from helpers.processes import Child, repeated, until
 from helpers.robots import RRBOT
 
 from zstate.ingest.events import WriterEvent
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.transform import Transform
 
 Spawn = Callable[..., Child]
 
@@ -93,6 +95,29 @@ def test_frozen_writer_is_stale_then_resumed(collector, spawn):
     writer.process.send_signal(signal.SIGCONT)
     collector.await_kinds("joined", "stale", "resumed")
     collector.await_samples()
+
+
+def test_frozen_writer_of_transforms_is_stale_on_its_own_stream(sessions):
+    writer, reader = sessions
+    events: list[WriterEvent] = []
+    with (
+        StatePublisher(writer, RRBOT, "r1") as wheels,
+        TransformPublisher(writer, "r1", "odometry") as odometry,
+        TransformListener(reader, "r1", on_event=events.append),
+        repeated(lambda: wheels.publish([0.0, 0.0])),
+    ):
+        edge = Transform("odom", "world", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+        def of_odometry() -> list[str]:
+            return [event.kind for event in events if event.stream == "transforms"]
+
+        with repeated(lambda: odometry.publish([edge])):
+            until(lambda: of_odometry() == ["joined"])
+            until(lambda: odometry.stats.sent > 10)
+        until(lambda: of_odometry() == ["joined", "stale"])
+        assert "published nothing on transforms" in events[-1].text
+        until(lambda: odometry.publish([edge]) or of_odometry() == ["joined", "stale", "resumed"])
+    assert not any(event.kind == "stale" and event.stream != "transforms" for event in events)
 
 
 def test_writer_frozen_for_longer_than_its_lease_is_cut_off_then_back(collector, spawn):

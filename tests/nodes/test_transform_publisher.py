@@ -6,18 +6,20 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
-from helpers.robots import RRBOT
+from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
 from zstate.net.presence import discover
 from zstate.net.status import StatusSubscriber
+from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
-from zstate.wire.messages import Status
+from zstate.wire.messages import Status, TransformSample, order_digest, to_block
+from zstate.wire.native import ENCODINGS, encode
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -291,3 +293,26 @@ def test_covariance_comes_back_from_lookups_of_its_edge(sessions):
         assert np.allclose(between.covariance, (first + last) / 2)
         assert (between.kind, buffer.lookup("base_link", "wheel", stamp).covariance) == ("interpolated", None)
         assert buffer.lookup("odom", "wheel", stamp).covariance is None
+
+
+def test_samples_that_arrive_after_their_writer_left_join_its_history(sessions):
+    writer, reader = sessions
+    stamp = time.time_ns()
+    edges, key = (("odom", "base_link"),), "zstate/r1/transforms/odometry"
+    with TransformListener(reader, "r1") as listener:
+
+        def counts() -> list[int]:
+            return [frame.count for frame in listener.buffer.frames() if frame.parent]
+
+        with TransformPublisher(writer, "r1", "odometry") as odometry:
+            for step in range(2):
+                odometry.publish([pose("odom", "base_link")], stamp + step)
+            until(lambda: counts() == [2])
+            session = odometry._session_id
+        until(lambda: [event.kind for event in listener.events()] == ["joined", "left"])
+        late = TransformSample(stamp + 2, 2, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
+        with StreamPublisher(writer, key, ENCODINGS[TransformSample]) as stream:
+            wait_for_reader(writer, key)
+            stream.put(encode(late))
+            until(lambda: counts() == [3])
+        assert listener.robots() == ("r1",)

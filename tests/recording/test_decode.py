@@ -97,7 +97,7 @@ def test_static_writers_keep_their_names(tmp_path: Path):
         builder.statics("arm", START, {("world", "base"): pose()}, writer=MODEL_WRITER)
         builder.encoder.withdraw("arm", "camera", START + S)
     found = DecodedFile(tmp_path / "r.mcap").of(StaticTransforms)
-    assert [(decoded.writer.static_writer, decoded.message.edges) for decoded in found] == [
+    assert [(decoded.writer.edge_writer, decoded.message.edges) for decoded in found] == [
         ("camera", (("tool", "camera"),)),
         (MODEL_WRITER, (("world", "base"),)),
         ("camera", ()),
@@ -127,7 +127,7 @@ def test_bag_is_read_by_its_topics(tmp_path: Path, storage: StoragePlugin):
     (description,), (statics,) = read.of(RobotDescription), read.of(StaticTransforms)
     (sample,), (ros, dog) = read.of(TransformSample), read.of(JointState)
     assert description.message.urdf == RRBOT.urdf
-    assert statics.writer.static_writer is None
+    assert statics.writer.edge_writer is None
     assert statics.message.edges == (("base", "lidar"),)
     assert (sample.message.stamp, sample.message.edges) == (START + 5, (("odom", "base"),))
     assert np.array_equal(poses_from_block(sample.message.poses)[0], odom_from_base.pose7)

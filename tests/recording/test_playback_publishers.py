@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import math
 import threading
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from helpers.processes import until
 from helpers.recording_builder import MS, START, RecordingBuilder, pose
-from helpers.robots import RRBOT
+from helpers.robots import RRBOT, SampleCollector
 
 from zstate.errors import SecondWriter
 from zstate.net.presence import current_tokens
 from zstate.net.session import connect
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.recording.player import Player
 from zstate.transform import Transform
+from zstate.wire.messages import TransformSample, poses_from_block
+from zstate.wire.native import ENCODINGS, decode
 
 COUNT = 20
 CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
@@ -32,6 +36,18 @@ def cart(tmp_path: Path) -> Path:
             builder.statics("cart", START, {("cart/base", "cart/camera"): pose(z=0.1)}, writer=writer)
         for n in range(COUNT):
             builder.edges("cart", START + n * 10 * MS, {("odom", "base"): pose(n)})
+    return path
+
+
+@pytest.fixture
+def tracked(tmp_path: Path) -> Path:
+    """A cart without a model, with two writers of transforms."""
+    path = tmp_path / "tracked.mcap"
+    with RecordingBuilder(path, "cart") as builder:
+        for n in range(COUNT):
+            stamp = START + n * 10 * MS
+            builder.edges("cart", stamp, {("odom", "base"): pose(y=n)}, session=5, writer="odometry")
+            builder.edges("cart", stamp, {("odom", "ball"): pose(x=n)}, session=6, writer="camera")
     return path
 
 
@@ -94,3 +110,32 @@ def test_ownership_is_the_same_behind_a_router(cart: Path, free_port: int):
         until(lambda: current_tokens(ours, "zstate/cart/@writer/tf/*", 1.0))
         with pytest.raises(SecondWriter):
             replay(ours, cart)
+
+
+def test_transforms_are_played_by_writers_of_the_same_names(sessions, tracked: Path):
+    with (
+        closing(SampleCollector(sessions[0], "zstate/cart/transforms/odometry")) as odometry,
+        closing(SampleCollector(sessions[0], "zstate/cart/transforms/camera")) as camera,
+    ):
+        assert replay(sessions[1], tracked) == 2 * COUNT
+        for collector, edge, column in ((odometry, ("odom", "base"), 1), (camera, ("odom", "ball"), 0)):
+            payloads = collector.payloads(COUNT)
+            samples = [decode(one, ENCODINGS[TransformSample], TransformSample) for one in payloads]
+            assert [sample.edges for sample in samples] == [(edge,)] * COUNT
+            assert [sample.seq for sample in samples] == list(range(COUNT))
+            assert [sample.stamp for sample in samples] == [START + n * 10 * MS for n in range(COUNT)]
+            poses = [poses_from_block(sample.poses)[0, column] for sample in samples]
+            assert poses == list(range(COUNT))
+
+
+def test_transforms_of_an_active_writer_are_played_only_with_takeover(sessions, tracked: Path):
+    with TransformPublisher(sessions[0], "cart", "odometry", program="driver") as live:
+        with pytest.raises(SecondWriter) as raised:
+            replay(sessions[1], tracked)
+        assert (raised.value.edge, raised.value.first.program) == (None, "driver")
+        assert replay(sessions[1], tracked, takeover=True) == 2 * COUNT
+    with TransformPublisher(sessions[0], "cart", "other", program="driver") as live:
+        live.publish([Transform("odom", "base", [0, 0, 0], [0, 0, 0, 1])])
+        with pytest.raises(SecondWriter) as raised:
+            replay(sessions[1], tracked)
+        assert raised.value.edge == ("cart/odom", "cart/base")

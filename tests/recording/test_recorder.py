@@ -25,8 +25,10 @@ from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
+from zstate.recording.recording import Recording
 from zstate.sources import SineSource
 from zstate.transform import Transform
 from zstate.wire.messages import ClockMessage, JointState, order_digest, to_block
@@ -518,3 +520,31 @@ def test_large_latched_values_are_recorded_entirely_on_their_own_thread(
     assert [children for children in fixed if "mark_0" in children] == [marks[: n + 1] for n in range(20)]
     assert len(read(tmp_path / "run.mcap", "/joint_states")) == 20
     assert recorder.stats.dropped == recorder.stats.unwritten == 0
+
+
+def test_transforms_of_each_writer_are_recorded_beside_joint_states(sessions, tmp_path: Path):
+    writer, reader = sessions
+    path = tmp_path / "run.mcap"
+    with (
+        StatePublisher(writer, RRBOT, "r1", streams=("joint_states", "robot_description")) as wheels,
+        TransformPublisher(writer, "r1", "odometry") as odometry,
+        TransformPublisher(writer, "r1", "tracker") as tracker,
+        Recorder(reader, path, "r1") as recorder,
+    ):
+        wait_for_stream_readers(writer, "r1", "joint_states", "transforms/odometry", "transforms/tracker")
+        for k in range(3):
+            wheels.publish([0.0, 0.0], stamp=STAMP + k * PERIOD)
+            odometry.publish([Transform("odom", "world", (float(k), 0, 0), UPRIGHT)], STAMP + k * PERIOD)
+            tracker.publish([Transform("odom", "ball", (0, float(k), 0), UPRIGHT)], STAMP + k * PERIOD)
+        until(lambda: count(recorder, "r1", "transforms") == 6 and count(recorder, "r1") == 3)
+    messages = [message.transforms[0] for message in read(path, "/tf")]
+    assert Counter((one.header.frame_id, one.child_frame_id) for one in messages) == {
+        ("odom", "world"): 3,
+        ("odom", "ball"): 3,
+    }
+    with Recording(path) as recording:
+        found = recording.buffer().lookup("ball", "world", STAMP + PERIOD // 2)
+        named = {channel.metadata.get("zstate.writer") for channel in recording.info.channels}
+    # Half way between samples at x = 0 and 1 of one writer, and y = 0 and 1 of the other.
+    assert found.translation == pytest.approx([0.5, -0.5, 0.0])
+    assert {"odometry", "tracker"} <= named

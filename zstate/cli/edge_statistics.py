@@ -54,7 +54,10 @@ class EdgeMeasure:
 
 
 class EdgeStatistics(Closeable):
-    """Subscribes to ``stream`` of ``robot`` ("*": of all) on ``wire``; ``clock`` is the one of the stamps."""
+    """Subscribes to ``stream`` and the transforms of ``robot`` ("*": of all) on ``wire``.
+
+    ``clock`` is the one of the stamps.
+    """
 
     def __init__(self, session: Session, robot: str, wire: str, stream: Stream, clock: Clock) -> None:
         def sources(robot: str, _: Stream, sample: Sample) -> Iterator[str]:
@@ -65,8 +68,11 @@ class EdgeStatistics(Closeable):
                     yield from [full_name(robot, child) for _, child in sample.edges or ()]
 
         self._clock = clock
-        self.topic = TopicStatistics(session, get_wire(wire), sources=sources, clock=clock)
+        wire_format = get_wire(wire)
+        self.topic = TopicStatistics(session, wire_format, sources=sources, clock=clock)
         self.topic.subscribe(stream, robot)
+        if wire_format.transforms != stream:
+            self.topic.subscribe(wire_format.transforms, robot)
 
     def close(self) -> None:
         self.topic.close()

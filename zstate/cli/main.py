@@ -29,6 +29,7 @@ _COMMANDS = {
     "publish": ("Write", "Publish a robot's state: its model, fixed edges, and transforms."),
     "joints": ("Write", "Publish a sine on every joint, and nothing else."),
     "static": ("Write", "Publish one edge that never moves, until Ctrl-C."),
+    "transform": ("Write", "Publish moving edges: one pose at a rate, or lines of JSON."),
     "tf": ("Look", "The pose of one frame in another."),
     "monitor": ("Look", "How samples come in, by edge or by robot: rates, latencies, losses."),
     "tree": ("Look", "The frames of the announced robots, as a tree."),

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress, MetricsCollector
     from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
+    from zstate.nodes.transform_publisher import TransformPublisher
     from zstate.recording.recorder import Recorder
 
 Factory = Callable[[], "MetricsCollector"]
@@ -33,7 +34,7 @@ def serve_metrics(address: BindAddress | None, *factories: Factory) -> Generator
         yield
 
 
-def publisher_collector(*publishers: StatePublisher) -> Factory:
+def publisher_collector(*publishers: StatePublisher | TransformPublisher) -> Factory:
     """Metrics of publishers."""
     return lambda: _collectors().PublisherMetrics(publishers)
 

@@ -254,6 +254,23 @@ metrics_option = click.option(
 )
 
 
+_POSE_OPTIONS = (
+    click.option("--xyz", type=float, nargs=3, metavar="X Y Z", help="Position of SOURCE in TARGET [m]."),
+    click.option(
+        "--rpy-deg", type=float, nargs=3, metavar="R P Y", help="Rotation as in URDF, but in degrees."
+    ),
+    click.option("--rpy", type=float, nargs=3, metavar="R P Y", help="Rotation as in URDF, in radians."),
+    click.option(
+        "--quat-xyzw", type=float, nargs=4, metavar="X Y Z W", help="Rotation as a unit quaternion."
+    ),
+)
+
+
+def pose_options(command: Command) -> Command:
+    """``--xyz`` and three forms of a rotation, under the names of the fields of ``StaticSection``."""
+    return _with_options(command, _POSE_OPTIONS)
+
+
 def json_option(what: str = "One JSON object a line.") -> Callable[[Command], Command]:
     """``--json``, as ``as_json``; ``what`` describes the output."""
     return click.option("--json", "as_json", is_flag=True, help=what)

@@ -55,6 +55,7 @@ _SYNONYMS = {
     "tf_echo": "tf",
     "topic": "ls | echo | hz",
     "topics": "ls",
+    "transform_broadcaster": "transform",
     "view_frames": "tree --svg",
     "wtf": "doctor",
     "zenohd": "router",

@@ -13,8 +13,9 @@ from typing import Generic, Literal, TypeVar
 from zstate._util.bounded import MAX_ENTRIES, BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
-from zstate.errors import format_duration
+from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
+from zstate.ingest.frame_ownership import EdgeSource
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream
 
@@ -201,7 +202,7 @@ class EventLog(Closeable):
                 self._on_left(announced, "cut off")
 
     def on_sample(self, robot: str, session: int) -> None:
-        """Record the arrival of a sample of the followed stream."""
+        """Record the arrival of a sample."""
         if self._thread is not None:
             silent_s = self._deadlines.on_sample((robot, session), time.monotonic())
             if silent_s is not None:
@@ -209,16 +210,23 @@ class EventLog(Closeable):
                     self._add_silence("resumed", robot, session, silent_s)
 
     def add_set_back(self, robot: str, session: int, text: str) -> None:
-        """Add the event of a writer of the followed stream whose clock was set back."""
+        """Add the event of a writer whose clock was set back."""
         with self._lock:
-            announced = self._alive.get((robot, self._followed, ""), {}).get(session)
+            announced = self._sample_writer(robot, session)
             writer = None if announced is None else announced.writer
-            self._add("set back", robot, self._followed, writer, text)
+            stream = self._followed if announced is None else announced.stream
+            self._add("set back", robot, stream, writer, text)
 
-    def add_second_edge(self, robot: str, name: str, child: str, text: str) -> None:
-        """Add the conflict of a refused static edge: ``child`` of the writer ``name`` has another owner."""
+    def add_second_edge(self, stream: Stream, source: EdgeSource, refusal: InsertRefused) -> None:
+        """Add the conflict of a refused edge of ``source`` on ``stream``: its child has another owner."""
+        child, text = refusal.edge[1], str(refusal)
         with self._lock:
-            self._add_conflict(robot, name, child, text)
+            if stream == "tf_static":
+                self._add_static_conflict(source.robot, source.name, child, text)
+                return
+            announced = self._sample_writer(source.robot, source.session)
+            writer = None if announced is None else announced.writer
+            self._add_conflict((source.robot, "", source.session, child), stream, writer, text)
 
     def set_static_children(self, robot: str, name: str, children: frozenset[str]) -> None:
         """Set the full names of the frames that the static writer ``name`` of ``robot`` places now."""
@@ -226,14 +234,20 @@ class EventLog(Closeable):
             for child, others in self._owners.replace((robot, name), children):
                 owners = " and ".join(f"{other!r} of {of!r}" for of, other in others)
                 text = f"{name!r} of {robot!r} places {child!r}, and so does {owners}"
-                self._add_conflict(robot, name, child, text)
+                self._add_static_conflict(robot, name, child, text)
 
-    def _add_conflict(self, robot: str, name: str, child: str, text: str) -> None:
+    def _add_static_conflict(self, robot: str, name: str, child: str, text: str) -> None:
         announced = next(iter(self._alive.get((robot, "tf_static", name), {}).values()), None)
         writer = None if announced is None else announced.writer
         key = (robot, name, 0 if writer is None else writer.session, child)
+        self._add_conflict(key, "tf_static", writer, text)
+
+    def _add_conflict(
+        self, key: tuple[str, str, int, str], stream: Stream, writer: WriterId | None, text: str
+    ) -> None:
+        """Add a conflict, once for each robot, writer name, session and child in ``key``."""
         if key not in self._conflicts:
-            self._add("conflict", robot, "tf_static", writer, text)
+            self._add("conflict", key[0], stream, writer, text)
         self._conflicts[key] = None
 
     def _check_deadlines(self, now_s: float) -> float:
@@ -274,6 +288,7 @@ class EventLog(Closeable):
         self._former[place, writer.program, writer.host] = writer
         if not others:
             del self._alive[place]
+        if not others and announced.stream == "tf_static":
             self._owners.replace((announced.robot, announced.name), frozenset())
         was_stale = self._deadlines.unregister((announced.robot, writer.session))
         what = _what(announced)
@@ -288,7 +303,7 @@ class EventLog(Closeable):
     def _add_silence(
         self, kind: Literal["stale", "resumed"], robot: str, session: int, silent_s: float
     ) -> None:
-        announced = self._alive.get((robot, self._followed, ""), {}).get(session)
+        announced = self._sample_writer(robot, session)
         if announced is None:
             return
         lasting = format_duration(round(silent_s * 1e9))
@@ -296,8 +311,17 @@ class EventLog(Closeable):
             text = f"for {lasting}, though it is announced: it is frozen, or its source is"
         else:
             text = f"for {lasting}; samples come again"
-        text = f"{robot!r}: {announced.writer} published nothing on {self._followed} {text}"
-        self._add(kind, robot, self._followed, announced.writer, text)
+        text = f"{robot!r}: {announced.writer} published nothing on {announced.stream} {text}"
+        self._add(kind, robot, announced.stream, announced.writer, text)
+
+    def _sample_writer(self, robot: str, session: int) -> Announcement | None:
+        """The announced writer of samples with this session, of the followed stream or of ``transforms``."""
+        announced = self._alive.get((robot, self._followed, ""), {}).get(session)
+        if announced is None:
+            for (owner, stream, _), writers in self._alive.items():
+                if owner == robot and stream == "transforms" and session in writers:
+                    return writers[session]
+        return announced
 
     def _add(self, kind: Kind, robot: str, stream: Stream, writer: WriterId | None, text: str) -> None:
         event = WriterEvent(kind, robot, stream, writer, time.time_ns(), text)

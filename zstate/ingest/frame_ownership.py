@@ -36,7 +36,7 @@ from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
-from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, foreign_edge_problem, frame_owner
+from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, Stream, foreign_edge_problem, frame_owner
 
 CONTESTED = ("second parent", "second writer", "loop")
 """The refusal reasons of edges that exclude each other."""
@@ -108,8 +108,8 @@ class FrameOwnership:
     """Decides which published edges are inserted into ``buffer``. Any thread may call it.
 
     ``is_shared`` means that all writers share all frames, as in ROS: no frame belongs to a robot. ``placers``
-    are the robots whose writers may place other robots' roots, None: all. If a static edge is refused,
-    ``on_conflict(robot, writer, child, text)`` is called.
+    are the robots whose writers may place other robots' roots, None: all. If an edge is refused because
+    of another writer, ``on_conflict(stream, source, refusal)`` is called; not for moving edges in ROS.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class FrameOwnership:
         *,
         is_shared: bool = False,
         placers: Collection[str] | None = None,
-        on_conflict: Callable[[str, str, str, str], None] | None = None,
+        on_conflict: Callable[[Stream, EdgeSource, InsertRefused], None] | None = None,
     ) -> None:
         self.buffer = buffer
         self.counters = counters
@@ -267,6 +267,8 @@ class FrameOwnership:
                 for claim in fresh:
                     self._drop(claim)
                 return Admitted((), refusal)
+            if refusal is not None and not source.is_model:
+                self._report_conflict("transforms", source, refusal)
             for claim in fresh:
                 if claim.is_accepted:
                     self._add_frames(claim)
@@ -489,8 +491,11 @@ class FrameOwnership:
 
     def _report(self, source: EdgeSource, error: InsertRefused) -> None:
         self.counters.count_refusal(error.reason, f"static edge of {source.name!r}: {error}")
+        self._report_conflict("tf_static", source, error)
+
+    def _report_conflict(self, stream: Stream, source: EdgeSource, error: InsertRefused) -> None:
         if error.reason in (*CONTESTED, FOREIGN_FRAME) and self._on_conflict is not None:
-            self._on_conflict(source.robot, source.name, error.edge[1], str(error))
+            self._on_conflict(stream, source, error)
 
 
 def _loop(names: EdgeNames, by: str, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:

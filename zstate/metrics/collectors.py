@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
+    from zstate.nodes.transform_publisher import TransformPublisher
     from zstate.recording.recorder import Recorder
 
 WINDOW_S = 10.0
@@ -116,7 +117,7 @@ class MetricFamilies:
 class PublisherMetrics:
     """Metrics of publishers."""
 
-    def __init__(self, publishers: Sequence[StatePublisher]) -> None:
+    def __init__(self, publishers: Sequence[StatePublisher | TransformPublisher]) -> None:
         self._publishers = publishers
         self._rates = CounterRates()
         self.sample()

@@ -96,25 +96,29 @@ def build_graph(
 ) -> Graph:
     """The graph of discovered writers and readers.
 
-    Static edges have a stream for each name under which they are written. The rate is that of the first
-    writer whose rate is known: usually there is only one.
+    Static edges and transforms have a stream for each name under which they are written. The rate is that of
+    the first writer whose rate is known: usually there is only one.
     """
 
     def programs(writers: Iterable[WriterId]) -> tuple[str, ...]:
         return tuple(sorted({str(writer) for writer in writers}))
 
     written: dict[tuple[str, Stream], dict[str, list[WriterId]]] = {}
-    """The writers of each stream, by the name under which they write static edges; else ""."""
+    """The writers of each stream, by the name under which they write edges; else ""."""
     for robot in robots:
         for stream, writer in robot.writers:
             by_name = written.setdefault((robot.name, stream), {})
-            names = [name for name in robot.names_of(writer) if name != MODEL_WRITER]
-            for name in names if stream == "tf_static" and names else ("",):
+            names = [name for name in robot.names_of(writer, stream) if name != MODEL_WRITER]
+            for name in names or ("",):
                 by_name.setdefault(name, []).append(writer)
-    # A reader of all robots does not miss a stream that one of them lacks.
+    # A reader of all robots does not miss a stream that one of them lacks, and no reader misses transforms.
     used: set[tuple[str, Stream]] = {
         *written,
-        *((one.robot, one.stream) for one in readers if one.robot != ANY or not written),
+        *(
+            (one.robot, one.stream)
+            for one in readers
+            if one.stream != "transforms" and (one.robot != ANY or not written)
+        ),
     }
     unwritten: dict[str, list[WriterId]] = {"": []}
     uses: list[StreamUse] = []

@@ -57,12 +57,14 @@ def local_writer(session: int, program: str = "") -> WriterId:
 class RobotInfo:
     """A robot with its writers as (stream, writer), sorted.
 
-    ``static_names`` are (name, writer) for the names under which static edges are written.
+    ``static_names`` are (name, writer) for the names under which static edges are written, and
+    ``transform_names`` the same for moving edges.
     """
 
     name: str
     writers: tuple[tuple[Stream, WriterId], ...]
     static_names: tuple[tuple[str, WriterId], ...] = ()
+    transform_names: tuple[tuple[str, WriterId], ...] = ()
 
     def __repr__(self) -> str:
         streams: dict[str, list[str]] = {}
@@ -71,9 +73,10 @@ class RobotInfo:
         written = "; ".join(f"{writer} writes {', '.join(names)}" for writer, names in streams.items())
         return f"<robot {self.name!r}: {written or 'no writer'}>"
 
-    def names_of(self, writer: WriterId) -> tuple[str, ...]:
-        """The names under which ``writer`` writes static edges, sorted."""
-        return tuple(name for name, owner in self.static_names if owner == writer)
+    def names_of(self, writer: WriterId, stream: Stream) -> tuple[str, ...]:
+        """The names under which ``writer`` writes edges on ``stream``, sorted; empty for other streams."""
+        names = {"tf_static": self.static_names, "transforms": self.transform_names}.get(stream, ())
+        return tuple(name for name, owner in names if owner == writer)
 
 
 class LivelinessToken(Closeable):
@@ -160,13 +163,22 @@ def confirmed_tokens(session: Session, expression: str) -> frozenset[str]:
 def by_robot(found: Iterable[Announcement]) -> tuple[RobotInfo, ...]:
     """The announced writers, grouped by robot, sorted."""
     writers: dict[str, set[tuple[Stream, WriterId]]] = {}
-    names: dict[str, set[tuple[str, WriterId]]] = {}
+    names: dict[tuple[str, Stream], set[tuple[str, WriterId]]] = {}
     for one in found:
         writers.setdefault(one.robot, set()).add((one.stream, one.writer))
         if one.name:
-            names.setdefault(one.robot, set()).add((one.name, one.writer))
+            names.setdefault((one.robot, one.stream), set()).add((one.name, one.writer))
+
+    def sorted_names(robot: str, stream: Stream) -> tuple[tuple[str, WriterId], ...]:
+        return tuple(sorted(names.get((robot, stream), ())))
+
     return tuple(
-        RobotInfo(robot, tuple(sorted(writers[robot])), tuple(sorted(names.get(robot, ()))))
+        RobotInfo(
+            robot,
+            tuple(sorted(writers[robot])),
+            sorted_names(robot, "tf_static"),
+            sorted_names(robot, "transforms"),
+        )
         for robot in sorted(writers)
     )
 

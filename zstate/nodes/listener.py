@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal, ParamSpec, TypeVar
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.clock import SYSTEM, Clock, ClockOffset
@@ -43,13 +44,17 @@ R = TypeVar("R")
 class _SampleStream:
     """One of the streams of samples that a listener receives, with the ingests of their writers.
 
-    ``is_shared`` means that each writer publishes its own part of a robot, and has its own ingest.
+    ``is_shared`` means that each writer publishes its own part of a robot, and has its own ingest. Its last
+    samples may arrive after it has left, so its ingest is among the ``departed`` then.
     """
 
     stream: Stream
     is_shared: bool
     capacity: int = 0
     ingests: dict[tuple[str, int], StreamIngest] = field(default_factory=dict[tuple[str, int], StreamIngest])
+    departed: BoundedDict[tuple[str, int], StreamIngest] = field(
+        default_factory=BoundedDict[tuple[str, int], StreamIngest]
+    )
     overflowed: set[StreamIngest] = field(default_factory=set[StreamIngest])
 
 
@@ -174,7 +179,9 @@ class TransformListener(Closeable):
     def robots(self) -> tuple[str, ...]:
         """The robots that sent any message so far, sorted by name."""
         ingests = [
-            ingest for samples in self._sample_streams.values() for ingest in list(samples.ingests.values())
+            ingest
+            for samples in self._sample_streams.values()
+            for ingest in (*list(samples.ingests.values()), *list(samples.departed.values()))
         ]
         return tuple(sorted({ingest.robot for ingest in ingests if ingest.has_data}))
 
@@ -217,7 +224,7 @@ class TransformListener(Closeable):
 
     def _ingest_for(self, samples: _SampleStream, robot: str, session: int) -> StreamIngest:
         key = (robot, session if samples.is_shared else 0)
-        ingest = samples.ingests.get(key)
+        ingest = samples.ingests.get(key) or samples.departed.get(key)
         if ingest is None:
             make = JointStateIngest if samples.stream == "joint_states" else TransformIngest
             ingest = samples.ingests.setdefault(key, make(robot, self._ownership, self._events.add_set_back))
@@ -361,7 +368,10 @@ class TransformListener(Closeable):
             self._clock_offsets.on_writer(announced, alive=alive)
         if alive and self._history is not None:
             self._history.request(stream_key(robot, samples.stream, announced.name), session)
-        if samples.is_shared and (robot, session) not in samples.ingests:
+        key = robot, session
+        if samples.is_shared and key in samples.departed and alive:  # it was cut off, and is back
+            samples.ingests[key] = samples.departed.pop(key)
+        if samples.is_shared and key not in samples.ingests:
             return  # it has not published yet
         ingest = self._ingest_for(samples, robot, session)
         if alive:
@@ -369,7 +379,7 @@ class TransformListener(Closeable):
             return
         ingest.writer_left(session)
         if samples.is_shared:
-            del samples.ingests[robot, session]
+            samples.departed[key] = samples.ingests.pop(key)
 
 
 class _WriterClockOffsets(Closeable):

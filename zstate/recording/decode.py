@@ -15,7 +15,7 @@ from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.recording.encode import StaticAccumulator
 from zstate.recording.reader import RecordingReader
-from zstate.recording.storage import ROBOT, Channel, Record
+from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms
 from zstate.wire.ros2.decoder import RosDecoder
@@ -23,8 +23,9 @@ from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import SHARED, robot_from_topic, ros_type
 
-STREAMS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
-"""The streams that are decoded."""
+_TOPICS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
+STREAMS: tuple[Stream, ...] = (*_TOPICS, "transforms")
+"""The streams that are decoded. ``transforms`` are channels of the topic tf with the name of a writer."""
 
 LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
 """Streams whose messages are in effect until the next."""
@@ -39,8 +40,8 @@ _MAX_TRIED = 100
 class RecordedWriter:
     """One writer of one stream, as one channel of a recording describes it.
 
-    ``robot`` is empty for the clock. ``static_writer`` is the name under which static edges were written,
-    each time all of them; None in the bags of ROS, where those of several messages add up. ``program`` is
+    ``robot`` is empty for the clock. ``edge_writer`` is the name under which edges were written: moving ones,
+    or static ones, each time all of them. None in the bags of ROS, where static edges add up. ``program`` is
     the writer's program, ``session`` one start of it. ``foreign`` channels do not describe writers: their
     robot is the topic's namespace, and all writers of a topic count as one.
     """
@@ -48,7 +49,7 @@ class RecordedWriter:
     robot: str
     stream: Stream
     session: int
-    static_writer: str | None
+    edge_writer: str | None
     program: str | None
     foreign: bool
 
@@ -56,7 +57,7 @@ class RecordedWriter:
     def from_channel(cls, channel: Channel) -> RecordedWriter | None:
         """The writer of ``channel``; None if it is no stream of a robot."""
         name = channel.topic.rpartition("/")[2]
-        for stream in STREAMS:
+        for stream in _TOPICS:
             if name == stream and channel.type_name == ros_type(stream).name:
                 break
         else:
@@ -67,9 +68,9 @@ class RecordedWriter:
         robot = robot_from_topic(channel.topic) if foreign else facts.get(ROBOT, "")
         return cls(
             robot="" if stream == "clock" else robot,
-            stream=stream,
+            stream="transforms" if stream == "tf" and EDGE_WRITER in facts else stream,
             session=int.from_bytes(digest, "little") if foreign else int(facts[_SESSION]),
-            static_writer=facts.get("zstate.writer"),
+            edge_writer=facts.get(EDGE_WRITER),
             program=facts.get("zstate.program"),
             foreign=foreign,
         )
@@ -153,7 +154,7 @@ class DecodedRecording:
         channel, record, seq = undecoded
         writer = channel.writer
         try:
-            messages = channel.ros.messages(writer.stream, record.payload, writer.session, seq, channel.names)
+            messages = channel.ros.messages(channel.topic, record.payload, writer.session, seq, channel.names)
         except MessageError as error:
             self._refuse(error.reason, f"{record.topic}: {error}")
             return
@@ -193,15 +194,18 @@ class DecodedRecording:
             decoder = None
             if writer is not None:
                 options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))
-                decoder = ChannelDecoder(writer, FrameNames(options, writer.robot or SHARED), RosDecoder())
+                names = FrameNames(options, writer.robot or SHARED)
+                topic: Stream = "tf" if writer.stream == "transforms" else writer.stream
+                decoder = ChannelDecoder(writer, topic, names, RosDecoder())
             self._known[channel] = decoder
         return self._known[channel]
 
 
 class ChannelDecoder(NamedTuple):
-    """The writer of a channel, and the decoder of its messages."""
+    """The writer of a channel, the stream that its topic is named after, and the decoder of its messages."""
 
     writer: RecordedWriter
+    topic: Stream
     names: FrameNames
     ros: RosDecoder
 
@@ -230,7 +234,7 @@ class LatchedState:
             before = self.descriptions.get(writer.robot)
             self.descriptions[writer.robot] = decoded
         elif isinstance(message, StaticTransforms):
-            if writer.static_writer is None:
+            if writer.edge_writer is None:
                 edges = self._accumulated.setdefault(writer, StaticAccumulator(writer.session))
                 decoded = decoded._replace(message=edges.with_edges(message))
             key = static_key(writer)
@@ -252,7 +256,7 @@ def _latched_value(message: Message) -> object:
 
 def static_key(writer: RecordedWriter) -> tuple[str, str]:
     """The robot of static edges, and the name of their static writer, "recorded" for a bag."""
-    return writer.robot, writer.static_writer or "recorded"
+    return writer.robot, writer.edge_writer or "recorded"
 
 
 def check_has_robot(recording: DecodedRecording, robot: str) -> str:

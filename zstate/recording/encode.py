@@ -13,7 +13,7 @@ from zstate.errors import InvalidInput, ModelError
 from zstate.model.robot import coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
 from zstate.recording.mcap.writer import ChannelId, RecordingWriter
-from zstate.recording.storage import ROBOT
+from zstate.recording.storage import EDGE_WRITER, ROBOT
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
@@ -104,26 +104,27 @@ class RecordingEncoder:
         return self._pending.dropped + self._pending.waiting
 
     def write_message(
-        self, robot: str, message: Message, log_time: int, static_writer: str | None = None
+        self, robot: str, message: Message, log_time: int, edge_writer: str | None = None
     ) -> bool:
         """Write ``message`` of ``robot``, received at ``log_time`` [ns]; the clock belongs to SHARED.
 
-        ``static_writer`` is the name under which static edges are written; without one, as in ROS, those of a
-        session add up. Returns False if the robot has no channel left for that writer. Raises RecordingError
+        ``edge_writer`` is the name under which edges are written: static ones, or moving ones of a
+        TransformPublisher, which go to the topic tf. Without one, as in ROS, the static edges of a session
+        add up. Returns False if the robot has no channel left for that writer. Raises RecordingError
         if the file cannot grow.
         """
         try:
             if isinstance(message, StaticTransforms):
-                if static_writer is None:
+                if edge_writer is None:
                     key = robot, message.session
                     edges = self._statics.setdefault(key, StaticAccumulator(message.session))
-                    message, static_writer = edges.with_edges(message), f"ros-{message.session}"
-                self._latch(robot, message, log_time, f"{robot}/{static_writer}", static_writer)
+                    message, edge_writer = edges.with_edges(message), f"ros-{message.session}"
+                self._latch(robot, message, log_time, f"{robot}/{edge_writer}", edge_writer)
             elif isinstance(message, RobotDescription):
                 self._write_description(robot, message, log_time)
             elif isinstance(message, Sample | ClockMessage):
                 with self._lock:
-                    self._write_sample(robot, message, log_time)
+                    self._write_sample(robot, message, log_time, edge_writer or "")
         except _TooManyWriters as error:
             self._refuse("too many writers", f"{robot!r}: {error}")
             return False
@@ -136,10 +137,10 @@ class RecordingEncoder:
             self._refuse(reason if stamp else "no stamp", f"{robot!r}: {error}")
         return True
 
-    def withdraw(self, robot: str, static_writer: str, log_time: int) -> None:
+    def withdraw(self, robot: str, edge_writer: str, log_time: int) -> None:
         """Write that a static writer has withdrawn all its edges."""
         with self._lock:
-            key = f"{robot}/{static_writer}"
+            key = f"{robot}/{edge_writer}"
             channel = self._latched.get(robot, {}).pop(key, None)
             if channel is not None:
                 payload = channel.encode(StaticTransforms(0, (), b""))
@@ -147,13 +148,15 @@ class RecordingEncoder:
                 self._writer.unlatch(channel.number, key)
                 self._counts[robot, "tf_static"] += 1
 
-    def _write_sample(self, robot: str, message: Sample | ClockMessage, log_time: int) -> None:
+    def _write_sample(
+        self, robot: str, message: Sample | ClockMessage, log_time: int, edge_writer: str
+    ) -> None:
         sample_names = self._orders_of(robot).sample_names(message)
         if sample_names is None:
             self._pending.append(robot, message, log_time)
             return
-        stream = _STREAMS[type(message)]
-        channel = self._channel(robot, stream, message.session, log_time)
+        stream: Stream = "transforms" if edge_writer else _STREAMS[type(message)]
+        channel = self._channel(robot, stream, message.session, log_time, edge_writer)
         payload = channel.encode(message, sample_names)
         # MCAP begins in 1970; the payload keeps an earlier stamp.
         publish_time = max(message.stamp, 0)
@@ -177,16 +180,14 @@ class RecordingEncoder:
         message: StaticTransforms | RobotDescription,
         log_time: int,
         key: str,
-        static_writer: str = "",
+        edge_writer: str = "",
     ) -> None:
         stream = _STREAMS[type(message)]
         with self._lock:
             latched = self._latched.setdefault(robot, {})
             if key not in latched and len(latched) >= MAX_LATCHED:
-                raise _TooManyWriters(
-                    f"it has {MAX_LATCHED} static writers, and {static_writer!r} is one more"
-                )
-            channel = self._channel(robot, stream, message.session, log_time, static_writer)
+                raise _TooManyWriters(f"it has {MAX_LATCHED} static writers, and {edge_writer!r} is one more")
+            channel = self._channel(robot, stream, message.session, log_time, edge_writer)
         payload = channel.encode(message)
         with self._lock:
             self._writer.latch(channel.number, key, payload, log_time, log_time)
@@ -201,9 +202,9 @@ class RecordingEncoder:
         return self._orders.setdefault(robot, OrderRegistry())
 
     def _channel(
-        self, robot: str, stream: Stream, session: int, log_time: int, static_writer: str = ""
+        self, robot: str, stream: Stream, session: int, log_time: int, edge_writer: str = ""
     ) -> ChannelEncoder:
-        key = (stream, session, static_writer)
+        key = (stream, session, edge_writer)
         opened = self._channels[robot]
         channel = opened.find(key)
         if channel is not None:
@@ -214,12 +215,13 @@ class RecordingEncoder:
         metadata = {"zstate.session": str(session)}
         if stream != "clock":
             metadata |= {ROBOT: robot, "zstate.frame_prefix": options.frame_prefix}
-        if static_writer:
-            metadata["zstate.writer"] = static_writer
+        if edge_writer:
+            metadata[EDGE_WRITER] = edge_writer
         if session in self._programs:
             metadata["zstate.program"] = self._programs[session]
-        topic = RmwKeys(options).topic(robot, stream)
-        number = self._writer.channel(topic, ros_type(stream), STREAM_QOS[stream], metadata)
+        carrier: Stream = "tf" if stream == "transforms" else stream
+        topic = RmwKeys(options).topic(robot, carrier)
+        number = self._writer.channel(topic, ros_type(carrier), STREAM_QOS[carrier], metadata)
         channel = ChannelEncoder(number, stream, FrameNames(options, robot))
         for unused in opened.add(key, channel, self._latched.get(robot, {}).values()):
             self._writer.release(unused.number)

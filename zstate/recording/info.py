@@ -134,7 +134,7 @@ def recorded_robots(info: RecordingInfo) -> list[RecordedRobot]:
             streams: list[RecordedStream] = []
             for writer, channel in written:
                 rate = None if writer.stream in LATCHED else mean_rate(channel, info.duration_s)
-                names = ", ".join(filter(None, (writer.static_writer, writer.program)))
+                names = ", ".join(filter(None, (writer.edge_writer, writer.program)))
                 facts = (channel.topic, channel.type_name, channel.count, rate, names)
                 streams.append(RecordedStream(writer.stream, *facts))
             robots.append(RecordedRobot(name, model, fault, tuple(streams)))

@@ -24,8 +24,15 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder
-from zstate.wire.keys import MODEL_WRITER, Stream
-from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample
+from zstate.wire.keys import MODEL_WRITER, NAMED_STREAMS, Stream
+from zstate.wire.messages import (
+    Edges,
+    JointState,
+    Message,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+)
 from zstate.wire.registry import get_wire
 
 _SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
@@ -60,11 +67,25 @@ class PlaybackPublishers(Closeable):
         self._sessions: set[int] = set()
         self._robots: dict[str, _RobotPublisher] = {}
         self._others: dict[str, PassthroughPublisher] = {}
+        self._transforms: dict[tuple[str, str], PassthroughPublisher] = {}
         with ExitStack() as opening:
             opening.callback(lambda: [robot.publisher.close() for robot in self._robots.values()])
             for robot, model in models.items():
                 self._open(robot, model, _is_computed(robot, writers))
             recorded = {(writer.robot, writer.stream) for writer in writers}
+            moving = {(one.robot, one.edge_writer) for one in writers if one.stream == "transforms"}
+            for robot, name in sorted((robot, name or "") for robot, name in moving):
+                self._transforms[robot, name] = opening.enter_context(
+                    PassthroughPublisher(
+                        session,
+                        wires,
+                        robot,
+                        ("transforms",),
+                        name,
+                        sessions=self._sessions,
+                        takeover=takeover,
+                    )
+                )
             for robot in {robot for robot, _ in recorded if robot}:
                 own = self._robots[robot].streams if robot in self._robots else ()
                 streams: list[Stream] = [
@@ -119,7 +140,7 @@ class PlaybackPublishers(Closeable):
     def _publish(self, writer: RecordedWriter, message: Message) -> bool:
         robot = self._robots.get(writer.robot)
         if isinstance(message, StaticTransforms):
-            if writer.static_writer == MODEL_WRITER and robot is not None:
+            if writer.edge_writer == MODEL_WRITER and robot is not None:
                 return False
             edges = self._modelled.filter_statics(writer.robot, message)
             self._others[writer.robot].set_statics(edges, static_key(writer)[1])
@@ -134,6 +155,8 @@ class PlaybackPublishers(Closeable):
         elif isinstance(message, JointState) and robot is not None:
             positions, velocities, efforts = robot.order.read(message)
             robot.publisher.publish(positions, velocities, efforts, message.stamp)
+        elif isinstance(message, TransformSample) and writer.stream == "transforms":
+            self._transforms[writer.robot, writer.edge_writer or ""].publish(message)
         elif isinstance(message, TransformSample):
             rest = self._computed.filter_sample(writer.robot, message)
             if rest is None or (robot is not None and "tf" in robot.streams):
@@ -159,10 +182,11 @@ class _RobotPublisher(NamedTuple):
 class PassthroughPublisher(Closeable):
     """Publishes messages of ``robot`` unchanged on all ``wires``, with its own session and sequence numbers.
 
-    ``streams`` are announced at once, latched values with the first of their name. A message that one of
-    the wires cannot encode raises InvalidInput, and is published on none. Raises SecondWriter if another
-    live writer publishes the same on the native wire, unless ``takeover``. Static edges of the ``sessions``
-    of this playback, its own included, may place the same frame, as in the recording.
+    ``streams`` are announced at once, latched values with the first of their name; ``transforms`` under the
+    name ``edge_writer``. A message that one of the wires cannot encode raises InvalidInput, and is published
+    on none. Raises SecondWriter if another live writer publishes the same on the native wire, unless
+    ``takeover``. Edges of the ``sessions`` of this playback, its own included, may place the same frame, as
+    in the recording.
     """
 
     def __init__(
@@ -171,6 +195,7 @@ class PassthroughPublisher(Closeable):
         wires: Sequence[str],
         robot: str,
         streams: Sequence[Stream],
+        edge_writer: str = "",
         *,
         sessions: set[int],
         takeover: bool = False,
@@ -178,6 +203,7 @@ class PassthroughPublisher(Closeable):
         self._session = session
         self._session_id = secrets.randbits(32)
         self._robot = robot
+        self._edge_writer = edge_writer
         self._sessions = sessions
         self._is_alone = "native" in wires and not takeover
         self._seqs: Counter[Stream] = Counter()
@@ -186,12 +212,19 @@ class PassthroughPublisher(Closeable):
         self._writer = writer = local_writer(self._session_id)
         sessions.add(self._session_id)
         with ExitStack() as opening:
-            self._claim = self._claimed(opening, [Announcement(robot, stream, writer) for stream in streams])
+            announced = [self._announced(stream, edge_writer) for stream in streams]
+            self._claim = self._claimed(opening, announced)
             self._wire_writers = [
                 opening.enter_context(WireWriter(session, get_wire(wire), robot, writer)) for wire in wires
             ]
             self._streams: dict[Stream, list[SampleWriter]] = {
-                stream: [one.open_stream(stream) for one in self._wire_writers] for stream in streams
+                stream: [
+                    one.open_stream(
+                        get_wire(wire).transforms if stream == "transforms" else stream, edge_writer
+                    )
+                    for wire, one in zip(wires, self._wire_writers, strict=True)
+                ]
+                for stream in streams
             }
             self._opened = opening.pop_all()
 
@@ -199,7 +232,11 @@ class PassthroughPublisher(Closeable):
         """Publish one sample."""
         if self._claim is not None:
             self._claim.check()
-        stream: Stream = "joint_states" if isinstance(message, JointState) else "tf"
+        stream: Stream = "joint_states"
+        if isinstance(message, TransformSample):
+            stream = "transforms" if "transforms" in self._streams else "tf"
+            if stream == "transforms":
+                self._own(message.edges or ())
         head = (message.stamp, self._seqs[stream], self._session_id, message.order)
         if isinstance(message, JointState):
             numbers = (message.positions, message.velocities, message.efforts)
@@ -208,6 +245,16 @@ class PassthroughPublisher(Closeable):
             sample = TransformSample(*head, message.poses, message.edges)
         write_all(self._streams[stream], sample)
         self._seqs[stream] += 1
+
+    def _own(self, edges: Edges) -> None:
+        """Own moving edges until the end of the pass. Raises SecondWriter if another writer places one."""
+        placed = self._placed.setdefault(self._edge_writer, set())
+        new = [edge for edge in named_edges(self._robot, edges) if edge not in placed]
+        if new and self._is_alone:
+            announced = self._announced("transforms", self._edge_writer)
+            claim = claim_edges(self._session, announced, new, allowed=self._sessions)
+            self._opened.enter_context(claim)
+        placed.update(new)
 
     def describe(self, description: RobotDescription) -> None:
         """Publish the robot's description (latched)."""
@@ -245,7 +292,7 @@ class PassthroughPublisher(Closeable):
         return self._latched[stream, writer]
 
     def _announced(self, stream: Stream, writer: str) -> Announcement:
-        return Announcement(self._robot, stream, self._writer, writer if stream == "tf_static" else "")
+        return Announcement(self._robot, stream, self._writer, writer if stream in NAMED_STREAMS else "")
 
     def _claimed(self, opening: ExitStack, streams: Sequence[Announcement]) -> WriterClaim | None:
         if not self._is_alone or not streams:

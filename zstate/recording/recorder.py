@@ -30,7 +30,7 @@ from zstate.recording.decode import LATCHED
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, Stream, check_robot
+from zstate.wire.keys import ANY, NAMED_STREAMS, Stream, check_robot
 from zstate.wire.messages import ClockMessage, Message, Sample
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
@@ -53,8 +53,6 @@ _DISCOVERY_NS = 300_000_000
 # Closing takes a second at most, subscriptions included.
 _DRAIN_S = 0.5
 _JOIN_WITHIN_S = 0.9
-
-_SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
 
 
 class Batch(NamedTuple):
@@ -166,6 +164,9 @@ class Recorder(Closeable):
         selected = (robots,) if isinstance(robots, str) else tuple(dict.fromkeys(robots))
         self._selected = tuple(map(check_robot, selected))
         self._wire = get_wire(wire)
+        # On a ROS wire all moving edges are on tf.
+        samples: tuple[Stream, ...] = ("joint_states", "tf", self._wire.transforms)
+        self._streams: tuple[Stream, ...] = tuple(dict.fromkeys((*LATCHED, *samples)))
         self._counters = Counters()
         self._gaps = GapCounter(self._counters)
         self._programs: BoundedDict[int, str] = BoundedDict()
@@ -184,7 +185,7 @@ class Recorder(Closeable):
             opening.enter_context(WriterWatch(session, robot, self._on_writer, wire))
             self._subscribe()
             for robot in self._selected or (ANY,):
-                for announcement in announce_reader(session, self._wire, robot, (*LATCHED, *_SAMPLES)):
+                for announcement in announce_reader(session, self._wire, robot, self._streams):
                     opening.enter_context(announcement)
             self._writer = RecordingWriter(
                 path, max_bytes=max_bytes, max_seconds=max_seconds, overwrite=overwrite
@@ -198,7 +199,7 @@ class Recorder(Closeable):
 
     def _subscribe(self) -> None:
         """Subscribe to every stream; if two robots share an expression, keys distinguish them."""
-        for stream in (*LATCHED, *_SAMPLES):
+        for stream in self._streams:
             robots: dict[str, set[str]] = {}
             for robot in self._selected or (ANY,):
                 robots.setdefault(self._wire.expression(robot, stream), set()).add(robot)
@@ -316,10 +317,10 @@ class Recorder(Closeable):
     def _write_arrival(self, robot: str, batch: Batch, arrival: SerializedSample) -> None:
         encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
         assert encoder is not None
-        static_writer = self._wire.static_writer_name(arrival.key) if stream == "tf_static" else None
+        edge_writer = self._wire.static_writer_name(arrival.key) if stream in NAMED_STREAMS else None
         if not arrival.payload and stream in LATCHED:
-            if static_writer is not None:
-                encoder.withdraw(robot, static_writer, stamp)
+            if edge_writer is not None:
+                encoder.withdraw(robot, edge_writer, stamp)
             return
         messages: Sequence[Message] = ()
         try:
@@ -327,13 +328,13 @@ class Recorder(Closeable):
         except MessageError as error:
             self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
         for message in messages:
-            is_known = encoder.write_message(robot, message, stamp, static_writer)
+            is_known = encoder.write_message(robot, message, stamp, edge_writer)
             if is_known and isinstance(message, Sample | ClockMessage):
                 self._gaps.add((robot, stream, message.session), message.seq)
 
     def _robot(self, batch: Batch, arrival: SerializedSample) -> str | None:
         try:
-            if batch.stream == "tf_static":
+            if batch.stream in NAMED_STREAMS:
                 self._wire.static_writer_name(arrival.key)  # raises for a key without one
             return self._wire.robot_from_key(arrival.key) if batch.robot is None else batch.robot
         except InvalidInput as error:

@@ -122,7 +122,7 @@ class Recording(Closeable):
         recording = DecodedRecording(self._reader, counters.count_refusal)
         robots = None if self.robot is None else (self.robot,)
         shares_frames = any(
-            writer.foreign or (writer.stream == "tf_static" and writer.static_writer is None)  # of ROS
+            writer.foreign or (writer.stream == "tf_static" and writer.edge_writer is None)  # of ROS
             for writer in recording.writers
         )
         loader = RecordingLoader(buffer, counters, () if shares_frames else recording.robots)
@@ -212,19 +212,19 @@ class RecordingLoader:
         ingest.insert_sample(rest, overflowed=False)
 
     def _insert_statics(self, writer: RecordedWriter, statics: StaticTransforms) -> None:
-        robot, static_writer = writer.robot, writer.static_writer
-        if static_writer == MODEL_WRITER and robot in self._joints:
+        robot, edge_writer = writer.robot, writer.edge_writer
+        if edge_writer == MODEL_WRITER and robot in self._joints:
             return  # the model has the same edges
-        key = robot, writer.session if static_writer is None else static_writer
+        key = robot, writer.session if edge_writer is None else edge_writer
         before = self._static_messages.get(key)
         if before is not None and (before.edges, before.poses) == (statics.edges, statics.poses):
             return  # repeated for readers that start in the middle
         self._static_messages[key] = statics
         rest = self._filter.filter_statics(robot, statics)
         self._remove_withdrawn(robot, rest.edges)
-        if before is not None and static_writer is not None:
+        if before is not None and edge_writer is not None:
             self._withdrawn |= _children(robot, before.edges) - _children(robot, statics.edges)
-        name = static_writer or writer.program or _UNNAMED
+        name = edge_writer or writer.program or _UNNAMED
         ingest = StaticTransformIngest(robot, name, self._ownership)
         self._statics.setdefault(key, ingest).add(rest)
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
+EDGE_WRITER = "zstate.writer"
+"""Channel metadata key under which a recorder writes the name of the writer of its edges."""
 ROBOT = "zstate.robot"
 """Channel metadata key under which a recorder writes the robot's name."""
 

@@ -53,6 +53,14 @@ def test_documents_follow_each_other_until_ctrl_c(spawn: Spawn):
         interrupted(command)
 
 
+def test_transforms_are_documents_of_poses_by_edge(spawn: Spawn):
+    started(spawn, "transform", "odom", "base", "--xyz", "1", "2", "3", "--robot", "r1").line()
+    document = json.loads(zstate("echo", "r1", "--stream", "transforms", "--once", "--json").stdout)
+    pose = {"translation": [1.0, 2.0, 3.0], "rotation": [0.0, 0.0, 0.0, 1.0]}
+    assert document["transforms"] == {"odom -> base": pose}
+    assert document["stamp"] > 0
+
+
 def test_json_is_one_object_a_line():
     with published_robot():
         document = json.loads(zstate("echo", "rrbot", "--once", "--json").stdout)

@@ -32,6 +32,18 @@ def test_json_has_the_numbers_of_either_stream(stream: str):
     assert measured["missed"] == 0
 
 
+def test_transforms_of_several_writers_are_measured_together(spawn: Spawn):
+    for child in ("base_link", "ball"):
+        options = ("--xyz", "0", "0", "0", "--rate", "50", "--robot", "r1")
+        started(spawn, "transform", "odom", child, *options).line()
+    measured = json.loads(zstate("hz", "r1", "--stream", "transforms", "--once", "--json").stdout)
+    # Two writers of 50 Hz each.
+    assert measured["rate_hz"] == pytest.approx(100.0, rel=0.2)
+    assert measured["missed"] == 0
+    message = failure("hz", "r2", "--stream", "transforms", "--once", "--timeout", "1")
+    assert "robot 'r2' is not announced" in message
+
+
 def test_the_window_limits_what_is_measured():
     with published_robot():
         measured = json.loads(zstate("hz", "rrbot", "--window", "5", "--once", "--json").stdout)

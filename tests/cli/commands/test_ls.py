@@ -106,3 +106,17 @@ def test_on_ros_side_the_list_is_watched_too(ros_router: str, spawn: Spawn):
     with published_robot(wire="ros2", router=ros_router):
         until(lambda: "/joint_states" in command.line())
     interrupted(command)
+
+
+def test_writers_of_transforms_have_their_names_and_rates(spawn: Spawn):
+    options = ("--xyz", "0", "0", "0", "--robot", "r1", "--writer", "odometry")
+    started(spawn, "transform", "odom", "base", *options).line()
+    (robot,) = json.loads(zstate("ls", "--json").stdout)
+    (writer,) = robot["writers"]
+    assert (robot["robot"], writer["stream"], writer["names"]) == ("r1", "transforms", ["odometry"])
+    assert writer["rate_hz"] == pytest.approx(50.0, rel=0.2)
+    assert "transforms/odometry" in zstate("ls").stdout.decode()
+    assert "r1: transforms/odometry (" in zstate("graph").stdout.decode()
+    edges = json.loads(zstate("monitor", "--once", "--json").stdout)["edges"]
+    assert [edge["rate_hz"] for edge in edges] == [pytest.approx(50.0, rel=0.2)]
+    assert zstate("monitor", "--robots", "--once").stdout.decode().startswith("r1  ")

@@ -17,6 +17,7 @@ from helpers.processes import find_free_port, repeated
 from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import ManualClock, SystemClock
 from zstate.nodes.clock import ClockPublisher
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.wire.keys import Stream
 
 pytestmark = pytest.mark.processes
@@ -159,6 +160,34 @@ def test_stopped_writer_is_distinguished_from_a_closed_one(spawn: Spawn, free_po
     assert found["name"] == "writers"
     assert "stopped" in found["text"]
     assert str(child.process.pid) in found["next"]
+
+
+def test_silent_writer_of_transforms_is_named_and_the_rest_is_sound():
+    edge = [Transform("odom", "world", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))]
+    with (
+        published_robot(),
+        connect() as session,
+        TransformPublisher(session, "rrbot", "odometry") as odometry,
+        TransformPublisher(session, "rrbot", "camera"),
+        repeated(lambda: odometry.publish(edge)),
+    ):
+        found = warnings("rrbot")
+    assert list(found) == ["transforms"]
+    assert "as 'camera', is announced, but no transform arrives" in found["transforms"]
+
+
+def test_robot_with_transforms_only_is_sound():
+    edge = [Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))]
+    with (
+        connect() as session,
+        TransformPublisher(session, "cart", "odometry") as odometry,
+        repeated(lambda: odometry.publish(edge)),
+    ):
+        report = diagnosed("cart", code=0)
+    found = {check["name"]: check["text"] for check in report["checks"]}
+    assert report["sound"]
+    assert "as 'odometry'" in found["transforms"]
+    assert found["poses"].endswith("cart/base in cart/odom is known")
 
 
 def test_writer_without_new_samples_is_broken():

@@ -21,13 +21,14 @@ from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
-from zstate.errors import InvalidInput
+from zstate.errors import AccessDenied, InvalidInput, SecondWriter
 from zstate.net.presence import announce, discover_readers
 from zstate.net.security.acl import AclRoles, access_control
 from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import STREAMS
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.wire import keys
 from zstate.wire.messages import TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
@@ -70,6 +71,8 @@ def site(tmp_path) -> Iterator[Site]:
 WRITES = [
     ("r1", "zstate/r1/joint_states", True),
     ("r1", "zstate/r1/joint_commands", True),
+    ("r1", "zstate/r1/transforms/odometry", True),
+    ("r1", "zstate/r2/transforms/odometry", False),
     ("r1", "zstate/r2/joint_states", False),
     ("r1", "zstate/*/joint_states", False),
     ("r1", "zstate/$*1/joint_states", False),
@@ -77,6 +80,7 @@ WRITES = [
     ("r1", "zstate/clock", False),
     ("desk", "zstate/r1/joint_states", False),
     ("desk", "zstate/r1/joint_commands", False),
+    ("desk", "zstate/r1/transforms/odometry", False),
     ("desk", "zstate/clock", False),
     ("hand", "zstate/r1/joint_commands", True),
     ("hand", "zstate/r1/joint_states", False),
@@ -85,6 +89,7 @@ WRITES = [
     ("stranger", "zstate/r1/joint_states", False),
     ("site", "zstate/site/tf_static/map", True),
     ("site", "zstate/site/joint_states", False),
+    ("site", "zstate/site/transforms/map", False),
     ("site", "zstate/r1/tf_static/map", False),
 ]
 
@@ -109,6 +114,23 @@ def test_late_viewer_receives_all_streams(site: Site):
             for listener in (model, poses):
                 assert listener.buffer.wait("base", "camera", timeout_s=5.0).kind == "static"
                 until(lambda reader=listener: publish_and_check(publisher, reader))
+
+
+def test_late_viewer_receives_the_transforms_of_a_robot_and_one_writer_owns_an_edge(site: Site):
+    edge = [Transform("odom", "world", (1.0, 0.0, 0.0), UPRIGHT)]
+    with (
+        TransformPublisher(site.join("r1"), "r1", "odometry") as odometry,
+        TransformPublisher(site.join("r1"), "r1", "lidar") as lidar,
+    ):
+        odometry.publish(edge)
+        with TransformListener(site.join("desk"), "*") as late:
+            assert late.buffer.wait("odom", "world", timeout_s=5.0).translation[0] == 1.0
+        with pytest.raises(SecondWriter) as raised:
+            lidar.publish(edge)
+        assert raised.value.edge == ("r1/odom", "r1/world")
+    for user in ("r2", "desk", "site", "stranger"):
+        with pytest.raises(AccessDenied, match="'r1'"):
+            TransformPublisher(site.join(user), "r1", "odometry")
 
 
 def test_robot_receives_only_the_clock_of_others(site: Site):
@@ -205,6 +227,7 @@ def test_viewers_discover_all_readers(site: Site):
             "robot_description",
             "tf_static",
             "tf",
+            "transforms",
         }
 
 

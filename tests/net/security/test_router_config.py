@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from zstate.net.config import default_config
 from zstate.net.security.acl import AclRoles, access_control, read_access_control
 from zstate.net.security.credentials import Credentials
 from zstate.net.security.router_config import Downsampling, RouterConfig, access_text
+from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.transform import Transform
 
 FILES = Credentials(ca="/certs/ca.pem", certificate="/certs/r1.pem", key="/certs/r1.key")
 CONFIGURATIONS = {
@@ -127,6 +130,28 @@ def test_each_robot_is_downsampled_separately_and_latched_values_never():
             assert max(received) < published / 2  # a few hundred a second are put
             assert max(received) - min(received) <= 3
             until(lambda: len(statics.arrivals) == 2)
+
+
+def test_transforms_of_a_robot_are_downsampled_together():
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
+    limits = Downsampling({"transforms": 20.0}, ("r1",))
+    with (
+        connect(RouterConfig((endpoint,), downsampling=limits).settings()),
+        connect(mode="client", endpoints=endpoint) as writer,
+        connect(mode="client", endpoints=endpoint) as reader,
+        closing(SampleCollector(reader, "zstate/r1/transforms/*")) as tap,
+        TransformPublisher(writer, "r1", "odometry") as odometry,
+    ):
+        published = 0
+
+        def has_ten() -> bool:
+            nonlocal published
+            odometry.publish([Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))])
+            published += 1
+            return len(tap.arrivals) >= 10
+
+        until(has_ten)
+        assert len(tap.arrivals) < published / 2  # a few hundred a second are put
 
 
 def test_other_interfaces_are_not_downsampled():

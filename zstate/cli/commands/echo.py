@@ -1,9 +1,11 @@
-"""zstate echo: joint states as documents."""
+"""zstate echo: joint states or transforms as documents."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -12,6 +14,10 @@ from zstate.cli.options import named_robot, refuse_topic
 from zstate.cli.output.console import print_json, print_result
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from zstate.cli.output.joint_state_text import Document
+    from zstate.wire.keys import Stream
 
 
 def _check_amount(amount: float) -> float:
@@ -22,6 +28,9 @@ def _check_amount(amount: float) -> float:
 
 @click.command("echo")
 @click.argument("robot", required=False)
+@click.option(
+    "--stream", type=click.Choice(["joint_states", "transforms"]), default="joint_states", show_default=True
+)
 @click.option("--once", is_flag=True, help="Print one document; fail after --timeout with the reason.")
 @options.timeout_option("How long --once waits [s].")
 @click.option("--field", metavar="NAME", help="Print only this: stamp, positions, positions.JOINT, or JOINT.")
@@ -44,6 +53,7 @@ def echo_command(
     *,
     network: SessionOptions,
     robot: str | None,
+    stream: Stream,
     once: bool,
     timeout: float,
     field: str | None,
@@ -52,13 +62,15 @@ def echo_command(
     form: str | None,
     wire: str,
 ) -> None:
-    """Print the joint states of ROBOT as they arrive, as YAML documents.
+    """Print the joint states or the transforms of ROBOT as they arrive, as YAML documents.
 
-    ROBOT may be left out if only one robot is announced.
+    ROBOT may be left out if only one robot is announced. Transforms are those of all their writers; on a ROS
+    wire these are all messages of /tf.
 
     \b
     zstate echo
     zstate echo panda
+    zstate echo panda --stream transforms
     zstate echo panda --field panda_joint1 --csv > joint1.csv
     zstate echo panda --by 0.001
     zstate echo --wire ros2 --once                     # /joint_states
@@ -69,11 +81,12 @@ def echo_command(
         CsvFormatter,
         DescribedJointStates,
         select_field,
+        transforms_document,
         yaml_text,
     )
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
-    from zstate.wire.messages import JointState
+    from zstate.wire.registry import get_wire
 
     table, changes = CsvFormatter(), ChangeFilter(by) if changed or by else None
 
@@ -93,14 +106,20 @@ def echo_command(
     refuse_topic(robot, wire)
     with (
         open_session(network, (wire,)) as session,
-        DescribedJointStates(session, selected := named_robot(session, robot, wire), wire) as states,
-        StreamReader(session, selected, "joint_states", wire) as reader,
+        ExitStack() as opened,
     ):
+        selected = named_robot(session, robot, wire)
+        document: Callable[[Any], Document] = transforms_document
+        if stream == "joint_states":
+            document = opened.enter_context(DescribedJointStates(session, selected, wire)).document
+        else:
+            stream = get_wire(wire).transforms
+        reader = opened.enter_context(StreamReader(session, selected, stream, wire))
         received = reader.first(timeout if once else None)
         while True:
             if received is not None:
-                assert isinstance(received.sample, JointState)
-                show(states.document(received.sample))
+                sample: Any = received.sample  # of the class that ``stream`` carries
+                show(document(sample))
             if once:
                 return
             received = reader.next(LONGEST_WAIT_S)

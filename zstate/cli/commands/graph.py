@@ -83,11 +83,13 @@ def _discover_measured_graph(session: Session) -> Graph:
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
         statistics.subscribe("joint_states")
+        statistics.subscribe("transforms")
         robots = discover(session)
         readers = discover_readers(session, _READERS_WITHIN_S)
-        # Transforms are published only while they are read: measuring must not make a publisher start.
+        # tf is published only while it is read: measuring must not make a publisher start.
         read = {one.robot for one in readers if one.stream == "tf"}
-        moving: set[tuple[str, Stream]] = {(robot.name, "joint_states") for robot in robots}
+        always: tuple[Stream, ...] = ("joint_states", "transforms")
+        moving: set[tuple[str, Stream]] = {(robot.name, stream) for robot in robots for stream in always}
         for robot in robots:
             if read & {robot.name, ANY}:
                 statistics.subscribe("tf", robot.name)

@@ -23,7 +23,10 @@ _SETTLING_S = 0.1
 @click.command("hz")
 @click.argument("robot", required=False)
 @click.option(
-    "--stream", type=click.Choice(["joint_states", "tf"]), default="joint_states", show_default=True
+    "--stream",
+    type=click.Choice(["joint_states", "tf", "transforms"]),
+    default="joint_states",
+    show_default=True,
 )
 @click.option(
     "--window",
@@ -52,22 +55,26 @@ def hz_command(
     """Print once a second the rate at which samples of ROBOT arrive.
 
     ROBOT may be left out if only one robot is announced. On a ROS wire this is the rate of the messages of a
-    topic, from all nodes together.
+    topic, from all nodes together; that of transforms is the rate of all their writers together.
 
     \b
     zstate hz
     zstate hz panda
+    zstate hz panda --stream transforms
     zstate hz --wire ros2                              # /joint_states
     zstate hz --wire ros2 --stream tf --once           # /tf
     """
     from zstate.cli.stream_reader import StreamReader
+    from zstate.wire.registry import get_wire
 
+    of_all = is_ros(wire) or stream == "transforms"
+    stream = get_wire(wire).transforms if stream == "transforms" else stream
     refuse_topic(robot, wire)
     with (
         open_session(network, (wire,)) as session,
         StreamReader(session, named_robot(session, robot, wire), stream, wire) as reader,
     ):
-        statistics = MessageStatistics(window, of_all=is_ros(wire))
+        statistics = MessageStatistics(window, of_all=of_all)
         reader.first(timeout if once else None)
         _read_for(_SETTLING_S, reader, MessageStatistics(2))  # what queued up while this process was starting
         deadline, silent = time.monotonic() + timeout, False

@@ -45,6 +45,7 @@ _REFRESH_S, _JSON_PERIOD_S = 0.5, 1.0
 _DISCOVERY_S = 0.5
 _HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
 _OPTIONAL = ("since", "age")
+_MEASURED: tuple[Stream, ...] = ("joint_states", "transforms")
 
 
 @click.command("ls")
@@ -55,10 +56,10 @@ _OPTIONAL = ("since", "age")
 def ls_command(network: SessionOptions, *, watch: bool, as_json: bool, wire: str) -> None:
     """List the announced robots and, for each stream, its writer and since when it writes.
 
-    Joint states also have their rate, from their stamps, and the age of the newest sample. On a ROS wire:
-    the nodes, and the publishers and subscribers of the topics of robot states, with QoS. A terminal gets
-    headings. With --watch a pipe gets the list after each change; with --json, once a second. If no robot
-    is announced the list is empty and the exit code is 0.
+    Joint states and transforms also have their rate, from their stamps, and the age of the newest sample. On
+    a ROS wire: the nodes, and the publishers and subscribers of the topics of robot states, with QoS. A
+    terminal gets headings. With --watch a pipe gets the list after each change; with --json, once a second.
+    If no robot is announced the list is empty and the exit code is 0.
 
     \b
     zstate ls
@@ -107,19 +108,20 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
         return robots_text(robots, statistics, width=output_width())
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
-        statistics.subscribe("joint_states")
+        for measured_stream in _MEASURED:
+            statistics.subscribe(measured_stream)
         facts = partial(_robots_facts, statistics=statistics)
         if watch:
             with RobotDirectory(session) as directory:
                 time.sleep(_DISCOVERY_S)
                 _watch(directory.robots, text, facts, as_json=as_json)
         robots = discover(session)
-        # Only joint states are measured: a reader of transforms would make a publisher send more.
+        # A reader of tf would make a publisher send more.
         measured = [
             WriterKey(robot.name, stream, writer.session)
             for robot in robots
             for stream, writer in robot.writers
-            if stream == "joint_states"
+            if stream in _MEASURED
         ]
         statistics.wait(measured, _MEASURED_WITHIN_S)
         if as_json:
@@ -162,7 +164,7 @@ def robots_text(robots: Sequence[RobotInfo], statistics: TopicStatistics, *, wid
         full.append((robot.name, "", "", "", ""))
         undated.append(full[-1])
         for stream, writer in robot.writers:
-            names = [one for one in robot.names_of(writer) if stream == "tf_static" and one != MODEL_WRITER]
+            names = [one for one in robot.names_of(writer, stream) if one != MODEL_WRITER]
             shown = f"  {stream}/{','.join(names)}" if names else f"  {stream}"
             rate = age = ""
             source = statistics.get(WriterKey(robot.name, stream, writer.session))
@@ -199,7 +201,7 @@ def _robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> l
         return {
             "stream": stream,
             **asdict(writer),
-            "names": robot.names_of(writer) if stream == "tf_static" else (),
+            "names": robot.names_of(writer, stream),
             "rate_hz": None if source is None else source.published_hz(),
             "silent_s": None if source is None else source.silent_s(),
         }

@@ -31,6 +31,7 @@ from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.wire.keys import ANY, Stream, check_robot
+from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
@@ -316,7 +317,9 @@ class RobotMonitor(Closeable):
             # All nodes share /tf. A selected robot means its joints, which need its model.
             is_described = self._robot is not None and {"joint_states", "robot_description"} <= streams
             follow = "joint_states" if is_described else "tf"
-        if follow not in streams:
+        # A listener also receives transforms, whatever it follows.
+        shown = follow if follow in streams else get_wire(self._wire).transforms
+        if shown not in streams:
             return
         if follow not in self._listeners:
             buffer = MeteredBuffer(self._clock)
@@ -325,7 +328,7 @@ class RobotMonitor(Closeable):
             )
             self._listeners[follow] = self._opened.enter_context(listener), buffer
         self._robots[robot] = MonitoredRobot(robot, *self._listeners[follow])
-        place = self._directory.messages.place(robot, (follow,))
+        place = self._directory.messages.place(robot, (shown,))
         print_status(f"following {place}", event="following", robot=robot)
 
     def report(self, *, as_json: bool) -> None:

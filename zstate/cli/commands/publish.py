@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import click
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
+    from zstate.rate import RateReport
     from zstate.sources import JointReading
     from zstate.sources.joint_source import JointSource
     from zstate.wire.keys import Stream
@@ -195,8 +196,18 @@ class _ObservedSource:
         return reading
 
 
+Source_contra = TypeVar("Source_contra", contravariant=True)
+
+
+class RatePublisher(Protocol[Source_contra]):
+    """A publisher that reads a source at an exact rate."""
+
+    def run(self, source: Source_contra, rate_hz: float, *, seconds: float | None) -> RateReport: ...
+    def close(self) -> None: ...
+
+
 def run_publisher(
-    publisher: StatePublisher, source: JointSource, rate_hz: float, seconds: float | None
+    publisher: RatePublisher[Source_contra], source: Source_contra, rate_hz: float, seconds: float | None
 ) -> None:
     """``publisher.run``, with its report at the end, also after a signal.
 

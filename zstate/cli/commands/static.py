@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 @click.command("static")
 @click.argument("target", required=False)
 @click.argument("source", required=False)
-@click.option("--xyz", type=float, nargs=3, metavar="X Y Z", help="Position of SOURCE in TARGET [m].")
-@click.option("--rpy-deg", type=float, nargs=3, metavar="R P Y", help="Rotation as in URDF, but in degrees.")
-@click.option("--rpy", type=float, nargs=3, metavar="R P Y", help="Rotation as in URDF, in radians.")
-@click.option("--quat-xyzw", type=float, nargs=4, metavar="X Y Z W", help="Rotation as a unit quaternion.")
+@options.pose_options
 @click.option(
     "--file",
     type=options.EXISTING_FILE,
@@ -137,39 +134,53 @@ def _by_owner(
     session: Session, edges: list[OwnedEdge], default: str | None, wire: str
 ) -> dict[tuple[str, tuple[str, ...]], list[Transform]]:
     """The edges by the robot that owns them and the wires they are published on."""
-    from zstate.net.presence import discover
-
     owned: dict[tuple[str, tuple[str, ...]], list[Transform]] = {}
     for one in edges:
-        wires, frames = one.wires or (wire,), (one.edge.source, one.edge.target)
-        # On a ROS wire frames have no owner, and a slash in a frame name has no meaning.
-        by_name = [frame.partition("/")[0] for frame in frames if "/" in frame and "native" in wires]
-        owner = one.robot or next(iter(by_name), None) or default
-        if owner is None and "native" in wires:
-            print_status("looking for the robot that owns this edge ...")
-            robots = discover(session)
-            if len(robots) != 1:
-                announced = messages_for("native").announced(robots)
-                fail(f"cannot tell which robot owns this edge; pass --robot NAME ({announced})")
-            owner = default = robots[0].name
-        elif owner is None:
-            owner = default = messages_for(wires[0]).robot
-            if owner is None:
-                raise click.UsageError(
-                    "pass --robot NAME; on this wire each robot has a namespace of its name"
-                )
+        wires = one.wires or (wire,)
+        owner = one.robot or owner_in_names(one.edge, wires) or default
+        if owner is None:
+            owner = default = only_owner(session, wires)
         owned.setdefault((owner, wires), []).append(one.edge)
     return owned
 
 
-def _edge_text(edge: Transform, publisher: StaticPublisher, wires: tuple[str, ...]) -> str:
+def owner_in_names(edge: Transform, wires: tuple[str, ...]) -> str | None:
+    """The robot in a full frame name of ``edge``, of the source first; None if both names are bare."""
+    # On a ROS wire frames have no owner, and a slash in a frame name has no meaning.
+    frames = (edge.source, edge.target) if "native" in wires else ()
+    return next((frame.partition("/")[0] for frame in frames if "/" in frame), None)
+
+
+def only_owner(session: Session, wires: tuple[str, ...]) -> str:
+    """The only announced robot, or the one that ``wires`` can mean. Ends the command without one."""
+    from zstate.net.presence import discover
+
+    if "native" in wires:
+        print_status("looking for the robot that owns this edge ...")
+        robots = discover(session)
+        if len(robots) != 1:
+            announced = messages_for("native").announced(robots)
+            fail(f"cannot tell which robot owns this edge; pass --robot NAME ({announced})")
+        return robots[0].name
+    robot = messages_for(wires[0]).robot
+    if robot is None:
+        raise click.UsageError("pass --robot NAME; on this wire each robot has a namespace of its name")
+    return robot
+
+
+def pose_text(edge: Transform) -> str:
+    """The pose of ``edge`` in a sentence, in metres and degrees."""
     x, y, z = edge.translation
     # Adding zero turns -0 into 0.
     roll, pitch, yaw = (round(degrees(angle), 6) + 0.0 for angle in edge.rpy)
-    pose = (
+    return (
         f"pose of {edge.source} in {edge.target}: xyz [{x:g}, {y:g}, {z:g}] m, "
         f"rpy [{roll:g}, {pitch:g}, {yaw:g}] deg"
     )
+
+
+def _edge_text(edge: Transform, publisher: StaticPublisher, wires: tuple[str, ...]) -> str:
+    pose = pose_text(edge)
     places = " and ".join(
         messages_for(wire).place(publisher.robot, ("tf_static",)) for wire in wires if is_ros(wire)
     )

@@ -47,7 +47,9 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
             break
     model, check = model_check(probe)
     yield check
-    yield _samples_check(probe)
+    if not probe.has_only_transforms:
+        yield _samples_check(probe)
+    yield from _transforms_checks(probe)
     yield clocks_check(probe)
     yield stamps_check(probe, session)
     if model is not None:
@@ -109,6 +111,8 @@ def model_check(probe: RobotProbe) -> tuple[RobotModel | None, Check]:
             check = broken("model", text, f"zstate doctor {robot} --timeout 10")
         elif probe.followed == "tf":
             check = ok("model", "not published, and not needed: the poses are published on tf")
+        elif probe.has_only_transforms:
+            check = ok("model", "not published, and not needed: its moving edges are on transforms")
         else:
             text = f"the model of {robot!r} has no publisher"
             check = broken("model", text, publish_command_for("publish", robot))
@@ -165,6 +169,27 @@ def _rate_check(probe: RobotProbe, writer: str, rate_hz: float) -> Check:
         text += f"; {stats.missed} were lost on the way and {stats.dropped} here"
         return warning(stream, text, f"zstate monitor --robots --robot {robot}")
     return ok(stream, f"{text}, newest {silence} ago")
+
+
+def _transforms_checks(probe: RobotProbe) -> Iterator[Check]:
+    """Whether each announced writer of transforms publishes."""
+    samples = {} if probe.transforms is None else probe.transforms.writers
+    hz = f"zstate hz {probe.info.name} --stream transforms"
+    for name, writer in probe.info.transform_names:
+        received, known_as = samples.get(writer.session), f"{writer}, as {name!r}"
+        if received is None:
+            stuck = ": it is stopped, or frozen" if writer in probe.unresponsive else ""
+            text = f"{known_as}, is announced, but no transform arrives{stuck}"
+            yield warning("transforms", text, hz)
+            continue
+        silence = format_duration(round(received.statistics.silent_s() * 1e9))
+        window = received.statistics.window()
+        if received.statistics.is_stale():
+            yield broken("transforms", f"the transforms of {known_as}, stopped {silence} ago", hz)
+        elif window is None or window.rate_hz is None:
+            yield ok("transforms", f"one sample from {known_as}, {silence} ago")
+        else:
+            yield ok("transforms", f"{window.rate_hz:.1f} Hz from {known_as}, newest {silence} ago")
 
 
 def _no_writer_check(probe: RobotProbe) -> Check:
@@ -249,7 +274,7 @@ def poses_check(probe: RobotProbe, model: RobotModel | None) -> Check:
     roots = sorted(frame.name for frame in frames if frame.parent is None)
     if len(roots) > 1:
         return _trees_check(probe, {frame.name for frame in frames}, roots)
-    has_samples = bool(probe.samples.statistics.count)
+    has_samples = bool(probe.sample_count)
     is_driven = "joint_states" in probe.streams and model is not None
     if not (has_samples or is_driven or (model is not None and not model.joint_names)):
         return skipped("poses", "no joint positions")

@@ -122,7 +122,8 @@ class RobotProbe(Closeable):
     """Subscribes to the streams of ``info`` and to the status of its writers.
 
     ``neighbours`` are all announced robots. ``on_change()`` is called after each description and sample.
-    ``nodes`` are the samples of each stream by ROS node, on a ROS wire.
+    ``nodes`` are the samples of each stream by ROS node, on a ROS wire; ``transforms`` are the samples of
+    that stream by writer, on the native wire.
     """
 
     def __init__(
@@ -152,7 +153,10 @@ class RobotProbe(Closeable):
             opening.enter_context(description)
             samples = StreamSamples(session, info.name, self.followed, wire_format, on_change)
             self.samples = opening.enter_context(samples)
+            self.transforms: StreamSamples | None = None
             if is_native:
+                transforms = StreamSamples(session, info.name, "transforms", wire_format)
+                self.transforms = opening.enter_context(transforms)
                 opening.enter_context(StatusSubscriber(session, info.name, self._on_status))
             for stream in () if is_native else _ROS_STREAMS:
                 nodes = StreamSamples(session, info.name, stream, wire_format)
@@ -202,9 +206,19 @@ class RobotProbe(Closeable):
     def is_silent(self) -> bool:
         """Whether nothing has arrived except announcements."""
         frames = any(frame.kind == "static" for frame in self.listener.buffer.frames())
-        return not (
-            self.description or self.samples.statistics.count or self.statuses or self.offsets or frames
-        )
+        return not (self.description or self.sample_count or self.statuses or self.offsets or frames)
+
+    @property
+    def sample_count(self) -> int:
+        """How many samples of the followed stream and of transforms have arrived."""
+        transforms = 0 if self.transforms is None else self.transforms.statistics.count
+        return self.samples.statistics.count + transforms
+
+    @property
+    def has_only_transforms(self) -> bool:
+        """Whether its writers publish moving edges, and no joints or model."""
+        others = {"joint_states", "tf", "robot_description"}
+        return "transforms" in self.streams and self.streams.isdisjoint(others)
 
     def find_unresponsive(self) -> None:
         """Query the writers that have not reported their clocks, and collect those that do not reply.

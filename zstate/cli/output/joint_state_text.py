@@ -1,4 +1,4 @@
-"""Joint states as documents with joint names, and documents as YAML, CSV or a single field."""
+"""Joint states and transforms as documents, and documents as YAML, CSV or a single field."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.urdf import parse_urdf
 from zstate.net.subscription import Received, subscribe
-from zstate.wire.messages import JointState, RobotDescription, from_block, order_digest
+from zstate.wire.messages import (
+    JointState,
+    RobotDescription,
+    TransformSample,
+    from_block,
+    order_digest,
+    poses_from_block,
+)
 from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
@@ -26,7 +33,7 @@ if TYPE_CHECKING:
     from zstate.net.session import Session
 
 Numbers: TypeAlias = "dict[str, float | list[float]] | list[float]"
-Document: TypeAlias = "dict[str, int | Numbers]"
+Document: TypeAlias = "dict[str, int | Numbers | dict[str, dict[str, list[float]]]]"
 
 _BLOCKS = ("positions", "velocities", "efforts")
 # A description arrives within milliseconds if the robot publishes one.
@@ -130,6 +137,17 @@ class DescribedJointStates(JointStateFormatter, Closeable):
             assert isinstance(description, RobotDescription)
             self.set_description(description)
             self._described.set()
+
+
+def transforms_document(sample: TransformSample) -> Document:
+    """``sample`` as a document: "stamp" [ns], "seq", and "transforms", poses by "parent -> child"."""
+    poses = poses_from_block(sample.poses).tolist()
+    edges = zip(sample.edges or (), poses, strict=False)
+    transforms = {
+        f"{parent} -> {child}": {"translation": pose[:3], "rotation": pose[3:]}
+        for (parent, child), pose in edges
+    }
+    return {"stamp": sample.stamp, "seq": sample.seq, "transforms": transforms}
 
 
 def yaml_text(value: Any, indent: str = "") -> str:

@@ -16,9 +16,9 @@ from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
 from zstate.net.security.acl import AclRoles, access_control, check_namespace
 from zstate.net.security.credentials import Credentials
-from zstate.wire.keys import Stream, stream_key
+from zstate.wire.keys import Stream, check_robot, stream_expression
 
-DOWNSAMPLED: tuple[Stream, ...] = ("joint_states", "tf")
+DOWNSAMPLED: tuple[Stream, ...] = ("joint_states", "tf", "transforms")
 """Streams that may lose samples: each is replaced by a newer one."""
 
 _WIDTH = 100
@@ -31,8 +31,8 @@ class Downsampling:
     """Limits on the samples per second that a router forwards to each neighbour.
 
     ``rates_hz`` is the limit by stream, for each of ``robots``; ``interfaces`` are the network interfaces
-    that it applies to (default: all). Latched values are never dropped. Readers count dropped samples
-    as missed. Raises InvalidInput.
+    that it applies to (default: all). The limit of ``transforms`` is that of all their writers of one robot
+    together. Latched values are never dropped. Readers count dropped samples as missed. Raises InvalidInput.
     """
 
     rates_hz: Mapping[str, float]
@@ -44,7 +44,7 @@ class Downsampling:
         check_namespace(self.namespace)
         for stream, rate_hz in self.rates_hz.items():
             if stream not in DOWNSAMPLED:
-                raise InvalidInput(f"{stream!r} cannot be downsampled; {' and '.join(DOWNSAMPLED)} can")
+                raise InvalidInput(f"{stream!r} cannot be downsampled; {', '.join(DOWNSAMPLED)} can")
             if not (math.isfinite(rate_hz) and rate_hz > 0.0):
                 raise InvalidInput(f"{stream!r} at {rate_hz} Hz; give a positive number of samples a second")
         if not self.rates_hz or not self.robots:
@@ -58,7 +58,10 @@ class Downsampling:
         interfaces = {"interfaces": list(self.interfaces)} if self.interfaces else {}
         prefix = f"{self.namespace}/" if self.namespace else ""
         rules = [
-            {"key_expr": prefix + stream_key(robot, stream), "freq": self.rates_hz[stream]}
+            {
+                "key_expr": prefix + stream_expression(check_robot(robot), stream),
+                "freq": self.rates_hz[stream],
+            }
             for robot in dict.fromkeys(self.robots)
             for stream in DOWNSAMPLED
             if stream in self.rates_hz
