@@ -395,7 +395,7 @@ RATCHETS = (
     Ratchet("modules in largest folder", modules_in_largest_folder, 17, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
     Ratchet("modules", lambda: len(modules()), 227, 270),
-    Ratchet("lines", lines, 41_000, 36_000),
+    Ratchet("lines", lines, 42_700, 36_000),  # 40,026 before moving frames and joints as data
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
 

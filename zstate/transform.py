@@ -394,7 +394,7 @@ def check_covariance(covariance: ArrayLike) -> list[float]:
     if smallest < -tolerance:
         raise InvalidInput(
             f"the covariance of a pose has no negative eigenvalue; got {smallest:g}. Variances (the "
-            "diagonal, in m^2 and rad^2) are not negative, and bound the numbers beside them"
+            "diagonal, in m^2 and rad^2) are not negative, and limit the covariances in their row"
         )
     return matrix[UPPER_TRIANGLE].tolist()
 
