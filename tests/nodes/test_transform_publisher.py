@@ -20,6 +20,7 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
 from zstate.wire.messages import Status, TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.protocol import SerializedSample
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -316,3 +317,19 @@ def test_samples_that_arrive_after_their_writer_left_join_its_history(sessions):
             stream.put(encode(late))
             until(lambda: counts() == [3])
         assert listener.robots() == ("r1",)
+
+
+def test_unannounced_writers_are_bounded_and_leave_no_edges(sessions):
+    """A hostile writer makes up a session for each sample."""
+    with TransformListener(sessions[0], "r1") as listener:
+        transforms = listener._sample_streams["transforms"]
+        stamp = time.time_ns()
+        for session in range(300):
+            edges = (("odom", f"frame{session}"),)
+            sample = TransformSample(stamp, 0, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
+            encoding = ENCODINGS[TransformSample]
+            arrival = SerializedSample("zstate/r1/transforms/thief", encode(sample), encoding)
+            listener._on_samples(transforms, [arrival])
+        moving = [frame.name for frame in listener.buffer.frames() if frame.parent]
+    assert len(transforms.unannounced) == 256
+    assert moving == [f"r1/frame{session}" for session in range(44, 300)]

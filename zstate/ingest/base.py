@@ -83,6 +83,11 @@ class StreamIngest(ABC):
                 self._has_joined_domain = False
                 self._buffer.domain.leave(self.robot)
 
+    def drop(self) -> None:
+        """Remove all samples and edges of this robot's writers from the buffer."""
+        with self._lock:
+            self._drop_history()
+
     def insert_sample(self, sample: Sample, *, overflowed: bool) -> None:
         """Insert a live sample; ``overflowed`` if the receiver's ring lost samples before it."""
         self.has_data = True

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal, ParamSpec, TypeVar
 
-from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.clock import SYSTEM, Clock, ClockOffset
@@ -40,22 +39,34 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+# Of one stream; a hostile writer can make up any number of sessions.
+_MAX_UNANNOUNCED = 256
+
+
 @dataclass(eq=False)
 class _SampleStream:
     """One of the streams of samples that a listener receives, with the ingests of their writers.
 
-    ``is_shared`` means that each writer publishes its own part of a robot, and has its own ingest. Its last
-    samples may arrive after it has left, so its ingest is among the ``departed`` then.
+    ``is_shared`` means that each writer publishes its own part of a robot, and has its own ingest. The first
+    samples of a writer may arrive before its announcement, and the last after it has left: then its ingest is
+    among the ``unannounced``, of which the oldest of more than 256 is dropped with its edges.
     """
 
     stream: Stream
     is_shared: bool
     capacity: int = 0
     ingests: dict[tuple[str, int], StreamIngest] = field(default_factory=dict[tuple[str, int], StreamIngest])
-    departed: BoundedDict[tuple[str, int], StreamIngest] = field(
-        default_factory=BoundedDict[tuple[str, int], StreamIngest]
+    unannounced: dict[tuple[str, int], StreamIngest] = field(
+        default_factory=dict[tuple[str, int], StreamIngest]
     )
     overflowed: set[StreamIngest] = field(default_factory=set[StreamIngest])
+
+    def add_unannounced(self, key: tuple[str, int], ingest: StreamIngest) -> StreamIngest:
+        """The ingest of a writer that is not announced: the one there is, else this one."""
+        ingest = self.unannounced.setdefault(key, ingest)
+        if len(self.unannounced) > _MAX_UNANNOUNCED:
+            self.unannounced.pop(next(iter(self.unannounced))).drop()
+        return ingest
 
 
 class TransformListener(Closeable):
@@ -181,7 +192,7 @@ class TransformListener(Closeable):
         ingests = [
             ingest
             for samples in self._sample_streams.values()
-            for ingest in (*list(samples.ingests.values()), *list(samples.departed.values()))
+            for ingest in (*list(samples.ingests.values()), *list(samples.unannounced.values()))
         ]
         return tuple(sorted({ingest.robot for ingest in ingests if ingest.has_data}))
 
@@ -224,13 +235,18 @@ class TransformListener(Closeable):
 
     def _ingest_for(self, samples: _SampleStream, robot: str, session: int) -> StreamIngest:
         key = (robot, session if samples.is_shared else 0)
-        ingest = samples.ingests.get(key) or samples.departed.get(key)
+        ingest = samples.ingests.get(key) or samples.unannounced.get(key)
         if ingest is None:
             make = JointStateIngest if samples.stream == "joint_states" else TransformIngest
-            ingest = samples.ingests.setdefault(key, make(robot, self._ownership, self._events.add_set_back))
+            ingest = make(robot, self._ownership, self._events.add_set_back)
             self._ownership.add_robot(robot)
-            if samples.is_shared and (robot, session) in self._names:
-                ingest.name_writer(session, self._names[robot, session])
+            if not samples.is_shared:
+                ingest = samples.ingests.setdefault(key, ingest)
+            elif key in self._names:
+                ingest = samples.ingests.setdefault(key, ingest)
+                ingest.name_writer(session, self._names[key])
+            else:
+                ingest = samples.add_unannounced(key, ingest)
         return ingest
 
     def _on_samples(self, samples: _SampleStream, arrivals: list[SerializedSample]) -> None:
@@ -369,8 +385,8 @@ class TransformListener(Closeable):
         if alive and self._history is not None:
             self._history.request(stream_key(robot, samples.stream, announced.name), session)
         key = robot, session
-        if samples.is_shared and key in samples.departed and alive:  # it was cut off, and is back
-            samples.ingests[key] = samples.departed.pop(key)
+        if samples.is_shared and alive and key in samples.unannounced:
+            samples.ingests[key] = samples.unannounced.pop(key)
         if samples.is_shared and key not in samples.ingests:
             return  # it has not published yet
         ingest = self._ingest_for(samples, robot, session)
@@ -379,7 +395,7 @@ class TransformListener(Closeable):
             return
         ingest.writer_left(session)
         if samples.is_shared:
-            samples.departed[key] = samples.ingests.pop(key)
+            samples.add_unannounced(key, samples.ingests.pop(key))
 
 
 class _WriterClockOffsets(Closeable):
