@@ -18,7 +18,7 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
-from zstate.wire.messages import Status, TransformSample, order_digest, to_block
+from zstate.wire.messages import Status, WriterTransforms, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.protocol import SerializedSample
 
@@ -311,8 +311,8 @@ def test_samples_that_arrive_after_their_writer_left_join_its_history(sessions):
             until(lambda: counts() == [2])
             session = odometry._session_id
         until(lambda: [event.kind for event in listener.events()] == ["joined", "left"])
-        late = TransformSample(stamp + 2, 2, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
-        with StreamPublisher(writer, key, ENCODINGS[TransformSample]) as stream:
+        late = WriterTransforms(stamp + 2, 2, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
+        with StreamPublisher(writer, key, ENCODINGS[WriterTransforms]) as stream:
             wait_for_reader(writer, key)
             stream.put(encode(late))
             until(lambda: counts() == [3])
@@ -326,8 +326,8 @@ def test_unannounced_writers_are_bounded_and_leave_no_edges(sessions):
         stamp = time.time_ns()
         for session in range(300):
             edges = (("odom", f"frame{session}"),)
-            sample = TransformSample(stamp, 0, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
-            encoding = ENCODINGS[TransformSample]
+            sample = WriterTransforms(stamp, 0, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
+            encoding = ENCODINGS[WriterTransforms]
             arrival = SerializedSample("zstate/r1/transforms/thief", encode(sample), encoding)
             listener._on_samples(transforms, [arrival])
         moving = [frame.name for frame in listener.buffer.frames() if frame.parent]

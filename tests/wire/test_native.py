@@ -19,6 +19,7 @@ from zstate.wire.messages import (
     StaticTransforms,
     Status,
     TransformSample,
+    WriterTransforms,
     order_digest,
     to_block,
 )
@@ -69,6 +70,28 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     "transforms": (
         TransformSample(STAMP, 300, 2**63 + 5, ORDER, to_block([1, 2, 3, 0, 0, 0, 1])),
         header(6) + bin8(struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)) + NIL,
+    ),
+    "transforms of a writer": (
+        WriterTransforms(
+            STAMP,
+            300,
+            2**63 + 5,
+            order_digest(EDGES),
+            to_block([1, 2, 3, 0, 0, 0, 1] * 2),
+            EDGES,
+            to_block([0.5] * 42),
+        ),
+        header(7)[:-8]
+        + order_digest(EDGES)
+        + bin8(struct.pack("<14d", *[1, 2, 3, 0, 0, 0, 1] * 2))
+        + b"\x92\x92"
+        + fixstr("b")
+        + fixstr("a")
+        + b"\x92"
+        + fixstr("a")
+        + fixstr("h")
+        + b"\xc5\x01\x50"
+        + struct.pack("<42d", *[0.5] * 42),
     ),
     "command": (
         JointCommand(STAMP, 300, 2**63 + 5, ORDER, velocities=to_block([0.25])),

@@ -19,6 +19,7 @@ from zstate.wire.messages import (
     Sample,
     StaticTransforms,
     TransformSample,
+    WriterTransforms,
     from_block,
     order_digest,
     poses_from_block,
@@ -68,7 +69,8 @@ class TransformIngest(StreamIngest):
 
     def _insert(self, sample: Sample) -> bool | None:
         assert isinstance(sample, TransformSample)
-        if self._version == self._ownership.version and sample.covariances is None:
+        covariances = sample.covariances if isinstance(sample, WriterTransforms) else None
+        if self._version == self._ownership.version and covariances is None:
             edges = self._all_admitted.get(sample.order)
             if edges is not None:
                 try:
@@ -121,7 +123,7 @@ class TransformIngest(StreamIngest):
             self._all_admitted[sample.order] = edges
         poses = poses_from_block(sample.poses)
         covariances = None
-        if sample.covariances is not None:
+        if isinstance(sample, WriterTransforms) and sample.covariances is not None:
             covariances = from_block(sample.covariances).reshape(len(poses), -1)
         if admitted.refusal is None:
             return self._buffer.insert_many(

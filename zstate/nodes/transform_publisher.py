@@ -29,7 +29,7 @@ from zstate.rate import Rate, RateReport
 from zstate.transform import UPPER_TRIANGLE, Transform
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import Stream, check_robot, full_name
-from zstate.wire.messages import Edges, TransformSample, order_digest, to_block
+from zstate.wire.messages import Edges, WriterTransforms, order_digest, to_block
 from zstate.wire.registry import as_wire_names, get_wire
 
 # Edges of a sample for which the cache has room for 2000 samples.
@@ -91,7 +91,7 @@ class TransformPublisher(Closeable):
         self._placed: set[Edge] = set()
         self._edge_tokens = ExitStack()
         self._claim: WriterClaim | None = None
-        self._cache: SampleCache[TransformSample] | None = None
+        self._cache: SampleCache[WriterTransforms] | None = None
         self._lock = fork_safe_lock()
         self._stop = fork_safe(threading.Event())
         self._seq = 0
@@ -161,7 +161,7 @@ class TransformPublisher(Closeable):
                 if order is None:
                     order = self._orders[names] = self._place(names)
                 head = (stamp, self._seq, self._session_id)
-                sample = TransformSample(*head, order, poses, names, covariances)
+                sample = WriterTransforms(*head, order, poses, names, covariances)
                 # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
                 payloads = [(writer, writer.encoder.encode(sample)) for writer in self._writers.values()]
                 self._seq += 1

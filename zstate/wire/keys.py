@@ -4,7 +4,7 @@
 ``zstate/<robot>/joint_states``                 JointState, each sample; a query returns a HistoryPage
 ``zstate/<robot>/tf``                           TransformSample, each sample; likewise
 ``zstate/<robot>/tf_static/<writer>``           StaticTransforms, latched
-``zstate/<robot>/transforms/<writer>``          TransformSample of a writer's own edges; a query likewise
+``zstate/<robot>/transforms/<writer>``          WriterTransforms, each sample; likewise
 ``zstate/<robot>/robot_description``            RobotDescription, latched
 ``zstate/<robot>/joint_commands``               JointCommand, to a driver
 ``zstate/<robot>/lookup``                       a queryable

@@ -99,27 +99,40 @@ class JointState(Sample, frozen=True, array_like=True, gc=False):
 
 
 class TransformSample(Sample, frozen=True, array_like=True, gc=False):
-    """Moving edges at one instant: all those of a robot, or those of one ``TransformPublisher``.
+    """Every moving edge of a robot at one instant.
 
     ``poses`` is a block of ``parent_from_child``, seven numbers for each edge. The edges are ``edges``, or
-    ``RobotDescription.moving_edges`` if None. ``covariances`` is a block of 21 numbers for each edge, NaN if
-    not known: the upper triangle of the pose's covariance row by row, in the order x y z [m], rotation about
-    the fixed axes x y z of the parent [rad], as in ROS (geometry_msgs/PoseWithCovariance).
+    ``RobotDescription.moving_edges`` if None.
     """
 
     poses: bytes
     edges: Edges | None = None
+
+    def __post_init__(self) -> None:
+        _check_poses(self.poses, self.edges)
+        if self.edges is not None:
+            _check_order(self.order, self.edges)
+
+
+class WriterTransforms(TransformSample, frozen=True, array_like=True, gc=False):
+    """Moving edges of one ``TransformPublisher`` at one instant.
+
+    ``covariances`` is a block of 21 numbers for each edge, NaN if not known: the upper triangle of the pose's
+    covariance row by row, in the order x y z [m], rotation about the fixed axes x y z of the parent [rad], as
+    in ROS (geometry_msgs/PoseWithCovariance).
+    """
+
     covariances: bytes | None = None
 
     def __post_init__(self) -> None:
         _check_poses(self.poses, self.edges)
+        if self.edges is not None:
+            _check_order(self.order, self.edges)
         if self.covariances is not None and len(self.covariances) != 3 * len(self.poses):
             raise InvalidInput(
                 f"{len(self.poses) // POSE_BYTES} poses take 21 numbers of covariance each; got "
                 f"{len(self.covariances)} bytes"
             )
-        if self.edges is not None:
-            _check_order(self.order, self.edges)
 
 
 class JointCommand(Sample, frozen=True, array_like=True, gc=False):
@@ -262,6 +275,6 @@ def message_size(message: Message) -> int:
         blocks = len(message.positions) + len(message.velocities or b"") + len(message.efforts or b"")
         return _OVERHEAD + blocks + 60 * len(message.names or ())
     if isinstance(message, TransformSample):
-        blocks = len(message.poses) + len(message.covariances or b"")
-        return _OVERHEAD + blocks + 200 * len(message.edges or ())
+        size = _OVERHEAD + len(message.poses) + 200 * len(message.edges or ())
+        return size + 3 * len(message.poses) if isinstance(message, WriterTransforms) else size
     return _OVERHEAD

@@ -25,6 +25,7 @@ from zstate.wire.messages import (
     StaticTransforms,
     Status,
     TransformSample,
+    WriterTransforms,
     check_edges,
     check_size,
 )
@@ -38,6 +39,7 @@ M = TypeVar("M", bound=Message)
 ENCODINGS: dict[type[Message], str] = {
     JointState: "zstate/JointState;v=1",
     TransformSample: "zstate/TransformSample;v=1",
+    WriterTransforms: "zstate/WriterTransforms;v=1",
     JointCommand: "zstate/JointCommand;v=1",
     StaticTransforms: "zstate/StaticTransforms;v=1",
     RobotDescription: "zstate/RobotDescription;v=1",
@@ -48,7 +50,7 @@ ENCODINGS: dict[type[Message], str] = {
 STREAM_TYPES: dict[Stream, type[Message]] = {
     "joint_states": JointState,
     "tf": TransformSample,
-    "transforms": TransformSample,
+    "transforms": WriterTransforms,
     "tf_static": StaticTransforms,
     "robot_description": RobotDescription,
     "joint_commands": JointCommand,
