@@ -31,7 +31,6 @@ from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.wire.keys import ANY, Stream, check_robot
-from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
@@ -311,6 +310,7 @@ class RobotMonitor(Closeable):
     def _add(self, robot: str, streams: frozenset[Stream]) -> None:
         from zstate.metrics.buffer import MeteredBuffer
         from zstate.nodes.listener import TransformListener
+        from zstate.wire.registry import get_wire
 
         follow: Follow = "joint_states" if "joint_states" in streams else "tf"
         if is_ros(self._wire) and "tf" in streams:
