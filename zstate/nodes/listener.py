@@ -49,7 +49,8 @@ class _SampleStream:
 
     ``is_shared`` means that each writer publishes its own part of a robot, and has its own ingest. The first
     samples of a writer may arrive before its announcement, and the last after it has left: then its ingest is
-    among the ``unannounced``, of which the oldest of more than 256 is dropped with its edges.
+    among the ``unannounced``. Of more than 256 the oldest is dropped, with its edges if it was never
+    announced.
     """
 
     stream: Stream
@@ -65,7 +66,9 @@ class _SampleStream:
         """The ingest of a writer that is not announced: the one there is, else this one."""
         ingest = self.unannounced.setdefault(key, ingest)
         if len(self.unannounced) > _MAX_UNANNOUNCED:
-            self.unannounced.pop(next(iter(self.unannounced))).drop()
+            oldest = self.unannounced.pop(next(iter(self.unannounced)))
+            if oldest.writer is None:
+                oldest.drop()
         return ingest
 
 
