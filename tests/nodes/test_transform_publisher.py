@@ -333,3 +333,24 @@ def test_unannounced_writers_are_bounded_and_leave_no_edges(sessions):
         moving = [frame.name for frame in listener.buffer.frames() if frame.parent]
     assert len(transforms.unannounced) == 256
     assert moving == [f"r1/frame{session}" for session in range(44, 300)]
+
+
+def test_edges_of_writers_that_have_left_stay(sessions, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("zstate.nodes.listener._MAX_UNANNOUNCED", 1)
+    writer, reader = sessions
+    with TransformListener(reader, "r1") as listener:
+        for number in range(3):
+            with TransformPublisher(writer, "r1", f"writer{number}") as publisher:
+                publisher.publish([pose("odom", f"frame{number}")])
+                listener.buffer.wait("odom", f"frame{number}", timeout_s=SOON_S)
+            left = 2 * (number + 1)  # each has joined and left
+            until(lambda left=left: len(listener.events()) == left)
+        assert all(listener.buffer.can_lookup("odom", f"frame{number}") for number in range(3))
+
+
+@pytest.mark.parametrize("transforms", [pose("odom", "base_link"), [("odom", "base_link")], "odom", None])
+def test_anything_but_a_list_of_transforms_is_refused(sessions, transforms):
+    with TransformPublisher(sessions[0], "r1", "tracker") as tracker:
+        with pytest.raises(InvalidInput, match="publish takes a list of Transforms; got"):
+            tracker.publish(transforms)
+        assert (tracker.stats.sent, tracker.stats.refused) == (0, 1)

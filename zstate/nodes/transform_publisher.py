@@ -6,7 +6,7 @@ import secrets
 import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 
@@ -143,12 +143,14 @@ class TransformPublisher(Closeable):
         (``Transform.with_covariance``), are published on the native wire. The first sample with an edge takes
         some round trips, in which the edge is compared with those of other writers.
 
-        Raises InvalidInput for no transforms, for two of one child, and for transforms with different stamps;
-        InsertRefused for a self edge, a loop or a second parent among this writer's edges, on the native wire
-        also for an edge that contradicts an announced model, or that places a frame of another robot if that
-        robot, or a third one, places it; SecondWriter; and Closed. If it raises, nothing was sent.
+        Raises InvalidInput for anything but a list of Transforms, at least one, for two of one child, and for
+        transforms with different stamps; InsertRefused for a self edge, a loop or a second parent among this
+        writer's edges, on the native wire also for an edge that contradicts an announced model, or that
+        places a frame of another robot if that robot, or a third one, places it; SecondWriter; and Closed. If
+        it raises, nothing was sent.
         """
         try:
+            _check_transforms(transforms)
             stamp = self._stamp(transforms) if stamp is None else check_stamp(stamp)
             poses = to_block([transform.pose7 for transform in transforms])
             covariances = _covariance_block(transforms)
@@ -237,6 +239,12 @@ class TransformPublisher(Closeable):
         self._stop.set()
         with self._lock:
             self._opened.close()
+
+
+def _check_transforms(transforms: object) -> None:
+    is_list = isinstance(transforms, Sequence) and not isinstance(transforms, str)
+    if not is_list or not all(isinstance(one, Transform) for one in cast("Sequence[object]", transforms)):
+        raise InvalidInput(f"publish takes a list of Transforms; got {transforms!r}")
 
 
 def _covariance_block(transforms: Sequence[Transform]) -> bytes | None:
