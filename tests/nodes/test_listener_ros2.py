@@ -247,6 +247,79 @@ def test_restarted_node_starts_a_new_epoch_on_any_clock(sessions, follow, behind
         assert listener.stats.refused == {}
 
 
+MOVING = [(joint.parent, joint.child) for joint in RRBOT.joints if joint.type != "fixed"]
+
+
+def x_moved(*places: float) -> list[tuple[float, ...]]:
+    return [moved(x) for x in places]
+
+
+def test_other_edges_of_tf_are_received_beside_joint_states(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2") as listener:
+        publish_description(writer)
+        driver = publish_known_joints(writer, listener)
+        ekf = RosNode(writer, "ekf").publisher(TF).announce().wait_for_reader()
+        amcl, tags = (RosNode(writer, name).publisher(TF).announce() for name in ("amcl", "apriltag"))
+        driver.joints(STAMP, NAMES, [0.5, 0.25])
+        ekf.edge(STAMP, "odom", "world", 2.0)
+        amcl.edge(STAMP, "map", "odom", 30.0)
+        tags.edge(STAMP, "tool", "tag_5", 0.5)
+        until(lambda: x_of(listener, "tool", "tag_5", STAMP) == 0.5)
+        found = listener.buffer.wait("map", "tool", STAMP, timeout_s=5.0)
+        in_world = listener.buffer.lookup("world", "tool", STAMP)
+        assert_pose(in_world, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
+        assert found.translation - in_world.translation == pytest.approx([32.0, 0.0, 0.0])
+        assert writers(listener)["world"] == "/ekf"
+        assert listener.stats.refused == {}
+
+
+@pytest.mark.parametrize("is_described_first", [True, False])
+def test_edges_of_the_model_on_tf_change_nothing(sessions, is_described_first: bool):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2") as listener:
+        state_publisher = RosNode(writer, "robot_state_publisher").publisher(TF).announce().wait_for_reader()
+        if not is_described_first:
+            state_publisher.transforms(STAMP, MOVING, x_moved(7.0, 8.0))
+            until(lambda: x_of(listener, *MOVING[0]) == 7.0)
+        publish_description(writer)
+        driver = publish_known_joints(writer, listener)
+        for later in range(5):
+            # In one message with an edge that only this writer has, as simulators publish them.
+            edges = [("odom", "world"), *MOVING]
+            state_publisher.transforms(STAMP + later, edges, x_moved(float(later), 7.0, 8.0))
+            state_publisher.transforms(STAMP + later, MOVING, x_moved(7.0, 8.0))
+            driver.joints(STAMP + later, NAMES, [0.5, 0.25])
+        until(lambda: listener.buffer.can_lookup("odom", "tool", STAMP + 4))
+        assert x_of(listener, "odom", "world", STAMP + 3) == 3.0
+        pose = listener.buffer.lookup("world", "tool", STAMP + 4)
+        assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
+        kinds = {frame.name: frame.kind for frame in listener.buffer.frames()}
+        assert {kinds[f"r1/{child}"] for _, child in MOVING} == {"joint"}
+        # Of both writers five samples with something new, and the one before the description.
+        assert listener.stats.received == (10 if is_described_first else 11)
+        assert (listener.stats.refused, listener.stats.missed) == ({}, 0)
+
+
+def test_another_parent_of_a_link_of_the_model_is_refused_by_name(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2") as listener:
+        publish_description(writer)
+        publish_known_joints(writer, listener)
+        RosNode(writer, "ekf").publisher(TF).announce().wait_for_reader().edge(STAMP, "odom", "lower", 1.0)
+        until(lambda: listener.stats.refused == {"second parent": 1})
+        assert "'r1/odom'" in listener.refusals["second parent"]
+
+
+def test_transforms_of_a_robot_without_a_description_are_received(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "cell", wire="ros2") as listener:
+        tracker = RosNode(writer, "tracker").publisher(TF).announce().wait_for_reader()
+        tracker.edge(STAMP, "cell_origin", "ball", 2.0)
+        until(lambda: x_of(listener, "cell_origin", "ball") == 2.0)
+        assert listener.robots() == ("cell",)
+
+
 def test_namespace_and_root_are_subscribed_separately(sessions):
     writer, reader = sessions
     with (

@@ -82,7 +82,7 @@ class EdgeSource:
 
 
 class Admitted(NamedTuple):
-    """The ``rows`` of a sample that may be inserted, None for all, and the refusal of another row."""
+    """The ``rows`` of a sample that are inserted, None for all, and the refusal of another row."""
 
     rows: tuple[int, ...] | None = None
     refusal: InsertRefused | None = None
@@ -107,9 +107,10 @@ class _AcceptedEdge(NamedTuple):
 class FrameOwnership:
     """Decides which published edges are inserted into ``buffer``. Any thread may call it.
 
-    ``is_shared`` means that all writers share all frames, as in ROS: no frame belongs to a robot. ``placers``
-    are the robots whose writers may place other robots' roots, None: all. If an edge is refused because
-    of another writer, ``on_conflict(stream, source, refusal)`` is called; not for moving edges in ROS.
+    ``is_shared`` means that all writers share all frames, as in ROS: no frame belongs to a robot, and moving
+    edges that a model in the buffer has too are left out, because the model computes them. ``placers`` are
+    the robots whose writers may place other robots' roots, None: all. If an edge is refused because of
+    another writer, ``on_conflict(stream, source, refusal)`` is called; not for moving edges in ROS.
     """
 
     def __init__(
@@ -127,6 +128,8 @@ class FrameOwnership:
         """Increases when the set of accepted moving edges may have changed."""
         self.live: dict[tuple[str, int], str] = {}
         """Printed names of the announced writers, by robot and session."""
+        self.model_edges: dict[str, frozenset[EdgeNames]] = {}
+        """The edges of the models in the buffer, by robot, if all writers share all frames; else empty."""
         self._is_shared = is_shared
         self._placers = placers
         self._on_conflict = on_conflict
@@ -174,13 +177,27 @@ class FrameOwnership:
         with self._lock:
             if before is not None:
                 self.buffer.remove_robot(before)
+            edges = frozenset((f"{robot}/{joint.parent}", f"{robot}/{joint.child}") for joint in model.joints)
+            self.model_edges = {name: known for name, known in self.model_edges.items() if name != robot}
+            if self._is_shared:
+                self._drop_repeated(edges)
             has_withdrawn = self._withdraw_overlapping(robot, model)
             try:
-                return self.buffer.add_robot(model, robot)
+                track = self.buffer.add_robot(model, robot)
+                if self._is_shared:
+                    self.model_edges[robot] = edges
+                return track
             finally:
                 self.version += self._is_shared
                 if has_withdrawn or before is not None or self._refused:
                     self.resolve()
+
+    def _drop_repeated(self, edges: frozenset[EdgeNames]) -> None:
+        """Remove moving edges that a model has too: those that arrived before it."""
+        for child in {child for _, child in edges}.intersection(self._claims):
+            for claim in list(self._claims.get(child, ())):
+                if claim.pose is None and claim.names in edges:
+                    self._drop(claim)
 
     def _withdraw_overlapping(self, robot: str, model: RobotModel) -> bool:
         """Withdraw the edges that conflict with a model; True if there were any."""
@@ -249,20 +266,26 @@ class FrameOwnership:
     def admit(self, source: EdgeSource, edges: Sequence[EdgeNames]) -> Admitted:
         """Decide which of these moving edges of ``source`` may be inserted.
 
-        If all writers share all frames, one refused edge refuses the whole sample.
+        If all writers share all frames, edges of models are left out, and one refused edge refuses the whole
+        sample.
         """
         with self._lock:
-            named = [self._named(names) for names in edges]
+            named = {row: self._named(names) for row, names in enumerate(edges)}
+            if self._is_shared:
+                named = {row: names for row, names in named.items() if not self._repeats_model(names)}
             fresh = [
-                self._claim(source, names) for names in dict.fromkeys(named) if names not in source.claims
+                self._claim(source, names)
+                for names in dict.fromkeys(named.values())
+                if names not in source.claims
             ]
             if self._refused or not all(self._is_uncontested(claim) for claim in fresh):
                 self.resolve()
             else:
                 for claim in fresh:
                     claim.is_accepted = True
-            claims = [source.claims[names] for names in named]
-            refusal = next((claim.refusal for claim in claims if claim.refusal is not None), None)
+            claims = {row: source.claims[names] for row, names in named.items()}
+            refusals = (claim.refusal for claim in claims.values() if claim.refusal is not None)
+            refusal = next(refusals, None)
             if refusal is not None and self._is_shared:
                 for claim in fresh:
                     self._drop(claim)
@@ -272,8 +295,16 @@ class FrameOwnership:
             for claim in fresh:
                 if claim.is_accepted:
                     self._add_frames(claim)
-            rows = [row for row, claim in enumerate(claims) if claim.is_accepted]
-            return Admitted(None if refusal is None else tuple(rows), refusal)
+            rows = tuple(row for row, claim in claims.items() if claim.is_accepted)
+            return Admitted(None if len(rows) == len(edges) else rows, refusal)
+
+    def repeats_models(self, edges: Sequence[EdgeNames]) -> bool:
+        """Whether all ``edges`` are among ``model_edges``."""
+        with self._lock:
+            return all(self._repeats_model(self._named(names)) for names in edges)
+
+    def _repeats_model(self, names: EdgeNames) -> bool:
+        return any(names in edges for edges in self.model_edges.values())
 
     def release(self, source: EdgeSource) -> None:
         """Remove all edges of ``source``."""

@@ -46,6 +46,9 @@ class TransformIngest(StreamIngest):
         # The full names of edges that are all admitted, by their digest: nearly all samples.
         self._all_admitted: BoundedDict[bytes, Edges] = BoundedDict()
         self._version = -1
+        # Whether samples have no edges but those of models, by their digest.
+        self._repeats: BoundedDict[bytes, bool] = BoundedDict()
+        self._model_edges = ownership.model_edges
 
     def describe(self, description: RobotDescription) -> None:
         self.has_data = True
@@ -66,6 +69,27 @@ class TransformIngest(StreamIngest):
 
     def _named(self, edges: Edges) -> Edges:
         return tuple((full_name(self.robot, parent), full_name(self.robot, child)) for parent, child in edges)
+
+    def _insert_counted(self, sample: Sample, *, is_in_order: bool) -> bool:
+        # What the joint states give again is neither received nor late.
+        return self._repeats_models(sample) or super()._insert_counted(sample, is_in_order=is_in_order)
+
+    def _repeats_models(self, sample: Sample) -> bool:
+        """Whether all edges of a sample are those of models, which compute them."""
+        model_edges = self._ownership.model_edges
+        if not model_edges:
+            return False
+        if self._model_edges is not model_edges:
+            self._model_edges = model_edges
+            self._repeats.clear()
+        repeats = self._repeats.get(sample.order)
+        if repeats is None:
+            assert isinstance(sample, TransformSample)
+            repeats = False
+            with suppress(InvalidInput):  # a name that is refused and counted when it is inserted
+                repeats = self._ownership.repeats_models(self._named(sample.edges or ()))
+            self._repeats[sample.order] = repeats
+        return repeats
 
     def _insert(self, sample: Sample) -> bool | None:
         assert isinstance(sample, TransformSample)
@@ -119,24 +143,24 @@ class TransformIngest(StreamIngest):
         return admitted
 
     def _insert_admitted(self, sample: TransformSample, edges: Edges, admitted: Admitted) -> bool:
-        if admitted.refusal is None:
+        if admitted.refusal is not None:
+            if not admitted.rows:
+                raise admitted.refusal.with_traceback(None)  # it is raised for each sample
+            self._count_refusal(admitted.refusal)
+        elif admitted.rows is None:
             self._all_admitted[sample.order] = edges
+        elif not admitted.rows:
+            return True  # a model has all of them by now
         poses = poses_from_block(sample.poses)
         covariances = None
         if isinstance(sample, WriterTransforms) and sample.covariances is not None:
             covariances = from_block(sample.covariances).reshape(len(poses), -1)
-        if admitted.refusal is None:
-            return self._buffer.insert_many(
-                edges, sample.stamp, poses, covariances=covariances, writer=self.writer
-            )
-        if not admitted.rows:
-            raise admitted.refusal.with_traceback(None)  # it is raised for each sample
-        self._count_refusal(admitted.refusal)
-        rows = list(admitted.rows)
-        chosen = [edges[row] for row in rows]
-        covariances = None if covariances is None else covariances[rows]
+        if admitted.rows is not None:
+            rows = list(admitted.rows)
+            edges, poses = tuple(edges[row] for row in rows), poses[rows]
+            covariances = None if covariances is None else covariances[rows]
         return self._buffer.insert_many(
-            chosen, sample.stamp, poses[rows], covariances=covariances, writer=self.writer
+            edges, sample.stamp, poses, covariances=covariances, writer=self.writer
         )
 
     def _advance(self, sample: Sample) -> bool:

@@ -78,7 +78,8 @@ class TransformListener(Closeable):
     Frames are named ``robot/frame`` in the buffer; bare names work while they are unique.
     ``follow="joint_states"`` subscribes to joint positions and the model and computes the kinematics here;
     ``follow="tf"`` subscribes to transforms and needs no model. The edges of other writers of the robot, of a
-    ``StaticPublisher`` or a ``TransformPublisher``, come in either way. With ``history_on_join``
+    ``StaticPublisher`` or a ``TransformPublisher``, come in either way; on the ROS wires these are all edges
+    of /tf and /tf_static but those of a model, which robot_state_publisher repeats there. With ``history_on_join``
     the buffer also gets the samples that publishers of the native wire cached in the seconds before (their
     ``cache_s``). A context manager.
 
@@ -128,8 +129,9 @@ class TransformListener(Closeable):
         self._stamp_check = StampCheck(self.buffer, self._counters, is_described=not self._wire.shared)
         self._samples = _SampleStream(follow, is_shared=follow in self._wire.shared)
         self._sample_streams: dict[Stream, _SampleStream] = {follow: self._samples}
-        if not self._wire.shared:
-            self._sample_streams["transforms"] = _SampleStream("transforms", is_shared=True)
+        if self._wire.transforms != follow:
+            others = _SampleStream(self._wire.transforms, is_shared=True)
+            self._sample_streams[others.stream] = others
         streams: tuple[Stream, ...] = ("robot_description", "tf_static", *self._sample_streams)
         self._events = EventLog(streams, follow, self._wire.shared, on_event)
         self._ownership = FrameOwnership(

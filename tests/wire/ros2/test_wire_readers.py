@@ -23,7 +23,7 @@ def program(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_listener_is_a_node_with_subscriptions_in_the_graph(sessions):
     writer, reader = sessions
     with TransformListener(reader, "panda", wire="ros2:namespace=r1", follow="joint_states"):
-        until(lambda: len(tokens(writer)) == 4)
+        until(lambda: len(tokens(writer)) == 5)
         chunks = sorted(one.split("/") for one in tokens(writer))
     node, *subscriptions = chunks
     assert node[5:] == ["NN", "%", "%r1", "arm_driver"]
@@ -31,9 +31,10 @@ def test_listener_is_a_node_with_subscriptions_in_the_graph(sessions):
         ("MS", "%r1%robot_description"),
         ("MS", "%tf_static"),
         ("MS", "%r1%joint_states"),
+        ("MS", "%tf"),
     }
     assert {one[3] for one in subscriptions} == {node[3]}
-    assert len({one[4] for one in chunks}) == 4
+    assert len({one[4] for one in chunks}) == 5
     until(lambda: not tokens(writer))
 
 
