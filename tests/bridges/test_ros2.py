@@ -22,6 +22,7 @@ from zstate.net.streams import StreamSubscriber
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.sources import JointStateListener, SineSource
 from zstate.transform import Transform
 from zstate.wire.protocol import SerializedSample
@@ -90,16 +91,17 @@ def publish_until(publisher: StatePublisher, arrived: Callable[[], object]) -> N
 
 
 class Ear:
-    """Counts received joint states of a robot by stamp."""
+    """Counts received samples of a stream of a robot by stamp."""
 
-    def __init__(self, session: Session, robot: str, wire: str) -> None:
+    def __init__(self, session: Session, robot: str, wire: str, stream: str = "joint_states") -> None:
         self.stamps: Counter[int] = Counter()
         self._robot, self._wire = robot, get_wire(wire)
-        self._subscriber = StreamSubscriber(session, self._wire.expression(robot, "joint_states"), self._take)
+        self._stream = self._wire.transforms if stream == "transforms" else stream
+        self._subscriber = StreamSubscriber(session, self._wire.expression(robot, self._stream), self._take)
 
     def _take(self, arrivals: list[SerializedSample]) -> None:
         for arrival in arrivals:
-            self.stamps.update(s.stamp for s in self._wire.decode("joint_states", arrival, self._robot))
+            self.stamps.update(s.stamp for s in self._wire.decode(self._stream, arrival, self._robot))
 
     def __enter__(self) -> Ear:
         return self
@@ -321,6 +323,124 @@ def test_static_edges_of_another_robot_are_not_carried(world):
         own.set(Transform("tool", "hook", (0.0, 0.0, 1.0), UPRIGHT))
         until(lambda: "r1/hook" in {frame.name for frame in listener.buffer.frames()})
         assert not any("plate" in frame.name for frame in listener.buffer.frames())
+
+
+def odometry_on(session: Session, side: str) -> TransformPublisher:
+    """A writer of odometry: "odometry" in zstate, the node ``/ekf`` in ROS."""
+    wire = "native" if side == "native" else "ros2:node=ekf"
+    return TransformPublisher(session, "r1", "odometry", wire)
+
+
+def edge(child: str, x: float, parent: str = "odom") -> Transform:
+    return Transform(parent, child, (x, 0.0, 0.0), UPRIGHT)
+
+
+@pytest.mark.parametrize("side", ["native", "ros2"])
+def test_other_moving_edges_are_carried_from_either_side(world, here, there, side):
+    world.bridge("r1")
+    with (
+        StatePublisher(world.join(here), RRBOT, "r1", (here,)) as publisher,
+        odometry_on(world.join(side), side) as odometry,
+        TransformListener(world.join(here), "r1", wire=here) as original,
+        TransformListener(world.join(there), "r1", wire=there) as carried,
+    ):
+        covariance = np.diag([0.25] * 6)
+
+        def move(stamp: int) -> None:
+            publish(publisher, [stamp])
+            odometry.publish([edge("world", stamp * 1e-9).with_covariance(covariance)], stamp)
+
+        stamps = iter(range(1, 1_000_000))
+        sides = original.buffer, carried.buffer
+        until(lambda: move(next(stamps)) or all(buffer.can_lookup("odom", "tool") for buffer in sides))
+        for stamp in STAMPS:
+            move(stamp)
+        for at in (STAMPS[3], STAMPS[3] + 2_500_000, STAMPS[-1]):
+            one, other = (buffer.lookup("odom", "tool", at, timeout_s=10.0) for buffer in sides)
+            assert one.pose7.tobytes() == other.pose7.tobytes()
+        assert original.stats.refused == carried.stats.refused == {}
+
+
+def test_edges_of_a_ros_node_have_its_name_in_zstate_until_it_leaves(world):
+    bridge = world.bridge("r1")
+    ros, native = world.join("ros2"), world.join("native")
+
+    def names() -> set[str]:
+        return {name for info in discover(native) for name, _ in info.transform_names}
+
+    with StatePublisher(ros, RRBOT, "r1", ("ros2",)), TransformListener(native, "r1") as listener:
+        stamps = iter(range(STAMP, STAMP + 1_000_000))
+        for _ in range(2):  # a node that leaves, and its successor
+            stamp = next(stamps)
+            with (
+                odometry_on(ros, "ros2") as odometry,
+                TransformPublisher(ros, "r1", wires="ros2:node=robot_state_publisher") as state_publisher,
+            ):
+
+                def is_carried() -> bool:
+                    nonlocal stamp
+                    stamp = next(stamps)
+                    state_publisher.publish([edge("upper", 9.0, "base")], stamp)
+                    odometry.publish([edge("world", 1.0), edge("upper", 9.0, "base")], stamp)
+                    return listener.buffer.can_lookup("odom", "world", stamp)
+
+                until(is_carried)
+                assert names() == {"ekf"}
+            until(lambda: names() == set())
+        assert bridge.carriers[0].refused == {}
+
+
+@pytest.mark.parametrize("side", ["native", "ros2"])
+def test_carried_edges_do_not_come_back(world, here, side):
+    for _ in range(2):
+        world.bridge("r1")
+    far = "ros2" if side == "native" else "native"
+    with (
+        StatePublisher(world.join(here), RRBOT, "r1", (here,), streams=("joint_states", "robot_description")),
+        odometry_on(world.join(side), side) as odometry,
+        Ear(world.join(side), "r1", side, "transforms") as source,
+        Ear(world.join(far), "r1", far, "transforms") as carried,
+    ):
+        # In ROS both bridges publish what is native; in zstate one of them owns the edge.
+        count = 2 if far == "ros2" else 1
+        stamps = iter(range(1, 1_000_000))
+
+        def goes_through() -> bool:
+            stamp = next(stamps)
+            odometry.publish([edge("world", 1.0)], stamp)
+            return count in carried.stamps.values() and bool(source.stamps)
+
+        until(goes_through)
+        for stamp in STAMPS:
+            odometry.publish([edge("world", 1.0)], stamp)
+            until(lambda s=stamp: carried.stamps[s] == count and source.stamps[s])
+        assert {source.stamps[stamp] for stamp in STAMPS} == {1}
+        assert {carried.stamps[stamp] for stamp in STAMPS} == {count}
+
+
+def test_an_edge_with_a_native_owner_is_refused_and_others_are_carried(world, caplog):
+    bridge = world.bridge("r1")
+    ros, native = world.join("ros2"), world.join("native")
+    with (
+        StatePublisher(ros, RRBOT, "r1", ("ros2",)),
+        TransformPublisher(native, "r1", "slam") as slam,
+        TransformListener(native, "r1") as listener,
+        odometry_on(ros, "ros2") as odometry,
+    ):
+        slam.publish([edge("world", 5.0)], STAMP)
+        stamps = iter(range(STAMP, STAMP + 1_000_000))
+
+        def is_refused() -> bool:
+            odometry.publish([edge("world", 1.0)], next(stamps))
+            odometry.publish([edge("ball", 2.0)], next(stamps))
+            refused = bridge.carriers[0].refused if bridge.carriers else {}
+            return refused.get("second writer", 0) > 10 and listener.buffer.can_lookup("odom", "ball")
+
+        until(is_refused)
+        assert listener.buffer.lookup("odom", "world", STAMP).translation[0] == 5.0
+    texts = [record.message for record in caplog.records if "transforms of 'ekf'" in record.message]
+    assert len(texts) == 1
+    assert "as 'slam' of 'r1'" in texts[0]
 
 
 def test_a_robot_published_on_both_sides_is_not_carried_and_logged_once(world, caplog):

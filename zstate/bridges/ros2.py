@@ -1,7 +1,8 @@
 """Bidirectional bridge of robots between the native and the ROS 2 wire, without feedback loops.
 
-``StaticBridge`` carries the static edges of one robot in one direction, ``RobotBridge`` the whole robot;
-``Bridge`` opens a ``RobotBridge`` for each robot that is published on one side only.
+``RobotBridge`` carries a whole robot: joint states and static edges in one direction (``StaticBridge``), and
+moving edges other than the model's in both (``TransformBridge``). ``Bridge`` opens one for each robot that
+is published on one side only.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from itertools import compress
 from typing import Literal, NamedTuple
 
 from zstate._util.closeable import Closeable
+from zstate.bridges.transforms import TransformRelay, edge_writer_of_node
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Closed, InvalidInput, MessageError, ZStateError
 from zstate.ingest.counters import Counters
@@ -23,15 +25,17 @@ from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.transforms import StaticTransformIngest
 from zstate.model.robot import RobotModel
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import WriterWatch
+from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
+from zstate.net.subscription import Received, subscribe
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.sources.joint_state_listener import DescriptionSubscriber, JointStateListener
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot
-from zstate.wire.messages import StaticTransforms, poses_from_block, to_block
+from zstate.wire.messages import Edges, StaticTransforms, TransformSample, poses_from_block, to_block
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.wire import Ros2Wire
@@ -86,7 +90,7 @@ class StaticBridge(Closeable):
                     ingest.replace(message)
                     continue
                 # One key for all robots: the edges of this one.
-                kept = [child.partition("/")[0] in (self._robot, child) for _, child in message.edges]
+                kept = [is_of_robot(self._robot, child) for _, child in message.edges]
                 edges = tuple(compress(message.edges, kept))
                 poses = to_block(poses_from_block(message.poses)[kept])
                 ingest.add(StaticTransforms(message.session, edges, poses))
@@ -122,10 +126,106 @@ class BridgeSide(NamedTuple):
     direction: Way
 
 
+class TransformBridge(Closeable):
+    """Publishes on ``target`` the moving edges of programs on ``source``, except those of ``model``.
+
+    On the native side they keep the names of their writers; for a ROS node it is its own. Covariances are
+    dropped, because /tf has none. Samples of bridges are skipped, and samples of writers that are not
+    announced, which may be bridges. If all robots share /tf, the edges whose child is a frame of this robot
+    are published. Subscribes only while there is a writer: on the ROS side the bridge itself would be
+    a reader for which it computes /tf.
+    """
+
+    def __init__(
+        self, robot: str, model: RobotModel, source: BridgeSide, target: BridgeSide, counters: Counters
+    ) -> None:
+        self._robot = robot
+        self._source = source
+        self._wire = get_wire(source.wire)
+        self._counters = counters
+        self._writers: dict[int, str] = {}
+        self._subscription: ExitStack | None = None
+
+        def open_publisher(writer: str) -> TransformPublisher:
+            return TransformPublisher(target.session, robot, writer, target.wire, program=PROGRAM)
+
+        with ExitStack() as opening:
+            relay = TransformRelay(robot, model, open_publisher, counters.count_refusal)
+            self._relay = opening.enter_context(relay)
+            opening.callback(self._unsubscribe)
+            opening.enter_context(WriterWatch(source.session, robot, self._on_writer, source.wire))
+            self._opened = opening.pop_all()
+
+    def close(self) -> None:
+        """Unsubscribe, and close the publishers. A second call does nothing."""
+        self._opened.close()
+
+    def _on_writer(self, announced: Announcement, alive: bool) -> None:
+        if announced.stream != self._wire.transforms or is_bridge(announced):
+            return
+        session = announced.writer.session
+        name = announced.name or edge_writer_of_node(announced.writer.program)
+        if alive:
+            self._writers[session] = name
+            self._subscribe()
+            return
+        self._writers.pop(session, None)
+        if name not in self._writers.values():  # a ROS node may have several publishers
+            self._relay.remove(name)
+        if not self._writers:
+            self._unsubscribe()
+
+    def _subscribe(self) -> None:
+        if self._subscription is not None:
+            return
+        session, robot, stream = self._source.session, self._robot, self._wire.transforms
+        on_error = self._counters.count_refusal
+        with ExitStack() as opening:
+            opening.enter_context(
+                subscribe(session, self._wire, robot, stream, self._on_messages, on_error=on_error)
+            )
+            for announcement in announce_reader(session, self._wire, robot, [stream]):
+                opening.enter_context(announcement)
+            self._subscription = opening.pop_all()
+
+    def _unsubscribe(self) -> None:
+        subscription, self._subscription = self._subscription, None
+        if subscription is not None:
+            subscription.close()
+
+    def _on_messages(self, received: list[Received]) -> None:
+        with suppress(Closed):
+            for _, _, sample in received:
+                assert isinstance(sample, TransformSample)
+                writer = self._writers.get(sample.session)
+                if writer is not None and sample.edges is not None:
+                    self._publish(writer, sample.edges, sample)
+
+    def _publish(self, writer: str, edges: Edges, sample: TransformSample) -> None:
+        poses = poses_from_block(sample.poses)
+        if self._wire.shared:
+            kept = [is_of_robot(self._robot, child) for _, child in edges]
+            edges, poses = tuple(compress(edges, kept)), poses[kept]
+        if edges:
+            self._relay.publish(writer, edges, poses, sample.stamp)
+
+
+def is_of_robot(robot: str, frame: str) -> bool:
+    """Whether a frame in messages of ``robot`` is one of its own."""
+    return frame.partition("/")[0] in (robot, frame)
+
+
+def is_bridge(announced: Announcement) -> bool:
+    """Whether it is a writer of a bridge, on either side."""
+    # The name of a ROS node includes its namespace.
+    return announced.writer.program.rpartition("/")[2] == PROGRAM
+
+
 class RobotBridge(Closeable):
     """Publishes on ``target`` the messages of ``robot`` from ``source``, from its first model on.
 
-    Joint states keep their stamps and numbers; model and static edges are latched for late joiners.
+    Joint states keep their stamps and numbers; model and static edges are latched for late joiners. Moving
+    edges that are not the model's are carried in both directions: odometry may come from either side.
     ``on_model()`` is called with each model. ``refused`` counts messages that ``target`` cannot express; the
     first of each kind is logged.
     """
@@ -146,7 +246,7 @@ class RobotBridge(Closeable):
 
     @property
     def refused(self) -> dict[str, int]:
-        """Counts of joint states, static edges and models that could not be carried."""
+        """Counts of joint states, transforms, static edges and models that could not be carried."""
         return self._counters.stats().refused
 
     def _carry(self, robot: str, model: RobotModel) -> None:
@@ -173,6 +273,8 @@ class RobotBridge(Closeable):
                 StaticPublisher(target.session, robot, wires=(target.wire,), program=PROGRAM, takeover=True)
             )
             opening.enter_context(StaticBridge(source.session, model, statics, self._counters, source.wire))
+            for one, other in ((source, target), (target, source)):
+                opening.enter_context(TransformBridge(robot, model, one, other, self._counters))
             readings = opening.enter_context(
                 JointStateListener(source.session, robot, model, wire=source.wire)
             )
@@ -210,10 +312,11 @@ _ADVICE = (
 class Bridge(Closeable):
     """Carries each robot that is published on one side to the other: joint states, model, static edges.
 
-    Moving transforms are recomputed on the other side; edges of ROS's /tf that belong to no model are
-    not carried. ``robots`` names the robots; None is all, which needs a namespace for each: the
-    ``ros_wire`` "ros2:namespace=*". Messages of bridges are never carried back. A robot with other
-    publishers on both sides is not carried, which is logged.
+    The transforms of the model are recomputed on the other side; other moving edges are carried from either
+    side to the other: those of each native ``TransformPublisher``, and those of ROS nodes on /tf.
+    ``robots`` names the robots; None is all, which needs a namespace for each: the ``ros_wire``
+    "ros2:namespace=*". Messages of bridges are never carried back. A robot with other publishers on both
+    sides is not carried, which is logged.
 
     ``on_change(robot, way)`` is called with each first or new model of a carried robot, and with None when
     carrying stops; from threads of the bridge. Raises InvalidInput for robots that would share a namespace,
@@ -258,8 +361,7 @@ class Bridge(Closeable):
         self._opened.close()
 
     def _on_writer(self, side: int, announced: Announcement, alive: bool) -> None:
-        # The name of a ROS node includes its namespace.
-        if announced.stream in _ROBOT_STREAMS and announced.writer.program.rpartition("/")[2] != PROGRAM:
+        if announced.stream in _ROBOT_STREAMS and not is_bridge(announced):
             with self._lock:
                 writers = self._writers[announced.robot]
                 (writers[side].add if alive else writers[side].discard)(announced)

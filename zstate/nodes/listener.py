@@ -79,7 +79,7 @@ class TransformListener(Closeable):
     ``follow="joint_states"`` subscribes to joint positions and the model and computes the kinematics here;
     ``follow="tf"`` subscribes to transforms and needs no model. The edges of other writers of the robot, of a
     ``StaticPublisher`` or a ``TransformPublisher``, come in either way; on the ROS wires these are all edges
-    of /tf and /tf_static but those of a model, which robot_state_publisher repeats there. With ``history_on_join``
+    of /tf and /tf_static but those of a model, which robot_state_publisher repeats. With ``history_on_join``
     the buffer also gets the samples that publishers of the native wire cached in the seconds before (their
     ``cache_s``). A context manager.
 

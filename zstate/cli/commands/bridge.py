@@ -42,9 +42,10 @@ def bridge_command(
 ) -> None:
     """Bridge ROBOT between zstate's native wire and ROS 2 nodes that run rmw_zenoh, in both directions.
 
-    Carries the model, joint states with their stamps, and static edges, whichever side publishes them. /tf
-    is computed again on the other side; additional edges on it, such as odom -> base_link, are not carried.
-    Nothing that the bridge has published is carried back.
+    Carries the model, joint states with their stamps, and static edges, whichever side publishes them. The
+    model's part of /tf is computed again on the other side. Other moving edges, such as odom -> base_link,
+    are carried from either side, without covariances, which /tf does not have; in zstate their writer has the
+    name of the ROS node. Nothing that the bridge has published is carried back.
 
     On the ROS side the robot is in the root namespace, or in the one that --wire names. ROBOT may be left
     out if only one robot is announced natively, or with namespace=*, which gives each robot a namespace of

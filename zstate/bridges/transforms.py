@@ -1,0 +1,129 @@
+"""Moving edges that a bridge brings from one side to the other, under the names of their writers."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+from zstate._util.bounded import BoundedDict
+from zstate._util.closeable import Closeable
+from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter, ZStateError
+from zstate.model.robot import RobotModel
+from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.transform import Transform
+from zstate.wire.joint_order import Floats
+from zstate.wire.keys import full_name
+from zstate.wire.messages import Edges
+
+RETRY_S = 2.0
+"""Edges that another writer owns are tried again after this time: a try takes some round trips."""
+
+
+def edge_writer_of_node(node: str) -> str:
+    """The name under which zstate publishes the edges of a ROS node: ``/r1/ekf`` becomes ``r1.ekf``."""
+    return node.strip("/").replace("/", ".")
+
+
+class _Refusal(NamedTuple):
+    """The reason and text of a refusal, and when its edges are tried again [s], by ``time.monotonic``."""
+
+    reason: str
+    text: str
+    retry_at: float
+
+
+class TransformRelay(Closeable):
+    """Publishes moving edges of ``robot``, except those of its ``model``, for any number of writers.
+
+    ``open_publisher(writer)`` opens the ``TransformPublisher`` of one writer, with its first edge.
+    ``count_refusal(reason, text)`` is called for each sample that cannot be published, for instance because
+    another writer of the robot owns one of its edges; the relay continues. Any thread may call the methods.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        model: RobotModel,
+        open_publisher: Callable[[str], TransformPublisher],
+        count_refusal: Callable[[str, str], object],
+    ) -> None:
+        self._robot = robot
+        self._model_edges = {
+            (full_name(robot, joint.parent), full_name(robot, joint.child)) for joint in model.joints
+        }
+        self._open_publisher = open_publisher
+        self._count_refusal = count_refusal
+        self._publishers: dict[str, TransformPublisher] = {}
+        self._kept: BoundedDict[Edges, tuple[int, ...]] = BoundedDict()
+        self._refusals: BoundedDict[tuple[str, Edges], _Refusal] = BoundedDict()
+        self._lock = threading.Lock()
+        self._closed = False
+
+    @property
+    def writers(self) -> tuple[str, ...]:
+        """The writers with an open publisher."""
+        return tuple(self._publishers)
+
+    def publish(self, writer: str, edges: Edges, poses: Floats, stamp: int) -> bool:
+        """Publish one sample of ``writer``; False if nothing of it is published.
+
+        Row i of ``poses`` (n, 7) is ``parent_from_child`` of ``edges[i]``, named as in messages of the robot.
+        Raises Closed.
+        """
+        refused = self._refusals.get((writer, edges))
+        if refused is not None and time.monotonic() < refused.retry_at:
+            self._count_refusal(refused.reason, refused.text)
+            return False
+        try:
+            rows = self._rows(edges)
+            transforms = [Transform.from_pose7(*edges[row], poses[row]) for row in rows]
+            if transforms:
+                self._publisher(writer).publish(transforms, stamp)
+        except Closed:
+            raise
+        except ZStateError as error:
+            text = f"transforms of {writer!r}: {error}"
+            if isinstance(error, InvalidInput) and not isinstance(error, InsertRefused):
+                self._count_refusal("bad numbers", text)
+                return False
+            reason = error.reason if isinstance(error, InsertRefused) else "second writer"
+            self._refusals[writer, edges] = _Refusal(reason, text, time.monotonic() + RETRY_S)
+            if isinstance(error, SecondWriter) and error.edge is None:
+                self.remove(writer)  # the other writer has its name
+            self._count_refusal(reason, text)
+            return False
+        return bool(transforms)
+
+    def remove(self, writer: str) -> None:
+        """Close the publisher of a writer that has left."""
+        with self._lock:
+            publisher = self._publishers.pop(writer, None)
+        if publisher is not None:
+            publisher.close()
+
+    def close(self) -> None:
+        """Close all publishers. A second call does nothing."""
+        with self._lock:
+            self._closed = True
+            while self._publishers:
+                self._publishers.popitem()[1].close()
+
+    def _rows(self, edges: Edges) -> tuple[int, ...]:
+        """The rows of the edges that are not those of the model."""
+        rows = self._kept.get(edges)
+        if rows is None:
+            names = [tuple(full_name(self._robot, frame) for frame in edge) for edge in edges]
+            rows = tuple(row for row, edge in enumerate(names) if edge not in self._model_edges)
+            self._kept[edges] = rows
+        return rows
+
+    def _publisher(self, writer: str) -> TransformPublisher:
+        with self._lock:
+            if self._closed:
+                raise Closed("the bridge is closed")
+            publisher = self._publishers.get(writer)
+            if publisher is None:
+                publisher = self._publishers[writer] = self._open_publisher(writer)
+            return publisher
