@@ -50,12 +50,14 @@ class TransformRelay(Closeable):
         count_refusal: Callable[[str, str], object],
     ) -> None:
         self._robot = robot
-        self._model_edges = {
-            (full_name(robot, joint.parent), full_name(robot, joint.child)) for joint in model.joints
-        }
+        edges = [(joint.parent, joint.child) for joint in model.joints]
+        # A link with a slash in its name has another name in ROS without a prefix.
+        self._model_edges = {(f"{robot}/{parent}", f"{robot}/{child}") for parent, child in edges}
+        self._model_edges |= {(full_name(robot, parent), full_name(robot, child)) for parent, child in edges}
         self._open_publisher = open_publisher
         self._count_refusal = count_refusal
         self._publishers: dict[str, TransformPublisher] = {}
+        self._published_at: dict[str, float] = {}
         self._kept: BoundedDict[Edges, tuple[int, ...]] = BoundedDict()
         self._refusals: BoundedDict[tuple[str, Edges], _Refusal] = BoundedDict()
         self._lock = threading.Lock()
@@ -81,6 +83,7 @@ class TransformRelay(Closeable):
             transforms = [Transform.from_pose7(*edges[row], poses[row]) for row in rows]
             if transforms:
                 self._publisher(writer).publish(transforms, stamp)
+                self._published_at[writer] = time.monotonic()
         except Closed:
             raise
         except ZStateError as error:
@@ -100,8 +103,16 @@ class TransformRelay(Closeable):
         """Close the publisher of a writer that has left."""
         with self._lock:
             publisher = self._publishers.pop(writer, None)
+            self._published_at.pop(writer, None)
         if publisher is not None:
             publisher.close()
+
+    def remove_silent(self, longer_than_s: float) -> None:
+        """Close the publishers of writers without a sample for this time: the next one opens them again."""
+        before = time.monotonic() - longer_than_s
+        for writer, published_at in list(self._published_at.items()):
+            if published_at < before:
+                self.remove(writer)
 
     def close(self) -> None:
         """Close all publishers. A second call does nothing."""

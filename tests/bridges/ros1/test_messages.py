@@ -11,6 +11,7 @@ from helpers.processes import until
 from helpers.ros1_processes import JOINTS, RRBOT, Spawn
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
 
 from zstate import load_model
 from zstate.bridges.ros1.messages import (
@@ -18,11 +19,13 @@ from zstate.bridges.ros1.messages import (
     JointStateWriter,
     Ros1FrameNames,
     get_stamp,
+    read_transforms,
     set_stamp,
 )
 from zstate.bridges.ros1.node import RospyModules
 from zstate.errors import MessageError
 from zstate.wire.joint_order import JointNumbers
+from zstate.wire.messages import to_block
 
 MODEL = load_model(RRBOT)
 BARE = st.text("abc_/", min_size=1, max_size=8).filter(lambda name: not name.startswith("/"))
@@ -145,3 +148,43 @@ def test_a_direction_must_be_chosen(spawn: Spawn):
     child = spawn("from zstate.cli.main import main; main()", "ros1", "rrbot")
     assert child.wait() == 2
     assert "--to-ros, --from-ros, or both" in child.stderr
+
+
+NOETIC = get_typestore(Stores.ROS1_NOETIC)
+
+
+def tf_message(*transforms: tuple[int, str, str, list[float]]) -> bytes:
+    """A TFMessage of ROS 1: its count, and transforms that rosbags has serialized."""
+    kinds = NOETIC.types
+    quaternion, vector = kinds["geometry_msgs/msg/Quaternion"], kinds["geometry_msgs/msg/Vector3"]
+    stamped = [
+        kinds["geometry_msgs/msg/TransformStamped"](
+            header=kinds["std_msgs/msg/Header"](
+                seq=7,
+                stamp=kinds["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)),
+                frame_id=parent,
+            ),
+            child_frame_id=child,
+            transform=kinds["geometry_msgs/msg/Transform"](
+                translation=vector(*pose[:3]), rotation=quaternion(*pose[3:])
+            ),
+        )
+        for stamp, parent, child, pose in transforms
+    ]
+    written = [bytes(NOETIC.serialize_ros1(one, "geometry_msgs/msg/TransformStamped")) for one in stamped]
+    return len(written).to_bytes(4, "little") + b"".join(written)
+
+
+def test_transforms_are_read_with_their_stamps_names_and_numbers():
+    pose = [1.0, -2.0, 0.5, 0.0, 0.6, 0.0, 0.8]
+    sent = [(1_700_000_000_123_456_789, "odom", "base", pose), (2 * 10**9, "map", "\u00f6dom", pose[::-1])]
+    read = read_transforms(tf_message(*sent))
+    assert [tuple(one) for one in read] == [(*head, to_block(numbers)) for *head, numbers in sent]
+    assert read_transforms(tf_message()) == []
+
+
+def test_transforms_that_are_cut_off_are_refused():
+    whole = tf_message((1, "odom", "base", [0.0] * 6 + [1.0]))
+    for length in range(len(whole)):
+        with pytest.raises(MessageError):
+            read_transforms(whole[:length])

@@ -62,6 +62,7 @@ class Ros1Bridge(Closeable):
                         self._names,
                         self._refusals,
                         is_own=self._is_own,
+                        is_own_writer=self._is_own_writer,
                         with_description=with_description,
                     )
                 )
@@ -72,7 +73,7 @@ class Ros1Bridge(Closeable):
 
     @property
     def carried(self) -> tuple[int, int]:
-        """The count of samples to ROS, and from ROS."""
+        """The count of joint states to ROS, and from ROS."""
         return (
             0 if self._to_ros is None else self._to_ros.carried,
             0 if self._from_ros is None else self._from_ros.carried,
@@ -95,7 +96,7 @@ class Ros1Bridge(Closeable):
         return f"joint_states of {self.robot!r} {' or '.join(places)}"
 
     def check(self) -> None:
-        """Check the connection to ROS. Raises NetworkError if this bridge must be restarted."""
+        """Check ROS and its nodes. Raises NetworkError if this bridge must be restarted."""
         if self._node.has_ended:
             raise NetworkError("ROS has ended the node of this bridge (`rosnode kill` does that)")
         try:
@@ -105,6 +106,8 @@ class Ros1Bridge(Closeable):
                 )
             self._lost_master = False
             self._open_from_ros()
+            if self._from_ros is not None:
+                self._from_ros.check()
         except Unreachable as error:
             if not self._lost_master:
                 self._lost_master = True
@@ -127,6 +130,9 @@ class Ros1Bridge(Closeable):
 
     def _is_own(self, session: int, writer: str) -> bool:
         return self._from_ros is not None and self._from_ros.wrote(session, writer)
+
+    def _is_own_writer(self, writer: str) -> bool:
+        return self._from_ros is not None and self._from_ros.wrote_transforms(writer)
 
     def close(self) -> None:
         """Stop carrying; the node stays. A second call does nothing."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from typing import Any
 
 import numpy as np
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.bridges.ros1.messages import (
@@ -20,9 +20,11 @@ from zstate.bridges.ros1.messages import (
     TransformsWriter,
     get_stamp,
     pose_from_ros,
+    read_transforms,
     refusal_reason,
 )
 from zstate.bridges.ros1.node import NAME, Node, sender
+from zstate.bridges.transforms import TransformRelay, edge_writer_of_node
 from zstate.errors import Closed, InvalidInput, MessageError, ModelError, SecondWriter, Unreachable
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -30,10 +32,18 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
 from zstate.wire.joint_order import Floats
 from zstate.wire.keys import MODEL_WRITER
-from zstate.wire.messages import JointState, RobotDescription, StaticTransforms, poses_from_block
+from zstate.wire.messages import (
+    Edges,
+    JointState,
+    RobotDescription,
+    StaticTransforms,
+    WriterTransforms,
+    poses_from_block,
+)
 from zstate.wire.native import NativeWire
 
 _LOG = logging.getLogger("zstate")
@@ -42,10 +52,11 @@ _LOG = logging.getLogger("zstate")
 class NativeToRos1(Closeable):
     """Publishes a robot of zstate in ROS, every sample at its own stamp.
 
-    Joints go to ``joint_states``, moving edges to ``/tf``, and all static edges together, latched, to
-    ``/tf_static``; ``with_description`` sets the parameter ``robot_description`` if it is not set. Messages
-    for which ``is_own(session, writer)`` holds came from ROS and are skipped. ``carried`` counts samples.
-    Each stream has a thread of its own.
+    Joints go to ``joint_states``, moving edges of the model and of other writers to ``/tf``, without
+    covariances, and all static edges together, latched, to ``/tf_static``; ``with_description`` sets the
+    parameter ``robot_description`` if it is not set. Messages for which ``is_own(session, writer)`` holds,
+    and transforms for which ``is_own_writer(writer)`` does, came from ROS and are skipped. ``carried`` counts
+    joint states. Each stream has a thread of its own.
     """
 
     def __init__(
@@ -56,6 +67,7 @@ class NativeToRos1(Closeable):
         refusals: Refusals,
         *,
         is_own: Callable[[int, str], bool],
+        is_own_writer: Callable[[str], bool],
         with_description: bool = True,
     ) -> None:
         self.carried = 0
@@ -63,15 +75,17 @@ class NativeToRos1(Closeable):
         self._node = node
         self._names = names
         self._is_own = is_own
+        self._is_own_writer = is_own_writer
         self._with_description = with_description
         self._refusals = refusals
         self._wire = NativeWire()
         self._statics: dict[str, dict[tuple[str, str], Floats]] = {}
+        self._transforms: BoundedDict[Edges, TransformsWriter] = BoundedDict()
         self._joints = node.publisher("joint_states", node.ros.JointState)
         self._moving = node.publisher("/tf", node.ros.TFMessage)
         self._fixed = node.publisher("/tf_static", node.ros.TFMessage, latch=True)
         with ExitStack() as opening:
-            for stream in ("robot_description", "tf_static", "joint_states"):
+            for stream in ("robot_description", "tf_static", "joint_states", "transforms"):
                 opening.enter_context(
                     subscribe(
                         session,
@@ -90,6 +104,8 @@ class NativeToRos1(Closeable):
             try:
                 if isinstance(message, JointState):
                     self._publish_joints(message)
+                elif isinstance(message, WriterTransforms):
+                    self._publish_transforms(self._wire.static_writer_name(key), message)
                 elif isinstance(message, StaticTransforms):
                     self._publish_statics(self._wire.static_writer_name(key), message)
                 elif isinstance(message, RobotDescription):
@@ -142,6 +158,20 @@ class NativeToRos1(Closeable):
         message = TransformsWriter(self._node.ros, list(merged))
         self._fixed.publish(message.message(None, np.array(list(merged.values())).reshape(-1, 7)))
 
+    def _publish_transforms(self, writer: str, sample: WriterTransforms) -> None:
+        """Publish one sample of a ``TransformPublisher``."""
+        if sample.edges is None or self._is_own_writer(writer) or not self._moving.has_readers:
+            return
+        poses = poses_from_block(sample.poses)
+        if not np.isfinite(poses).all():
+            raise InvalidInput(f"a transform of {writer!r} is NaN or infinite")
+        encoder = self._transforms.get(sample.edges)
+        if encoder is None:
+            in_ros = self._names.in_ros
+            edges = [(in_ros(parent), in_ros(child)) for parent, child in sample.edges]
+            encoder = self._transforms[sample.edges] = TransformsWriter(self._node.ros, edges)
+        self._moving.publish(encoder.message(sample.stamp, poses))
+
     def _publish_joints(self, state: JointState) -> None:
         """Publish one sample. Samples before the description are skipped."""
         robot = self.robot
@@ -159,17 +189,17 @@ class NativeToRos1(Closeable):
         self._opened.close()
 
 
-# Each node's /tf may come a thousand times a second; one message per period is decoded.
-_TF_CHECK_PERIOD_S = 1.0
+_SILENT_S = 10.0
+"""rospy does not report that a node has left: after this time without /tf its writer in zstate is closed."""
 
 
 class Ros1ToNative(Closeable):
     """Publishes a robot of ROS 1, whose ``model`` is known, in zstate.
 
     ``joint_states`` become joint states at their own stamps, and zstate computes the kinematics; the edges
-    on ``/tf_static`` that are not the model's become static edges. Moving edges on ``/tf`` that are not the
-    model's are only logged. ``at_once`` publishes the model at once, not with the first joint state.
-    ``carried`` counts samples. Messages of bridges are skipped.
+    on ``/tf_static`` that are not the model's become static edges, and those on ``/tf`` transforms under the
+    name of their node. ``at_once`` publishes the model at once, not with the first joint state. ``carried``
+    counts joint states. Messages of bridges are skipped.
     """
 
     def __init__(
@@ -200,8 +230,9 @@ class Ros1ToNative(Closeable):
         self._statics: StaticPublisher | None = None
         self._edges: dict[str, tuple[str, tuple[float, ...]]] = {}
         self._joint_names: list[str] = []
-        self._tf_checked_at: dict[str, float] = {}
-        self._not_carried: set[tuple[str, str]] = set()
+        self._transforms = self._opened.enter_context(
+            TransformRelay(names.robot, model, self._open_transforms, refusals.count)
+        )
         if at_once:
             self._publisher()
         node.subscribe("joint_states", node.ros.JointState, self._on_joints)
@@ -214,6 +245,10 @@ class Ros1ToNative(Closeable):
         if states is not None and session == states.description().session:
             return True
         return statics is not None and writer == statics.writer
+
+    def wrote_transforms(self, writer: str) -> bool:
+        """Whether the transforms of this writer come from here."""
+        return writer in self._transforms.writers
 
     def _publisher(self) -> StatePublisher:
         with self._lock:
@@ -282,22 +317,31 @@ class Ros1ToNative(Closeable):
             self._edges[child] = edge
 
     def _on_transforms(self, raw: Any) -> None:
-        """Decode one /tf message per node and second, to log moving edges that are not carried."""
-        now, writer = time.monotonic(), sender(raw)
-        checked_at = self._tf_checked_at.get(writer, -_TF_CHECK_PERIOD_S)
-        if now - checked_at < _TF_CHECK_PERIOD_S or self._is_of_a_bridge(raw):
+        if self._is_of_a_bridge(raw):
             return
-        self._tf_checked_at[writer] = now
-        message = self._node.ros.TFMessage()
-        message.deserialize(raw._buff)  # rospy has no public name for the bytes
-        for transform in message.transforms:
-            edge = (transform.header.frame_id, transform.child_frame_id)
-            if edge not in self._not_carried and self._names.bare(edge[1]) not in self._model_children:
-                self._not_carried.add(edge)
-                self._refusals.count(
-                    "not carried",
-                    f"{edge[0]!r} -> {edge[1]!r} of {writer!r} moves on /tf and is not a joint of the model",
-                )
+        node = sender(raw)
+        try:
+            transforms = read_transforms(raw._buff)  # rospy has no public name for the bytes
+        except MessageError as error:
+            self._refusals.count(error.reason, f"/tf of {node!r}: {error}")
+            return
+        in_zstate, links = self._names.in_zstate, self._links
+        with suppress(Closed):  # received while closing
+            for stamp in sorted({transform.stamp for transform in transforms}):
+                if not stamp:
+                    self._refusals.count("zero stamp", f"/tf of {node!r}: a transform without a stamp")
+                    continue
+                part = [transform for transform in transforms if transform.stamp == stamp]
+                edges = tuple((in_zstate(one.parent, links), in_zstate(one.child, links)) for one in part)
+                poses = poses_from_block(b"".join(one.pose for one in part))
+                self._transforms.publish(edge_writer_of_node(node), edges, poses, stamp)
+
+    def _open_transforms(self, writer: str) -> TransformPublisher:
+        return TransformPublisher(self._session, self._names.robot, writer)
+
+    def check(self) -> None:
+        """Close the writers of nodes that have stopped publishing on /tf. Call it regularly."""
+        self._transforms.remove_silent(_SILENT_S)
 
     def close(self) -> None:
         """Stop, and withdraw what was published in zstate. A second call does nothing."""

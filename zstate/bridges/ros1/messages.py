@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from struct import Struct, error
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,11 @@ from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by
 from zstate.sources.joint_source import JointStateValidator
 from zstate.wire.joint_order import Floats, JointNumbers
 from zstate.wire.keys import wire_name
+from zstate.wire.messages import POSE_BYTES
 
 _SECOND = 1_000_000_000
+_COUNT = Struct("<I")
+_HEADER = Struct("<III")  # sequence number, seconds and nanoseconds
 # A ROS 1 time is two unsigned numbers of 32 bits.
 _END_OF_TIME = 2**32 * _SECOND
 
@@ -120,6 +124,42 @@ class RobotWriter:
 
     def transforms(self, stamp: int, positions: Floats) -> Any:
         return self._transforms.message(stamp, self._table.poses(positions).take(self._rows, axis=0))
+
+
+class RosTransform(NamedTuple):
+    """One transform of a TFMessage: ``stamp`` [ns], frame names, and pose7 of the child in the parent."""
+
+    stamp: int
+    parent: str
+    child: str
+    pose: bytes
+
+
+def read_transforms(data: bytes) -> list[RosTransform]:
+    """The transforms in a serialized TFMessage, some ten times as fast as by rospy. Raises MessageError."""
+    transforms: list[RosTransform] = []
+    try:
+        (count,) = _COUNT.unpack_from(data)
+        position = _COUNT.size
+        for _ in range(count):
+            _, seconds, nanoseconds = _HEADER.unpack_from(data, position)
+            parent, position = _read_text(data, position + _HEADER.size)
+            child, position = _read_text(data, position)
+            pose = data[position : position + POSE_BYTES]
+            position += POSE_BYTES
+            transforms.append(RosTransform(seconds * _SECOND + nanoseconds, parent, child, pose))
+    except (error, UnicodeDecodeError) as problem:
+        raise MessageError(f"a malformed TFMessage: {problem}", reason="malformed") from None
+    if position > len(data):
+        raise MessageError(f"a TFMessage cut off after {len(data)} bytes", reason="truncated")
+    return transforms
+
+
+def _read_text(data: bytes, position: int) -> tuple[str, int]:
+    """The string at ``position``, and the position after it."""
+    (length,) = _COUNT.unpack_from(data, position)
+    end = position + _COUNT.size + length
+    return data[position + _COUNT.size : end].decode(), end
 
 
 def pose_from_ros(transform: Any) -> tuple[float, ...]:

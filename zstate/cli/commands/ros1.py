@@ -39,9 +39,10 @@ def ros1_command(
     """Carry the joint states and transforms of ROBOT between zstate and ROS 1.
 
     To ROS: joint_states, /tf and /tf_static (no robot_state_publisher is needed there), and the parameter
-    robot_description if it is not set. From ROS: joint_states and the edges of /tf_static that are not in the
-    model; zstate computes the kinematics. Other edges on /tf, such as odom -> base_link, are reported but not
-    carried. Every sample keeps its stamp; a JointState without one is refused.
+    robot_description if it is not set. From ROS: joint_states, and the edges of /tf and /tf_static that are
+    not in the model; zstate computes the kinematics. Edges such as odom -> base_link keep the name of their
+    node in zstate, and lose their covariance in ROS. Every sample keeps its stamp; a JointState without one
+    is refused.
 
     Give --to-ros, --from-ros or both; carried samples are not carried back. Run one bridge per robot.
     ROS_MASTER_URI, ROS_IP and ROS_NAMESPACE apply as for every ROS program. Needs rospy, on Debian 12:
