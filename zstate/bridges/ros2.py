@@ -52,8 +52,10 @@ class StaticBridge(Closeable):
         self, session: Session, model: RobotModel, publisher: StaticPublisher, counters: Counters, wire: str
     ) -> None:
         self._robot = publisher.robot
+        self._publisher = publisher
+        self._published: dict[str, Transform] = {}
         self._counters = counters
-        self._buffer = _PublishedBuffer(publisher)
+        self._buffer = TransformBuffer()
         self._buffer.add_robot(model, self._robot)
         self._ownership = FrameOwnership(self._buffer, counters, is_shared=True)
         self._ingests: dict[str, StaticTransformIngest] = {}
@@ -94,22 +96,23 @@ class StaticBridge(Closeable):
                 edges = tuple(compress(message.edges, kept))
                 poses = to_block(poses_from_block(message.poses)[kept])
                 ingest.add(StaticTransforms(message.session, edges, poses))
+            self._publish_changes()
 
-
-class _PublishedBuffer(TransformBuffer):
-    """A buffer whose static edges are published."""
-
-    def __init__(self, publisher: StaticPublisher) -> None:
-        super().__init__()
-        self._publisher = publisher
-
-    def insert_static(self, transform: Transform, *, writer: str | None = None) -> None:
-        super().insert_static(transform, writer=writer)
-        self._publisher.set(transform)
-
-    def withdraw(self, child: str) -> None:
-        super().withdraw(child)
-        self._publisher.withdraw(child)
+    def _publish_changes(self) -> None:
+        """Publish the accepted edges that are new or changed, and withdraw those that are no longer there."""
+        accepted = {
+            child: Transform.from_pose7(edge.parent, child, edge.pose)
+            for child, edge in self._buffer.tree_snapshot().edges.items()
+            if edge is not None and edge.kind == "static" and edge.robot is None
+        }
+        for child, before in list(self._published.items()):
+            if child not in accepted or accepted[child].target != before.target:
+                self._publisher.withdraw(child)
+                del self._published[child]
+        for child, edge in accepted.items():
+            if self._published.get(child) != edge:
+                self._publisher.set(edge)
+                self._published[child] = edge
 
 
 PROGRAM = "zstate_bridge"
