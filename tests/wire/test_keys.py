@@ -44,7 +44,7 @@ PARSERS: tuple[Callable[[str], object], ...] = (
     keys.parse_edge_key,
     keys.robot_from_key,
     WriterId.parse,
-    NativeWire().static_writer_name,
+    NativeWire().edge_writer_name,
 )
 
 

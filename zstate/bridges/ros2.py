@@ -69,7 +69,7 @@ class StaticBridge(Closeable):
 
     def _on_static(self, arrival: SerializedSample) -> None:
         try:
-            writer = self._wire.static_writer_name(arrival.key)
+            writer = self._wire.edge_writer_name(arrival.key)
         except InvalidInput as error:
             self._counters.count_refusal("foreign", str(error))
             return

@@ -81,7 +81,7 @@ class _KnownFrames(Closeable):
     def _on_messages(self, received: list[Received]) -> None:
         for _, key, message in received:
             if isinstance(message, StaticTransforms):
-                writer = self._wire.static_writer_name(key) or ""
+                writer = self._wire.edge_writer_name(key) or ""
                 if writer not in (MODEL_WRITER, self._writer):
                     names = (full_name(self._robot, frame) for edge in message.edges for frame in edge)
                     self._statics[writer] = frozenset(names)

@@ -269,7 +269,7 @@ class _RobotCapture(Closeable):
 
     def _on_statics(self, arrival: SerializedSample) -> None:
         try:
-            writer = self._wire.static_writer_name(arrival.key) or arrival.key
+            writer = self._wire.edge_writer_name(arrival.key) or arrival.key
             if not arrival.payload or writer == MODEL_WRITER:
                 self._statics.pop(writer, None)  # the model has the same edges
             else:

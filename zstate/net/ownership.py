@@ -438,7 +438,7 @@ def _current_statics(session: Session) -> Iterator[tuple[str, str, StaticTransfo
     """Robot, writer name and edges of each static writer."""
     for value in _latched_values(session, _WIRE.expression(ANY, "tf_static")):
         with suppress(MessageError, InvalidInput):  # withdrawn, or not of zstate
-            robot, name = _WIRE.robot_from_key(value.key), _WIRE.static_writer_name(value.key)
+            robot, name = _WIRE.robot_from_key(value.key), _WIRE.edge_writer_name(value.key)
             if value.key == stream_key(robot, "tf_static", name):
                 (statics,) = _WIRE.decode("tf_static", value, robot)
                 assert isinstance(statics, StaticTransforms)

@@ -309,7 +309,7 @@ class TransformListener(Closeable):
 
     def _on_statics(self, arrival: SerializedSample) -> None:
         try:
-            robot, writer = self._robot_from_key(arrival.key), self._wire.static_writer_name(arrival.key)
+            robot, writer = self._robot_from_key(arrival.key), self._wire.edge_writer_name(arrival.key)
         except InvalidInput as error:
             self._count_foreign(arrival.key, error)
             return

@@ -317,7 +317,7 @@ class Recorder(Closeable):
     def _write_arrival(self, robot: str, batch: Batch, arrival: SerializedSample) -> None:
         encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
         assert encoder is not None
-        edge_writer = self._wire.static_writer_name(arrival.key) if stream in NAMED_STREAMS else None
+        edge_writer = self._wire.edge_writer_name(arrival.key) if stream in NAMED_STREAMS else None
         if not arrival.payload and stream in LATCHED:
             if edge_writer is not None:
                 encoder.withdraw(robot, edge_writer, stamp)
@@ -335,7 +335,7 @@ class Recorder(Closeable):
     def _robot(self, batch: Batch, arrival: SerializedSample) -> str | None:
         try:
             if batch.stream in NAMED_STREAMS:
-                self._wire.static_writer_name(arrival.key)  # raises for a key without one
+                self._wire.edge_writer_name(arrival.key)  # raises for a key without one
             return self._wire.robot_from_key(arrival.key) if batch.robot is None else batch.robot
         except InvalidInput as error:
             self._counters.count_refusal("foreign", str(error))

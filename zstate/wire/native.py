@@ -145,7 +145,7 @@ class NativeWire:
             check_edges(message)
         return (message,)
 
-    def static_writer_name(self, key: str) -> str:
+    def edge_writer_name(self, key: str) -> str:
         keys.robot_from_key(key)
         return keys.check_writer(key.rpartition("/")[2])
 

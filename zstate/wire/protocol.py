@@ -114,8 +114,8 @@ class Wire(Protocol):
         """The messages of a sample received on ``stream`` of ``robot``. Raises MessageError."""
         ...
 
-    def static_writer_name(self, key: str) -> str | None:
-        """The name under which the static edges on ``key`` are written, if the key has it.
+    def edge_writer_name(self, key: str) -> str | None:
+        """The name under which the edges on ``key`` are written, if the key has it.
 
         Raises InvalidInput if the key belongs to no robot.
         """

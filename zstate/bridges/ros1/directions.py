@@ -105,9 +105,9 @@ class NativeToRos1(Closeable):
                 if isinstance(message, JointState):
                     self._publish_joints(message)
                 elif isinstance(message, WriterTransforms):
-                    self._publish_transforms(self._wire.static_writer_name(key), message)
+                    self._publish_transforms(self._wire.edge_writer_name(key), message)
                 elif isinstance(message, StaticTransforms):
-                    self._publish_statics(self._wire.static_writer_name(key), message)
+                    self._publish_statics(self._wire.edge_writer_name(key), message)
                 elif isinstance(message, RobotDescription):
                     self._set_model(message)
             except (MessageError, InvalidInput) as error:  # noqa: PERF203 - the other messages may be good
@@ -115,7 +115,7 @@ class NativeToRos1(Closeable):
 
     def _on_withdrawn(self, key: str) -> None:
         with suppress(InvalidInput):  # a key without a writer's name
-            self._publish_statics(self._wire.static_writer_name(key), None)
+            self._publish_statics(self._wire.edge_writer_name(key), None)
 
     def _set_model(self, description: RobotDescription) -> None:
         """Use the newest model, and set the ROS parameter."""

@@ -96,8 +96,8 @@ class Ros2Wire:
     def robot_from_key(self, key: str) -> str:
         return self._keys.robot_from_key(key)
 
-    def static_writer_name(self, key: str) -> None:
-        """None: all static edges of ROS share one topic."""
+    def edge_writer_name(self, key: str) -> None:
+        """None: in ROS all writers of edges share the topics."""
 
     def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         # CDR repeats all frame names in each sample.
