@@ -7,14 +7,16 @@ import threading
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers.processes import until
+from helpers.processes import SOON_S, until
 from helpers.recording_builder import MS, START, RecordingBuilder, pose
 from helpers.robots import RRBOT, SampleCollector
 
 from zstate.errors import SecondWriter
 from zstate.net.presence import current_tokens
 from zstate.net.session import connect
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
@@ -126,6 +128,24 @@ def test_transforms_are_played_by_writers_of_the_same_names(sessions, tracked: P
             assert [sample.stamp for sample in samples] == [START + n * 10 * MS for n in range(COUNT)]
             poses = [poses_from_block(sample.poses)[0, column] for sample in samples]
             assert poses == list(range(COUNT))
+
+
+def test_covariances_are_played_with_their_samples(sessions, tmp_path: Path):
+    path, known = tmp_path / "run.mcap", np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    with RecordingBuilder(path, "cart") as builder:
+        poses = {("odom", "base"): pose(x=1), ("odom", "ball"): pose(y=2)}
+        builder.edges("cart", START, poses, writer="odometry", covariances={("odom", "base"): known})
+        builder.edges("cart", START + MS, poses, writer="odometry")
+    with (
+        TransformListener(sessions[0], "cart") as listener,
+        Player(sessions[1], path, rate=math.inf) as player,
+    ):
+        assert player.run().samples == 2
+        without = listener.buffer.lookup("cart/odom", "cart/base", START + MS, timeout_s=SOON_S)
+        assert without.covariance is None
+        found = listener.buffer.lookup("cart/odom", "cart/base", START)
+        assert np.array_equal(found.covariance, known)
+        assert listener.buffer.lookup("cart/odom", "cart/ball", START).covariance is None
 
 
 def test_transforms_of_an_active_writer_are_played_only_with_takeover(sessions, tracked: Path):

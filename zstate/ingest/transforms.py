@@ -20,9 +20,10 @@ from zstate.wire.messages import (
     StaticTransforms,
     TransformSample,
     WriterTransforms,
-    from_block,
+    covariances_of,
     order_digest,
     poses_from_block,
+    to_block,
 )
 
 
@@ -122,9 +123,7 @@ class TransformIngest(StreamIngest):
         if admitted.refusal is None:
             self._all_admitted[sample.order] = edges
         poses = poses_from_block(sample.poses)
-        covariances = None
-        if isinstance(sample, WriterTransforms) and sample.covariances is not None:
-            covariances = from_block(sample.covariances).reshape(len(poses), -1)
+        covariances = covariances_of(sample)
         if admitted.refusal is None:
             return self._buffer.insert_many(
                 edges, sample.stamp, poses, covariances=covariances, writer=self.writer
@@ -240,7 +239,12 @@ class ModelEdgeFilter:
             return sample if named else None
         edges = tuple(named[row] for row in rows)
         head = (sample.stamp, sample.seq, sample.session, order_digest(edges))
-        return TransformSample(*head, _rows_of(sample.poses, rows), edges) if rows else None
+        if not rows:
+            return None
+        poses, covariances = _rows_of(sample.poses, rows), covariances_of(sample)
+        if covariances is None:
+            return TransformSample(*head, poses, edges)
+        return WriterTransforms(*head, poses, edges, to_block(covariances[rows]))
 
     def filter_statics(self, robot: str, statics: StaticTransforms) -> StaticTransforms:
         """The rest of a message of static edges."""

@@ -32,6 +32,7 @@ from zstate.wire.messages import (
     RobotDescription,
     StaticTransforms,
     TransformSample,
+    WriterTransforms,
 )
 from zstate.wire.registry import get_wire
 
@@ -241,6 +242,8 @@ class PassthroughPublisher(Closeable):
         if isinstance(message, JointState):
             numbers = (message.positions, message.velocities, message.efforts)
             sample = JointState(*head, *numbers, message.names)
+        elif isinstance(message, WriterTransforms):
+            sample = WriterTransforms(*head, message.poses, message.edges, message.covariances)
         else:
             sample = TransformSample(*head, message.poses, message.edges)
         write_all(self._streams[stream], sample)

@@ -55,6 +55,7 @@ from zstate.wire.messages import (
     Sample,
     StaticTransforms,
     TransformSample,
+    covariances_of,
     poses_from_block,
 )
 
@@ -289,8 +290,10 @@ class RecordedTransformIngest(TransformIngest):
         self._children.update(children)
         if self._epochs.is_new_epoch(sample, children):
             self._drop_edges(set(children))
-        poses = poses_from_block(sample.poses)
-        inserted = self._buffer.insert_many(edges, sample.stamp, poses, writer=self.writer)
+        poses, covariances = poses_from_block(sample.poses), covariances_of(sample)
+        inserted = self._buffer.insert_many(
+            edges, sample.stamp, poses, covariances=covariances, writer=self.writer
+        )
         self._epochs.add(sample, children)
         return inserted
 

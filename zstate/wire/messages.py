@@ -28,6 +28,8 @@ Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
 Level = Literal["ok", "warn", "error", "stale"]
 
 POSE_BYTES = 7 * 8
+COVARIANCE_NUMBERS = 21
+"""The upper triangle of a covariance of a pose."""
 _FLOAT64 = np.dtype("<f8")
 
 
@@ -133,6 +135,13 @@ class WriterTransforms(TransformSample, frozen=True, array_like=True, gc=False):
                 f"{len(self.poses) // POSE_BYTES} poses take 21 numbers of covariance each; got "
                 f"{len(self.covariances)} bytes"
             )
+
+
+def covariances_of(sample: TransformSample) -> NDArray[np.float64] | None:
+    """The covariances of the edges of a sample: (n, 21), read-only, NaN where not known; None if none is."""
+    if not isinstance(sample, WriterTransforms) or sample.covariances is None:
+        return None
+    return from_block(sample.covariances).reshape(-1, COVARIANCE_NUMBERS)
 
 
 class JointCommand(Sample, frozen=True, array_like=True, gc=False):
