@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
-from helpers.recording_builder import MS, START, RecordingBuilder, pose
+from helpers.recording_builder import MS, START, RecordingBuilder, S, pose
 from helpers.robots import RRBOT, SampleCollector
 
 from zstate.errors import SecondWriter
@@ -128,6 +128,53 @@ def test_transforms_are_played_by_writers_of_the_same_names(sessions, tracked: P
             assert [sample.stamp for sample in samples] == [START + n * 10 * MS for n in range(COUNT)]
             poses = [poses_from_block(sample.poses)[0, column] for sample in samples]
             assert poses == list(range(COUNT))
+
+
+@pytest.fixture
+def restarted(tmp_path: Path) -> Path:
+    """A cart whose writers of transforms were replaced by one with another name in the middle."""
+    path = tmp_path / "restarted.mcap"
+    with RecordingBuilder(path, "cart") as builder:
+        for n in range(2 * COUNT):
+            stamp = START + n * 10 * MS
+            base, ball = {("odom", "base"): pose(y=n)}, {("odom", "ball"): pose(x=n)}
+            if n < COUNT:
+                builder.edges("cart", stamp, base, session=5, writer="odometry-12-ab")
+                builder.edges("cart", stamp, ball, session=6, writer="camera-13-cd")
+            else:
+                builder.edges("cart", stamp, base | ball, session=7, writer="rover-99-ef")
+    return path
+
+
+def test_writer_restarted_under_another_name_is_played_without_loss(sessions, restarted: Path):
+    with (
+        TransformListener(sessions[0], "cart", history_s=100.0) as listener,
+        Player(sessions[1], restarted, rate=math.inf) as player,
+    ):
+        assert player.run().samples == 3 * COUNT
+        stamps = [START + n * 10 * MS for n in range(2 * COUNT)]
+        for child in ("base", "ball"):
+            listener.buffer.lookup("cart/odom", f"cart/{child}", stamps[-1], timeout_s=SOON_S)
+        base, has_base = listener.buffer.lookup_many("cart/odom", "cart/base", stamps)
+        ball, has_ball = listener.buffer.lookup_many("cart/odom", "cart/ball", stamps)
+        assert has_base.all()
+        assert has_ball.all()
+        assert base[:, 1].tolist() == ball[:, 0].tolist() == list(range(2 * COUNT))
+        assert not listener.stats.refused
+
+
+@pytest.mark.parametrize("names", [("rover", "rover"), ("rover-1", "rover-2")])
+def test_frame_that_a_restarted_writer_places_on_another_is_played(
+    sessions, tmp_path: Path, names: tuple[str, str]
+):
+    path = tmp_path / "moved.mcap"
+    with RecordingBuilder(path, "cart") as builder:
+        builder.edges("cart", START, {("odom", "ball"): pose(x=1)}, session=5, writer=names[0])
+        builder.edges("cart", START + S, {("map", "ball"): pose(x=2)}, session=6, writer=names[1])
+    with TransformListener(sessions[0], "cart") as listener, Player(sessions[1], path) as player:
+        assert player.run().samples == 2
+        found = listener.buffer.lookup("cart/map", "cart/ball", START + S, timeout_s=SOON_S)
+        assert found.translation[0] == 2.0
 
 
 def test_covariances_are_played_with_their_samples(sessions, tmp_path: Path):

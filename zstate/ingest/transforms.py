@@ -23,7 +23,7 @@ from zstate.wire.messages import (
     covariances_of,
     order_digest,
     poses_from_block,
-    to_block,
+    select_edges,
 )
 
 
@@ -237,14 +237,7 @@ class ModelEdgeFilter:
         rows = self._kept(robot, named)
         if len(rows) == len(named):
             return sample if named else None
-        edges = tuple(named[row] for row in rows)
-        head = (sample.stamp, sample.seq, sample.session, order_digest(edges))
-        if not rows:
-            return None
-        poses, covariances = _rows_of(sample.poses, rows), covariances_of(sample)
-        if covariances is None:
-            return TransformSample(*head, poses, edges)
-        return WriterTransforms(*head, poses, edges, to_block(covariances[rows]))
+        return select_edges(sample, named, rows) if rows else None
 
     def filter_statics(self, robot: str, statics: StaticTransforms) -> StaticTransforms:
         """The rest of a message of static edges."""

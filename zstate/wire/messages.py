@@ -144,6 +144,16 @@ def covariances_of(sample: TransformSample) -> NDArray[np.float64] | None:
     return from_block(sample.covariances).reshape(-1, COVARIANCE_NUMBERS)
 
 
+def select_edges(sample: TransformSample, edges: Edges, rows: Sequence[int]) -> TransformSample:
+    """The ``rows`` of a sample of ``edges``."""
+    chosen = tuple(edges[row] for row in rows)
+    head = (sample.stamp, sample.seq, sample.session, order_digest(chosen))
+    poses, covariances = poses_from_block(sample.poses), covariances_of(sample)
+    if covariances is None:
+        return TransformSample(*head, to_block(poses[rows]), chosen)
+    return WriterTransforms(*head, to_block(poses[rows]), chosen, to_block(covariances[rows]))
+
+
 class JointCommand(Sample, frozen=True, array_like=True, gc=False):
     """Setpoints for a driver; a block that is not commanded is None."""
 
