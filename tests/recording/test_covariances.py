@@ -15,17 +15,23 @@ from rosbags.highlevel import AnyReader
 
 from zstate.errors import MessageError
 from zstate.recording.covariances import (
+    CHILD_FRAME,
     CovarianceJoin,
     EdgeCovariance,
     covariance_topic,
     decode_covariance,
     encode_covariance,
 )
+from zstate.recording.decode import DecodedRecording
 from zstate.recording.info import other_channels, read_info, recorded_robots
 from zstate.recording.mcap.records import MAGIC
 from zstate.recording.mcap.recover import recover
 from zstate.recording.mcap.writer import MIN_BYTES
+from zstate.recording.reader import RecordingReader
+from zstate.recording.storage import EDGE_WRITER, ROBOT
 from zstate.wire.messages import TransformSample, covariances_of, order_digest, to_block
+from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 
 BASE, BALL = ("odom", "base"), ("base", "ball")
 COUNT = 20
@@ -123,6 +129,23 @@ def test_recovered_recording_has_the_covariances(tmp_path: Path):
     (tmp_path / "cut.mcap").write_bytes(data[: -len(MAGIC)])  # as a killed recorder leaves it
     recover(tmp_path / "cut.mcap", tmp_path / "whole.mcap")
     check(tmp_path / "whole.mcap")
+
+
+def test_malformed_covariance_is_counted_and_its_sample_read(tmp_path: Path):
+    path = tmp_path / "r.mcap"
+    with RecordingBuilder(path, "cart") as builder:
+        known = {BASE: covariance(1)}
+        builder.edges("cart", START, {BASE: pose()}, writer="odometry", covariances=known)
+        metadata = {"zstate.session": "2", ROBOT: "cart", EDGE_WRITER: "odometry", CHILD_FRAME: "base"}
+        channel = builder.writer.channel("/covariances", POSE_WITH_COVARIANCE, Qos(), metadata)
+        builder.writer.write(channel, b"\x00\x01\x00\x00", START + MS, START + MS)
+        builder.edges("cart", START + MS, {BASE: pose(x=1)}, writer="odometry", log_time=START + MS)
+    refused: list[str] = []
+    with RecordingReader(path) as reader:
+        recording = DecodedRecording(reader, lambda reason, text: refused.append(reason))
+        messages = [decoded.message for decoded in recording.messages()]
+    assert [covariances_of(message) is None for message in messages] == [False, True]
+    assert refused == ["truncated"]
 
 
 def test_covariance_of_another_stamp_or_edge_is_not_joined():
