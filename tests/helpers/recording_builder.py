@@ -22,6 +22,7 @@ from zstate.wire.messages import (
     RobotDescription,
     StaticTransforms,
     TransformSample,
+    WriterTransforms,
     order_digest,
     to_block,
 )
@@ -44,8 +45,15 @@ def recorded_buffer(path: Path, robot: str | None = None) -> TransformBuffer:
 class RecordingBuilder:
     """Writes a recording; every message is logged ``LATENCY`` after its stamp by default."""
 
-    def __init__(self, path: Path, alone: str | None = None, programs: dict[int, str] | None = None) -> None:
-        self.writer = RecordingWriter(path)
+    def __init__(
+        self,
+        path: Path,
+        alone: str | None = None,
+        programs: dict[int, str] | None = None,
+        *,
+        max_bytes: int | None = None,
+    ) -> None:
+        self.writer = RecordingWriter(path, max_bytes=max_bytes)
         self.refused: list[str] = []
         self.encoder = RecordingEncoder(
             self.writer, lambda reason, _: self.refused.append(reason), alone=alone, programs=programs or {}
@@ -99,10 +107,16 @@ class RecordingBuilder:
         session: int = 2,
         writer: str | None = None,
         log_time: int | None = None,
+        covariances: dict[Edge, np.ndarray] | None = None,
     ) -> TransformSample:
         names = tuple(poses)
         block = to_block(list(poses.values()))
-        sample = TransformSample(stamp, self._seq(robot, session), session, order_digest(names), block, names)
+        head = (stamp, self._seq(robot, session), session, order_digest(names))
+        sample = TransformSample(*head, block, names)
+        if covariances is not None:
+            unknown = np.full((6, 6), np.nan)
+            known = [covariances.get(edge, unknown)[np.triu_indices(6)] for edge in names]
+            sample = WriterTransforms(*head, block, names, to_block(known))
         at = stamp + LATENCY if log_time is None else log_time
         self.encoder.write_message(robot, sample, at, writer)
         return sample

@@ -11,6 +11,8 @@ from zstate.wire.messages import (
     Edges,
     StaticTransforms,
     TransformSample,
+    WriterTransforms,
+    covariances_of,
     order_digest,
     poses_from_block,
     to_block,
@@ -35,6 +37,15 @@ def test_only_edges_outside_the_model_remain():
     assert rest.edges == (("odom", "world"), ("tool", "lens"))
     assert poses_from_block(rest.poses)[:, 0].tolist() == [1.0, 2.0]
     assert (rest.stamp, rest.seq, rest.session) == (START, 4, 5)
+
+
+def test_covariances_of_the_remaining_edges_remain():
+    edges = (("base", "upper"), ("odom", "world"), ("tool", "lens"))
+    poses, covariances = to_block([pose()] * 3), np.arange(3 * 21.0).reshape(3, 21)
+    message = WriterTransforms(START, 4, 5, order_digest(edges), poses, edges, to_block(covariances))
+    rest = rrbot_filter().filter_sample("arm", message)
+    assert rest is not None
+    assert np.array_equal(covariances_of(rest), covariances[1:])
 
 
 def test_sample_of_model_edges_only_is_removed():

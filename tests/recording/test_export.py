@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from helpers.recording_builder import (
 )
 
 from zstate.errors import InvalidInput, LibraryMissing, RecordingError, UnknownFrame
-from zstate.recording.export import Exporter, ExportReport
+from zstate.model.urdf import parse_urdf
+from zstate.recording.export import Exporter, ExportReport, StreamedBuffer
 from zstate.recording.recording import Recording
 from zstate.wire.messages import JointState, order_digest, to_block
 
@@ -107,6 +109,100 @@ def test_poses_are_the_lookups_at_the_same_rows(run: Path, options: dict[str, ob
     np.testing.assert_array_equal(found, expected)
     assert (~valid).sum() == report.unknown_poses["odom", "arm/tool"] == 100
     assert ("velocity.shoulder" in columns) == (not options)
+
+
+@pytest.fixture
+def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows of a fraction of a second, in recordings of some seconds."""
+    for name, value in {"_ROWS": 37, "_RELOADED_ROWS": 500, "DELAYED_NS": 100 * MS}.items():
+        monkeypatch.setattr(f"zstate.recording.export.{name}", value)
+
+
+def swing(builder: RecordingBuilder, numbers: range, offset: int = 0, **options: int) -> None:
+    """The swinging "arm" at 100 Hz on a base that moves at 50 Hz; ``offset`` [ns] of stamps to log times."""
+    for n in numbers:
+        at = START + n * 10 * MS
+        joints = swing_positions(n / 100), swing_velocities(n / 100)
+        builder.joints("arm", at + offset, *joints, log_time=at, **options)
+        if not n % 2:
+            builder.edges("arm", at + offset, {("odom", "world"): pose(n / 100)}, log_time=at, **options)
+
+
+def new_model(builder: RecordingBuilder) -> None:
+    """A writer with another model replaces the first."""
+    urdf = RRBOT.urdf.replace('xyz="0 0', 'xyz="1 0')
+    builder.describe("arm", parse_urdf(urdf, "moved"), 2, START + COUNT * 10 * MS)
+    swing(builder, range(COUNT, COUNT + 100), session=2)
+
+
+def base_on_a_map(builder: RecordingBuilder) -> None:
+    """The base is placed in a map from now on, by a writer that replaced the first."""
+    for n in range(COUNT, COUNT + 100):
+        builder.edges("arm", START + n * 10 * MS, {("map", "world"): pose(n / 100)}, session=9)
+        builder.edges("arm", START + n * 10 * MS, {("odom", "map"): pose(y=n)}, session=8)
+
+
+LATER: dict[str, Callable[[RecordingBuilder], None]] = {
+    "nothing": lambda builder: None,
+    "more": lambda builder: swing(builder, range(COUNT, 2 * COUNT)),
+    "gap": lambda builder: swing(builder, range(3 * COUNT, 4 * COUNT)),
+    "clock set back": lambda builder: swing(builder, range(COUNT, 2 * COUNT), -4 * S, session=7),
+    "clock set back by an hour": lambda builder: swing(builder, range(COUNT, 2 * COUNT), -3600 * S),
+    "late sample": lambda builder: builder.edges(
+        "arm", START + S + MS, {("odom", "world"): pose(7)}, log_time=START + COUNT * 10 * MS
+    ),
+    "late static edge": lambda builder: builder.statics(
+        "arm", START + COUNT * 10 * MS, {("tool", "tip"): pose(z=3)}
+    ),
+    "frame on another": base_on_a_map,
+    "new model": new_model,
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"rate_hz": 131.0}])
+@pytest.mark.parametrize("later", LATER)
+@pytest.mark.usefixtures("small_windows")
+def test_rows_are_lookups_in_the_whole_recording(tmp_path: Path, later: str, options: dict[str, float]):
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        builder.describe("arm")
+        builder.statics("arm", START, {("tool", "tip"): pose(z=1)})
+        swing(builder, range(COUNT))
+        LATER[later](builder)
+    pairs = [("arm/odom", "arm/tip"), ("arm/world", "arm/tool")]
+    columns, report = export(tmp_path / "r.mcap", "parquet", poses=pairs, **options)
+    with Recording(tmp_path / "r.mcap") as recording:
+        buffer = recording.buffer()
+        samples = recording.joint_states().stamps
+    stamps = np.array(columns["stamp"])
+    if options:
+        assert (stamps[0], stamps[-1] // S) == (samples[0], samples[-1] // S)
+        positions, _ = buffer.joint_positions_many("arm", stamps)
+        assert np.array_equal(np.array([columns[name] for name in POSITIONS]).T, positions, equal_nan=True)
+    else:
+        assert stamps.tolist() == samples.tolist()
+    for pair in pairs:
+        names = [f"{'.'.join(pair)}.{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+        expected, valid = buffer.lookup_many(*pair, stamps)
+        assert np.array_equal(np.array([columns[name] for name in names]).T, expected, equal_nan=True)
+        assert report.unknown_poses[pair] == (~valid).sum()
+        assert valid.sum() > 10
+
+
+@pytest.mark.usefixtures("small_windows")
+def test_buffer_holds_the_samples_around_one_window(tmp_path: Path):
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        builder.describe("arm")
+        swing(builder, range(10 * COUNT))
+    stamps = START + np.arange(10 * COUNT) * 10 * MS
+    with Recording(tmp_path / "r.mcap") as recording:
+        streamed = StreamedBuffer(recording, "arm", [("odom", "arm/tool")], stamps)
+        counts: list[int] = []
+        for first in range(0, len(stamps), 50):
+            frames = streamed.around(stamps[first : first + 50]).frames()
+            counts.append(max(frame.count for frame in frames))
+        streamed.finish()
+    # 50 rows, 10 samples until none is late, what one more read adds, and the ends of the history.
+    assert max(counts) <= 50 + 10 + 37 + 2
 
 
 def test_later_velocities_and_efforts_have_columns_in_all_rows(tmp_path: Path):

@@ -105,6 +105,21 @@ def test_efforts_are_kept_and_nan_in_rows_without_them(tmp_path: Path):
     assert states.efforts[3:].tolist() == [[3.0, 0.5], [4.0, 0.5], [5.0, 0.5]]
 
 
+def test_efforts_of_a_part_in_the_middle_are_kept_at_their_rows(tmp_path: Path):
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        builder.describe("arm")
+        digest = order_digest(RRBOT.joint_names)
+        for n in range(6_000):
+            efforts = to_block([n, -n]) if 2_000 <= n < 2_500 else None
+            state = JointState(START + n * 20 * MS, n, 1, digest, to_block([n, n]), None, efforts)
+            builder.encoder.write_message("arm", state, state.stamp)
+    states = joint_states(tmp_path / "r.mcap")
+    assert states.positions[:, 0].tolist() == list(range(6_000))
+    assert states.efforts is not None
+    assert np.flatnonzero(~np.isnan(states.efforts).any(axis=1)).tolist() == list(range(2_000, 2_500))
+    assert states.efforts[2_000:2_500, 1].tolist() == [-n for n in range(2_000, 2_500)]
+
+
 def test_messages_of_ros_are_reordered_and_those_that_cannot_be_used_are_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
@@ -163,6 +178,7 @@ def test_one_of_several_robots_must_be_named(tmp_path: Path):
 
 def test_parts_ascend_and_take_memory_that_does_not_grow_with_the_recording(tmp_path: Path):
     peaks: list[int] = []
+    whole_peaks: list[int] = []
     for count in (20_000, 60_000):
         path = tmp_path / f"{count}.mcap"
         with RecordingBuilder(path) as builder:
@@ -176,5 +192,12 @@ def test_parts_ascend_and_take_memory_that_does_not_grow_with_the_recording(tmp_
             stamps = [part.trajectory.stamps.copy() for part in recording.joint_state_reader().parts()]
             peaks.append(tracemalloc.get_traced_memory()[1] - sum(part.nbytes for part in stamps))
             tracemalloc.stop()
+            tracemalloc.start()
+            whole = recording.joint_states()
+            whole_peaks.append(tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+        assert len(whole) == sum(map(len, stamps))
         assert (np.diff(np.concatenate(stamps)) > 0).all()
     assert peaks[1] < 1.5 * peaks[0]
+    # All samples together take their size and an eighth: stamp and two positions of 40,000 more.
+    assert whole_peaks[1] - whole_peaks[0] < 1.5 * 40_000 * 3 * 8

@@ -7,14 +7,16 @@ import threading
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers.processes import until
-from helpers.recording_builder import MS, START, RecordingBuilder, pose
+from helpers.processes import SOON_S, until
+from helpers.recording_builder import MS, START, RecordingBuilder, S, pose
 from helpers.robots import RRBOT, SampleCollector
 
 from zstate.errors import SecondWriter
 from zstate.net.presence import current_tokens
 from zstate.net.session import connect
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
@@ -126,6 +128,74 @@ def test_transforms_are_played_by_writers_of_the_same_names(sessions, tracked: P
             assert [sample.stamp for sample in samples] == [START + n * 10 * MS for n in range(COUNT)]
             poses = [poses_from_block(sample.poses)[0, column] for sample in samples]
             assert poses == list(range(COUNT))
+
+
+@pytest.fixture
+def restarted(tmp_path: Path) -> Path:
+    """A cart whose writers of transforms were replaced by one with another name in the middle."""
+    path = tmp_path / "restarted.mcap"
+    with RecordingBuilder(path, "cart") as builder:
+        for n in range(2 * COUNT):
+            stamp = START + n * 10 * MS
+            base, ball = {("odom", "base"): pose(y=n)}, {("odom", "ball"): pose(x=n)}
+            if n < COUNT:
+                builder.edges("cart", stamp, base, session=5, writer="odometry-12-ab")
+                builder.edges("cart", stamp, ball, session=6, writer="camera-13-cd")
+            else:
+                builder.edges("cart", stamp, base | ball, session=7, writer="rover-99-ef")
+    return path
+
+
+def test_writer_restarted_under_another_name_is_played_without_loss(sessions, restarted: Path):
+    with (
+        TransformListener(sessions[0], "cart", history_s=100.0) as listener,
+        Player(sessions[1], restarted, rate=math.inf) as player,
+    ):
+        assert player.run().samples == 3 * COUNT
+        stamps = [START + n * 10 * MS for n in range(2 * COUNT)]
+        for child in ("base", "ball"):
+            listener.buffer.lookup("cart/odom", f"cart/{child}", stamps[-1], timeout_s=SOON_S)
+        base, has_base = listener.buffer.lookup_many("cart/odom", "cart/base", stamps)
+        ball, has_ball = listener.buffer.lookup_many("cart/odom", "cart/ball", stamps)
+        assert has_base.all()
+        assert has_ball.all()
+        assert base[:, 1].tolist() == ball[:, 0].tolist() == list(range(2 * COUNT))
+        assert not listener.stats.refused
+
+
+@pytest.mark.parametrize("names", [("rover", "rover"), ("rover-1", "rover-2")])
+def test_frame_that_a_restarted_writer_places_on_another_is_played(
+    sessions, tmp_path: Path, names: tuple[str, str]
+):
+    path = tmp_path / "moved.mcap"
+    with RecordingBuilder(path, "cart") as builder:
+        builder.edges("cart", START, {("odom", "ball"): pose(x=1)}, session=5, writer=names[0])
+        # As live, listeners refuse the first ones until they have processed that the other writer left.
+        stamps = [START + S + n * 50 * MS for n in range(COUNT)]
+        for stamp in stamps:
+            builder.edges("cart", stamp, {("map", "ball"): pose(x=2)}, session=6, writer=names[1])
+    with TransformListener(sessions[0], "cart") as listener, Player(sessions[1], path) as player:
+        assert player.run().samples == 1 + COUNT
+        found = listener.buffer.lookup("cart/map", "cart/ball", stamps[-1], timeout_s=SOON_S)
+        assert found.translation[0] == 2.0
+
+
+def test_covariances_are_played_with_their_samples(sessions, tmp_path: Path):
+    path, known = tmp_path / "run.mcap", np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    with RecordingBuilder(path, "cart") as builder:
+        poses = {("odom", "base"): pose(x=1), ("odom", "ball"): pose(y=2)}
+        builder.edges("cart", START, poses, writer="odometry", covariances={("odom", "base"): known})
+        builder.edges("cart", START + MS, poses, writer="odometry")
+    with (
+        TransformListener(sessions[0], "cart") as listener,
+        Player(sessions[1], path, rate=math.inf) as player,
+    ):
+        assert player.run().samples == 2
+        without = listener.buffer.lookup("cart/odom", "cart/base", START + MS, timeout_s=SOON_S)
+        assert without.covariance is None
+        found = listener.buffer.lookup("cart/odom", "cart/base", START)
+        assert np.array_equal(found.covariance, known)
+        assert listener.buffer.lookup("cart/odom", "cart/ball", START).covariance is None
 
 
 def test_transforms_of_an_active_writer_are_played_only_with_takeover(sessions, tracked: Path):

@@ -534,7 +534,8 @@ def test_transforms_of_each_writer_are_recorded_beside_joint_states(sessions, tm
         wait_for_stream_readers(writer, "r1", "joint_states", "transforms/odometry", "transforms/tracker")
         for k in range(3):
             wheels.publish([0.0, 0.0], stamp=STAMP + k * PERIOD)
-            odometry.publish([Transform("odom", "world", (float(k), 0, 0), UPRIGHT)], STAMP + k * PERIOD)
+            base = Transform("odom", "world", (float(k), 0, 0), UPRIGHT)
+            odometry.publish([base.with_covariance(np.diag([k + 1.0] * 6))], STAMP + k * PERIOD)
             tracker.publish([Transform("odom", "ball", (0, float(k), 0), UPRIGHT)], STAMP + k * PERIOD)
         until(lambda: count(recorder, "r1", "transforms") == 6 and count(recorder, "r1") == 3)
     messages = [message.transforms[0] for message in read(path, "/tf")]
@@ -543,8 +544,12 @@ def test_transforms_of_each_writer_are_recorded_beside_joint_states(sessions, tm
         ("odom", "ball"): 3,
     }
     with Recording(path) as recording:
-        found = recording.buffer().lookup("ball", "world", STAMP + PERIOD // 2)
+        buffer = recording.buffer()
+        found = buffer.lookup("ball", "world", STAMP + PERIOD // 2)
+        placed = buffer.lookup("odom", "world", STAMP + PERIOD)
         named = {channel.metadata.get("zstate.writer") for channel in recording.info.channels}
     # Half way between samples at x = 0 and 1 of one writer, and y = 0 and 1 of the other.
     assert found.translation == pytest.approx([0.5, -0.5, 0.0])
     assert {"odometry", "tracker"} <= named
+    assert np.array_equal(placed.covariance, np.diag([2.0] * 6))
+    assert len(read(path, "/pose_with_covariance/world")) == 3

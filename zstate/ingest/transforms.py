@@ -20,9 +20,10 @@ from zstate.wire.messages import (
     StaticTransforms,
     TransformSample,
     WriterTransforms,
-    from_block,
+    covariances_of,
     order_digest,
     poses_from_block,
+    select_edges,
 )
 
 
@@ -152,9 +153,7 @@ class TransformIngest(StreamIngest):
         elif not admitted.rows:
             return True  # a model has all of them by now
         poses = poses_from_block(sample.poses)
-        covariances = None
-        if isinstance(sample, WriterTransforms) and sample.covariances is not None:
-            covariances = from_block(sample.covariances).reshape(len(poses), -1)
+        covariances = covariances_of(sample)
         if admitted.rows is not None:
             rows = list(admitted.rows)
             edges, poses = tuple(edges[row] for row in rows), poses[rows]
@@ -262,9 +261,7 @@ class ModelEdgeFilter:
         rows = self._kept(robot, named)
         if len(rows) == len(named):
             return sample if named else None
-        edges = tuple(named[row] for row in rows)
-        head = (sample.stamp, sample.seq, sample.session, order_digest(edges))
-        return TransformSample(*head, _rows_of(sample.poses, rows), edges) if rows else None
+        return select_edges(sample, named, rows) if rows else None
 
     def filter_statics(self, robot: str, statics: StaticTransforms) -> StaticTransforms:
         """The rest of a message of static edges."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -13,11 +13,12 @@ from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.joint_states import joint_order
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
+from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance
 from zstate.recording.encode import StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
 from zstate.wire.keys import Stream
-from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms
+from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
@@ -25,7 +26,8 @@ from zstate.wire.ros2.topics import SHARED, robot_from_topic, ros_type
 
 _TOPICS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
 STREAMS: tuple[Stream, ...] = (*_TOPICS, "transforms")
-"""The streams that are decoded. ``transforms`` are channels of the topic tf with the name of a writer."""
+"""The streams that are decoded. ``transforms`` are channels of the topic tf with the name of a writer, and
+those of their covariances."""
 
 LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
 """Streams whose messages are in effect until the next."""
@@ -56,12 +58,14 @@ class RecordedWriter:
     @classmethod
     def from_channel(cls, channel: Channel) -> RecordedWriter | None:
         """The writer of ``channel``; None if it is no stream of a robot."""
-        name = channel.topic.rpartition("/")[2]
-        for stream in _TOPICS:
-            if name == stream and channel.type_name == ros_type(stream).name:
-                break
-        else:
-            return None
+        stream: Stream = "transforms"
+        if child_frame(channel) is None:
+            name = channel.topic.rpartition("/")[2]
+            for stream in _TOPICS:
+                if name == stream and channel.type_name == ros_type(stream).name:
+                    break
+            else:
+                return None
         facts = channel.metadata
         foreign = _SESSION not in facts
         digest = blake2b(channel.topic.encode(), digest_size=4).digest()
@@ -111,7 +115,7 @@ class DecodedRecording:
             if decoder is None:
                 self.ignored += (channel,)
             else:
-                self._counts[decoder.writer] += channel.count
+                self._counts[decoder.writer] += 0 if decoder.covariances_of else channel.count
                 self._topics.setdefault(channel.topic, set()).add(decoder.writer)
 
     @property
@@ -146,8 +150,28 @@ class DecodedRecording:
         end: int | None = None,
     ) -> Iterator[DecodedMessage]:
         """The messages of ``writers_of(robots)`` on ``streams``, by log time in [begin, end)."""
+        joins: defaultdict[RecordedWriter, CovarianceJoin] = defaultdict(CovarianceJoin)
         for undecoded in self.records(robots, streams, begin, end):
-            yield from self.decode(undecoded)
+            writer = undecoded.channel.writer
+            if undecoded.channel.covariances_of:
+                self._add_covariance(undecoded, joins[writer])
+                continue
+            for decoded in self.decode(undecoded):
+                if joins and writer in joins and isinstance(decoded.message, TransformSample):
+                    yield decoded._replace(message=joins[writer].join(decoded.message))
+                else:
+                    yield decoded
+
+    def _add_covariance(self, undecoded: UndecodedRecord, join: CovarianceJoin) -> None:
+        channel, record, _ = undecoded
+        try:
+            covariance = decode_covariance(record.payload, channel.covariances_of)
+        except MessageError as error:
+            self._refuse(error.reason, f"{record.topic}: {error}")
+            return
+        to_zstate = channel.names.to_zstate
+        parent, child = to_zstate(covariance.parent), to_zstate(covariance.child)
+        join.add(covariance._replace(parent=parent, child=child))
 
     def decode(self, undecoded: UndecodedRecord) -> Iterator[DecodedMessage]:
         """The messages of one record; none if it cannot be decoded."""
@@ -168,7 +192,7 @@ class DecodedRecording:
         begin: int | None = None,
         end: int | None = None,
     ) -> Iterator[UndecodedRecord]:
-        """The records of ``messages``, for readers that decode many together."""
+        """The records of ``messages`` and of their covariances, for readers that decode many together."""
         selected = {writer for writer in self.writers_of(robots) if writer.stream in streams}
         topics = {topic for topic, writers in self._topics.items() if writers & selected}
         counts: Counter[RecordedWriter] = Counter()
@@ -196,18 +220,22 @@ class DecodedRecording:
                 options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))
                 names = FrameNames(options, writer.robot or SHARED)
                 topic: Stream = "tf" if writer.stream == "transforms" else writer.stream
-                decoder = ChannelDecoder(writer, topic, names, RosDecoder())
+                decoder = ChannelDecoder(writer, topic, names, RosDecoder(), child_frame(channel) or "")
             self._known[channel] = decoder
         return self._known[channel]
 
 
 class ChannelDecoder(NamedTuple):
-    """The writer of a channel, the stream that its topic is named after, and the decoder of its messages."""
+    """The writer of a channel, the stream that its topic is named after, and the decoder of its messages.
+
+    A channel of covariances has those of the child frame ``covariances_of``, by its name in ROS.
+    """
 
     writer: RecordedWriter
     topic: Stream
     names: FrameNames
     ros: RosDecoder
+    covariances_of: str
 
 
 class LatchedState:

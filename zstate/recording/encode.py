@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
@@ -12,6 +11,14 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.robot import coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
+from zstate.recording.covariances import (
+    CHILD_FRAME,
+    EdgeCovariance,
+    covariance_topic,
+    encode_covariance,
+    known_covariances,
+    ros_name,
+)
 from zstate.recording.mcap.writer import ChannelId, RecordingWriter
 from zstate.recording.storage import EDGE_WRITER, ROBOT
 from zstate.wire.joint_order import SampleLayout
@@ -33,6 +40,7 @@ from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
 from zstate.wire.ros2.topics import SHARED, RmwKeys, ros_type
+from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 
 MAX_LATCHED = 256
 """Descriptions and sets of static edges of one robot that are latched, one of each static writer."""
@@ -156,12 +164,30 @@ class RecordingEncoder:
             self._pending.append(robot, message, log_time)
             return
         stream: Stream = "transforms" if edge_writer else _STREAMS[type(message)]
+        if edge_writer and isinstance(message, TransformSample):
+            edges = sample_names.moving_edges if message.edges is None else message.edges
+            for one in known_covariances(message, edges):
+                self._write_covariance(robot, message, one, log_time, edge_writer)
         channel = self._channel(robot, stream, message.session, log_time, edge_writer)
         payload = channel.encode(message, sample_names)
         # MCAP begins in 1970; the payload keeps an earlier stamp.
         publish_time = max(message.stamp, 0)
         self._writer.write(channel.number, payload, log_time, publish_time, sequence=message.seq)
         self._counts[robot, stream] += 1
+
+    def _write_covariance(
+        self, robot: str, sample: Sample, covariance: EdgeCovariance, log_time: int, edge_writer: str
+    ) -> None:
+        """Write the covariance of one edge, before its sample."""
+        try:
+            channel = self._channel(
+                robot, "transforms", sample.session, log_time, edge_writer, covariances_of=covariance.child
+            )
+        except _TooManyWriters as error:  # the sample itself may have a channel
+            self._refuse("too many writers", f"{robot!r}, covariance of {covariance.child!r}: {error}")
+            return
+        payload = channel.encode_covariance(covariance)
+        self._writer.write(channel.number, payload, log_time, max(sample.stamp, 0), sequence=sample.seq)
 
     def _write_description(self, robot: str, description: RobotDescription, log_time: int) -> None:
         self._latch(robot, description, log_time, robot)
@@ -202,9 +228,17 @@ class RecordingEncoder:
         return self._orders.setdefault(robot, OrderRegistry())
 
     def _channel(
-        self, robot: str, stream: Stream, session: int, log_time: int, edge_writer: str = ""
+        self,
+        robot: str,
+        stream: Stream,
+        session: int,
+        log_time: int,
+        edge_writer: str = "",
+        *,
+        covariances_of: str = "",
     ) -> ChannelEncoder:
-        key = (stream, session, edge_writer)
+        """The channel of a writer's stream, or of the covariances of one of its child frames."""
+        key = (stream, session, edge_writer, covariances_of)
         opened = self._channels[robot]
         channel = opened.find(key)
         if channel is not None:
@@ -212,6 +246,7 @@ class RecordingEncoder:
         if not opened.allow(log_time):
             raise _TooManyWriters("its writers start too often, each with channels of its own")
         options = self._options(robot)
+        names = FrameNames(options, robot)
         metadata = {"zstate.session": str(session)}
         if stream != "clock":
             metadata |= {ROBOT: robot, "zstate.frame_prefix": options.frame_prefix}
@@ -220,9 +255,12 @@ class RecordingEncoder:
         if session in self._programs:
             metadata["zstate.program"] = self._programs[session]
         carrier: Stream = "tf" if stream == "transforms" else stream
-        topic = RmwKeys(options).topic(robot, carrier)
-        number = self._writer.channel(topic, ros_type(carrier), STREAM_QOS[carrier], metadata)
-        channel = ChannelEncoder(number, stream, FrameNames(options, robot))
+        topic, kind = RmwKeys(options).topic(robot, carrier), ros_type(carrier)
+        if covariances_of:
+            metadata[CHILD_FRAME] = child = names.to_ros(covariances_of)
+            topic, kind = covariance_topic(options.namespace, names.to_zstate(child)), POSE_WITH_COVARIANCE
+        number = self._writer.channel(topic, kind, STREAM_QOS[carrier], metadata)
+        channel = ChannelEncoder(number, stream, names)
         for unused in opened.add(key, channel, self._latched.get(robot, {}).values()):
             self._writer.release(unused.number)
         return channel
@@ -232,8 +270,7 @@ class RecordingEncoder:
         if robot in self._root:
             return Ros2Options()
         if robot not in self._namespaces:
-            # "arm-1" and "arm.1" are valid robots for zstate, but not valid names in ROS.
-            name = re.sub(r"\W|^(?=\d)", "_", robot, flags=re.ASCII)
+            name = ros_name(robot)
             while name in self._namespaces.values():
                 name += "_"
             self._namespaces[robot] = name
@@ -259,6 +296,10 @@ class ChannelEncoder:
             self._sample_names = sample_names
             self._encoder = RosStreamEncoder(self._names, sample_names)
         return self._encoder.encode(message)
+
+    def encode_covariance(self, covariance: EdgeCovariance) -> bytes:
+        """The payload for a channel of covariances. Raises InvalidInput if CDR cannot represent it."""
+        return encode_covariance(covariance._replace(parent=self._names.to_ros(covariance.parent)))
 
 
 class OpenChannels:

@@ -23,23 +23,27 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
-from zstate.errors import InvalidInput, LibraryMissing, RecordingError
+from zstate.buffer.buffer import TransformBuffer
+from zstate.errors import InvalidInput, LibraryMissing, LookupFailed, RecordingError
 from zstate.model.joint_trajectory import JointTrajectory
-from zstate.recording.joint_states import JointStatePart
-from zstate.recording.recording import Recording
+from zstate.recording.joint_states import DELAYED_NS, JointStatePart
+from zstate.recording.recording import HISTORY_S, Recording
+from zstate.wire.keys import frame_owner
+from zstate.wire.messages import Sample
 
 if TYPE_CHECKING:
     from pyarrow.parquet import ParquetWriter
 
-    from zstate.buffer.buffer import TransformBuffer
+    from zstate.buffer.frame_tree import FrameInfo
 
 TableFormat = Literal["csv", "parquet"]
 Columns: TypeAlias = Mapping[str, NDArray[Any]]
@@ -51,6 +55,12 @@ Frames: TypeAlias = tuple[str, str]
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _ROWS = 4096
 """Rows of interpolated samples computed together."""
+
+_MAX_KEPT = 50_000
+"""Samples of an edge kept for rows to come, 25 MB for a humanoid."""
+
+_RELOADED_ROWS = 32_768
+"""Rows for which a recording is read again: 50 MB for a humanoid."""
 
 _ROW_GROUP = 32_768
 """Rows of a row group of Parquet, which are kept in memory: 25 MB for a humanoid with velocities."""
@@ -82,9 +92,9 @@ class Exporter:
     last, or ``stamps`` [ns], with positions interpolated as in lookups, and without velocities and efforts.
     ``poses`` are pairs (target, source) of frames, looked up at the same instants.
 
-    Samples as recorded are streamed in bounded memory. Interpolated samples and poses need a buffer, whose
-    memory grows with the number of rows. ``on_progress(read, recorded)`` is called with numbers of samples.
-    Raises InvalidInput for an unknown robot, and for interpolation without a model of the robot.
+    The recording is streamed: memory does not grow with it. ``on_progress(read, recorded)`` is called with
+    numbers of samples. Raises InvalidInput for an unknown robot, and for interpolation without a model of
+    the robot.
     """
 
     def __init__(
@@ -141,14 +151,16 @@ class Exporter:
 
     def _write(self, table: Table) -> ExportReport:
         if self._is_as_recorded and not self._poses:
-            return self._write_samples(table, None)
-        stamps = self._instants()
-        buffer = self._recording.buffer(stamps)
-        for target, source in self._poses:
-            buffer.path(target, source)  # raises before anything is written
-        if self._is_as_recorded:
-            return self._write_samples(table, buffer)
-        return self._write_interpolated(table, buffer, stamps)
+            return self._write_samples(table)
+        survey = self._survey()
+        if (np.diff(survey.stamps) >= 0).all():
+            try:
+                streamed = StreamedBuffer(self._recording, self.robot, self._poses, survey.stamps)
+                return self._write_lookups(table, survey, streamed)
+            except _Changed:
+                table.restart()
+        reloaded = ReloadedBuffer(self._recording, self._poses, survey.stamps)
+        return self._write_lookups(table, survey, reloaded)
 
     def _samples(self) -> Iterator[JointStatePart]:
         """All samples, in order of their stamps. Raises InvalidInput if there are none."""
@@ -163,33 +175,36 @@ class Exporter:
             reasons = ", ".join(f"{reason} {count}" for reason, count in self._refusals.counts.items())
             raise InvalidInput(f"no joint state of {self.robot!r} can be used: {reasons or 'there is none'}")
 
-    def _instants(self) -> NDArray[np.int64]:
-        """The stamps of all rows."""
+    def _survey(self) -> Survey:
+        """The stamps of all rows, and which samples they are."""
         if self._stamps is not None:
-            return self._stamps
+            return Survey(self._stamps)
         parts: list[NDArray[np.int64]] = []
+        kinds: set[str] = set()
+        histories = 0
         for trajectory, restarts in self._samples():
             if restarts:
                 parts.clear()
+                kinds.clear()
+                histories += 1
             parts.append(trajectory.stamps.copy())
+            kinds |= trajectory.kinds
         recorded = np.concatenate(parts)
         if self._rate_hz is None:
-            return recorded
+            return Survey(recorded, frozenset(kinds), histories)
         first, last = int(recorded[0]), int(recorded[-1])
         count = int((last - first) * 1e-9 * self._rate_hz) + 2
         grid = first + np.round(np.arange(count) * (1e9 / self._rate_hz)).astype(np.int64)
-        return grid[grid <= last]
+        return Survey(grid[grid <= last])
 
-    def _write_samples(self, table: Table, buffer: TransformBuffer | None) -> ExportReport:
+    def _write_samples(self, table: Table) -> ExportReport:
         """Write all samples; from the start again if velocities or efforts first appear later."""
         kinds: dict[int, set[str]] = {}
-        while (report := self._try_samples(table, buffer, kinds)) is None:
+        while (report := self._try_samples(table, kinds)) is None:
             table.restart()
         return report
 
-    def _try_samples(
-        self, table: Table, buffer: TransformBuffer | None, kinds: dict[int, set[str]]
-    ) -> ExportReport | None:
+    def _try_samples(self, table: Table, kinds: dict[int, set[str]]) -> ExportReport | None:
         """Write all samples with the columns of ``kinds``, by the number of the history.
 
         None if a part has more; ``kinds`` then has them.
@@ -204,21 +219,36 @@ class Exporter:
             known |= missing
             if missing and report.rows:
                 return None
-            self._write_rows(table, trajectory.with_kinds(known), buffer, report)
+            self._write_rows(table, trajectory.with_kinds(known), None, report)
         report.refused += self._refusals.counts
         return report
 
-    def _write_interpolated(
-        self, table: Table, buffer: TransformBuffer, stamps: NDArray[np.int64]
+    def _write_lookups(
+        self, table: Table, survey: Survey, source: StreamedBuffer | ReloadedBuffer
     ) -> ExportReport:
-        report, nothing = self._report(), buffer.joint_states(self.robot, 0, 0)
-        for first in range(0, len(stamps), _ROWS):
-            part = stamps[first : first + _ROWS]
-            positions, valid = buffer.joint_positions_many(self.robot, part)
+        """Write the rows of ``survey`` with lookups in the buffers of ``source``."""
+        report = self._report()
+        if self._is_as_recorded:
+            for trajectory in self._recorded(survey):
+                self._write_rows(table, trajectory, source.around(trajectory.stamps), report)
+        for first in () if self._is_as_recorded else range(0, len(survey.stamps), _ROWS):
+            stamps = survey.stamps[first : first + _ROWS]
+            buffer = source.around(stamps)
+            positions, valid = buffer.joint_positions_many(self.robot, stamps)
             report.unknown_joints += int((~valid).sum())
-            self._write_rows(table, replace(nothing, stamps=part, positions=positions), buffer, report)
+            trajectory = replace(buffer.joint_states(self.robot, 0, 0), stamps=stamps, positions=positions)
+            self._write_rows(table, trajectory, buffer, report)
+        source.finish()
         report.refused += self._refusals.counts
         return report
+
+    def _recorded(self, survey: Survey) -> Iterator[JointTrajectory]:
+        """The samples of ``survey``."""
+        histories = 0
+        for trajectory, restarts in self._samples():
+            histories += restarts
+            if histories == survey.histories:
+                yield trajectory.with_kinds(survey.kinds)
 
     def _report(self) -> ExportReport:
         return ExportReport(self.robot, unknown_poses=dict.fromkeys(self._poses, 0))
@@ -239,6 +269,133 @@ class Exporter:
         report.rows += len(trajectory)
         report.joint_count = len(trajectory.joint_names)
         report.kinds = ("position", *sorted(trajectory.kinds, reverse=True))
+
+
+class Survey(NamedTuple):
+    """The ``stamps`` of all rows [ns]; of samples as recorded also their ``kinds``, in the last history.
+
+    ``histories`` counts the histories that other ones replaced.
+    """
+
+    stamps: NDArray[np.int64]
+    kinds: frozenset[str] = frozenset()
+    histories: int = 0
+
+
+class _Changed(Exception):
+    """The rest of a recording changes what earlier lookups returned."""
+
+
+class StreamedBuffer:
+    """A buffer that follows ascending ``stamps`` through a recording, which is read once.
+
+    It holds what lookups of ``poses`` and of the positions of ``robot`` need at the next stamps. They equal
+    those in the whole recording unless the rest of it changes the past: a clock is set back, a model
+    replaced, a static edge moved, a frame placed on another, or a sample comes more than 10 s late. Then
+    ``around`` and ``finish`` raise _Changed, also if an edge pauses for ``_MAX_KEPT`` samples of another.
+    """
+
+    def __init__(
+        self, recording: Recording, robot: str, poses: Sequence[Frames], stamps: NDArray[np.int64]
+    ) -> None:
+        self._robot = robot
+        self._poses = poses
+        self._stamps = stamps
+        self._buffer = TransformBuffer(HISTORY_S)
+        self._messages = recording.fill(self._buffer)
+        self._newest = -(1 << 63)
+        self._returned: int | None = None
+        self._layout: tuple[Sequence[object], Sequence[FrameInfo]] = (), ()
+
+    def around(self, stamps: NDArray[np.int64]) -> TransformBuffer:
+        """The buffer for the next of the stamps. Raises LookupFailed for frames without a path."""
+        last = int(stamps[-1])
+        while not self._has_passed(last) and self._read():
+            pass
+        self._check()
+        self._returned = last
+        self._stamps = self._stamps[len(stamps) :]
+        return self._buffer
+
+    def finish(self) -> None:
+        """Read the rest of the recording."""
+        while self._read():
+            pass
+        self._check()
+
+    def _read(self) -> bool:
+        """Insert the next messages; False at the end of the recording."""
+        messages = [decoded.message for decoded in islice(self._messages, _ROWS)]
+        for message in messages:
+            if isinstance(message, Sample):
+                if self._returned is not None and message.stamp <= self._returned:
+                    raise _Changed
+                self._newest = max(self._newest, message.stamp)
+        reached = self._stamps.searchsorted(self._newest, "right")
+        self._buffer.keep_only_around(self._stamps[: reached + 1])
+        return len(messages) == _ROWS
+
+    def _has_passed(self, stamp: int) -> bool:
+        """Whether all samples that lookups until ``stamp`` need were read."""
+        try:
+            frames = self._moving_frames()
+        except LookupFailed:  # its edges may follow
+            return False
+        if any(frame.count > _MAX_KEPT for frame in frames):
+            raise _Changed
+        is_known = all(frame.newest is not None and frame.newest >= stamp for frame in frames)
+        return is_known and self._newest >= stamp + DELAYED_NS
+
+    def _moving_frames(self) -> list[FrameInfo]:
+        """The frames whose samples lookups read."""
+        joints = (frame for frame in self._buffer.frames() if frame.kind == "joint")
+        own = (frame for frame in joints if frame_owner(frame.name) == self._robot)
+        paths = (frame for pair in self._poses for _, frame in self._buffer.path_frames(*pair))
+        moving = (frame for frame in paths if frame is not None and frame.kind in ("joint", "pose"))
+        return [*islice(own, 1), *moving]  # all joints of a robot have the same samples
+
+    def _check(self) -> None:
+        """Raise _Changed if frames, edges or the beginnings of histories are others than before."""
+        try:
+            layout = [self._buffer.path(*pair) for pair in self._poses], self._moving_frames()
+        except LookupFailed:
+            if self._returned is None:
+                raise
+            raise _Changed from None
+        if self._returned is not None:
+            paths = zip(layout[0], self._layout[0], strict=True)
+            beginnings = [
+                [(one.name, one.oldest) for one in frames] for frames in (layout[1], self._layout[1])
+            ]
+            if beginnings[0] != beginnings[1] or any(path is not before for path, before in paths):
+                raise _Changed
+        self._layout = layout
+
+
+class ReloadedBuffer:
+    """Buffers around ``stamps`` in any order, for which the recording is read every ``_RELOADED_ROWS``."""
+
+    def __init__(self, recording: Recording, poses: Sequence[Frames], stamps: NDArray[np.int64]) -> None:
+        self._recording = recording
+        self._poses = poses
+        self._stamps = stamps
+        self._buffer = TransformBuffer()
+        self._rows = 0
+
+    def around(self, stamps: NDArray[np.int64]) -> TransformBuffer:
+        """The buffer for the next of the stamps. Raises LookupFailed for frames without a path."""
+        if len(stamps) > self._rows:
+            window = self._stamps[: max(len(stamps), _RELOADED_ROWS)]
+            self._buffer = self._recording.buffer(window)
+            for target, source in self._poses:
+                self._buffer.path(target, source)
+            self._rows = len(window)
+        self._stamps = self._stamps[len(stamps) :]
+        self._rows -= len(stamps)
+        return self._buffer
+
+    def finish(self) -> None:
+        """Nothing: each buffer is of the whole recording."""
 
 
 def joint_columns(trajectory: JointTrajectory) -> dict[str, NDArray[Any]]:

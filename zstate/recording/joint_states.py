@@ -7,7 +7,8 @@ decoded together, in a fraction of the time; the samples kept are the same, and 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,40 @@ class JointStatePart(NamedTuple):
 
     trajectory: JointTrajectory
     restarts: bool
+
+
+class _GrowingTrajectory:
+    """Consecutive trajectories as one, in arrays that grow in place: no sample is in memory twice."""
+
+    def __init__(self, first: JointTrajectory) -> None:
+        self._arrays: dict[str, NDArray[Any]] = {}
+        self._count = 0
+        self.append(first)
+
+    def append(self, part: JointTrajectory) -> None:
+        """Append a trajectory of the same joints."""
+        first, self._count = self._count, self._count + len(part)
+        self._newest = part
+        for name in ("stamps", "positions", "velocities", "efforts"):
+            block: NDArray[Any] | None = getattr(part, name)
+            if block is not None and name not in self._arrays:
+                unknown = np.nan if first else 0  # none is without a stamp
+                self._arrays[name] = np.full((first, *block.shape[1:]), unknown, block.dtype)
+            if name in self._arrays:
+                array = self._arrays[name]
+                if len(array) < self._count:
+                    _resize(array, self._count + self._count // 8)
+                array[first : self._count] = np.nan if block is None else block
+
+    def trajectory(self) -> JointTrajectory:
+        """All of them. No ``append`` may follow."""
+        for array in self._arrays.values():
+            _resize(array, self._count)
+        return replace(self._newest, **self._arrays)
+
+
+def _resize(array: NDArray[Any], rows: int) -> None:
+    array.resize((rows, *array.shape[1:]), refcheck=False)  # there is no other reference
 
 
 class _Batch(NamedTuple):
@@ -88,12 +123,13 @@ class JointStateReader:
 
     def all(self) -> JointTrajectory:
         """All samples."""
-        parts: list[JointTrajectory] = []
+        whole: _GrowingTrajectory | None = None
         for trajectory, restarts in self.parts():
-            if restarts:
-                parts.clear()
-            parts.append(trajectory)
-        return concatenate(parts) if parts else self._layout.empty()
+            if whole is None or restarts:
+                whole = _GrowingTrajectory(trajectory)
+            else:
+                whole.append(trajectory)
+        return self._layout.empty() if whole is None else whole.trajectory()
 
     def parts(self) -> Iterator[JointStatePart]:
         """All samples in order of their stamps, which ascend across parts too.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import secrets
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import ExitStack
-from typing import NamedTuple
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
+from typing import NamedTuple, TypeAlias
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
@@ -24,7 +25,7 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder
-from zstate.wire.keys import MODEL_WRITER, NAMED_STREAMS, Stream
+from zstate.wire.keys import MODEL_WRITER, NAMED_STREAMS, Stream, full_name
 from zstate.wire.messages import (
     Edges,
     JointState,
@@ -32,8 +33,13 @@ from zstate.wire.messages import (
     RobotDescription,
     StaticTransforms,
     TransformSample,
+    WriterTransforms,
+    select_edges,
 )
 from zstate.wire.registry import get_wire
+
+EdgeWriter: TypeAlias = tuple[str, str]
+"""The robot and the name of a writer of transforms."""
 
 _SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
 
@@ -67,25 +73,18 @@ class PlaybackPublishers(Closeable):
         self._sessions: set[int] = set()
         self._robots: dict[str, _RobotPublisher] = {}
         self._others: dict[str, PassthroughPublisher] = {}
-        self._transforms: dict[tuple[str, str], PassthroughPublisher] = {}
         with ExitStack() as opening:
             opening.callback(lambda: [robot.publisher.close() for robot in self._robots.values()])
             for robot, model in models.items():
                 self._open(robot, model, _is_computed(robot, writers))
             recorded = {(writer.robot, writer.stream) for writer in writers}
             moving = {(one.robot, one.edge_writer) for one in writers if one.stream == "transforms"}
-            for robot, name in sorted((robot, name or "") for robot, name in moving):
-                self._transforms[robot, name] = opening.enter_context(
-                    PassthroughPublisher(
-                        session,
-                        wires,
-                        robot,
-                        ("transforms",),
-                        name,
-                        sessions=self._sessions,
-                        takeover=takeover,
-                    )
+            self._transforms = opening.enter_context(
+                TransformPlayback(
+                    partial(PassthroughPublisher, session, wires, sessions=self._sessions, takeover=takeover),
+                    sorted((robot, name or "") for robot, name in moving),
                 )
+            )
             for robot in {robot for robot, _ in recorded if robot}:
                 own = self._robots[robot].streams if robot in self._robots else ()
                 streams: list[Stream] = [
@@ -156,7 +155,7 @@ class PlaybackPublishers(Closeable):
             positions, velocities, efforts = robot.order.read(message)
             robot.publisher.publish(positions, velocities, efforts, message.stamp)
         elif isinstance(message, TransformSample) and writer.stream == "transforms":
-            self._transforms[writer.robot, writer.edge_writer or ""].publish(message)
+            self._transforms.publish((writer.robot, writer.edge_writer or ""), message)
         elif isinstance(message, TransformSample):
             rest = self._computed.filter_sample(writer.robot, message)
             if rest is None or (robot is not None and "tf" in robot.streams):
@@ -177,6 +176,71 @@ class _RobotPublisher(NamedTuple):
     publisher: StatePublisher
     order: JointOrder
     streams: tuple[Stream, ...]
+
+
+class TransformPlayback(Closeable):
+    """Publishes the recorded transforms of ``writers``, given by robot and name, under their names.
+
+    A writer that was restarted under another name, as by default, places the frames of its predecessor. Two
+    writers of one frame exclude each other, and readers would refuse the second: the publisher of the
+    predecessor publishes its edges on. If one has another parent now, that publisher is closed instead, as
+    the predecessor was. ``open_publisher(robot, streams, name)`` opens one, and may raise SecondWriter.
+    """
+
+    def __init__(
+        self, open_publisher: Callable[..., PassthroughPublisher], writers: Sequence[EdgeWriter]
+    ) -> None:
+        self._open_publisher = open_publisher
+        self._publishers: dict[EdgeWriter, PassthroughPublisher] = {}
+        self._parents: dict[Edge, tuple[str, EdgeWriter]] = {}
+        """The parent and the writer of each frame, by robot and frame."""
+        self._routes: dict[tuple[EdgeWriter, Edges], dict[EdgeWriter, list[int]]] = {}
+        try:
+            for writer in writers:
+                self._publisher(writer)
+        except BaseException:
+            self.close()
+            raise
+
+    def publish(self, writer: EdgeWriter, sample: TransformSample) -> None:
+        """Publish one sample."""
+        edges = sample.edges or ()
+        route = self._routes.get((writer, edges))
+        if route is None:
+            by_writer: defaultdict[EdgeWriter, list[int]] = defaultdict(list)
+            for row, edge in enumerate(edges):
+                by_writer[self._writer_of(writer, edge)].append(row)
+            route = self._routes[writer, edges] = dict(by_writer)
+        for publishing, rows in route.items():
+            part = sample if len(rows) == len(edges) else select_edges(sample, edges, rows)
+            self._publisher(publishing).publish(part)
+
+    def _writer_of(self, writer: EdgeWriter, edge: Edge) -> EdgeWriter:
+        """The writer by which an edge of ``writer`` is published."""
+        robot = writer[0]
+        with suppress(InvalidInput):  # readers refuse it
+            edge = full_name(robot, edge[0]), full_name(robot, edge[1])
+        parent, child = edge
+        placed = self._parents.get((robot, child))
+        if placed is not None and placed[0] == parent:
+            return placed[1]
+        if placed is not None:
+            if (publisher := self._publishers.pop(placed[1], None)) is not None:
+                publisher.close()
+            self._routes.clear()
+        self._parents[robot, child] = parent, writer
+        return writer
+
+    def _publisher(self, writer: EdgeWriter) -> PassthroughPublisher:
+        if writer not in self._publishers:
+            robot, name = writer
+            self._publishers[writer] = self._open_publisher(robot, ("transforms",), name)
+        return self._publishers[writer]
+
+    def close(self) -> None:
+        """Close all publishers. A second call does nothing."""
+        for publisher in self._publishers.values():
+            publisher.close()
 
 
 class PassthroughPublisher(Closeable):
@@ -241,6 +305,8 @@ class PassthroughPublisher(Closeable):
         if isinstance(message, JointState):
             numbers = (message.positions, message.velocities, message.efforts)
             sample = JointState(*head, *numbers, message.names)
+        elif isinstance(message, WriterTransforms):
+            sample = WriterTransforms(*head, message.poses, message.edges, message.covariances)
         else:
             sample = TransformSample(*head, message.poses, message.edges)
         write_all(self._streams[stream], sample)

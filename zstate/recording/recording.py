@@ -16,7 +16,7 @@ a withdrawn static edge                     the edge, until another writer place
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -55,11 +55,12 @@ from zstate.wire.messages import (
     Sample,
     StaticTransforms,
     TransformSample,
+    covariances_of,
     poses_from_block,
 )
 
 # A buffer that keeps a whole recording: 28 years, on any clock.
-_HISTORY_S = 9e8
+HISTORY_S = 9e8
 # The buffer drops unneeded samples after every so many messages, at least.
 _BATCH = 4096
 _UNNAMED = "a ROS node"
@@ -117,8 +118,17 @@ class Recording(Closeable):
         grows with their number, not with the recording. Reads the recording once from beginning to end.
         """
         stamps = None if around is None else np.unique(check_stamps(around))
-        buffer, counters = TransformBuffer(_HISTORY_S), Counters()
+        buffer = TransformBuffer(HISTORY_S)
+        batch = _BATCH if stamps is None else max(_BATCH, len(stamps))
+        for count, _ in enumerate(self.fill(buffer), 1):
+            if stamps is not None and not count % batch:
+                buffer.keep_only_around(stamps)
+        return buffer
+
+    def fill(self, buffer: TransformBuffer) -> Iterator[DecodedMessage]:
+        """Insert all of the recording into an empty ``buffer``; each message is returned when it is in."""
         buffer.is_recording = True
+        counters = Counters()
         recording = DecodedRecording(self._reader, counters.count_refusal)
         robots = None if self.robot is None else (self.robot,)
         shares_frames = any(
@@ -130,12 +140,9 @@ class Recording(Closeable):
             model = recorded_model(recording, description, counters.count_refusal)
             if model is not None:
                 loader.add_model(description, model)
-        batch = _BATCH if stamps is None else max(_BATCH, len(stamps))
-        for count, decoded in enumerate(recording.messages(robots), 1):
+        for decoded in recording.messages(robots):
             loader.insert(decoded)
-            if stamps is not None and not count % batch:
-                buffer.keep_only_around(stamps)
-        return buffer
+            yield decoded
 
     def lookup_many(
         self, target: str, source: str, stamps: ArrayLike
@@ -289,8 +296,10 @@ class RecordedTransformIngest(TransformIngest):
         self._children.update(children)
         if self._epochs.is_new_epoch(sample, children):
             self._drop_edges(set(children))
-        poses = poses_from_block(sample.poses)
-        inserted = self._buffer.insert_many(edges, sample.stamp, poses, writer=self.writer)
+        poses, covariances = poses_from_block(sample.poses), covariances_of(sample)
+        inserted = self._buffer.insert_many(
+            edges, sample.stamp, poses, covariances=covariances, writer=self.writer
+        )
         self._epochs.add(sample, children)
         return inserted
 

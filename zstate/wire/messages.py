@@ -28,6 +28,8 @@ Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
 Level = Literal["ok", "warn", "error", "stale"]
 
 POSE_BYTES = 7 * 8
+COVARIANCE_NUMBERS = 21
+"""The upper triangle of a covariance of a pose."""
 _FLOAT64 = np.dtype("<f8")
 
 
@@ -133,6 +135,23 @@ class WriterTransforms(TransformSample, frozen=True, array_like=True, gc=False):
                 f"{len(self.poses) // POSE_BYTES} poses take 21 numbers of covariance each; got "
                 f"{len(self.covariances)} bytes"
             )
+
+
+def covariances_of(sample: TransformSample) -> NDArray[np.float64] | None:
+    """The covariances of the edges of a sample: (n, 21), read-only, NaN where not known; None if none is."""
+    if not isinstance(sample, WriterTransforms) or sample.covariances is None:
+        return None
+    return from_block(sample.covariances).reshape(-1, COVARIANCE_NUMBERS)
+
+
+def select_edges(sample: TransformSample, edges: Edges, rows: Sequence[int]) -> TransformSample:
+    """The ``rows`` of a sample of ``edges``."""
+    chosen = tuple(edges[row] for row in rows)
+    head = (sample.stamp, sample.seq, sample.session, order_digest(chosen))
+    poses, covariances = poses_from_block(sample.poses), covariances_of(sample)
+    if covariances is None:
+        return TransformSample(*head, to_block(poses[rows]), chosen)
+    return WriterTransforms(*head, to_block(poses[rows]), chosen, to_block(covariances[rows]))
 
 
 class JointCommand(Sample, frozen=True, array_like=True, gc=False):

@@ -6,9 +6,9 @@ from helpers.manual_cdr import STORE, rosbags_joint_state, rosbags_tf_message
 from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosType
+from zstate.wire.ros2.types import CLOCK, JOINT_STATE, POSE_WITH_COVARIANCE, STRING, TF_MESSAGE, RosType
 
-TYPES = (JOINT_STATE, TF_MESSAGE, STRING, CLOCK)
+TYPES = (JOINT_STATE, TF_MESSAGE, STRING, CLOCK, POSE_WITH_COVARIANCE)
 EACH = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])
 
 

@@ -32,9 +32,16 @@ _FIELDS: dict[str, tuple[tuple[str, str], ...]] = {
         ("geometry_msgs/Transform", "transform"),
     ),
     "tf2_msgs/TFMessage": (("geometry_msgs/TransformStamped[]", "transforms"),),
+    "geometry_msgs/Point": (("float64", "x"), ("float64", "y"), ("float64", "z")),
+    "geometry_msgs/Pose": (("geometry_msgs/Point", "position"), ("geometry_msgs/Quaternion", "orientation")),
+    "geometry_msgs/PoseWithCovariance": (("geometry_msgs/Pose", "pose"), ("float64[36]", "covariance")),
+    "geometry_msgs/PoseWithCovarianceStamped": (
+        ("std_msgs/Header", "header"),
+        ("geometry_msgs/PoseWithCovariance", "pose"),
+    ),
 }
 # The numbers of type_description_interfaces/FieldType.
-_NESTED, _UNBOUNDED_SEQUENCE = 1, 144
+_NESTED, _ARRAY, _UNBOUNDED_SEQUENCE = 1, 48, 144
 _PRIMITIVES = {"int32": 6, "uint32": 7, "float64": 11, "string": 17}
 
 _SEPARATOR = "=" * 80
@@ -77,17 +84,18 @@ def _with_parts(short: str) -> Iterator[str]:
     """A type, then recursively the types of its fields; some more than once."""
     yield short
     for kind, _ in _FIELDS[short]:
-        if (part := kind.removesuffix("[]")) in _FIELDS:
+        if (part := kind.partition("[")[0]) in _FIELDS:
             yield from _with_parts(part)
 
 
 def _description(short: str) -> dict[str, Any]:
     fields: list[dict[str, Any]] = []
     for kind, name in _FIELDS[short]:
-        item = kind.removesuffix("[]")
+        item, bracket, length = kind.removesuffix("]").partition("[")
+        several = 0 if not bracket else _ARRAY if length else _UNBOUNDED_SEQUENCE
         field_type = {
-            "type_id": _PRIMITIVES.get(item, _NESTED) + (_UNBOUNDED_SEQUENCE if item != kind else 0),
-            "capacity": 0,
+            "type_id": _PRIMITIVES.get(item, _NESTED) + several,
+            "capacity": int(length or 0),
             "string_capacity": 0,
             "nested_type_name": _full(item) if item in _FIELDS else "",
         }
@@ -99,3 +107,4 @@ JOINT_STATE = RosType.from_fields("sensor_msgs/JointState")
 TF_MESSAGE = RosType.from_fields("tf2_msgs/TFMessage")
 STRING = RosType.from_fields("std_msgs/String")
 CLOCK = RosType.from_fields("rosgraph_msgs/Clock")
+POSE_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/PoseWithCovarianceStamped")
