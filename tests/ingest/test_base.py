@@ -169,6 +169,39 @@ def test_writer_with_a_slow_clock_does_not_take_over_edges_of_a_live_writer():
     assert behind.elbow_is([0, 0], 1003)
 
 
+def test_writer_that_returns_moves_no_edge_that_another_took_over():
+    frozen = IngestCase(TransformIngest)
+    rival = IngestCase(TransformIngest, sharing=frozen)
+    edges, live = edge_names(RRBOT), frozen.live
+
+    def join(case: IngestCase, session: int, name: str) -> None:
+        live["r1", session] = name
+        frozen.ownership.add_writer("r1", session)
+        case.ingest.name_writer(session, name)
+
+    def leave(case: IngestCase, session: int) -> None:
+        del live["r1", session]
+        frozen.ownership.remove_writer("r1", session)
+        case.ingest.writer_left(session)
+
+    join(frozen, 7, "frozen")
+    frozen.receive(*(frozen.sample(seq, [1.0, 1.0], stamp=seq, edges=edges) for seq in range(3)))
+    leave(frozen, 7)
+    join(rival, 8, "rival")
+    rival.receive(*(rival.sample(seq, [2.0, 2.0], 8, 10 + seq, edges=edges) for seq in range(3)))
+    join(frozen, 7, "frozen")
+    frozen.receive(*(frozen.sample(seq, [1.0, 1.0], stamp=20 + seq, edges=edges) for seq in range(3, 6)))
+    assert rival.buffer.latest("r1/upper", "r1/lower") == 12
+    assert rival.elbow_is([2.0, 2.0])
+    assert rival.counters.stats().refused == {"second writer": 3}
+    refusal = rival.counters.refusals()["second writer"]
+    assert "is written by rival already; refused: frozen" in refusal
+    leave(rival, 8)
+    frozen.receive(frozen.sample(6, [1.0, 1.0], stamp=30, edges=edges))
+    assert frozen.buffer.latest("r1/upper", "r1/lower") == 30
+    assert frozen.buffer.explain("r1/upper", "r1/lower", 25) is not None  # between two writers is no pose
+
+
 def test_new_session_starts_a_new_epoch_even_if_its_clock_is_behind(case: IngestCase):
     case.ingest.describe(description())
     case.receive(case.sample(5, [1.0, 1.0], session=1, stamp=10**12))

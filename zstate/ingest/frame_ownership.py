@@ -332,7 +332,8 @@ class FrameOwnership:
             del self._claims[claim.child]
         self._outside.pop(claim, None)
         self._refused.pop(claim, None)
-        self.version += self._is_shared  # samples that are refused as a whole have no claims
+        # If all writers share all frames, samples that are refused as a whole have no claims.
+        self.version += self._is_shared or claim.pose is None
         if self._is_in_buffer(claim):
             self.buffer.withdraw(claim.child)
             self._is_resolved &= not rest
