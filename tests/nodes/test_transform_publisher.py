@@ -2,15 +2,17 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from helpers.processes import SOON_S, until
+from helpers.processes import SOON_S, find_free_port, until
 from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
-from zstate.net.presence import discover
+from zstate.net.presence import announce, current_tokens, discover
+from zstate.net.session import connect
 from zstate.net.status import StatusSubscriber
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
@@ -18,6 +20,8 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.keys import writer_key
 from zstate.wire.messages import Status, WriterTransforms, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.protocol import SerializedSample
@@ -166,6 +170,58 @@ def test_of_two_writers_that_start_an_edge_at_once_one_is_refused(sessions):
         futures = [threads.submit(writer.publish, [pose("odom", "base_link")]) for writer in (one, other)]
         errors = [future.exception(timeout=SOON_S) for future in futures]
     assert sorted(type(error).__name__ for error in errors) == ["NoneType", "SecondWriter"]
+
+
+@pytest.mark.parametrize("later_publishes_first", [True, False])
+def test_later_writer_of_an_edge_ends_when_two_networks_are_joined(later_publishes_first):
+    endpoints = [f"tcp/127.0.0.1:{find_free_port()}" for _ in range(2)]
+    edges = [pose("odom", "base_link")]
+    with ExitStack() as opened:
+        ours, theirs = (opened.enter_context(connect(listen=endpoint)) for endpoint in endpoints)
+        first = opened.enter_context(TransformPublisher(ours, "r1", "wheels", program="wheels.py"))
+        second = opened.enter_context(TransformPublisher(theirs, "r1", "visual"))
+        for publisher in (first, second):
+            publisher.publish(edges)
+        opened.enter_context(connect(endpoints=endpoints))
+        for session in (ours, theirs):
+            until(lambda s=session: len(current_tokens(s, "zstate/*/@edge/**", 1.0)) == 2)
+        if not later_publishes_first:
+            first.publish(edges)
+        second.publish(edges)  # a token alone displaces no writer
+        with pytest.raises(SecondWriter, match=r"wheels\.py.* places 'r1/base_link' on 'r1/odom'") as raised:
+            until(lambda: first.publish(edges) or second.publish(edges))
+        assert raised.value.edge == ("r1/odom", "r1/base_link")
+        until(lambda: len(current_tokens(ours, "zstate/*/@edge/**", 1.0)) == 1)
+        with pytest.raises(SecondWriter):
+            second.publish([pose("map", "ball")])
+        first.publish(edges)
+
+
+def test_token_of_an_earlier_writer_ends_none_that_publishes_an_edge(sessions):
+    ours, theirs = sessions
+    stranger = Announcement("r1", "transforms", WriterId("stranger", "laptop", 9, 1, 99), "stranger")
+    with (
+        TransformPublisher(ours, "r1", "wheels") as wheels,
+        StreamPublisher(theirs, "zstate/r1/transforms/stranger", ENCODINGS[WriterTransforms]) as stream,
+    ):
+        wheels.publish([pose("odom", "base_link")])
+        with announce(theirs, writer_key("r1", "transforms", stranger.identity)):
+            until(lambda: len(current_tokens(ours, "zstate/r1/@writer/*/*", 1.0)) == 2)
+
+            def publish_both(child: str, seconds: float) -> bool:
+                deadline = time.monotonic() + seconds
+                while time.monotonic() < deadline:
+                    names = (("odom", child),)
+                    stream.put(
+                        encode(WriterTransforms(1, 0, 99, order_digest(names), to_block(np.eye(7)[6]), names))
+                    )
+                    wheels.publish([pose("odom", "base_link")])
+                return True
+
+            assert publish_both("another", 0.3)
+            with pytest.raises(SecondWriter) as raised:
+                publish_both("base_link", SOON_S)
+    assert raised.value.first == stranger.writer
 
 
 def test_link_of_an_announced_model_is_refused(sessions):
