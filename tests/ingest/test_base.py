@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import pytest
 from helpers.robots import RRBOT, assert_pose, kinematic_pose
 
@@ -200,6 +202,29 @@ def test_writer_that_returns_moves_no_edge_that_another_took_over():
     frozen.receive(frozen.sample(6, [1.0, 1.0], stamp=30, edges=edges))
     assert frozen.buffer.latest("r1/upper", "r1/lower") == 30
     assert frozen.buffer.explain("r1/upper", "r1/lower", 25) is not None  # between two writers is no pose
+
+
+def test_frames_and_memory_of_a_writer_of_many_edges_are_bounded(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("zstate.ingest.frame_ownership.MAX_MOVING_FRAMES", 50)
+    monkeypatch.setattr("zstate.ingest.transforms._MAX_CACHED_EDGES", 100)
+    monkeypatch.setattr("zstate.buffer.pose_tracks._MAX_CACHED_EDGES", 100)
+    case = IngestCase(TransformIngest)
+
+    def sample(seq: int, edges: tuple[tuple[str, str], ...]) -> TransformSample:
+        poses = to_block([[0.0, 0.0, float(seq), 0.0, 0.0, 0.0, 1.0]] * len(edges))
+        return TransformSample(seq, seq, 7, order_digest(edges), poses, edges)
+
+    frames = [("odom", f"frame{number}") for number in range(50)]
+    shuffled = list(permutations(frames[:5]))
+    case.receive(sample(0, tuple(frames)))
+    case.receive(*(sample(seq, tuple(edges)) for seq, edges in enumerate(shuffled, 1)))
+    case.receive(sample(200, (("odom", "another"),)))
+    assert case.counters.stats().refused == {"too many frames": 1}
+    assert "moves 50 frames, and 1 more would exceed the limit" in case.counters.refusals()["too many frames"]
+    assert len(case.ingest._full_names) <= 20
+    assert len(case.buffer._pose_tracks._cache) <= 20
+    case.receive(sample(201, tuple(frames[:5])))
+    assert case.buffer.lookup("r1/odom", "r1/frame4").translation[2] == 201.0
 
 
 def test_new_session_starts_a_new_epoch_even_if_its_clock_is_behind(case: IngestCase):

@@ -41,6 +41,9 @@ from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, Stream, foreign_edge_prob
 CONTESTED = ("second parent", "second writer", "loop")
 """The refusal reasons of edges that exclude each other."""
 
+MAX_MOVING_FRAMES = 100_000
+"""Limit of the frames that the writers of one robot move: a buffer removes no frame, and each takes 2 kB."""
+
 # A static edge this close to the model's [m, or the sine of an angle] was computed from the same URDF.
 _SAME_POSE = 1e-6
 
@@ -131,6 +134,7 @@ class FrameOwnership:
         self._placers = placers
         self._on_conflict = on_conflict
         self._robots: set[str] = set()
+        self._moved: dict[str, set[str]] = {}
         self._departed: BoundedDict[tuple[str, int], None] = BoundedDict()
         self._claims: dict[str, list[EdgeClaim]] = {}
         self._outside: dict[EdgeClaim, None] = {}
@@ -249,10 +253,12 @@ class FrameOwnership:
     def admit(self, source: EdgeSource, edges: Sequence[EdgeNames]) -> Admitted:
         """Decide which of these moving edges of ``source`` may be inserted.
 
-        If all writers share all frames, one refused edge refuses the whole sample.
+        If all writers share all frames, one refused edge refuses the whole sample. Raises InsertRefused if
+        the robot's writers have moved 100,000 frames, for a sample with another one.
         """
         with self._lock:
             named = [self._named(names) for names in edges]
+            self._count_frames(source.robot, named)
             fresh = [
                 self._claim(source, names) for names in dict.fromkeys(named) if names not in source.claims
             ]
@@ -274,6 +280,17 @@ class FrameOwnership:
                     self._add_frames(claim)
             rows = [row for row, claim in enumerate(claims) if claim.is_accepted]
             return Admitted(None if refusal is None else tuple(rows), refusal)
+
+    def _count_frames(self, robot: str, edges: Sequence[EdgeNames]) -> None:
+        moved = self._moved.setdefault(robot, set())
+        new = {child for _, child in edges}.difference(moved)
+        if new and len(moved) + len(new) > MAX_MOVING_FRAMES:
+            text = (
+                f"{robot!r} moves {len(moved)} frames, and {len(new)} more would exceed the limit of "
+                f"{MAX_MOVING_FRAMES}; give each frame the same name for as long as the robot runs"
+            )
+            raise InsertRefused(text, reason="too many frames", edge=edges[0])
+        moved |= new
 
     def release(self, source: EdgeSource) -> None:
         """Remove all edges of ``source``."""
