@@ -253,14 +253,12 @@ def reader(session: Session, robot: str = "*", follow: str = "joint_states", bus
 
 
 def _slow_down_inserts(listener: TransformListener, busy_ms: float) -> None:
-    def slowed(insert: Answer) -> Answer:
-        def slowly(*arguments: Any, **options: Any) -> bool:
-            until = time.perf_counter() + busy_ms * 1e-3
-            while time.perf_counter() < until:
-                pass
-            return insert(*arguments, **options)
+    insert = listener.buffer.insert_joints
 
-        return slowly
+    def slowly(*arguments: Any) -> bool:
+        until = time.perf_counter() + busy_ms * 1e-3
+        while time.perf_counter() < until:
+            pass
+        return insert(*arguments)
 
-    for name in ("insert_joints", "insert_many"):
-        setattr(listener.buffer, name, slowed(getattr(listener.buffer, name)))
+    listener.buffer.insert_joints = slowly  # type: ignore[method-assign]

@@ -1,8 +1,10 @@
 """TransformPublisher: moving edges of several writers, beside a robot's joint states."""
 
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from itertools import count
 
 import numpy as np
 import pytest
@@ -402,6 +404,83 @@ def test_edges_of_writers_that_have_left_stay(sessions, monkeypatch: pytest.Monk
             left = 2 * (number + 1)  # each has joined and left
             until(lambda left=left: len(listener.events()) == left)
         assert all(listener.buffer.can_lookup("odom", f"frame{number}") for number in range(3))
+
+
+def test_samples_lost_in_a_full_ring_are_counted_and_the_others_inserted(
+    sessions, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("zstate.net.streams.WILDCARD_CAPACITY", 64)
+    writer, reader = sessions
+    stamp, goes_on = time.time_ns(), threading.Event()
+    with (
+        TransformPublisher(writer, "r1", "odometry") as odometry,
+        TransformListener(reader, "r1", history_on_join=False) as listener,
+    ):
+        insert = listener.buffer.insert_many
+
+        def slowly(*arguments: object, **options: object) -> bool:
+            goes_on.wait(SOON_S)
+            return insert(*arguments, **options)
+
+        monkeypatch.setattr(listener.buffer, "insert_many", slowly)
+        for step in range(500):
+            odometry.publish([pose("odom", "base_link", float(step))], stamp + step * MS)
+        goes_on.set()
+
+        def is_last_counted() -> bool:
+            stats = listener.stats
+            return stats.received + stats.dropped + stats.missed == 500 and stats.dropped > 0
+
+        until(is_last_counted)
+        for at in range(0, 500, 7):  # the motion is linear: a gap changes no pose
+            found = listener.buffer.lookup("odom", "base_link", stamp + at * MS)
+            assert found.translation[0] == pytest.approx(at)
+
+
+def test_writer_with_a_clock_set_back_restarts_only_its_own_edges(sessions):
+    writer, reader = sessions
+    now = time.time_ns()
+    with (
+        TransformPublisher(writer, "r1", "wheels") as wheels,
+        TransformPublisher(writer, "r1", "tracker") as tracker,
+        TransformListener(reader, "r1") as listener,
+    ):
+
+        def counts() -> dict[str, int]:
+            return {frame.name: frame.count for frame in listener.buffer.frames() if frame.parent}
+
+        for step in range(5):
+            wheels.publish([pose("odom", "base_link")], now + step * MS)
+            tracker.publish([pose("map", "ball")], now + step * MS)
+        until(lambda: counts() == {"r1/base_link": 5, "r1/ball": 5})
+        for step in range(3):  # the first late sample may have a wrong stamp; the second begins a new epoch
+            wheels.publish([pose("odom", "base_link")], now - 3600 * SECOND + step * MS)
+        until(lambda: counts() == {"r1/base_link": 2, "r1/ball": 5})
+        (event,) = [event for event in listener.events() if event.kind == "set back"]
+        assert (event.stream, event.writer and event.writer.session) == ("transforms", wheels._session_id)
+
+
+def test_publish_from_many_threads_numbers_the_samples_and_close_ends_them(sessions):
+    writer, reader = sessions
+    stamp = time.time_ns()
+    odometry = TransformPublisher(writer, "r1", "odometry")
+
+    sent = [0] * 4
+
+    def publish(number: int) -> None:
+        with suppress(Closed):
+            for sent[number] in count():
+                odometry.publish([pose("odom", f"wheel{number}")], stamp + sent[number] * MS)
+
+    with TransformListener(reader, "r1") as listener, ThreadPoolExecutor(4) as threads:
+        published = [threads.submit(publish, number) for number in range(4)]
+        until(lambda: odometry.stats.sent >= 400)
+        odometry.close()
+        for future in published:
+            future.result(timeout=SOON_S)
+        assert odometry.stats.sent == sum(sent)
+        until(lambda: listener.stats.received > 0)
+        assert (listener.stats.refused, listener.stats.late) == ({}, 0)
 
 
 @pytest.mark.parametrize("transforms", [pose("odom", "base_link"), [("odom", "base_link")], "odom", None])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ ROUNDS = 4
 RATE_HZ = 100.0
 BOUND_S = 1.0
 TOKEN_EXPIRY_S = 0.5
+HOUR = 3600 * 1_000_000_000
 
 
 class Site:
@@ -178,3 +180,38 @@ def test_writer_frozen_for_so_long_that_another_took_its_edge_continues_and_the_
     (conflict,) = conflicts(reader)
     for process in (frozen, rival):
         assert f"pid {process.child.process.pid}" in conflict
+
+
+def test_denied_writer_gets_the_missing_rule_and_doctor_reports_a_denied_reader(start: Start, site: Site):
+    start("odometry", robot="r1", session=site.join("r1"), writer="wheels")
+    denied = start("odometry", robot="r1", session=site.join("r2"), writer="visual", wait=False)
+    with ThreadPoolExecutor() as threads:
+        robot, stranger = (threads.submit(site.doctor, identity) for identity in ("r2", "stranger"))
+    assert robot.result().returncode == stranger.result().returncode == 1
+    report = robot.result().stdout.decode()
+    assert "none of its data arrives: the router denies zstate/r1/** to the certificate" in report
+    assert "next: zstate acl --viewer NAME" in report
+    assert "or the router shows none to the certificate" in stranger.result().stdout.decode()
+    assert denied.child.wait() != 0
+    for text in ("AccessDenied", "r2.pem", "'r1 writes'", "`zstate acl --robot r1`"):
+        assert text in denied.child.stderr
+
+
+def test_clock_of_one_writer_set_back_restarts_only_its_edges(start: Start, endpoint: str):
+    start("router", listen=endpoint)
+    odometry = start("odometry", robot="r1", session=client(endpoint), writer="wheels")
+    start("publisher", robot="r1", session=client(endpoint))
+    reader = start("reader", session=client(endpoint), robot="r1")
+    for motion in ("", "odometry "):
+        assert reader.query(f"{motion}after", "r1", 0)
+    reader.query("watch", "r1")
+    for shift in (-HOUR, 0):
+        stepped = odometry.query("shift", shift)
+        assert reader.query("odometry near", "r1", stepped)
+        assert reader.query("odometry after", "r1", stepped + 50_000_000)
+    assert_all_true(reader, "")
+    (set_back,) = [event for event in reader.query("events") if event[0] == "set back"]
+    assert set_back[1] == "transforms"
+    stats = reader.query("stats")
+    assert stats["refused"] == {}
+    assert stats["missed"] <= 1
