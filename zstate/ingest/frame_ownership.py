@@ -13,9 +13,9 @@ order they arrive:
 3. edges by which other writers place the robot's root.
 
 Among equals, an edge that places the root of a model yields to one that does not, then an edge of a writer
-that has left to one of a writer that is announced, then a static edge to a moving one, then the later edge
-to the earlier one. Refused edges are kept, and accepted once nothing conflicts with them: the buffer depends
-on what is published, not on the order of arrival.
+that has left, or that moves it without being announced, to one of a writer that is announced, then a static
+edge to a moving one, then the later edge to the earlier one. Refused edges are kept, and accepted once
+nothing conflicts with them: the buffer depends on what is published, not on the order of arrival.
 """
 
 from __future__ import annotations
@@ -154,9 +154,11 @@ class FrameOwnership:
                 self.resolve()
 
     def add_writer(self, robot: str, session: int) -> None:
-        """Add an announced writer of static edges."""
+        """Add an announced writer of edges."""
         with self._lock:
             self._departed.pop((robot, session), None)
+            if self._refused:
+                self.resolve()
 
     def remove_writer(self, robot: str, session: int) -> None:
         """Remove a writer that has left. Its edges stay until they conflict with an announced one's."""
@@ -451,7 +453,8 @@ class FrameOwnership:
         return accepted, roots
 
     def _is_departed(self, claim: EdgeClaim) -> bool:
-        return (claim.source.robot, claim.source.session) in self._departed
+        is_unannounced = not self._is_shared and claim.pose is None and not self._is_live(claim.source)
+        return is_unannounced or (claim.source.robot, claim.source.session) in self._departed
 
     def _refusal(self, claim: EdgeClaim, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
         """The refusal of an edge that conflicts with the edges accepted before it."""
@@ -519,6 +522,10 @@ class FrameOwnership:
 def _loop(names: EdgeNames, by: str, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
     """The refusal of an edge that would close a loop."""
     parent, child = names
+    if parent == child:
+        return InsertRefused(
+            f"{parent!r} -> {child!r}: a frame cannot be placed on itself", reason="self edge", edge=names
+        )
     ring, below, writer = [parent], child, by
     while ring[-1] != child:
         above = accepted.get(ring[-1])
