@@ -180,7 +180,10 @@ def odometry(
         except ZStateError as error:
             errors.append(f"{type(error).__name__}: {error}")
 
-    with join(session) as opened, TransformPublisher(opened, robot, writer, clock=clock) as writing:
+    with (
+        join(session) as opened,
+        TransformPublisher(opened, robot, writer, clock=clock, cache_s=60.0) as writing,
+    ):
         threading.Thread(target=run, daemon=True).start()
         _serve_queries(
             sent=lambda: writing.stats.sent,
@@ -225,7 +228,7 @@ def reader(session: Session, robot: str = "*", follow: str = "joint_states", bus
     """
     with (
         join(session) as opened,
-        TransformListener(opened, robot, follow=follow, on_event=lambda _: None) as listener,
+        TransformListener(opened, robot, follow=follow, history_s=60.0, on_event=lambda _: None) as listener,
     ):
         answers = {
             "": ReaderQueries(listener, ArmMotion()),

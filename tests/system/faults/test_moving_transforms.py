@@ -18,7 +18,7 @@ from helpers.processes import find_free_port, until
 
 pytestmark = pytest.mark.processes
 
-ROUNDS = 4
+ROUNDS = 3
 RATE_HZ = 100.0
 BOUND_S = 1.0
 TOKEN_EXPIRY_S = 0.5
