@@ -15,19 +15,23 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from helpers.fault_queries import ReaderQueries
+from helpers.fault_queries import ArmMotion, OdometryMotion, ReaderQueries
 
 from zstate import (
     SineSource,
     StatePublisher,
     StaticPublisher,
     TransformListener,
+    ZStateError,
     connect,
     load_model,
 )
 from zstate.clock import SystemClock
+from zstate.net.security.acl import AclRoles, access_control
+from zstate.net.security.credentials import Credentials
+from zstate.net.security.router_config import RouterConfig
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.recording.recorder import Recorder
-from zstate.sources.joint_source import JointReading
 from zstate.transform import Transform
 
 CLONE_NEWNET = 0x40000000
@@ -41,7 +45,14 @@ def main() -> None:
     namespace = options.pop("namespace", None)
     if namespace:
         _enter(namespace)
-    {"publisher": publisher, "reader": reader, "recorder": recorder, "router": router}[role](**options)
+    roles: dict[str, Answer] = {
+        "publisher": publisher,
+        "odometry": odometry,
+        "reader": reader,
+        "recorder": recorder,
+        "router": router,
+    }
+    roles[role](**options)
 
 
 def _enter(namespace: str) -> None:
@@ -82,23 +93,34 @@ class ShiftedClock(SystemClock):
         return super().wait_until(stamp - self.shift_ns, stop)
 
 
+def join(session: Session) -> Any:
+    """Connects with the options of ``session``; "certificates" is a folder and a name in it."""
+    options = session.copy()
+    certificates = options.pop("certificates", None)
+    credentials = Credentials.from_folder(*certificates) if certificates else None
+    return connect(credentials=credentials, **options)
+
+
 class PausableSource:
-    """A sine source that keeps its last stamp, and returns no readings after ``pause``."""
+    """A source that keeps its last stamp, and returns nothing after ``pause``. ``read`` is of the source."""
 
-    def __init__(self, source: SineSource) -> None:
-        self._source = source
+    def __init__(self, read: Callable[[int], Any], *, paused: bool = False) -> None:
+        self._read = read
         self._last = 0
-        self._paused = False
+        self._paused = paused
 
-    def read(self, stamp: int) -> JointReading | None:
+    def read(self, stamp: int) -> Any:
         if self._paused:
             return None
         self._last = stamp
-        return self._source.read(stamp)
+        return self._read(stamp)
 
     def pause(self) -> int:
         self._paused = True
         return self._last
+
+    def resume(self) -> None:
+        self._paused = False
 
 
 def publisher(
@@ -106,7 +128,7 @@ def publisher(
 ) -> None:
     """Publishes a moving robot and one extra static edge, whose length is the mark."""
     model, clock = load_model("rrbot"), ShiftedClock()
-    source = PausableSource(SineSource(model))
+    source = PausableSource(SineSource(model).read)
 
     def shift(shift_ns: int) -> int:
         clock.shift_ns = shift_ns
@@ -118,7 +140,7 @@ def publisher(
         return time.monotonic() - began
 
     with (
-        connect(**session) as opened,
+        join(session) as opened,
         StatePublisher(opened, model, robot, clock=clock, takeover=takeover) as writing,
         StaticPublisher(opened, robot, f"mark.{os.getpid()}", takeover=takeover) as statics,
     ):
@@ -135,8 +157,45 @@ def publisher(
         _serve_queries(mark=put_mark, shift=shift, pause=source.pause, routers=routers, leave=leave)
 
 
+def odometry(
+    robot: str,
+    session: Session,
+    writer: str | None = None,
+    rate_hz: float = 100.0,
+    lane: int = 0,
+    *,
+    paused: bool = False,
+) -> None:
+    """Publishes ``OdometryMotion`` until an error ends it; if ``paused``, from the query "resume" on."""
+    motion, clock, errors = OdometryMotion(lane), ShiftedClock(), list[str]()
+    source = PausableSource(lambda stamp: [motion.pose(stamp)], paused=paused)
+
+    def shift(shift_ns: int) -> int:
+        clock.shift_ns = shift_ns
+        return clock.now()
+
+    def run() -> None:
+        try:
+            writing.run(source, rate_hz)
+        except ZStateError as error:
+            errors.append(f"{type(error).__name__}: {error}")
+
+    with (
+        join(session) as opened,
+        TransformPublisher(opened, robot, writer, clock=clock, cache_s=60.0) as writing,
+    ):
+        threading.Thread(target=run, daemon=True).start()
+        _serve_queries(
+            sent=lambda: writing.stats.sent,
+            errors=lambda: errors,
+            shift=shift,
+            pause=source.pause,
+            resume=source.resume,
+        )
+
+
 def recorder(session: Session, path: str) -> None:
-    with connect(**session) as opened, Recorder(opened, path, ["r1"]) as recording:
+    with join(session) as opened, Recorder(opened, path, ["r1"]) as recording:
 
         def ended() -> str | None:
             return f"{type(recording.failure).__name__}: {recording.failure}" if recording.wait(0.0) else None
@@ -144,26 +203,55 @@ def recorder(session: Session, path: str) -> None:
         _serve_queries(ended=ended, written=lambda: sum(recording.stats.messages.values()))
 
 
-def router(listen: str, connect_to: list[str] | None = None) -> None:
-    with connect(mode="router", listen=listen, endpoints=connect_to or ()) as opened:
+def router(
+    listen: str,
+    connect_to: list[str] | None = None,
+    certificates: tuple[str, str] | None = None,
+    roles: dict[str, list[str]] | None = None,
+) -> None:
+    """A router; with ``roles`` it has access control, the arguments of ``AclRoles``."""
+    if roles is None:
+        opening = connect(mode="router", listen=listen, endpoints=connect_to or ())
+    else:
+        assert certificates is not None
+        access = access_control(AclRoles(**{role: tuple(names) for role, names in roles.items()}))
+        credentials = Credentials.from_folder(*certificates)
+        opening = connect(RouterConfig((listen,), credentials=credentials, access_control=access).settings())
+    with opening as opened:
         _serve_queries(zid=lambda: opened.zid)
 
 
 def reader(session: Session, robot: str = "*", follow: str = "joint_states", busy_ms: float = 0.0) -> None:
-    """Listens to robots; with ``busy_ms`` each insert blocks the process for that long."""
-    with connect(**session) as opened, TransformListener(opened, robot, follow=follow) as listener:
-        answers = ReaderQueries(listener)
+    """Listens to robots; with ``busy_ms`` each insert blocks the process for that long.
+
+    Replies to the queries of ``ReaderQueries`` about the arm, and as ``odometry NAME`` about the odometry.
+    """
+    with (
+        join(session) as opened,
+        TransformListener(opened, robot, follow=follow, history_s=60.0, on_event=lambda _: None) as listener,
+    ):
+        answers = {
+            "": ReaderQueries(listener, ArmMotion()),
+            "odometry ": ReaderQueries(listener, OdometryMotion()),
+        }
         if busy_ms:
             _slow_down_inserts(listener, busy_ms)
+        names = (
+            "after",
+            "newest",
+            "near",
+            "mark",
+            "stats",
+            "watch",
+            "watched",
+            "latencies",
+            "count",
+            "wrong",
+            "lane",
+            "events",
+        )
         _serve_queries(
-            after=answers.after,
-            newest=answers.newest,
-            near=answers.near,
-            mark=answers.mark,
-            stats=answers.stats,
-            watch=answers.watch,
-            watched=answers.watched,
-            latencies=answers.latencies,
+            **{f"{motion}{name}": getattr(one, name) for motion, one in answers.items() for name in names}
         )
 
 

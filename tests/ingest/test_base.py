@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import pytest
 from helpers.robots import RRBOT, assert_pose, kinematic_pose
 
@@ -167,6 +169,62 @@ def test_writer_with_a_slow_clock_does_not_take_over_edges_of_a_live_writer():
     del behind.live["r1", 7]
     behind.receive(behind.sample(3, [0, 0], session=8, stamp=1003))
     assert behind.elbow_is([0, 0], 1003)
+
+
+def test_writer_that_returns_moves_no_edge_that_another_took_over():
+    frozen = IngestCase(TransformIngest)
+    rival = IngestCase(TransformIngest, sharing=frozen)
+    edges, live = edge_names(RRBOT), frozen.live
+
+    def join(case: IngestCase, session: int, name: str) -> None:
+        live["r1", session] = name
+        frozen.ownership.add_writer("r1", session)
+        case.ingest.name_writer(session, name)
+
+    def leave(case: IngestCase, session: int) -> None:
+        del live["r1", session]
+        frozen.ownership.remove_writer("r1", session)
+        case.ingest.writer_left(session)
+
+    join(frozen, 7, "frozen")
+    frozen.receive(*(frozen.sample(seq, [1.0, 1.0], stamp=seq, edges=edges) for seq in range(3)))
+    leave(frozen, 7)
+    join(rival, 8, "rival")
+    rival.receive(*(rival.sample(seq, [2.0, 2.0], 8, 10 + seq, edges=edges) for seq in range(3)))
+    join(frozen, 7, "frozen")
+    frozen.receive(*(frozen.sample(seq, [1.0, 1.0], stamp=20 + seq, edges=edges) for seq in range(3, 6)))
+    assert rival.buffer.latest("r1/upper", "r1/lower") == 12
+    assert rival.elbow_is([2.0, 2.0])
+    assert rival.counters.stats().refused == {"second writer": 3}
+    refusal = rival.counters.refusals()["second writer"]
+    assert "is written by rival already; refused: frozen" in refusal
+    leave(rival, 8)
+    frozen.receive(frozen.sample(6, [1.0, 1.0], stamp=30, edges=edges))
+    assert frozen.buffer.latest("r1/upper", "r1/lower") == 30
+    assert frozen.buffer.explain("r1/upper", "r1/lower", 25) is not None  # between two writers is no pose
+
+
+def test_frames_and_memory_of_a_writer_of_many_edges_are_bounded(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("zstate.ingest.frame_ownership.MAX_MOVING_FRAMES", 50)
+    monkeypatch.setattr("zstate.ingest.transforms._MAX_CACHED_EDGES", 100)
+    monkeypatch.setattr("zstate.buffer.pose_tracks._MAX_CACHED_EDGES", 100)
+    case = IngestCase(TransformIngest)
+
+    def sample(seq: int, edges: tuple[tuple[str, str], ...]) -> TransformSample:
+        poses = to_block([[0.0, 0.0, float(seq), 0.0, 0.0, 0.0, 1.0]] * len(edges))
+        return TransformSample(seq, seq, 7, order_digest(edges), poses, edges)
+
+    frames = [("odom", f"frame{number}") for number in range(50)]
+    shuffled = list(permutations(frames[:5]))
+    case.receive(sample(0, tuple(frames)))
+    case.receive(*(sample(seq, tuple(edges)) for seq, edges in enumerate(shuffled, 1)))
+    case.receive(sample(200, (("odom", "another"),)))
+    assert case.counters.stats().refused == {"too many frames": 1}
+    assert "moves 50 frames, and 1 more would exceed the limit" in case.counters.refusals()["too many frames"]
+    assert len(case.ingest._full_names) <= 20
+    assert len(case.buffer._pose_tracks._cache) <= 20
+    case.receive(sample(201, tuple(frames[:5])))
+    assert case.buffer.lookup("r1/odom", "r1/frame4").translation[2] == 201.0
 
 
 def test_new_session_starts_a_new_epoch_even_if_its_clock_is_behind(case: IngestCase):

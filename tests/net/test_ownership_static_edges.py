@@ -1,4 +1,4 @@
-"""Two writers of the same static edges at the same time: one gets SecondWriter, on any network."""
+"""Two writers of the same edges at the same time: one gets SecondWriter, on any network."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import edge_key
@@ -89,6 +90,22 @@ def test_one_of_two_simultaneous_static_writers_of_a_frame_gets_second_writer(pa
             assert error.edge == ("fleet/base", "fleet/camera")
             listener.buffer.wait("fleet/base", "fleet/camera", timeout_s=5.0)
             assert listener.buffer.lookup("fleet/base", "fleet/camera").translation[0] == (2.0, 1.0)[place]
+
+
+def test_one_of_two_simultaneous_writers_of_a_moving_edge_gets_second_writer(pair):
+    for _ in range(2):
+        with (
+            TransformPublisher(pair[0], "r1", "wheels", program="wheels") as wheels,
+            TransformPublisher(pair[1], "r1", "visual", program="visual") as visual,
+        ):
+            for number in range(ROUNDS):  # of the first edge the writers watch no tokens yet
+                edges = [Transform("odom", f"base{number}", [1, 0, 0], [0, 0, 0, 1])]
+                place, error = only_error(
+                    run_together(partial(wheels.publish, edges), partial(visual.publish, edges))
+                )
+                assert error.first.program == ("visual", "wheels")[place]
+                assert error.edge == ("r1/odom", f"r1/base{number}")
+            assert wheels.stats.sent + visual.stats.sent == ROUNDS
 
 
 # Peers do not wait for a reply that may never come: they miss each other once in a hundred times.

@@ -1,16 +1,20 @@
 """TransformPublisher: moving edges of several writers, beside a robot's joint states."""
 
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from itertools import count
 
 import numpy as np
 import pytest
-from helpers.processes import SOON_S, until
+from helpers.processes import SOON_S, find_free_port, until
 from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
-from zstate.net.presence import discover
+from zstate.net.presence import announce, current_tokens, discover
+from zstate.net.session import connect
 from zstate.net.status import StatusSubscriber
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
@@ -18,6 +22,8 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.keys import writer_key
 from zstate.wire.messages import Status, WriterTransforms, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.protocol import SerializedSample
@@ -166,6 +172,58 @@ def test_of_two_writers_that_start_an_edge_at_once_one_is_refused(sessions):
         futures = [threads.submit(writer.publish, [pose("odom", "base_link")]) for writer in (one, other)]
         errors = [future.exception(timeout=SOON_S) for future in futures]
     assert sorted(type(error).__name__ for error in errors) == ["NoneType", "SecondWriter"]
+
+
+@pytest.mark.parametrize("later_publishes_first", [True, False])
+def test_later_writer_of_an_edge_ends_when_two_networks_are_joined(later_publishes_first):
+    endpoints = [f"tcp/127.0.0.1:{find_free_port()}" for _ in range(2)]
+    edges = [pose("odom", "base_link")]
+    with ExitStack() as opened:
+        ours, theirs = (opened.enter_context(connect(listen=endpoint)) for endpoint in endpoints)
+        first = opened.enter_context(TransformPublisher(ours, "r1", "wheels", program="wheels.py"))
+        second = opened.enter_context(TransformPublisher(theirs, "r1", "visual"))
+        for publisher in (first, second):
+            publisher.publish(edges)
+        opened.enter_context(connect(endpoints=endpoints))
+        for session in (ours, theirs):
+            until(lambda s=session: len(current_tokens(s, "zstate/*/@edge/**", 1.0)) == 2)
+        if not later_publishes_first:
+            first.publish(edges)
+        second.publish(edges)  # a token alone displaces no writer
+        with pytest.raises(SecondWriter, match=r"wheels\.py.* places 'r1/base_link' on 'r1/odom'") as raised:
+            until(lambda: first.publish(edges) or second.publish(edges))
+        assert raised.value.edge == ("r1/odom", "r1/base_link")
+        until(lambda: len(current_tokens(ours, "zstate/*/@edge/**", 1.0)) == 1)
+        with pytest.raises(SecondWriter):
+            second.publish([pose("map", "ball")])
+        first.publish(edges)
+
+
+def test_token_of_an_earlier_writer_ends_none_that_publishes_an_edge(sessions):
+    ours, theirs = sessions
+    stranger = Announcement("r1", "transforms", WriterId("stranger", "laptop", 9, 1, 99), "stranger")
+    with (
+        TransformPublisher(ours, "r1", "wheels") as wheels,
+        StreamPublisher(theirs, "zstate/r1/transforms/stranger", ENCODINGS[WriterTransforms]) as stream,
+    ):
+        wheels.publish([pose("odom", "base_link")])
+        with announce(theirs, writer_key("r1", "transforms", stranger.identity)):
+            until(lambda: len(current_tokens(ours, "zstate/r1/@writer/*/*", 1.0)) == 2)
+
+            def publish_both(child: str, seconds: float) -> bool:
+                deadline = time.monotonic() + seconds
+                while time.monotonic() < deadline:
+                    names = (("odom", child),)
+                    stream.put(
+                        encode(WriterTransforms(1, 0, 99, order_digest(names), to_block(np.eye(7)[6]), names))
+                    )
+                    wheels.publish([pose("odom", "base_link")])
+                return True
+
+            assert publish_both("another", 0.3)
+            with pytest.raises(SecondWriter) as raised:
+                publish_both("base_link", SOON_S)
+    assert raised.value.first == stranger.writer
 
 
 def test_link_of_an_announced_model_is_refused(sessions):
@@ -346,6 +404,83 @@ def test_edges_of_writers_that_have_left_stay(sessions, monkeypatch: pytest.Monk
             left = 2 * (number + 1)  # each has joined and left
             until(lambda left=left: len(listener.events()) == left)
         assert all(listener.buffer.can_lookup("odom", f"frame{number}") for number in range(3))
+
+
+def test_samples_lost_in_a_full_ring_are_counted_and_the_others_inserted(
+    sessions, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("zstate.net.streams.WILDCARD_CAPACITY", 64)
+    writer, reader = sessions
+    stamp, goes_on = time.time_ns(), threading.Event()
+    with (
+        TransformPublisher(writer, "r1", "odometry") as odometry,
+        TransformListener(reader, "r1", history_on_join=False) as listener,
+    ):
+        insert = listener.buffer.insert_many
+
+        def slowly(*arguments: object, **options: object) -> bool:
+            goes_on.wait(SOON_S)
+            return insert(*arguments, **options)
+
+        monkeypatch.setattr(listener.buffer, "insert_many", slowly)
+        for step in range(500):
+            odometry.publish([pose("odom", "base_link", float(step))], stamp + step * MS)
+        goes_on.set()
+
+        def is_last_counted() -> bool:
+            stats = listener.stats
+            return stats.received + stats.dropped + stats.missed == 500 and stats.dropped > 0
+
+        until(is_last_counted)
+        for at in range(0, 500, 7):  # the motion is linear: a gap changes no pose
+            found = listener.buffer.lookup("odom", "base_link", stamp + at * MS)
+            assert found.translation[0] == pytest.approx(at)
+
+
+def test_writer_with_a_clock_set_back_restarts_only_its_own_edges(sessions):
+    writer, reader = sessions
+    now = time.time_ns()
+    with (
+        TransformPublisher(writer, "r1", "wheels") as wheels,
+        TransformPublisher(writer, "r1", "tracker") as tracker,
+        TransformListener(reader, "r1") as listener,
+    ):
+
+        def counts() -> dict[str, int]:
+            return {frame.name: frame.count for frame in listener.buffer.frames() if frame.parent}
+
+        for step in range(5):
+            wheels.publish([pose("odom", "base_link")], now + step * MS)
+            tracker.publish([pose("map", "ball")], now + step * MS)
+        until(lambda: counts() == {"r1/base_link": 5, "r1/ball": 5})
+        for step in range(3):  # the first late sample may have a wrong stamp; the second begins a new epoch
+            wheels.publish([pose("odom", "base_link")], now - 3600 * SECOND + step * MS)
+        until(lambda: counts() == {"r1/base_link": 2, "r1/ball": 5})
+        (event,) = [event for event in listener.events() if event.kind == "set back"]
+        assert (event.stream, event.writer and event.writer.session) == ("transforms", wheels._session_id)
+
+
+def test_publish_from_many_threads_numbers_the_samples_and_close_ends_them(sessions):
+    writer, reader = sessions
+    stamp = time.time_ns()
+    odometry = TransformPublisher(writer, "r1", "odometry")
+
+    sent = [0] * 4
+
+    def publish(number: int) -> None:
+        with suppress(Closed):
+            for sent[number] in count():
+                odometry.publish([pose("odom", f"wheel{number}")], stamp + sent[number] * MS)
+
+    with TransformListener(reader, "r1") as listener, ThreadPoolExecutor(4) as threads:
+        published = [threads.submit(publish, number) for number in range(4)]
+        until(lambda: odometry.stats.sent >= 400)
+        odometry.close()
+        for future in published:
+            future.result(timeout=SOON_S)
+        assert odometry.stats.sent == sum(sent)
+        until(lambda: listener.stats.received > 0)
+        assert (listener.stats.refused, listener.stats.late) == ({}, 0)
 
 
 @pytest.mark.parametrize("transforms", [pose("odom", "base_link"), [("odom", "base_link")], "odom", None])

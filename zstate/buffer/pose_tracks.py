@@ -24,6 +24,9 @@ TrackRows: TypeAlias = list[tuple[PoseTrack, list[int]]]
 """Tracks, each with the rows of a sample that go into it, in the order of the track's edges."""
 
 
+# Limit of the edges in the cache of orders: a writer may shuffle its edges from sample to sample.
+_MAX_CACHED_EDGES = 100_000
+
 # The places of the six variances in an upper triangle, row by row.
 _VARIANCES = [0, 6, 11, 15, 18, 20]
 
@@ -40,6 +43,7 @@ class PoseTrackTable:
         self._owner = owner
         self._span_ns = span_ns
         self._cache: dict[tuple[EdgeNames, ...], TrackRows] = {}
+        self._cached_edges = 0
         # Samples whose edges are those of one track, in its order: nearly all.
         self._whole: dict[tuple[EdgeNames, ...], PoseTrack] = {}
         self._version = -1
@@ -59,7 +63,8 @@ class PoseTrackTable:
         if found is None:
             with self._tree.transaction():
                 found = self._assign(names, stamp, writer)
-            if self._version != self._tree.version:
+            self._cached_edges += len(names)
+            if self._version != self._tree.version or self._cached_edges > _MAX_CACHED_EDGES:
                 self._clear()
             self._cache[names] = found
             if len(found) == 1 and found[0][1] == list(range(len(names))):
@@ -74,6 +79,7 @@ class PoseTrackTable:
     def _clear(self) -> None:
         self._cache.clear()
         self._whole.clear()
+        self._cached_edges = 0
 
     def _assign(self, names: tuple[EdgeNames, ...], stamp: int, writer: str | None) -> TrackRows:
         edges = [self.check_edge(parent, child, writer) for parent, child in names]

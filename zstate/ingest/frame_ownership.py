@@ -13,9 +13,9 @@ order they arrive:
 3. edges by which other writers place the robot's root.
 
 Among equals, an edge that places the root of a model yields to one that does not, then an edge of a writer
-that has left to one of a writer that is announced, then a static edge to a moving one, then the later edge
-to the earlier one. Refused edges are kept, and accepted once nothing conflicts with them: the buffer depends
-on what is published, not on the order of arrival.
+that has left, or that moves it without being announced, to one of a writer that is announced, then a static
+edge to a moving one, then the later edge to the earlier one. Refused edges are kept, and accepted once
+nothing conflicts with them: the buffer depends on what is published, not on the order of arrival.
 """
 
 from __future__ import annotations
@@ -40,6 +40,9 @@ from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, Stream, foreign_edge_prob
 
 CONTESTED = ("second parent", "second writer", "loop")
 """The refusal reasons of edges that exclude each other."""
+
+MAX_MOVING_FRAMES = 100_000
+"""Limit of the frames that the writers of one robot move: a buffer removes no frame, and each takes 2 kB."""
 
 # A static edge this close to the model's [m, or the sine of an angle] was computed from the same URDF.
 _SAME_POSE = 1e-6
@@ -134,6 +137,7 @@ class FrameOwnership:
         self._placers = placers
         self._on_conflict = on_conflict
         self._robots: set[str] = set()
+        self._moved: dict[str, set[str]] = {}
         self._departed: BoundedDict[tuple[str, int], None] = BoundedDict()
         self._claims: dict[str, list[EdgeClaim]] = {}
         self._outside: dict[EdgeClaim, None] = {}
@@ -153,9 +157,11 @@ class FrameOwnership:
                 self.resolve()
 
     def add_writer(self, robot: str, session: int) -> None:
-        """Add an announced writer of static edges."""
+        """Add an announced writer of edges."""
         with self._lock:
             self._departed.pop((robot, session), None)
+            if self._refused:
+                self.resolve()
 
     def remove_writer(self, robot: str, session: int) -> None:
         """Remove a writer that has left. Its edges stay until they conflict with an announced one's."""
@@ -267,12 +273,14 @@ class FrameOwnership:
         """Decide which of these moving edges of ``source`` may be inserted.
 
         If all writers share all frames, edges of models are left out, and one refused edge refuses the whole
-        sample.
+        sample. Raises InsertRefused if the robot's writers have moved 100,000 frames, for a sample with
+        another one.
         """
         with self._lock:
             named = {row: self._named(names) for row, names in enumerate(edges)}
             if self._is_shared:
                 named = {row: names for row, names in named.items() if not self._repeats_model(names)}
+            self._count_frames(source.robot, named.values())
             fresh = [
                 self._claim(source, names)
                 for names in dict.fromkeys(named.values())
@@ -305,6 +313,17 @@ class FrameOwnership:
 
     def _repeats_model(self, names: EdgeNames) -> bool:
         return any(names in edges for edges in self.model_edges.values())
+
+    def _count_frames(self, robot: str, edges: Collection[EdgeNames]) -> None:
+        moved = self._moved.setdefault(robot, set())
+        new = {child for _, child in edges}.difference(moved)
+        if new and len(moved) + len(new) > MAX_MOVING_FRAMES:
+            text = (
+                f"{robot!r} moves {len(moved)} frames, and {len(new)} more would exceed the limit of "
+                f"{MAX_MOVING_FRAMES}; give each frame the same name for as long as the robot runs"
+            )
+            raise InsertRefused(text, reason="too many frames", edge=next(iter(edges)))
+        moved |= new
 
     def release(self, source: EdgeSource) -> None:
         """Remove all edges of ``source``."""
@@ -363,7 +382,8 @@ class FrameOwnership:
             del self._claims[claim.child]
         self._outside.pop(claim, None)
         self._refused.pop(claim, None)
-        self.version += self._is_shared  # samples that are refused as a whole have no claims
+        # If all writers share all frames, samples that are refused as a whole have no claims.
+        self.version += self._is_shared or claim.pose is None
         if self._is_in_buffer(claim):
             self.buffer.withdraw(claim.child)
             self._is_resolved &= not rest
@@ -464,7 +484,8 @@ class FrameOwnership:
         return accepted, roots
 
     def _is_departed(self, claim: EdgeClaim) -> bool:
-        return (claim.source.robot, claim.source.session) in self._departed
+        is_unannounced = not self._is_shared and claim.pose is None and not self._is_live(claim.source)
+        return is_unannounced or (claim.source.robot, claim.source.session) in self._departed
 
     def _refusal(self, claim: EdgeClaim, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
         """The refusal of an edge that conflicts with the edges accepted before it."""
@@ -532,6 +553,10 @@ class FrameOwnership:
 def _loop(names: EdgeNames, by: str, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
     """The refusal of an edge that would close a loop."""
     parent, child = names
+    if parent == child:
+        return InsertRefused(
+            f"{parent!r} -> {child!r}: a frame cannot be placed on itself", reason="self edge", edge=names
+        )
     ring, below, writer = [parent], child, by
     while ring[-1] != child:
         above = accepted.get(ring[-1])

@@ -26,6 +26,9 @@ from zstate.wire.messages import (
     select_edges,
 )
 
+# Limit of the edges in the caches of one writer: it may shuffle its edges from sample to sample.
+_MAX_CACHED_EDGES = 100_000
+
 
 class TransformIngest(StreamIngest):
     """Inserts transform samples as poses of edges; needs no model."""
@@ -43,6 +46,7 @@ class TransformIngest(StreamIngest):
         self._undescribed = EdgeSource(robot, "")
         # By the edges that samples name: their full names, and which of those are admitted.
         self._full_names: BoundedDict[Edges, Edges] = BoundedDict()
+        self._cached_edges = 0
         self._admitted: BoundedDict[Edges, Admitted] = BoundedDict()
         # The full names of edges that are all admitted, by their digest: nearly all samples.
         self._all_admitted: BoundedDict[bytes, Edges] = BoundedDict()
@@ -122,6 +126,9 @@ class TransformIngest(StreamIngest):
     def _named_edges(self, names: Edges) -> Edges:
         edges = self._full_names.get(names)
         if edges is None:
+            self._cached_edges += len(names)
+            if self._cached_edges > _MAX_CACHED_EDGES:
+                self._clear_cached_edges()
             edges = self._full_names[names] = self._named(names)
             new = {child for _, child in edges} - {child for _, child in self._undescribed.claims}
             self._ownership.replace_departed(self._undescribed, new)
@@ -134,7 +141,7 @@ class TransformIngest(StreamIngest):
             known = self._admitted.get(edges)
             if known is not None:
                 return known
-        source.name, source.session = self.writer or "", self._session or 0
+        source.name, source.session = self.writer or "an unannounced writer", self._session or 0
         admitted = self._ownership.admit(source, edges)
         if self._version != self._ownership.version:
             self._admitted.clear()
@@ -184,9 +191,13 @@ class TransformIngest(StreamIngest):
 
     def _release(self, source: EdgeSource) -> None:
         self._ownership.release(source)
+        self._clear_cached_edges()
+
+    def _clear_cached_edges(self) -> None:
         self._full_names.clear()
         self._admitted.clear()
         self._all_admitted.clear()
+        self._cached_edges = 0
 
     def _may_restart_epoch(self) -> bool:
         return not any(map(self._ownership.others_move, (self._described, self._undescribed)))

@@ -56,7 +56,7 @@ _DISCOVERY_S = 0.03
 _PROPAGATION_S = 0.02
 """The longest time until a token has reached all peers; on a loopback that took some milliseconds."""
 
-_CHECK_PERIOD_S = 0.05
+CHECK_PERIOD_S = 0.05
 """Asking Zenoh for new tokens is a fifth of what a sample costs its writer."""
 
 _STARTUP_S = 1.0
@@ -132,7 +132,7 @@ class WriterClaim(Closeable):
             if self._tokens is None:
                 self._established_at = now + _STARTUP_S
             elif now > self._established_at:
-                self._next_check = now + _CHECK_PERIOD_S
+                self._next_check = now + CHECK_PERIOD_S
             self._update_rivals()
             if not self._rivals:
                 return
@@ -300,7 +300,7 @@ def _wait_for_rival_claims(
             return
         first, edge = min(claims, key=lambda claim: seniority(claim[0]))
         if seniority(first) < seniority(writer) or time.monotonic() > deadline:
-            raise _frame_conflict(_announced(session, first), edge, "is placing")
+            raise frame_conflict(_announced(session, first), edge, "is placing")
         time.sleep(ROUND_S)
 
 
@@ -320,7 +320,7 @@ def check_edges(
         for parent, child in named_edges(robot, statics.edges):
             if child in children and not _outranks(writer, robot, child):
                 first = Announcement(robot, "tf_static", WriterId(name, "", 0, 0, statics.session), name)
-                raise _frame_conflict(_announced(session, first), (parent, child), "places")
+                raise frame_conflict(_announced(session, first), (parent, child), "places")
 
 
 def _announced(session: Session, writer: Announcement) -> Announcement:
@@ -460,7 +460,8 @@ def named_edges(robot: str, edges: Edges) -> Iterator[Edge]:
             yield full_name(robot, parent), full_name(robot, child)
 
 
-def _frame_conflict(first: Announcement, edge: Edge, verb: str) -> SecondWriter:
+def frame_conflict(first: Announcement, edge: Edge, verb: str) -> SecondWriter:
+    """The error of a writer whose edge excludes ``edge`` of the writer ``first``."""
     parent, child = edge
     advice = "stop or withdraw that first, or use takeover=True (--takeover)"
     if first.stream == "transforms":

@@ -17,6 +17,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net.clock_offset import ClockService
+from zstate.net.edge_monitor import EdgeMonitor
 from zstate.net.ownership import Edge, WriterClaim, check_readers, claim_edges
 from zstate.net.presence import local_writer
 from zstate.net.sample_history import SampleCache, serve_history
@@ -58,7 +59,9 @@ class TransformPublisher(Closeable):
 
     On the native wire each edge has one writer. SecondWriter, which names the first writer, is raised if
     another active writer has the same name, and by ``publish`` if another writer of any robot places the
-    same frame. The ROS wires publish on /tf, where every node may write.
+    same frame. If two writers publish one edge on networks that are joined later, or because one was frozen
+    while the other took it over, the later one to start raises it and is closed. The ROS wires publish on
+    /tf, where every node may write.
 
     On the native wire the last ``cache_s`` seconds of samples are cached for joining listeners (0: only the
     newest sample), and the status is published once a second while it has a reader. A context manager; safe
@@ -91,6 +94,8 @@ class TransformPublisher(Closeable):
         self._placed: set[Edge] = set()
         self._edge_tokens = ExitStack()
         self._claim: WriterClaim | None = None
+        self._edge_monitor: EdgeMonitor | None = None
+        self._second_writer: SecondWriter | None = None
         self._cache: SampleCache[WriterTransforms] | None = None
         self._lock = fork_safe_lock()
         self._stop = fork_safe(threading.Event())
@@ -102,6 +107,7 @@ class TransformPublisher(Closeable):
         with ExitStack() as opening:
             if "native" in self._wires:
                 self._claim = opening.enter_context(WriterClaim(session, [self._announced]))
+                self._edge_monitor = opening.enter_context(EdgeMonitor(session, self._announced))
             if "native" in self._wires and self._clock.domain == SYSTEM:
                 # Before this writer is announced: readers that see its token measure its clock at once.
                 opening.enter_context(ClockService(session, self.robot, identity, self._clock))
@@ -158,7 +164,7 @@ class TransformPublisher(Closeable):
             with self._lock:
                 if self._stop.is_set():
                     raise Closed(f"the transform publisher {self.writer!r} is closed")
-                self._check_name()
+                self._check_ownership()
                 order = self._orders.get(names)
                 if order is None:
                     order = self._orders[names] = self._place(names)
@@ -186,13 +192,17 @@ class TransformPublisher(Closeable):
         (stamp,) = stamps or {None}
         return self._clock.now() if stamp is None else stamp
 
-    def _check_name(self) -> None:
-        if self._claim is not None:
+    def _check_ownership(self) -> None:
+        """Raise SecondWriter if an older writer has the same name or an edge of this one (sticky)."""
+        if self._second_writer is None and self._claim is not None and self._edge_monitor is not None:
             try:
                 self._claim.check()
-            except SecondWriter:
+                self._edge_monitor.check()
+            except SecondWriter as error:
+                self._second_writer = error
                 self._opened.close()
-                raise
+        if self._second_writer is not None:
+            raise self._second_writer.with_traceback(None)
 
     def _place(self, names: Edges) -> bytes:
         """Check edges that are published together for the first time, and own them. Returns their digest."""
@@ -209,9 +219,11 @@ class TransformPublisher(Closeable):
                 check_readers(self._session, self._announced, fresh)
                 claims.enter_context(claim_edges(self._session, self._announced, fresh))
                 # An earlier writer that answered above has announced itself by now.
-                self._check_name()
+                self._check_ownership()
             self._check.insert_many(edges, 0, [_IDENTITY] * len(edges), writer=self.writer)
             self._placed.update(fresh)
+            if self._edge_monitor is not None and fresh:
+                self._edge_monitor.add(fresh)
             self._edge_tokens.push(claims.pop_all().__exit__)
         return order_digest(names)
 

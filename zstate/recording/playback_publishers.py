@@ -17,6 +17,7 @@ from zstate.ingest.joint_states import joint_order
 from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
+from zstate.net.edge_monitor import EdgeMonitor
 from zstate.net.ownership import Edge, WriterClaim, claim_edges, named_edges
 from zstate.net.presence import local_writer
 from zstate.net.session import Session
@@ -278,6 +279,8 @@ class PassthroughPublisher(Closeable):
         with ExitStack() as opening:
             announced = [self._announced(stream, edge_writer) for stream in streams]
             self._claim = self._claimed(opening, announced)
+            moving = self._announced("transforms", edge_writer)
+            self._edge_monitor = opening.enter_context(EdgeMonitor(session, moving, allowed=sessions))
             self._wire_writers = [
                 opening.enter_context(WireWriter(session, get_wire(wire), robot, writer)) for wire in wires
             ]
@@ -296,6 +299,7 @@ class PassthroughPublisher(Closeable):
         """Publish one sample."""
         if self._claim is not None:
             self._claim.check()
+            self._edge_monitor.check()
         stream: Stream = "joint_states"
         if isinstance(message, TransformSample):
             stream = "transforms" if "transforms" in self._streams else "tf"
@@ -320,6 +324,7 @@ class PassthroughPublisher(Closeable):
             announced = self._announced("transforms", self._edge_writer)
             claim = claim_edges(self._session, announced, new, allowed=self._sessions)
             self._opened.enter_context(claim)
+            self._edge_monitor.add(new)
         placed.update(new)
 
     def describe(self, description: RobotDescription) -> None:

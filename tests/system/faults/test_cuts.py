@@ -50,6 +50,8 @@ def test_recovery_from_cuts_of_5_and_15_s_within_a_second_without_old_samples_as
     cut_writer = start(
         "publisher", robot="r2", session=away, rate_hz=RATE_HZ, namespace=hosts.namespace("writer")
     )
+    for robot, session, host in (("r1", at_home, home), ("r2", away, hosts.namespace("writer"))):
+        start("odometry", robot=robot, session=session, rate_hz=RATE_HZ, namespace=host)
     witness = start("reader", session=at_home, namespace=home)
     watching = {"writer": Watched(witness, "r2", *swallowing(hosts, "writer"), 15.0)}
     for name in CUT_READERS:
@@ -59,7 +61,9 @@ def test_recovery_from_cuts_of_5_and_15_s_within_a_second_without_old_samples_as
     for one in watching.values():
         assert one.process.query("after", "r1", 0)
         assert one.process.query("after", "r2", 0)
-        one.process.query("watch", one.robot)
+        for motion in ("", "odometry "):
+            assert one.process.query(f"{motion}after", one.robot, 0)
+            one.process.query(f"{motion}watch", one.robot)
     before = [one.process.query("census") for one in watching.values()], router.query("census")
 
     began = time.monotonic()
@@ -96,14 +100,18 @@ def check_recovery(name: str, one: Watched, healed_at: int) -> None:
     received_at, latched_at = one.process.receive(), one.process.receive()
     assert received_at, name
     assert latched_at, name
-    one.process.query("after", one.robot, received_at)  # the monitor sees the end of the gap
+    for motion in ("", "odometry "):
+        one.process.query(f"{motion}after", one.robot, received_at)  # the monitor sees the end of the gap
     watched, stats = one.process.query("watched", one.robot), one.process.query("stats")
+    moved = one.process.query("odometry watched", one.robot)
     received_s, latched_s = ((at - healed_at) * 1e-9 for at in (received_at, latched_at))
     print(
         f"{name}: answers again {received_s:.3f} s after the heal, latched value after {latched_s:.3f} s; "
         f"missed {stats['missed']}, late {stats['late']}, stale lookups {watched['stale']}"
     )
-    assert (watched["went_back"], watched["old_as_fresh"]) == (0, 0), name
+    for seen in (watched, moved):
+        assert (seen["went_back"], seen["old_as_fresh"], seen["wrong"]) == (0, 0, 0), name
+    assert moved["stale"] > 0, name
     assert watched["gap_ns"] > (one.seconds - MAX_AGE_S) * 1e9, name
     assert watched["stale"] > 0, name
     # Lost samples are counted: all that were published during the cut, except for queued ones.

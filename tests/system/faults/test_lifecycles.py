@@ -16,14 +16,18 @@ STARTS = 200
 FORKING = """
     import json, multiprocessing, os, select, sys, threading, time
     from zstate import SineSource, StatePublisher, TransformListener, connect, discover, load_model
+    from zstate import Transform, TransformPublisher
     from zstate.errors import Closed, LookupFailed
     from zstate.recording.recorder import Recorder
 
     with (
         connect(**json.loads(sys.argv[1])) as session,
         StatePublisher(session, load_model("rrbot"), "r1") as publisher,
+        TransformPublisher(session, "r1", "odometry") as odometry,
         TransformListener(session, "r1") as listener,
     ):
+        odom = [Transform("odom", "world", (0, 0, 0), (0, 0, 0, 1))]
+        odometry.publish(odom)
         buffer, model = listener.buffer, publisher.model
         running = threading.Thread(target=publisher.run, args=(SineSource(model), 2000.0), daemon=True)
         running.start()
@@ -56,7 +60,9 @@ FORKING = """
             results = [
                 refused(lambda: session.zenoh),
                 refused(lambda: publisher.publish([0.0, 0.0])),
+                refused(lambda: odometry.publish(odom)),
                 refused(lambda: StatePublisher(session, model, "r2")),
+                refused(lambda: TransformPublisher(session, "r2")),
                 refused(lambda: TransformListener(session, "r2")),
                 refused(connect),
                 refused(lambda: discover(session)),
@@ -65,7 +71,7 @@ FORKING = """
                 waits_fail(),
                 buffer.lookup("world", "tool").stamp > 0,
             ]
-            for one in (listener, publisher, session):
+            for one in (listener, odometry, publisher, session):
                 one.close()
             os.write(write_fd, (json.dumps(results) + "\\n").encode())
 
@@ -94,6 +100,7 @@ FORKING = """
                 code = ends_by_itself(pid)
             os.close(write_fd)
             results = json.loads(os.read(read_fd, 1000) or b"null")
+            odometry.publish(odom)
             print(json.dumps([way, results, code, receives_samples()]))
     print("closed")
 """
@@ -132,10 +139,25 @@ def test_forked_child_gets_an_error_naming_connect_and_affects_no_other_process(
     child = spawn(FORKING, json.dumps(client(endpoint) if mode == "client" else {}))
     for _ in range(10):
         way, refusals, code, receives_samples = json.loads(child.line(30.0))
-        assert (refusals, code, receives_samples) == ([True] * 10, 0, True), way
+        assert (refusals, code, receives_samples) == ([True] * 12, 0, True), way
     assert child.line() == "closed"
     assert child.wait() == 0
     assert not re.search("Traceback|panicked", child.stderr)
+
+
+UNCLOSED = """
+    from zstate import Transform, TransformPublisher, connect
+    odometry = TransformPublisher(connect(), "r1", "odometry")
+    odometry.publish([Transform("odom", "base", (0, 0, 0), (0, 0, 0, 1))])
+    print("published")
+"""
+
+
+def test_writer_of_transforms_that_exits_without_close_releases_its_name_and_edges(spawn):
+    for _ in range(2):
+        child = spawn(UNCLOSED)
+        assert child.wait() == 0
+        assert (child.line(), child.stderr) == ("published", "")
 
 
 @pytest.mark.parametrize("way", ["client", "peer"])

@@ -55,7 +55,9 @@ class Target:
 
 
 def native_keys(follow: Follow) -> tuple[str, ...]:
-    streams = (follow, "robot_description", "tf_static/w", "tf_static/\u00fc", "tf_static/" + "w" * 99)
+    writers = ("w", "\u00fc", "w" * 99)
+    named = [f"{stream}/{writer}" for stream in ("tf_static", "transforms") for writer in writers]
+    streams = (follow, "robot_description", *named)
     return tuple(f"zstate/{name}/{stream}" for name in NAMES for stream in streams)
 
 
@@ -81,6 +83,7 @@ def odd_tokens(dice: random.Random) -> list[str]:
     letters = "abz019%~._-=;:|\\ \u00e9"
     parts = ["".join(dice.choices(letters, k=dice.randrange(1, 60))) for _ in range(20)]
     native = [f"zstate/{dice.choice(NAMES)}/@writer/{part}/{part[::-1]}" for part in parts]
+    native += [f"zstate/{dice.choice(NAMES)}/@edge/{part}/{part[::-1]}/{part}" for part in parts]
     return [*native, *(f"@ros2_lv/0/{part}/0/0/MP/%/%/{part}" for part in parts)]
 
 
