@@ -330,8 +330,12 @@ class DemoTable:
         for title in (r"x       y       z \[m]", *angles, "age"):
             table.add_column(title, justify="right", no_wrap=True)
         for one in self.transforms():
-            xyz = " ".join(f"{value:7.3f}" for value in one.translation)
-            rpy = (" ".join(f"{degrees(angle):6.1f}" for angle in one.rpy),) if with_angles else ()
+            xyz = " ".join(f"{round(value, 3) + 0.0:7.3f}" for value in one.translation)
+            rpy = (
+                (" ".join(f"{round(degrees(angle), 1) + 0.0:6.1f}" for angle in one.rpy),)
+                if with_angles
+                else ()
+            )
             assert one.stamp is not None
             table.add_row(_link(one), xyz, *rpy, format_duration(time.time_ns() - one.stamp))
         return table
