@@ -183,7 +183,9 @@ def commands_of(group: click.Group, context: click.Context, prefix: str) -> Iter
         command = group.get_command(context, name)
         assert command
         variables = f"{prefix}_{name.upper()}"
-        yield name, sorted(parameter_text(one, variables) for one in command.params)
+        # Hidden options are for processes that a command starts itself.
+        offered = (one for one in command.params if not getattr(one, "hidden", False))
+        yield name, sorted(parameter_text(one, variables) for one in offered)
         if isinstance(command, click.Group):
             for inner, parameters in commands_of(command, context, variables):
                 yield f"{name} {inner}", parameters

@@ -49,6 +49,30 @@ def test_frame_added_later_appears_in_the_next_snapshot():
     assert buffer.frame_table() is table
 
 
+def test_tracks_of_a_robot_are_its_joints_and_the_edges_above_its_root():
+    buffer = filled()
+    buffer.insert(Transform("r1/odom", "r1/world", [1, 0, 0], [0, 0, 0, 1], stamp=0))
+    buffer.insert(Transform("map", "r1/odom", [1, 0, 0], [0, 0, 0, 1], stamp=0))
+    buffer.insert(Transform("r1/lower", "r1/marker", [1, 0, 0], [0, 0, 0, 1], stamp=0))
+    table = buffer.frame_table()
+    joints, *above = table.tracks_of["r1"]
+    assert joints is table.robots["r1"]
+    assert [track.name for track in above] == ["r1/odom -> r1/world", "map -> r1/odom"]
+    assert {track.name for track in table.moving} == {
+        *("r1", "r1/odom -> r1/world", "map -> r1/odom", "r1/lower -> r1/marker")
+    }
+
+
+def test_tracks_of_a_robot_without_a_model_are_those_of_its_frames_and_above():
+    buffer = TransformBuffer(10.0, ManualClock())
+    buffer.insert_static(Transform("hall", "cam/room", [0, 0, 0], [0, 0, 0, 1]))
+    for child in ("cam/cup", "cam/box"):
+        buffer.insert(Transform("cam/room", child, [1, 0, 0], [0, 0, 0, 1], stamp=0))
+    buffer.insert(Transform("site", "hall", [1, 0, 0], [0, 0, 0, 1], stamp=0))
+    (names,) = [[track.name for track in tracks] for tracks in buffer.frame_table().tracks_of.values()]
+    assert names == ["site -> hall", "cam/room -> cam/cup", "cam/room -> cam/box"]
+
+
 def test_span_reaches_from_the_oldest_sample_to_the_newest():
     assert filled(seconds=2.0).span() == TimeSpan(0, 2 * SECOND)
     assert TransformBuffer().span() is None

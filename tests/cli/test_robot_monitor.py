@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -39,6 +40,23 @@ def test_robot_that_publishes_only_transforms_is_monitored(spawn: Spawn):
     with published_robot(streams=("tf", "tf_static", "robot_description")):
         until(lambda: json.loads(command.line())["received"] > 0)
     assert "following zstate/rrbot/tf" in command.stderr
+
+
+def test_joint_states_and_transforms_have_separate_rates(spawn: Spawn):
+    """Also if the transforms were there first: then the joint states are followed when they appear."""
+    command = started(spawn, "monitor", "--robots", "--json")
+    odometry = started(spawn, "transform", "odom", "world", "--xyz", "1", "0", "0", "--robot", "rrbot")
+    until(lambda: json.loads(command.line())["received"] > 0)
+    assert "following zstate/rrbot/transforms" in command.stderr
+    with published_robot():
+        until(lambda: "following zstate/rrbot/{joint_states,transforms}" in command.stderr)
+        until(lambda: json.loads(command.line())["transforms_hz"])
+        line = zstate("monitor", "--robots", "--once").stdout.decode()
+        assert re.match(r"rrbot  [\d.]+ Hz  transforms [\d.]+ Hz  age ", line)
+        interrupted(odometry)
+        until(lambda: json.loads(command.line())["transforms_hz"] == 0.0)
+        assert json.loads(command.line())["rate_hz"] > 0.0
+    interrupted(command)
 
 
 def test_the_missing_robot_is_reported(spawn: Spawn):

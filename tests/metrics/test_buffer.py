@@ -93,7 +93,21 @@ def test_latency_is_the_median_and_age_that_of_the_newest():
     assert measure.age_s == pytest.approx(0.02)
     assert measure.rate_hz > 0.0
     assert buffer.statistics_of("r1").count == 3
-    assert buffer.has_samples.is_set()
+    assert measure.transforms_hz is None
+
+
+def test_transforms_besides_joint_states_have_their_own_rate():
+    buffer = metered()
+    for _ in range(5):
+        buffer.insert_many([("r1/odom", "r1/world")], NOW, [[0.0, 0.0, 0.0, *UPRIGHT]])
+    track = buffer.add_robot(RRBOT, "r1")
+    for age_s in (0.3, 0.2):
+        buffer.insert_joints(track, NOW - round(age_s * SECOND), [0.0, 0.0])
+    measure = buffer.measure("r1")
+    assert (buffer.statistics_of("r1").count, buffer.statistics_of("r1", "transforms").count) == (2, 5)
+    assert measure.age_s == pytest.approx(0.2)
+    assert measure.transforms_hz is not None
+    assert measure.transforms_hz > 0.0
 
 
 def test_samples_of_another_robot_do_not_count():
@@ -104,4 +118,3 @@ def test_without_samples_nothing_is_measured():
     buffer = metered()
     measure = buffer.measure("r1")
     assert (measure.rate_hz, measure.latency_s, measure.age_s) == (0.0, None, None)
-    assert not buffer.has_samples.is_set()

@@ -10,7 +10,14 @@ from helpers.processes import until
 from helpers.raw_ros_nodes import JOINT_STATES, key_of
 from helpers.robots import wait_for_reader, wait_for_stream_readers
 
-from zstate import SineSource, StatePublisher, Transform, TransformBuffer, load_model
+from zstate import (
+    SineSource,
+    StatePublisher,
+    Transform,
+    TransformBuffer,
+    TransformPublisher,
+    load_model,
+)
 from zstate.recording.recorder import Recorder
 from zstate.view.data_source import FixedFrame, ViewSource
 
@@ -120,23 +127,37 @@ def test_only_selected_robots_and_their_ancestors_are_in_a_snapshot():
     assert not [name for name in names if name.startswith("b/")]
 
 
-def test_silent_time_of_a_robot_grows_until_its_next_sample(sessions):
+def test_silent_time_of_a_track_grows_until_its_next_sample(sessions):
     writing, reading = sessions
     sine = SineSource(MODEL)
     with ViewSource(reading) as source:
         assert source.robots() == ()
         with StatePublisher(writing, MODEL, "r1") as publisher:
             publisher.publish(sine.read(SECOND).positions)
-            until(lambda: source.snapshot().stamp is not None and source.silent_s("r1") is not None)
+            until(lambda: source.snapshot().stamp is not None)
+            track = track_of(source, "r1")
             assert source.models["r1"].digest == MODEL.digest
             assert source.robots() == ("r1",)
-            first = source.silent_s("r1")
+            first = source.silent_s(track)
             assert first is not None
-            until(lambda: (source.silent_s("r1") or 0.0) > first + 0.05)
+            until(lambda: (source.silent_s(track) or 0.0) > first + 0.05)
             publisher.publish(sine.read(2 * SECOND).positions)
-            silent = source.silent_s("r1")
-            until(lambda: source.poll() or (source.silent_s("r1") or 0.0) < silent)
-        assert source.silent_s("unknown") is None
+            silent = source.silent_s(track)
+            until(lambda: source.poll() or (source.silent_s(track) or 0.0) < silent)
+
+
+def test_robot_of_transforms_only_is_timed_too(sessions):
+    writing, reading = sessions
+    with ViewSource(reading) as source, TransformPublisher(writing, "cam", "tracker") as tracker:
+        tracker.publish([shifted("room", "marker", 1.0)])
+        until(lambda: source.snapshot().stamp is not None)
+        assert (source.robots(), dict(source.models)) == (("cam",), {})
+        (track,) = source.snapshot().tree.tracks_of["cam"]
+        first = source.silent_s(track)
+        until(lambda: (source.silent_s(track) or 0.0) > first + 0.05)
+        silent = source.silent_s(track)
+        tracker.publish([shifted("room", "marker", 2.0)])
+        until(lambda: source.poll() or (source.silent_s(track) or 0.0) < silent)
 
 
 def test_recording_is_a_source_without_a_session(sessions, tmp_path: Path):
@@ -151,7 +172,7 @@ def test_recording_is_a_source_without_a_session(sessions, tmp_path: Path):
     with ViewSource.from_recording(file) as source:
         assert source.robots() == ("r1",)
         assert source.snapshot().known.all()
-        assert source.silent_s("r1") is None
+        assert source.silent_s(track_of(source, "r1")) is None
 
 
 def test_robots_of_the_ros2_wire_format_are_received(sessions, monkeypatch: pytest.MonkeyPatch):

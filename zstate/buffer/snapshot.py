@@ -7,7 +7,7 @@ code and data gone from the caches: the number of operations counts, not the siz
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
@@ -48,7 +48,7 @@ class FrameTable:
     Tables are compared by identity: each change of the tree or of a writer makes a new one.
     ``parents[i]`` is the row of its parent, -1 for a root. ``kinds`` are those of ``FrameInfo``: joint,
     pose, static or root; ``writers`` are those of the edges, as far as known. ``robots`` are the tracks
-    by name.
+    by name, of the robots with a model; ``tracks[i]`` is that of the edge of frame i, None if it never moves.
     """
 
     names: tuple[str, ...]
@@ -56,6 +56,7 @@ class FrameTable:
     kinds: tuple[str, ...]
     writers: tuple[str | None, ...]
     robots: Mapping[str, JointTrack] = field(default_factory=dict[str, JointTrack])
+    tracks: tuple[Track | None, ...] = ()
 
     @cached_property
     def index(self) -> Mapping[str, int]:
@@ -70,6 +71,36 @@ class FrameTable:
             if parent >= 0:
                 roots[row] = roots[parent]
         return roots
+
+    @cached_property
+    def tracks_of(self) -> Mapping[str, tuple[Track, ...]]:
+        """The tracks on which the place of each robot depends, by name.
+
+        That of its joints, or without a model those of the edges to its frames, ``robot/frame``; then those
+        of the edges above. A moving edge below a link of its model is not among them.
+        """
+        found: dict[str, dict[Track, None]] = {name: {track: None} for name, track in self.robots.items()}
+        roots = {track.frame(track.model.root): name for name, track in self.robots.items()}
+        for row, name in enumerate(self.names):
+            prefix, separator, _ = name.partition("/")
+            without_model = prefix if separator and prefix not in self.robots else None
+            robot = roots.get(name, without_model)
+            if robot is not None:
+                tracks = (self.tracks[above] for above in self._rows_up(row))
+                found.setdefault(robot, {}).update((track, None) for track in tracks if track is not None)
+        return {robot: tuple(tracks) for robot, tracks in found.items()}
+
+    def _rows_up(self, row: int) -> Iterator[int]:
+        """A row, that of its parent, and so on up to the root."""
+        while row >= 0:
+            yield row
+            row = int(self.parents[row])
+
+    @cached_property
+    def moving(self) -> tuple[Track, ...]:
+        """All tracks, each once."""
+        tracks = (*self.robots.values(), *(track for track in self.tracks if track is not None))
+        return tuple(dict.fromkeys(tracks))
 
     def row(self, name: str) -> int:
         """The row of a frame. Raises UnknownFrame."""
@@ -165,6 +196,7 @@ class SnapshotReader:
             tuple("root" if edge is None else edge.kind for edge in edges),
             tuple(None if edge is None else edge.writer for edge in edges),
             shown.robots,
+            tuple(None if edge is None else edge.track for edge in edges),
         )
         self._version = tree.version
         static = [se3.IDENTITY if edge is None else edge.pose for edge in edges]

@@ -164,6 +164,16 @@ class PoseTrack:
         return f"{first} and {more} more" if more else first
 
     @property
+    def newest(self) -> int | None:
+        """The stamp of the newest sample [ns]; None without any."""
+        return self.history.newest
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The mean rate of the samples kept [Hz]; None with fewer than two."""
+        return coverage(self.history.view).rate_hz
+
+    @property
     def has_covariances(self) -> bool:
         """Whether rows have columns for covariances."""
         return self.history.width > 7 * len(self.edges)

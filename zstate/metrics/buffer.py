@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any
+from typing import Any, Literal
 
 from numpy.typing import ArrayLike
 
@@ -26,6 +25,10 @@ LATENCY_BOUNDS_S = (
     *(0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05),
     *(0.1, 0.25, 0.5, 1.0, 2.5, 5.0),
 )
+
+
+SampleKind = Literal["joint_states", "transforms"]
+"""What a sample of a robot consists of; "transforms" in the streams tf and transforms."""
 
 
 class Histogram:
@@ -92,7 +95,7 @@ class InstrumentedBuffer(TransformBuffer):
         self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
     ) -> bool:
         inserted = super().insert_joints(track, stamp, positions, velocities)
-        self._on_sample(track.prefix, stamp)
+        self._on_sample(track.prefix, "joint_states", stamp)
         return inserted
 
     def insert_many(
@@ -105,10 +108,10 @@ class InstrumentedBuffer(TransformBuffer):
         writer: str | None = None,
     ) -> bool:
         inserted = super().insert_many(edges, stamp, poses, covariances=covariances, writer=writer)
-        self._on_sample(self.domain.robot_placing(edges[0][1]), stamp)
+        self._on_sample(self.domain.robot_placing(edges[0][1]), "transforms", stamp)
         return inserted
 
-    def _on_sample(self, robot: str, stamp: int) -> None:
+    def _on_sample(self, robot: str, kind: SampleKind, stamp: int) -> None:
         """Called when a sample of ``robot`` with this stamp [ns] can be looked up."""
         if self._is_comparable(robot):
             self.latency.add((self.clock.now() - stamp) * 1e-9)
@@ -125,30 +128,37 @@ _WINDOW_NS = 5_000_000_000
 class RobotMeasure:
     """How the samples of one robot arrived in the last five seconds.
 
-    ``rate_hz`` is 0 if they have missed their deadline, or are fewer than two. ``latency_s`` is the median
-    time from a sample's stamp until it could be looked up, by the clocks of both machines; ``age_s`` is that
-    of the newest sample. Both are None without samples, and with stamps of another clock domain.
+    They are its joint states, or its transforms if it has no joint states. ``rate_hz`` is 0 if they have
+    missed their deadline, or are fewer than two. ``latency_s`` is the median time from a sample's stamp until
+    it could be looked up, by the clocks of both machines; ``age_s`` is that of the newest sample. Both are
+    None without samples, and with stamps of another clock domain. ``transforms_hz`` is the rate of transforms
+    besides joint states, of all writers together; None if there are none.
     """
 
     rate_hz: float
     latency_s: float | None
     age_s: float | None
+    transforms_hz: float | None = None
 
 
 class MeteredBuffer(InstrumentedBuffer):
-    """An InstrumentedBuffer that also measures each robot; ``has_samples`` is set at the first sample."""
+    """An InstrumentedBuffer that also measures each robot."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         super().__init__(clock=clock)
-        self.has_samples = threading.Event()
-        self._statistics: BoundedDict[str, IntervalStatistics] = BoundedDict()
+        self._statistics: BoundedDict[tuple[str, SampleKind], IntervalStatistics] = BoundedDict()
         self._latencies: BoundedDict[str, Histogram] = BoundedDict()
 
-    def statistics_of(self, robot: str) -> IntervalStatistics:
-        """The statistics of the samples of one robot; delays are until they could be looked up."""
-        statistics = self._statistics.get(robot)
+    def statistics_of(self, robot: str, kind: SampleKind | None = None) -> IntervalStatistics:
+        """The statistics of the samples of one robot; delays are until they could be looked up.
+
+        By default those of its joint states, or of its transforms if it has no joint states.
+        """
+        if kind is None:
+            kind = "joint_states" if (robot, "joint_states") in self._statistics else "transforms"
+        statistics = self._statistics.get((robot, kind))
         if statistics is None:
-            statistics = self._statistics[robot] = IntervalStatistics()
+            statistics = self._statistics[robot, kind] = IntervalStatistics()
         return statistics
 
     def latency_of(self, robot: str) -> Histogram:
@@ -157,24 +167,31 @@ class MeteredBuffer(InstrumentedBuffer):
             latency = self._latencies[robot] = Histogram(LATENCY_BOUNDS_S)
         return latency
 
-    def _on_sample(self, robot: str, stamp: int) -> None:
-        super()._on_sample(robot, stamp)
+    def _on_sample(self, robot: str, kind: SampleKind, stamp: int) -> None:
+        super()._on_sample(robot, kind, stamp)
         delay = self.clock.now() - stamp
         if self._is_comparable(robot):
             self.latency_of(robot).add(delay * 1e-9)
-        statistics = self.statistics_of(robot)
+        statistics = self.statistics_of(robot, kind)
         statistics.add(Received(time.monotonic_ns(), stamp, statistics.count, delay))
-        if statistics.count == 1:
-            self.has_samples.set()
 
     def measure(self, robot: str, within_ns: int = _WINDOW_NS) -> RobotMeasure:
         """How the samples of ``robot`` arrived."""
         statistics, now = self.statistics_of(robot), time.monotonic_ns()
         window, newest = statistics.recent(within_ns, now), statistics.newest
-        rate_hz = None if window is None or statistics.is_stale(now) else window.rate_hz
         is_comparable = self._is_comparable(robot)
+        transforms = self._statistics.get((robot, "transforms"))
         return RobotMeasure(
-            rate_hz or 0.0,
+            _rate_hz(statistics, within_ns, now),
             window.delay_s if window is not None and is_comparable else None,
             (self.clock.now() - newest.stamp) * 1e-9 if newest is not None and is_comparable else None,
+            _rate_hz(transforms, within_ns, now)
+            if transforms is not None and transforms is not statistics
+            else None,
         )
+
+
+def _rate_hz(statistics: IntervalStatistics, within_ns: int, now: int) -> float:
+    """The rate of samples; 0 if they have missed their deadline, or are fewer than two."""
+    window = statistics.recent(within_ns, now)
+    return 0.0 if window is None or statistics.is_stale(now) else window.rate_hz or 0.0

@@ -12,6 +12,7 @@ import numpy as np
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FramePoses, FrameTable
+from zstate.buffer.tracks import Track
 from zstate.clock import Clock
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
@@ -49,15 +50,18 @@ class ViewSource(Closeable):
             self.listener = TransformListener(session, robot, self.buffer, wire)
         self._selected = frozenset(robots)
         self._version = 0
-        # By robot: its newest stamp [ns], and when that was first seen, by time.monotonic [s].
-        self._newest: dict[str, tuple[int, float]] = {}
+        self._recorded: tuple[str, ...] = ()
+        # By track: its newest stamp [ns], and when that was first seen, by time.monotonic [s].
+        self._newest: dict[Track, tuple[int, float]] = {}
         self._table = self.buffer.frame_table(self._selected)
 
     @classmethod
     def from_recording(cls, path: str | Path) -> ViewSource:
         """The robots of a recording, an MCAP file or a bag. Raises RecordingError."""
         with Recording(path) as recording:
-            return cls(None, buffer=recording.buffer())
+            source = cls(None, buffer=recording.buffer())
+            source._recorded = recording.robots
+        return source
 
     def close(self) -> None:
         """Stop listening; the buffer keeps its samples. A second call does nothing."""
@@ -78,7 +82,7 @@ class ViewSource(Closeable):
 
     def robots(self) -> tuple[str, ...]:
         """Every robot received or with a known model, sorted by name."""
-        received = () if self.listener is None else self.listener.robots()
+        received = self._recorded if self.listener is None else self.listener.robots()
         selected = (robot for robot in received if not self._selected or robot in self._selected)
         return tuple(sorted({*self.models, *selected}))
 
@@ -96,20 +100,23 @@ class ViewSource(Closeable):
     def poll(self) -> None:
         """Look for new samples, to time them for ``silent_s``. ``snapshot`` does this too."""
         now = time.monotonic()
-        for robot, track in self._table.robots.items():
+        for track in self._table.moving:
             newest = track.newest
-            known = self._newest.get(robot)
+            known = self._newest.get(track)
             if newest is not None and (known is None or known[0] != newest):
-                self._newest[robot] = newest, now
+                self._newest[track] = newest, now
 
-    def silent_s(self, robot: str) -> float | None:
-        """The time since a new sample of a robot [s]; None without samples, and in a recording."""
-        known = self._newest.get(robot)
+    def silent_s(self, track: Track) -> float | None:
+        """The time since a new sample of a track [s]; None without samples, and in a recording."""
+        known = self._newest.get(track)
         return None if known is None or self.session is None else time.monotonic() - known[1]
 
     def _set_table(self, table: FrameTable) -> None:
-        self._version += table is not self._table
-        self._table = table
+        if table is not self._table:
+            self._version += 1
+            self._table = table
+            kept = set(table.moving)
+            self._newest = {track: seen for track, seen in list(self._newest.items()) if track in kept}
 
 
 @dataclass

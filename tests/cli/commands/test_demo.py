@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -9,6 +10,9 @@ import sys
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
 from helpers.processes import DEADLINE_S, Child, until
+
+from zstate import Kinematics, load_model
+from zstate.cli.commands.demo import ROVER_BASE, ROVER_MODEL, ROVER_WHEELS
 
 pytestmark = pytest.mark.processes
 
@@ -75,7 +79,7 @@ def test_a_publisher_that_dies_ends_the_demo(spawn: Spawn):
     demo.line()
     os.kill(publisher, signal.SIGKILL)
     assert demo.wait() == 1
-    assert "the publisher ended with exit code -9" in demo.stderr
+    assert "the process 'publisher' ended with exit code -9" in demo.stderr
 
 
 def test_a_publisher_does_not_outlive_a_demo_that_is_killed(spawn: Spawn):
@@ -84,6 +88,67 @@ def test_a_publisher_does_not_outlive_a_demo_that_is_killed(spawn: Spawn):
     demo.line()
     demo.kill()
     until(lambda: is_gone(publisher))
+
+
+def rover_programs(demo: Child) -> list[int]:
+    """The process ids of the wheels and of the odometry."""
+    match = re.fullmatch(
+        r"rover \(2 joints, 7 links\): processes (\d+) \(wheels\) and (\d+) \(odometry\) publish it at "
+        r"100 Hz, this one looks it up",
+        demo.line(),
+    )
+    assert match
+    return [int(pid) for pid in match.groups()]
+
+
+def test_rover_shows_poses_across_the_edges_of_two_programs(spawn: Spawn):
+    demo = started(spawn, "demo", "rover")
+    programs = rover_programs(demo)
+    line = demo.line()
+    pattern = r"joint states [\d.]+ Hz, transforms [\d.]+ Hz, .*; lidar_link in odom: xyz \[.* 0\.195\] m, .*"
+    assert re.fullmatch(pattern, line)
+    interrupted(demo)
+    pattern = r"\d+ joint states and \d+ transforms received in [\d.]+ s: [\d.]+ and [\d.]+ Hz, 0 missed, .*"
+    until(lambda: re.fullmatch(pattern, demo.line()))
+    until(lambda: all(map(is_gone, programs)))
+
+
+@pytest.mark.parametrize("number, name", [(0, "wheels"), (1, "odometry")])
+def test_a_program_of_the_rover_that_dies_ends_the_demo(spawn: Spawn, number: int, name: str):
+    demo = started(spawn, "demo", "rover")
+    programs = rover_programs(demo)
+    demo.line()
+    os.kill(programs[number], signal.SIGKILL)
+    assert demo.wait() == 1
+    assert f"the process {name!r} ended with exit code -9" in demo.stderr
+    until(lambda: all(map(is_gone, programs)))
+
+
+def test_other_commands_follow_the_rover_at_the_printed_address(spawn: Spawn):
+    demo = started(spawn, "demo", "rover")
+    demo.line()
+    demo.line()
+    address = re.search(r"--connect (\S+);", demo.stderr)
+    assert address
+    robots = json.loads(zstate("ls", "--json", "--connect", address[1]).stdout)
+    writers = {(one["stream"], one["program"]) for one in robots[0]["writers"]}
+    assert robots[0]["robot"] == "rover"
+    assert {("joint_states", "rover-wheels"), ("transforms", "rover-odometry")} <= writers
+    interrupted(demo)
+
+
+def test_rover_takes_no_xacro_arguments():
+    assert "'rover' takes no xacro arguments; got side" in failure("demo", "rover", "side:=2", code=2)
+
+
+def test_the_wheels_of_the_rover_have_the_measures_of_its_model():
+    model = load_model(ROVER_MODEL)
+    assert model.joint_names == ("left_wheel_joint", "right_wheel_joint")  # the order of WheelSource
+    poses = dict(zip(model.links, Kinematics(model).link_poses([0.0, 0.0]), strict=True))
+    radius, track = ROVER_WHEELS
+    assert model.root == ROVER_BASE
+    assert poses["left_wheel"][:3] == pytest.approx([0.0, track / 2, radius])
+    assert poses["right_wheel"][:3] == pytest.approx([0.0, -track / 2, radius])
 
 
 def test_demo_is_isolated_with_its_publisher_in_any_environment(monkeypatch: pytest.MonkeyPatch):

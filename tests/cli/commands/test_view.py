@@ -13,7 +13,7 @@ import pytest
 from helpers.cli_runner import RRBOT, failure, interrupted, published_robot, started, zstate
 from helpers.processes import until
 
-from zstate import StatePublisher, connect, load_model
+from zstate import StatePublisher, Transform, TransformPublisher, connect, load_model
 
 pytestmark = [pytest.mark.processes]
 
@@ -111,6 +111,18 @@ def test_a_snapshot_is_a_picture_of_the_robot(tmp_path: Path):
     assert pixels.shape == (240, 320, 3)
     middle = pixels[80:160, 120:200]
     assert (middle.min(axis=2) < 200).mean() > 0.02
+
+
+@pytest.mark.browser
+def test_snapshot_of_a_robot_without_a_model_shows_its_frames(tmp_path: Path):
+    picture = tmp_path / "cam.png"
+    cup = Transform("room", "cup", (0.3, 0.2, 0.4), (0.0, 0.0, 0.0, 1.0))
+    with connect() as session, TransformPublisher(session, "cam", "tracker") as tracker:
+        tracker.publish([cup])
+        command = [sys.executable, "-m", "zstate", "view", "cam", "--snapshot", str(picture)]
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=100.0, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout == f"wrote {picture}: cam, 1280 x 800 pixels\n"
 
 
 MINE = """<robot name="mine"><link name="base"><visual><geometry>

@@ -7,7 +7,9 @@ from datetime import datetime
 
 import numpy as np
 import pytest
+from helpers.robots import SECOND, UPRIGHT
 
+from zstate import Transform, TransformBuffer, load_model
 from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.net.graph import Graph, StreamUse, WriterState
 from zstate.view.panels import html
@@ -15,10 +17,14 @@ from zstate.view.panels.display_panels import (
     disconnected_html,
     graph_html,
     search_frames,
+    stale_reason,
     stale_text,
+    state_text,
     unplaced_html,
 )
 from zstate.wire.messages import Level, Status
+
+ORIGIN = (0.0, 0.0, 0.0)
 
 
 def plain(text: str) -> str:
@@ -70,6 +76,44 @@ def test_stale_text_has_duration_and_start(silent_s: float, lasting: str):
     now = datetime(2026, 3, 4, 15, 6, 7).astimezone()
     since = datetime.fromtimestamp(now.timestamp() - silent_s).astimezone()
     assert stale_text(silent_s, now.timestamp()) == f"silent for {lasting}, since {since:%H:%M:%S}"
+
+
+def rover_buffer() -> TransformBuffer:
+    """diffbot on its odometry, joint states at 10 Hz; and a camera that tracks a cup at 5 Hz and a box."""
+    buffer = TransformBuffer()
+    joints = buffer.add_robot(load_model("diffbot"), "rover")
+    for tick in range(3):
+        buffer.insert_joints(joints, tick * SECOND // 10, [0.0, 0.0])
+        buffer.insert(Transform("rover/odom", "rover/base_footprint", ORIGIN, UPRIGHT, tick * SECOND // 10))
+        buffer.insert(Transform("cam/room", "cam/cup", ORIGIN, UPRIGHT, tick * SECOND // 5))
+    buffer.insert(Transform("cam/room", "cam/box", ORIGIN, UPRIGHT, 0))
+    return buffer
+
+
+def test_state_is_the_rate_of_the_joint_states_or_of_transforms():
+    tree = rover_buffer().frame_table()
+    assert state_text("rover", tree, is_live=True) == "live, 10.0 Hz"
+    assert state_text("cam", tree, is_live=True) == "live, 5.0 Hz, transforms only"
+    assert state_text("cam", tree, is_live=False) == "in the past, 5.0 Hz, transforms only"
+    assert state_text("driver", tree, is_live=True) == "no model yet"
+
+
+def test_robot_is_stale_if_a_writer_that_places_it_is():
+    tree = rover_buffer().frame_table()
+    joints, odometry = tree.tracks_of["rover"]
+    assert stale_reason("rover", tree, {}) is None
+    assert (
+        stale_reason("rover", tree, {joints: "silent for 4 s", odometry: "silent for 2 s"})
+        == "silent for 4 s"
+    )
+    assert stale_reason("rover", tree, {odometry: "silent for 2 s"}) == "its place: silent for 2 s"
+
+
+def test_tracked_objects_are_stale_if_all_of_their_writers_are():
+    tree = rover_buffer().frame_table()
+    cup, box = tree.tracks_of["cam"]
+    assert stale_reason("cam", tree, {box: "silent for 4 s"}) is None
+    assert stale_reason("cam", tree, {cup: "silent for 3 s", box: "silent for 4 s"}) == "silent for 3 s"
 
 
 NAMES = (

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Callable
 
 import pytest
+from helpers.processes import repeated
 from helpers.processes import until as until_then
 
+from zstate import Transform, TransformPublisher
 from zstate.model.load import load_model
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import discover
 from zstate.nodes.publisher import StatePublisher
+from zstate.sources import OdometrySource, SquareDrive, WheelPair, WheelSource
 from zstate.view.sliders import SliderPublisher
 
 pytestmark = [pytest.mark.browser, pytest.mark.processes]
@@ -154,6 +158,38 @@ def test_robot_of_a_killed_publisher_is_shown_as_silent(panels, sessions, spawn)
     text = page.view_tab.text("silent for").inner_text()
     assert re.search(r"silent for \d+ s, since \d\d:\d\d:\d\d", text)
     page.view_tab.save_screenshot("panels_silent")
+
+
+def test_tracked_object_without_a_model_is_shown_and_becomes_stale(panels, sessions):
+    with TransformPublisher(sessions[0], "cam", "tracker") as tracker:
+        cup, box = (
+            Transform("room", name, (x, 0.2, 0.4), (0.0, 0.0, 0.0, 1.0))
+            for name, x in (("cup", 0.3), ("box", -0.3))
+        )
+        with repeated(lambda: tracker.publish([cup, box]), every_s=0.05):
+            page = panels(sessions[1])
+            until(lambda: re.fullmatch(r"live, [\d.]+ Hz, transforms only", page.row("cam")))
+            page.view_tab.save_screenshot("panels_transforms_only")
+        until(lambda: re.match(r"silent for [1-9]", page.row("cam")))
+        page.view_tab.text("2 edges are stale", exact=True)
+        page.view_tab.save_screenshot("panels_transforms_silent")
+
+
+def test_mobile_robot_is_stale_without_its_odometry(panels, sessions):
+    drive, model = SquareDrive(WheelPair(0.08, 0.32)), load_model("diffbot")
+    with (
+        StatePublisher(sessions[0], model, "rover") as wheels,
+        TransformPublisher(sessions[0], "rover", "odometry") as odometry,
+    ):
+        source, edge = WheelSource(drive), OdometrySource(drive, "odom", model.root)
+        with repeated(lambda: wheels.publish(source.read(time.time_ns()).positions), every_s=0.05):
+            with repeated(lambda: odometry.publish(edge.read(time.time_ns())), every_s=0.05):
+                page = panels(sessions[1])
+                until(lambda: page.row("rover").startswith("live, "))
+                page.view_tab.save_screenshot("panels_rover")
+            until(lambda: re.match(r"its place: silent for [1-9]", page.row("rover")))
+            page.view_tab.text("rover/odom -> rover/base_footprint: silent for")
+            page.view_tab.save_screenshot("panels_rover_without_odometry")
 
 
 def test_time_is_paused_and_returns_to_live(panels, sessions, spawn):

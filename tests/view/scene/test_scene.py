@@ -110,6 +110,25 @@ def test_stale_robot_is_drawn_in_grey_with_its_text(scene, server):
     assert handles(server, viser.LabelHandle) == {}
 
 
+def test_text_of_a_stale_robot_is_at_its_model_or_at_its_first_frame(scene, server):
+    odometry = tree(
+        {
+            "map": None,
+            "cart/odom": "map",
+            "cart/base": "cart/odom",
+            "cart/wheel": "cart/base",
+            "cam/cup": "map",
+        }
+    )
+    poses = POSES | {"cart/odom": at(0, 0, 0), "cam/cup": at(0, 7, 0)}
+    scene.set_stale("cart", "silent")
+    scene.set_stale("cam", "silent")
+    drawn(scene, snapshot(odometry, poses))
+    labels = handles(server, viser.LabelHandle)
+    found = {one.text: tuple(pose_in_fixed(server, path)[:3]) for path, one in labels.items()}
+    assert found == {"cart: silent": (1.0, 0.0, 0.0), "cam: silent": (0.0, 7.0, 0.0)}
+
+
 def test_only_the_stale_robot_is_grey(scene, server):
     scene.set_robot("tug", CART)
     drawn(scene, snapshot(TWO, POSES))

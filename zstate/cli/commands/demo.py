@@ -6,10 +6,10 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from math import degrees
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import click
 
@@ -32,7 +32,10 @@ from zstate.errors import LookupFailed, UnknownModel, format_duration
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from zstate.metrics.buffer import MeteredBuffer
+    from zstate.metrics.buffer import MeteredBuffer, SampleKind
+    from zstate.model.robot import RobotModel
+    from zstate.net.session import Session
+    from zstate.net.topic_statistics import IntervalStatistics
     from zstate.nodes.listener import TransformListener
     from zstate.transform import Transform
 
@@ -51,6 +54,31 @@ _REFRESH_S = 0.1
 _RECENT_NS = 1_000_000_000
 # The least terminal width that has room for angles.
 _WIDTH_WITH_ANGLES = 72
+_NOUNS: dict[SampleKind, str] = {"joint_states": "joint state", "transforms": "transform"}
+
+RoverProgram = Literal["wheels", "odometry"]
+ROVER = "rover"
+ROVER_MODEL = "diffbot"
+# The root of the model is the frame to place: base_link is fixed on it already.
+_ODOM, ROVER_BASE = "odom", "base_footprint"
+_ROVER_LINKS = ("lidar_link", "left_wheel", "right_wheel")
+# Radius and track of diffbot's wheels [m].
+ROVER_WHEELS = 0.08, 0.32
+
+
+class Demo(NamedTuple):
+    """A robot that moves: poses of ``links`` are shown in the frame ``root``.
+
+    ``programs`` publish it: the arguments of each `zstate` process, by name. ``kinds`` are those of their
+    samples.
+    """
+
+    robot: str
+    model: RobotModel
+    root: str
+    links: Sequence[str]
+    programs: Mapping[str, Sequence[str]]
+    kinds: Sequence[SampleKind] = ("joint_states",)
 
 
 @click.command("demo")
@@ -59,23 +87,40 @@ _WIDTH_WITH_ANGLES = 72
 @click.option("--robot", "robot_option", metavar="ROBOT", help="Same as the argument.")
 @options.rate_option
 @options.seconds_option
+# Of the processes that `zstate demo rover` starts.
+@click.option("--program", type=click.Choice(("wheels", "odometry")), hidden=True, allow_from_autoenv=False)
+@click.option("--connect", "endpoint", hidden=True, allow_from_autoenv=False)
 def demo_command(
+    *,
     robot: str | None,
     xacro_args: dict[str, str],
     robot_option: str | None,
     rate: float,
     seconds: float | None,
+    program: RoverProgram | None,
+    endpoint: str | None,
 ) -> None:
     """Publish ROBOT (default: panda) in one process and look up its transforms in another, over Zenoh.
 
     ROBOT is a name that `zstate robots` lists, such as panda, or a URDF or xacro file; NAME:=VALUE are
     xacro arguments. If panda is not installed, the default is rrbot, which comes with zstate. The two
-    processes use a port of their own and do not affect other sessions.
-    """
-    from zstate.cli.processes import ChildProcess
-    from zstate.model.catalog import example_name
-    from zstate.model.robot import representative_links
+    processes use a port of their own and do not affect other sessions; other commands reach them with the
+    printed --connect.
 
+    `zstate demo rover` is a mobile robot that drives a square: one process publishes its wheels, another one
+    its odometry, odom -> base_footprint.
+
+    \b
+    zstate demo
+    zstate demo path/to/arm.urdf --rate 500
+    zstate demo rover
+    """
+    from zstate.model.catalog import example_name
+
+    if program is not None and endpoint is not None:
+        with open_session(SessionOptions(connect=(endpoint,))) as session:
+            _run_rover_program(session, program, rate)
+        return
     if robot and robot_option and robot != robot_option:
         raise click.UsageError(f"two robots are named, {robot!r} and {robot_option!r}; give one")
     source = robot or robot_option or example_name()
@@ -83,6 +128,14 @@ def demo_command(
         print_status(
             f"{_DEFAULT!r} is not installed (pip install 'zstate[robots]'), so this shows {source!r}"
         )
+    demo = _rover(xacro_args) if source == ROVER else _swinging_robot(source, xacro_args)
+    _run(demo, rate, seconds)
+
+
+def _swinging_robot(source: str, xacro_args: Mapping[str, str]) -> Demo:
+    """A robot whose joints swing, published by one program."""
+    from zstate.model.robot import representative_links
+
     try:
         model, name = load_robot(source, None, xacro_args)
     except UnknownModel as error:
@@ -90,63 +143,116 @@ def demo_command(
     links = representative_links(model)
     if not links:
         fail(f"no link of {name!r} moves, so there is nothing to show; `zstate check` shows its links")
+    arguments = ["publish", source, *(f"{argument}:={value}" for argument, value in xacro_args.items())]
+    arguments += ["--source", "sine", "--name", name]
+    return Demo(name, model, model.root, links, {"publisher": arguments})
+
+
+def _rover(xacro_args: Mapping[str, str]) -> Demo:
+    """A mobile robot whose wheels and odometry are published by two programs."""
+    if xacro_args:
+        raise click.UsageError(f"{ROVER!r} takes no xacro arguments; got {', '.join(xacro_args)}")
+    model, _ = load_robot(ROVER_MODEL, None)
+    programs = {name: ("demo", "--program", name) for name in ("wheels", "odometry")}
+    return Demo(ROVER, model, _ODOM, _ROVER_LINKS, programs, ("joint_states", "transforms"))
+
+
+def _run_rover_program(session: Session, program: RoverProgram, rate_hz: float) -> None:
+    """Publish the rover's wheels, with its model, or its odometry, until a signal."""
+    from zstate.cli.commands.publish import run_publisher
+    from zstate.nodes.publisher import StatePublisher
+    from zstate.nodes.transform_publisher import TransformPublisher
+    from zstate.sources.square_drive import OdometrySource, SquareDrive, WheelPair, WheelSource
+
+    drive = SquareDrive(WheelPair(*ROVER_WHEELS))
+    if program == "wheels":
+        model, _ = load_robot(ROVER_MODEL, None)
+        with StatePublisher(session, model, ROVER, program="rover-wheels") as wheels:
+            run_publisher(wheels, WheelSource(drive), rate_hz, None)
+    else:
+        with TransformPublisher(session, ROVER, "odometry", program="rover-odometry") as odometry:
+            run_publisher(odometry, OdometrySource(drive, _ODOM, ROVER_BASE), rate_hz, None)
+
+
+def _run(demo: Demo, rate_hz: float, seconds: float | None) -> None:
+    """Run the programs, isolated from the user's network, and show the transforms in this process."""
+    from zstate.cli.processes import ChildProcess
+
     for variable in _USERS_NETWORK:
         os.environ.pop(variable, None)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     ended = threading.Event()
-    arguments = ["publish", source, *(f"{argument}:={value}" for argument, value in xacro_args.items())]
-    arguments += ["--source", "sine", "--name", name, "--rate", repr(rate), "--connect", endpoint]
-    with ChildProcess("publisher", arguments, on_end=lambda _: ended.set()) as publisher:
+    common = ("--rate", repr(rate_hz), "--connect", endpoint)
+    with ExitStack() as running:
+        children = [
+            running.enter_context(ChildProcess(name, [*arguments, *common], on_end=lambda _: ended.set()))
+            for name, arguments in demo.programs.items()
+        ]
+        model = demo.model
         size = f"{count_text(len(model.joint_names), 'joint')}, {count_text(len(model.links), 'link')}"
-        print_wrapped(
-            f"{name} ({size}): process {publisher.pid} publishes it at {rate:g} Hz, this one looks it up"
-        )
-        _show_transforms(endpoint, name, model.root, links, ended, seconds)
-        if ended.is_set():
-            fail(f"the publisher ended with exit code {publisher.exit_code}: {publisher.last_error}")
+        processes = f"process {children[0].pid} publishes"
+        if len(children) > 1:
+            named = " and ".join(f"{child.pid} ({child.name})" for child in children)
+            processes = f"processes {named} publish"
+        print_wrapped(f"{demo.robot} ({size}): {processes} it at {rate_hz:g} Hz, this one looks it up")
+        _show_transforms(endpoint, demo, ended, seconds)
+        for child in children:
+            if child.exit_code is not None:
+                fail(f"the process {child.name!r} ended with exit code {child.exit_code}: {child.last_error}")
 
 
-def _show_transforms(  # noqa: PLR0917 - one use
-    endpoint: str, robot: str, root: str, links: Sequence[str], ended: threading.Event, seconds: float | None
-) -> None:
+def _show_transforms(endpoint: str, demo: Demo, ended: threading.Event, seconds: float | None) -> None:
     from zstate.metrics.buffer import MeteredBuffer
     from zstate.nodes.listener import TransformListener
 
     buffer = MeteredBuffer()
     with (
         open_session(SessionOptions(listen=(endpoint,))) as session,
-        TransformListener(session, robot, buffer, history_on_join=False) as listener,
+        TransformListener(session, demo.robot, buffer, history_on_join=False) as listener,
     ):
-        print_status(f"waiting for {robot!r} ...")
+        print_status(f"waiting for {demo.robot!r} ...")
+        frames = f"{demo.robot}/{demo.root}", f"{demo.robot}/{demo.links[0]}"
         deadline = time.monotonic() + _START_WITHIN_S
-        while not buffer.has_samples.wait(0.1):
+        while (reason := _missing_pose(buffer, *frames)) is not None:
             if ended.is_set():
                 return
             if time.monotonic() > deadline:
-                fail(f"no sample of the publisher arrived in {_START_WITHIN_S:g} s")
-        print_status(f"receiving {robot!r} over {endpoint}; Ctrl-C ends this")
-        table = DemoTable(listener, buffer, robot, root, links)
+                fail(f"no pose arrived in {_START_WITHIN_S:g} s: {reason}")
+        print_status(
+            f"receiving {demo.robot!r}; other commands do so with --connect {endpoint}; Ctrl-C ends this"
+        )
+        table = DemoTable(listener, buffer, demo)
         try:
             table.show(ended, seconds)
         finally:
             print_wrapped(table.summary())
 
 
+def _missing_pose(buffer: MeteredBuffer, target: str, source: str) -> LookupFailed | None:
+    """The reason why a pose is still missing after 0.1 s; None as soon as it is known."""
+    try:
+        buffer.wait(target, source, timeout_s=0.1)
+    except LookupFailed as reason:
+        return reason
+    return None
+
+
 class DemoTable:
-    """Transforms of ``links`` in ``root`` with their rate, latency and age.
+    """The transforms of ``demo`` with their rate, latency and age.
 
     A live table on a terminal, one line per second otherwise.
     """
 
-    def __init__(
-        self, listener: TransformListener, buffer: MeteredBuffer, robot: str, root: str, links: Sequence[str]
-    ) -> None:
+    def __init__(self, listener: TransformListener, buffer: MeteredBuffer, demo: Demo) -> None:
         self._listener, self._buffer = listener, buffer
-        self._robot, self._root, self._links = robot, root, links
-        self._statistics = buffer.statistics_of(robot)
-        self._start = time.monotonic_ns(), self._statistics.count
+        self._robot, self._root, self._links = demo.robot, demo.root, demo.links
+        self._statistics: dict[SampleKind, IntervalStatistics] = {
+            kind: buffer.statistics_of(demo.robot, kind) for kind in demo.kinds
+        }
+        self._start_ns = time.monotonic_ns()
+        self._before = [statistics.count for statistics in self._statistics.values()]
 
     def show(self, ended: threading.Event, seconds: float | None) -> None:
         from zstate.clock import wait_interruptible
@@ -168,21 +274,30 @@ class DemoTable:
                 live.update(self.table(), refresh=True)
 
     def summary(self) -> str:
-        stats, (start, before) = self._listener.stats, self._start
-        count, now = self._statistics.count - before, time.monotonic_ns()
-        seconds = (now - start) * 1e-9
+        stats, now = self._listener.stats, time.monotonic_ns()
+        seconds = (now - self._start_ns) * 1e-9
+        counts = [
+            statistics.count - before
+            for statistics, before in zip(self._statistics.values(), self._before, strict=True)
+        ]
+        nouns = [_NOUNS[kind] for kind in self._statistics] if len(counts) > 1 else ["sample"]
+        # So many digits that each rate is the shown count by the shown duration.
+        received = " and ".join(map(count_text, counts, nouns))
+        rates = " and ".join(f"{count / seconds:.1f}" for count in counts)
         return (
-            # So many digits that the rate is the shown count by the shown duration.
-            f"{count_text(count, 'sample')} received in {seconds:.2f} s: {count / seconds:.1f} Hz, "
-            f"{stats.missed + stats.dropped} missed, median latency {self._latency(now - start)}"
+            f"{received} received in {seconds:.2f} s: {rates} Hz, "
+            f"{stats.missed + stats.dropped} missed, median latency {self._latency(now - self._start_ns)}"
         )
 
     @property
     def _freshness(self) -> str:
-        window = self._statistics.recent(_RECENT_NS)
-        rate_hz = None if window is None else window.rate_hz
-        rate = "silent" if self._statistics.is_stale() else rate_text(rate_hz)
-        return f"{rate}, {self._latency(_RECENT_NS)}"
+        rates: list[str] = []
+        for kind, statistics in self._statistics.items():
+            window = statistics.recent(_RECENT_NS)
+            rate_hz = None if window is None else window.rate_hz
+            rate = "silent" if statistics.is_stale() else rate_text(rate_hz)
+            rates.append(f"{_NOUNS[kind]}s {rate}" if len(self._statistics) > 1 else rate)
+        return f"{', '.join(rates)}, {self._latency(_RECENT_NS)}"
 
     def _latency(self, within_ns: int) -> str:
         latency_s = self._buffer.measure(self._robot, within_ns).latency_s
@@ -215,8 +330,12 @@ class DemoTable:
         for title in (r"x       y       z \[m]", *angles, "age"):
             table.add_column(title, justify="right", no_wrap=True)
         for one in self.transforms():
-            xyz = " ".join(f"{value:7.3f}" for value in one.translation)
-            rpy = (" ".join(f"{degrees(angle):6.1f}" for angle in one.rpy),) if with_angles else ()
+            xyz = " ".join(f"{round(value, 3) + 0.0:7.3f}" for value in one.translation)
+            rpy = (
+                (" ".join(f"{round(degrees(angle), 1) + 0.0:6.1f}" for angle in one.rpy),)
+                if with_angles
+                else ()
+            )
             assert one.stamp is not None
             table.add_row(_link(one), xyz, *rpy, format_duration(time.time_ns() - one.stamp))
         return table

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from zstate.metrics.buffer import MeteredBuffer
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.session import Session
+    from zstate.net.topic_statistics import IntervalStatistics
     from zstate.nodes.listener import Follow, TransformListener
 
 _FIRST_AFTER_S = 1.0
@@ -83,8 +84,10 @@ def monitor_command(
 
     With --robots each robot has a line per second: rate, age of its newest sample, latency until a sample can
     be looked up, and counts since the start: received, dropped here, missed on the way, late (older than the
-    history), refused, and off the clock (stamped more than a minute away from the time here). On a ROS wire
-    this is /tf, all nodes together; with --robot, the joint states of a robot that has a description.
+    history), refused, and off the clock (stamped more than a minute away from the time here). Rate, age and
+    latency are those of its joint states, if it has any; transforms besides them have a rate of their own. On
+    a ROS wire this is /tf, all nodes together; with --robot, the joint states of a robot that has a
+    description.
 
     \b
     zstate monitor
@@ -263,6 +266,7 @@ class MonitoredRobot:
     """One robot and its listener, which may listen to other robots, too."""
 
     robot: str
+    follow: Follow
     listener: TransformListener
     buffer: MeteredBuffer
 
@@ -295,8 +299,8 @@ class RobotMonitor(Closeable):
         """Add robots that have appeared. While there is none, prints and returns what is missing."""
         directory, reason = self._directory, ""
         for info in directory.robots():
-            if self._robot in (None, info.name) and info.name not in self._robots:
-                self._add(info.name, directory.streams(info.name))
+            if self._robot in (None, info.name):
+                self._follow(info.name, directory.streams(info.name))
         if not self._robots and self._robot is not None:
             reason = directory.no_sample_text(self._robot, default_stream(self._wire))
         elif not self._robots:
@@ -307,19 +311,23 @@ class RobotMonitor(Closeable):
         self._reported = reason
         return reason
 
-    def _add(self, robot: str, streams: frozenset[Stream]) -> None:
+    def _follow(self, robot: str, streams: frozenset[Stream]) -> None:
+        """Follow a robot that has appeared, or whose joint states have."""
         from zstate.metrics.buffer import MeteredBuffer
         from zstate.nodes.listener import TransformListener
-        from zstate.wire.registry import get_wire
 
         follow: Follow = "joint_states" if "joint_states" in streams else "tf"
         if is_ros(self._wire) and "tf" in streams:
             # All nodes share /tf. A selected robot means its joints, which need its model.
             is_described = self._robot is not None and {"joint_states", "robot_description"} <= streams
             follow = "joint_states" if is_described else "tf"
-        # A listener also receives transforms, whatever it follows.
-        shown = follow if follow in streams else get_wire(self._wire).transforms
-        if shown not in streams:
+        known = self._robots.get(robot)
+        if known is not None and follow in (known.follow, "tf"):
+            return
+        # A native listener also receives transforms, whatever it follows.
+        received: tuple[Stream, ...] = (follow,) if is_ros(self._wire) else (follow, "transforms")
+        shown: list[Stream] = [stream for stream in received if stream in streams]
+        if not shown:
             return
         if follow not in self._listeners:
             buffer = MeteredBuffer(self._clock)
@@ -327,8 +335,8 @@ class RobotMonitor(Closeable):
                 self._session, self._selected, buffer, self._wire, follow, history_on_join=False
             )
             self._listeners[follow] = self._opened.enter_context(listener), buffer
-        self._robots[robot] = MonitoredRobot(robot, *self._listeners[follow])
-        place = self._directory.messages.place(robot, (shown,))
+        self._robots[robot] = MonitoredRobot(robot, follow, *self._listeners[follow])
+        place = self._directory.messages.place(robot, shown)
         print_status(f"following {place}", event="following", robot=robot)
 
     def report(self, *, as_json: bool) -> None:
@@ -339,13 +347,20 @@ class RobotMonitor(Closeable):
             if as_json:
                 print_json({"robot": one.robot, **asdict(measure), **asdict(stats)})
                 continue
-            is_stale = one.buffer.statistics_of(one.robot).is_stale()
+            rate = _rate_text(one.buffer.statistics_of(one.robot), measure.rate_hz)
+            if measure.transforms_hz is not None:
+                transforms = one.buffer.statistics_of(one.robot, "transforms")
+                rate += f"  transforms {_rate_text(transforms, measure.transforms_hz)}"
             reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
             print_wrapped(
-                f"{one.robot}  {'silent' if is_stale else rate_text(measure.rate_hz)}  "
+                f"{one.robot}  {rate}  "
                 f"age {time_text(measure.age_s)}  latency {time_text(measure.latency_s)}  "
                 f"received {stats.received}  dropped {stats.dropped}  missed {stats.missed}  "
                 f"late {stats.late}  refused {sum(stats.refused.values())}"
                 f"{f' ({reasons})' if reasons else ''}"
                 f"{f'  off the clock {stats.off_clock}' if stats.off_clock else ''}"
             )
+
+
+def _rate_text(statistics: IntervalStatistics, rate_hz: float) -> str:
+    return "silent" if statistics.is_stale() else rate_text(rate_hz)

@@ -277,7 +277,12 @@ def _write_snapshot(
         models = source.models
         return all(robot in models for robot in robots) if robots else bool(models)
 
-    if not _wait_for(source, has_models, _ANNOUNCED_WITHIN_S):
+    def has_frames() -> bool:
+        moving = source.snapshot().tree.tracks_of
+        return all(moving.get(robot) for robot in robots) if robots else bool(moving)
+
+    # Of a robot with a model, transforms may arrive first.
+    if not _wait_for(source, has_models, _ANNOUNCED_WITHIN_S) and not has_frames():
         received = ", ".join(map(repr, source.robots())) or "none"
         expected = " and ".join(map(repr, robots)) or "any robot"
         fail(f"waited {_ANNOUNCED_WITHIN_S:g} s for {expected}; robots that were received: {received}")

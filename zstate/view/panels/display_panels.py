@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from difflib import get_close_matches
@@ -12,6 +12,7 @@ import numpy as np
 import viser
 
 from zstate.buffer.snapshot import FramePoses, FrameTable
+from zstate.buffer.tracks import PoseTrack, Track
 from zstate.clock import SYSTEM
 from zstate.errors import LookupFailed, format_duration
 from zstate.ingest.deadline import is_stale
@@ -60,7 +61,11 @@ class DisplayPanel:
 
 
 class RobotsPanel:
-    """A line for each robot, and everything that cannot be drawn. Stale robots are drawn in grey."""
+    """A line for each robot, and everything that cannot be drawn. Stale robots are drawn in grey.
+
+    A robot is stale if one of the writers that place it is: of its joint states, or of an edge above it, such
+    as its odometry. A robot without a model consists of frames; it is stale if the writers of all are.
+    """
 
     def __init__(self, gui: viser.GuiApi, source: ViewSource, scene: Scene) -> None:
         self._source = source
@@ -70,19 +75,14 @@ class RobotsPanel:
 
     def update(self, context: PanelContext) -> None:
         robots, tree = self._source.robots(), context.snapshot.tree
+        # A writer that is stale now was not when a snapshot of the past was taken.
+        silent = self._silent_tracks(tree) if context.is_live else {}
         states: list[tuple[str, str]] = []
         colors: list[str] = []
         for robot in robots:
-            track = tree.robots.get(robot)
-            rate_hz = None if track is None else track.rate_hz
-            # A robot that is stale now was not when a snapshot of the past was taken.
-            silent_s = self._source.silent_s(robot) if context.is_live else None
-            stale = stale_text(silent_s) if silent_s is not None and is_stale(silent_s, rate_hz) else None
+            stale = stale_reason(robot, tree, silent)
             self._scene.set_stale(robot, stale)
-            state = "no model yet" if track is None else "no sample yet"
-            if rate_hz is not None:
-                state = f"{'live' if context.is_live else 'in the past'}, {rate_hz:.1f} Hz"
-            states.append((robot, stale or state))
+            states.append((robot, stale or state_text(robot, tree, is_live=context.is_live)))
             colors.append(html.ALARM if stale else "")
         if robots:
             self._robots.content = html.table(("Robot", "State"), states, colors)
@@ -90,12 +90,46 @@ class RobotsPanel:
             command = f"zstate publish {example_name()} --source sine"
             text = f"No robot is announced. Start one, for instance with: {command}"
             self._robots.content = html.paragraph(text, muted=True)
+        poses = [track for track in silent if isinstance(track, PoseTrack)]
+        edges = [f"{track.name}: {silent[track]}" for track in poses]
         meshes = [f"{uri}\n    {why}" for robot in robots for uri, why in self._scene.missing_meshes(robot)]
         self._missing.content = (
             disconnected_html(tree, context.fixed)
             + unplaced_html(context.snapshot)
+            + _listing("edge is stale", "edges are stale", edges, sum(len(track.edges) for track in poses))
             + _listing("mesh is missing", "meshes are missing", meshes)
         )
+
+    def _silent_tracks(self, tree: FrameTable) -> dict[Track, str]:
+        """The tracks whose writers have missed their deadlines, and since when."""
+        ages = ((track, self._source.silent_s(track)) for track in tree.moving)
+        return {
+            track: stale_text(silent_s)
+            for track, silent_s in ages
+            if silent_s is not None and is_stale(silent_s, track.rate_hz)
+        }
+
+
+def stale_reason(robot: str, tree: FrameTable, silent: Mapping[Track, str]) -> str | None:
+    """The reason why a robot is stale; None if it is not. ``silent`` are the stale tracks."""
+    tracks = tree.tracks_of.get(robot, ())
+    stale = [track for track in tracks if track in silent]
+    if not stale or (robot not in tree.robots and len(stale) < len(tracks)):
+        return None
+    first = stale[0]
+    is_above = robot in tree.robots and first is not tree.robots[robot]
+    return f"its place: {silent[first]}" if is_above else silent[first]
+
+
+def state_text(robot: str, tree: FrameTable, *, is_live: bool) -> str:
+    """What is known of a robot, and the rate of its joint states; without joints that of its transforms."""
+    joints, tracks = tree.robots.get(robot), tree.tracks_of.get(robot, ())
+    if not tracks:
+        return "no model yet"
+    expected = tracks if joints is None or not joints.model.joint_names else (joints,)
+    rates = [track.rate_hz for track in expected if track.rate_hz is not None]
+    text = f"{'live' if is_live else 'in the past'}, {rates[0]:.1f} Hz" if rates else "no sample yet"
+    return text if joints is not None else f"{text}, transforms only"
 
 
 def stale_text(silent_s: float, now_s: float | None = None) -> str:

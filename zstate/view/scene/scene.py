@@ -54,6 +54,7 @@ class Scene:
         self._stale: dict[str, str] = {}
         self._tree: FrameTable | None = None
         self._first_frames: dict[str, str] = {}
+        self._roots: dict[str, str] = {}
         self._nodes = FrameNodes(scene)
         self._axes = Axes(scene)
         self._names = FrameLabels(scene)
@@ -76,6 +77,7 @@ class Scene:
         ``shapes`` default to those of its model. ``base`` is the folder of its URDF file, if the user named
         one: then every file in it can be loaded, otherwise only those in packages.
         """
+        self._roots[name] = f"{name}/{model.root}"
         faults: Sequence[Finding] = ()
         if shapes is None:
             shapes, faults = read_shapes(model)
@@ -98,6 +100,7 @@ class Scene:
         """Remove a robot, if it exists."""
         self._remove_meshes(name)
         self._faults.pop(name, None)
+        self._roots.pop(name, None)
         self._stale.pop(name, None)
 
     def _remove_meshes(self, name: str) -> None:
@@ -111,7 +114,10 @@ class Scene:
                 del self._instanced[kind]
 
     def set_stale(self, robot: str, text: str | None) -> None:
-        """Draw a stale robot in translucent grey, with ``text`` at its root; with None, as usual."""
+        """Draw a stale robot in translucent grey, with ``text`` at its root; with None, as usual.
+
+        Without a model the text is at the first frame of the robot.
+        """
         if text is None:
             self._stale.pop(robot, None)
         else:
@@ -137,8 +143,9 @@ class Scene:
             self._tree = tree
             # Parents come first.
             self._first_frames = {name.partition("/")[0]: name for name in reversed(tree.names)}
-        first = self._first_frames
-        stale = {first[robot]: f"{robot}: {text}" for robot, text in self._stale.items() if robot in first}
+        # At the model, not at an odometry frame of the robot far from it.
+        frames = self._first_frames | {name: root for name, root in self._roots.items() if root in tree.index}
+        stale = {frames[robot]: f"{robot}: {text}" for robot, text in self._stale.items() if robot in frames}
         placed = self.layout.placed(snapshot, fixed)
         on_links = (meshes.frames for meshes in self._single.values())
         carriers = tree.names if self.names else chain(stale, self.layout.labels, *on_links)
