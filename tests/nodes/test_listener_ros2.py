@@ -274,21 +274,34 @@ def test_other_edges_of_tf_are_received_beside_joint_states(sessions):
         assert listener.stats.refused == {}
 
 
+def test_tf_of_a_state_publisher_is_not_read(sessions):
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "r1", "ros2") as publisher,
+        TransformListener(reader, "r1", wire="ros2") as listener,
+    ):
+        until(lambda: publisher.publish([0.5, 0.25]) or listener.buffer.can_lookup("world", "tool"))
+        assert publisher.stats.streams["ros2", "tf"].samples == 0
+        ekf = RosNode(writer, "ekf").publisher(TF).announce().wait_for_reader()
+        ekf.edge(STAMP, "odom", "world", 2.0)
+        until(lambda: x_of(listener, "odom", "world", STAMP) == 2.0)
+
+
 @pytest.mark.parametrize("is_described_first", [True, False])
 def test_edges_of_the_model_on_tf_change_nothing(sessions, is_described_first: bool):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
-        state_publisher = RosNode(writer, "robot_state_publisher").publisher(TF).announce().wait_for_reader()
+        simulator = RosNode(writer, "simulator").publisher(TF).announce().wait_for_reader()
         if not is_described_first:
-            state_publisher.transforms(STAMP, MOVING, x_moved(7.0, 8.0))
+            simulator.transforms(STAMP, MOVING, x_moved(7.0, 8.0))
             until(lambda: x_of(listener, *MOVING[0]) == 7.0)
         publish_description(writer)
         driver = publish_known_joints(writer, listener)
         for later in range(5):
             # In one message with an edge that only this writer has, as simulators publish them.
             edges = [("odom", "world"), *MOVING]
-            state_publisher.transforms(STAMP + later, edges, x_moved(float(later), 7.0, 8.0))
-            state_publisher.transforms(STAMP + later, MOVING, x_moved(7.0, 8.0))
+            simulator.transforms(STAMP + later, edges, x_moved(float(later), 7.0, 8.0))
+            simulator.transforms(STAMP + later, MOVING, x_moved(7.0, 8.0))
             driver.joints(STAMP + later, NAMES, [0.5, 0.25])
         until(lambda: listener.buffer.can_lookup("odom", "tool", STAMP + 4))
         assert x_of(listener, "odom", "world", STAMP + 3) == 3.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -145,19 +145,23 @@ class TransformListener(Closeable):
         self._statics: dict[tuple[str, int], StaticTransformIngest] = {}
         self._history: HistoryReader | None = None
         self._clock_offsets: _WriterClockOffsets | None = None
+        self._tf_of_others: _TfOfOtherNodes | None = None
         self._observers: tuple[Callable[[], object], ...] = ()
         with ExitStack() as opening:
             opening.enter_context(self._events)
-            expression = self._wire.expression
-            on_description = self._observed(self._on_description)
-            on_statics = self._observed(self._on_statics)
-            description, statics = expression(robot, "robot_description"), expression(robot, "tf_static")
-            opening.enter_context(LatchedSubscriber(session, description, on_description))
-            opening.enter_context(LatchedSubscriber(session, statics, on_statics))
-            for samples in self._sample_streams.values():
-                key = expression(robot, samples.stream)
-                samples.capacity = capacity_for(key)
-                opening.enter_context(StreamSubscriber(session, key, partial(self._on_samples, samples)))
+            latched: dict[Stream, Callable[[SerializedSample], None]] = {
+                "robot_description": self._on_description,
+                "tf_static": self._on_statics,
+            }
+            for stream, handle in latched.items():
+                key = self._wire.expression(robot, stream)
+                opening.enter_context(LatchedSubscriber(session, key, self._observed(handle)))
+            if len(self._sample_streams) > 1 and self._wire.shared:
+                subscribe = partial(self._subscribe, session, [self._wire.transforms])
+                self._tf_of_others = opening.enter_context(_TfOfOtherNodes(subscribe))
+                opening.enter_context(self._subscribe(session, [follow]))
+            else:
+                opening.enter_context(self._subscribe(session, tuple(self._sample_streams)))
             if history_on_join and self._wire.name == "native":
                 on_history = self._observed(self._on_history)
                 self._history = opening.enter_context(
@@ -173,6 +177,15 @@ class TransformListener(Closeable):
             self._opened = opening.pop_all()
         self._pid = os.getpid()
         _LISTENERS.add(self)
+
+    def _subscribe(self, session: Session, streams: Sequence[Stream]) -> ExitStack:
+        """Receive the samples of ``streams`` until the stack is closed."""
+        with ExitStack() as opening:
+            for stream in streams:
+                samples, key = self._sample_streams[stream], self._wire.expression(self.robot, stream)
+                samples.capacity = capacity_for(key)
+                opening.enter_context(StreamSubscriber(session, key, partial(self._on_samples, samples)))
+            return opening.pop_all()
 
     def __repr__(self) -> str:
         robots, received = len(self.robots()), self.stats.received
@@ -364,6 +377,8 @@ class TransformListener(Closeable):
         self._events.on_writer(announced, alive)
         robot, session, stream = announced.robot, announced.writer.session, announced.stream
         name = str(announced.writer)
+        if self._tf_of_others is not None:
+            self._tf_of_others.on_writer(announced, alive=alive)
         if alive:
             self._names[robot, session] = name
             self._ownership.add_robot(robot)
@@ -401,6 +416,48 @@ class TransformListener(Closeable):
         ingest.writer_left(session)
         if samples.is_shared:
             samples.add_unannounced(key, samples.ingests.pop(key))
+
+
+class _TfOfOtherNodes(Closeable):
+    """The subscription to /tf of a listener of joint states, while a node writes it beside state publishers.
+
+    A state publisher writes there what its model and the joint states contain; zstate's own does not even
+    compute it without a subscriber.
+    """
+
+    def __init__(self, subscribe: Callable[[], ExitStack]) -> None:
+        self._subscribe = subscribe
+        self._writers: set[Announcement] = set()
+        self._subscription: ExitStack | None = None
+
+    def on_writer(self, announced: Announcement, *, alive: bool) -> None:
+        """Subscribe or unsubscribe, if this writer makes a difference."""
+        (self._writers.add if alive else self._writers.discard)(announced)
+        streams: dict[str, set[Stream]] = {}
+        for one in self._writers:
+            streams.setdefault(one.node, set()).add(one.stream)
+        if not any(one.stream == "tf" and not _is_state_publisher(one, streams) for one in self._writers):
+            self.close()
+        elif self._subscription is None:
+            self._subscription = self._subscribe()
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        subscription, self._subscription = self._subscription, None
+        if subscription is not None:
+            subscription.close()
+
+
+def _is_state_publisher(announced: Announcement, streams: Mapping[str, Collection[Stream]]) -> bool:
+    """Whether it is of a node with the model that writes joint states, or is named robot_state_publisher.
+
+    ``streams`` are those of each node; the nodes behind a zenoh-plugin-ros2dds bridge are not known.
+    """
+    written = streams[announced.node]
+    is_named_so = announced.writer.program.endswith("/robot_state_publisher")
+    return (
+        bool(announced.node) and "robot_description" in written and ("joint_states" in written or is_named_so)
+    )
 
 
 class _WriterClockOffsets(Closeable):

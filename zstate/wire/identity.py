@@ -61,13 +61,15 @@ class Announcement:
     """The content of a liveliness token: ``writer`` writes ``stream`` of ``robot``.
 
     ``name`` is the name under which it writes edges, on the ``NAMED_STREAMS``; empty for other streams, and
-    on wires without such names.
+    on wires without such names. ``node`` is the same for all streams of one ROS node, whose name other nodes
+    may have, too; empty where nodes are not announced.
     """
 
     robot: str
     stream: Stream
     writer: WriterId
     name: str = ""
+    node: str = ""
 
     @property
     def identity(self) -> str:

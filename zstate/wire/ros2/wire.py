@@ -126,15 +126,18 @@ class Ros2Wire:
         if not isinstance(parsed, EndpointToken) or parsed.kind != "MP":
             return None
         writer = WriterId(parsed.full_name, host="", pid=0, since=0, session=session_from_gid(gid(token)))
-        return self._announcement(parsed.topic, parsed.dds_type, robot, writer)
+        node = f"{parsed.zid}/{parsed.node.nid}"
+        return self._announcement(parsed.topic, parsed.dds_type, robot, writer, node)
 
-    def _announcement(self, topic: str, dds_type: str, robot: str, writer: WriterId) -> Announcement | None:
+    def _announcement(
+        self, topic: str, dds_type: str, robot: str, writer: WriterId, node: str = ""
+    ) -> Announcement | None:
         named = robot_from_topic(topic) if robot == ANY else robot
         for stream in STREAMS:
             # a namespace that ROS does not allow matches no topic
             with suppress(InvalidInput):
                 if dds_type == ros_type(stream).dds and topic == self._keys.topic(named, stream):
-                    return Announcement(named, stream, writer)
+                    return Announcement(named, stream, writer, node=node)
         return None
 
 
