@@ -49,7 +49,7 @@ class Edge:
     def writer(self) -> str | None:
         """The writer of this edge, if known."""
         if self.robot is not None:
-            writer = self.robot.model_writer if self.kind == "static" else self.robot.writer
+            writer = self.robot.model_writer if self.track is None else self.track.writer
             return writer or f"the model of {self.robot.model.name!r}"
         return self.track.writer if self.track is not None else self.static_writer
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput
-from zstate.ingest.joint_states import joint_order
+from zstate.ingest.joint_parts import joint_order
 from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import Joint, RobotModel, velocity_columns_by_position
 from zstate.wire.joint_order import JointNumbers
