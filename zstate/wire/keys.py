@@ -49,6 +49,9 @@ ANY = "*"
 NAMED_STREAMS: frozenset[Stream] = frozenset({"tf_static", "transforms", "partial_joint_states"})
 """The streams with one key for each of the writer names of a robot."""
 
+JOINT_STREAMS: frozenset[Stream] = frozenset({"joint_states", "partial_joint_states"})
+"""The streams of joint positions."""
+
 READERS = "zstate/@reader/*/*/*"
 """The key expression of the tokens of all readers."""
 

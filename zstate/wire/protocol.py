@@ -64,6 +64,12 @@ class StreamEncoder(Protocol):
         ...
 
 
+def carrier(wire: Wire, stream: Stream) -> Stream:
+    """The stream that carries ``stream`` on ``wire``: in ROS transforms are on /tf."""
+    carriers = {"transforms": wire.transforms, "partial_joint_states": wire.partial_joint_states}
+    return carriers.get(stream, stream)
+
+
 class Wire(Protocol):
     """One wire format for the streams of a robot: keys, encodings and bytes.
 

@@ -173,7 +173,7 @@ def test_silent_writer_of_transforms_is_named_and_the_rest_is_sound():
     ):
         found = warnings("rrbot")
     assert list(found) == ["transforms"]
-    assert "as 'camera', is announced, but no transform arrives" in found["transforms"]
+    assert "as 'camera', is announced, but no sample arrives" in found["transforms"]
 
 
 def test_robot_with_transforms_only_is_sound():

@@ -30,7 +30,7 @@ from zstate.cli.output.console import (
 from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
-from zstate.wire.keys import ANY, Stream, check_robot
+from zstate.wire.keys import ANY, JOINT_STREAMS, Stream, check_robot
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
@@ -312,14 +312,13 @@ class RobotMonitor(Closeable):
         from zstate.nodes.listener import TransformListener
         from zstate.wire.registry import get_wire
 
-        follow: Follow = "joint_states" if "joint_states" in streams else "tf"
+        follow: Follow = "tf" if JOINT_STREAMS.isdisjoint(streams) else "joint_states"
         if is_ros(self._wire) and "tf" in streams:
             # All nodes share /tf. A selected robot means its joints, which need its model.
             is_described = self._robot is not None and {"joint_states", "robot_description"} <= streams
             follow = "joint_states" if is_described else "tf"
-        # A listener also receives transforms, whatever it follows.
-        shown = follow if follow in streams else get_wire(self._wire).transforms
-        if shown not in streams:
+        # A listener also receives transforms, whatever it follows, and partial joint states as joint states.
+        if streams.isdisjoint({follow, get_wire(self._wire).transforms, "partial_joint_states"}):
             return
         if follow not in self._listeners:
             buffer = MeteredBuffer(self._clock)
