@@ -99,8 +99,8 @@ def build_graph(
 ) -> Graph:
     """The graph of discovered writers and readers.
 
-    A stream with names, such as static edges, is one stream for each name under which it is written. The rate is that of
-    the first writer whose rate is known: usually there is only one.
+    A stream with names, such as static edges, is one stream for each name under which it is written. The rate
+    is that of the first writer whose rate is known: usually there is only one.
     """
 
     def programs(writers: Iterable[WriterId]) -> tuple[str, ...]:

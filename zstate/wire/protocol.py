@@ -66,8 +66,9 @@ class StreamEncoder(Protocol):
 
 def carrier(wire: Wire, stream: Stream) -> Stream:
     """The stream that carries ``stream`` on ``wire``: in ROS transforms are on /tf."""
-    carriers = {"transforms": wire.transforms, "partial_joint_states": wire.partial_joint_states}
-    return carriers.get(stream, stream)
+    if stream == "transforms":
+        return wire.transforms
+    return wire.partial_joint_states if stream == "partial_joint_states" else stream
 
 
 class Wire(Protocol):

@@ -318,7 +318,8 @@ class RobotMonitor(Closeable):
             is_described = self._robot is not None and {"joint_states", "robot_description"} <= streams
             follow = "joint_states" if is_described else "tf"
         # A listener also receives transforms, whatever it follows, and partial joint states as joint states.
-        if streams.isdisjoint({follow, get_wire(self._wire).transforms, "partial_joint_states"}):
+        shown: tuple[Stream, ...] = (follow, "partial_joint_states", get_wire(self._wire).transforms)
+        if streams.isdisjoint(shown):
             return
         if follow not in self._listeners:
             buffer = MeteredBuffer(self._clock)
@@ -327,7 +328,9 @@ class RobotMonitor(Closeable):
             )
             self._listeners[follow] = self._opened.enter_context(listener), buffer
         self._robots[robot] = MonitoredRobot(robot, *self._listeners[follow])
-        place = self._directory.messages.place(robot, (shown,))
+        place = self._directory.messages.place(
+            robot, (next(stream for stream in shown if stream in streams),)
+        )
         print_status(f"following {place}", event="following", robot=robot)
 
     def report(self, *, as_json: bool) -> None:
