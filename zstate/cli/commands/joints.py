@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 @options.xacro_arguments
 @click.option(
     "--only",
-    "joints",
     multiple=True,
     metavar="NAME",
     help="Publish this joint only, as the driver of a part of the robot. Repeatable.",
@@ -39,7 +38,7 @@ def joints_command(
     *,
     robot: str,
     xacro_args: dict[str, str],
-    joints: tuple[str, ...],
+    only: tuple[str, ...],
     rate: float,
     seconds: float | None,
     name: str | None,
@@ -68,12 +67,12 @@ def joints_command(
     from zstate.wire.registry import get_wire
 
     model, robot_name = load_robot(robot, name, xacro_args)
-    if joints and takeover:
+    if only and takeover:
         raise click.UsageError("--takeover is for all joints; with --only a joint has one writer")
     with open_session(network, (wire,)) as session, open_clock(session, clock, wire) as time:
-        if joints:
-            publisher = PartialStatePublisher(session, model, joints, robot_name, (wire,), clock=time)
-            shown = f"on {', '.join(joints)}"
+        if only:
+            publisher = PartialStatePublisher(session, model, only, robot_name, (wire,), clock=time)
+            shown = f"on {', '.join(only)}"
             place = messages_for(wire).place(robot_name, (get_wire(wire).partial_joint_states,))
         else:
             publisher = StatePublisher(

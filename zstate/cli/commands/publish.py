@@ -55,7 +55,6 @@ def _check_source(source: str) -> str:
 )
 @click.option(
     "--max-age",
-    "max_age_s",
     type=options.SECONDS,
     default=0.5,
     show_default=True,
@@ -75,7 +74,7 @@ def publish_command(
     xacro_args: dict[str, str],
     source: str,
     rate: float | None,
-    max_age_s: float,
+    max_age: float,
     wires: tuple[str, ...],
     clock: str,
     seconds: float | None,
@@ -136,7 +135,7 @@ def publish_command(
         rate_hz = rate or _RATE_HZ
         if derived_wires:
             source_joints = JointStateListener(
-                session, robot_name, model, wire=derived_wires[0], max_age_s=max_age_s
+                session, robot_name, model, wire=derived_wires[0], max_age_s=max_age
             )
             _publish_joint_states(source_joints, derived_wires[0], derived, whole, rate, seconds)
         elif source == "sine":
