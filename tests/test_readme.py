@@ -56,6 +56,7 @@ def test_every_python_block_is_a_program_tested_here() -> None:
         "publish.py",
         "lookup.py",
         "driver.py",
+        "gripper.py",
         "odometry.py",
         "buffer.py",
         "recording.py",
@@ -84,6 +85,12 @@ def test_driver_keeps_its_rate(spawn: Callable[..., Child]) -> None:
     driver = spawn(PROGRAMS["driver.py"])
     assert "commanded_hz=500.0" in driver.line()
     assert driver.wait() == 0, driver.stderr
+
+
+def test_driver_of_the_gripper_publishes_its_joints(spawn: Callable[..., Child]) -> None:
+    gripper = spawn(PROGRAMS["gripper.py"])
+    assert "commanded_hz=100.0" in gripper.line()
+    assert gripper.wait() == 0, gripper.stderr
 
 
 def test_odometry_is_looked_up_from_another_process(spawn: Callable[..., Child]) -> None:

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from zstate.net.session import connect
     from zstate.nodes.clock import SimulatedClock
     from zstate.nodes.listener import TransformListener
+    from zstate.nodes.partial_publisher import PartialStatePublisher
     from zstate.nodes.publisher import StatePublisher
     from zstate.nodes.static_publisher import StaticPublisher
     from zstate.nodes.transform_publisher import TransformPublisher
@@ -67,6 +68,7 @@ __all__ = [
     "LookupFailed",
     "ModelError",
     "NoData",
+    "PartialStatePublisher",
     "Recording",
     "RecordingError",
     "RobotModel",
@@ -94,6 +96,7 @@ _HOMES = {
     "JointReading": "sources",
     "JointStateListener": "sources",
     "Kinematics": "model.kinematics",
+    "PartialStatePublisher": "nodes.partial_publisher",
     "Recording": "recording.recording",
     "RobotModel": "model.robot",
     "SimulatedClock": "nodes.clock",

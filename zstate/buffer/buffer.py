@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.core import BufferCore
-from zstate.buffer.path import Plan, TransformPath, joints_path
+from zstate.buffer.path import Plan, TransformPath
+from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader, TimeSpan
 from zstate.buffer.tracks import JointTrack, Track
 from zstate.buffer.waiting import MessageFilter, RequiredStamps, TransformWatch, Waiter, WakeCondition
@@ -362,10 +363,12 @@ class TransformBuffer(BufferCore):
         """All joints of a robot at a stamp, and that stamp: (nq,) in the order of its model's joint_names.
 
         ``robot`` is the prefix of its frames, or the name of its model if it has no prefix. ``at=None`` is
-        its newest sample. Between samples joints are interpolated as in lookups. Raises NoData, InPast,
-        InFuture or NotFinite, and InvalidInput for an unknown robot, with near misses.
+        its newest sample; of a robot with several drivers, the newest instant that all of them have reached.
+        Between samples joints are interpolated as in lookups, each between those of its own driver. Raises
+        NoData, InPast, InFuture, Stale or NotFinite, which name the limiting driver, and InvalidInput for an
+        unknown robot, with near misses.
         """
-        return self._joint_positions(self._robot_track(robot), None if at is None else check_stamp(at))
+        return self._robot_joints(robot).positions(None if at is None else check_stamp(at))
 
     def joint_positions_many(
         self, robot: str, stamps: ArrayLike
@@ -375,23 +378,17 @@ class TransformBuffer(BufferCore):
         Rows without positions are NaN. Raises InvalidInput as ``joint_positions``.
         """
         instants = check_stamps(stamps)
-        track = self._robot_track(robot)
-        values, valid = joints_path(track, self._read_views).values_at(instants)
-        positions = np.full((len(instants), track.position_count), np.nan)
-        columns = [column for value in values[0] for column in np.atleast_2d(value)] if values else []
-        if columns:
-            positions[valid] = np.stack(columns, axis=-1)
-        unusable = ~np.isfinite(positions).all(axis=1)
-        positions[unusable] = np.nan
-        return positions, valid & ~unusable
+        return self._robot_joints(robot).positions_many(instants)
 
     def joint_states(self, robot: str, start: int | None = None, end: int | None = None) -> JointTrajectory:
         """The samples of a robot that are kept, with stamps in [start, end): copies; efforts are not kept.
 
-        Raises InvalidInput as ``joint_positions``.
+        Of a robot with several drivers: an instant for each sample of any of them that all of them cover,
+        with the other joints interpolated as in lookups, and their velocities NaN. Raises InvalidInput as
+        ``joint_positions``.
         """
         start, end = (None if stamp is None else check_stamp(stamp) for stamp in (start, end))
-        return self._robot_track(robot).samples(start, end)
+        return self._robot_joints(robot).samples(start, end)
 
     def link_poses(self, robot: str, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """Every link of a robot at a stamp, and that stamp: (L, 7), rows as the ``links`` of its model.
@@ -399,7 +396,7 @@ class TransformBuffer(BufferCore):
         Row i is ``root_from_link``: x y z [m], qx qy qz qw. Raises as ``joint_positions``.
         """
         track = self._robot_track(robot)
-        positions, stamp = self._joint_positions(track, None if at is None else check_stamp(at))
+        positions, stamp = self.joint_positions(robot, at)
         poses = track.kinematics.link_poses(positions)
         unknown = ~np.isfinite(poses).all(axis=1)
         if unknown.any():
@@ -407,13 +404,11 @@ class TransformBuffer(BufferCore):
             raise NotFinite(track.frame(track.model.root), track.frame(link), requested=stamp)
         return poses, stamp
 
-    def _joint_positions(self, track: JointTrack, at: int | None) -> tuple[NDArray[np.float64], int]:
-        path = joints_path(track, self._read_views)
-        values, stamp, *_ = path.read(at)
-        positions = np.hstack([np.empty(0), *values[0]])
-        if not np.isfinite(positions).all():
-            raise path.not_finite(values, stamp)
-        return positions, stamp
+    def _robot_joints(self, robot: str) -> RobotJoints:
+        return RobotJoints(self._robot_track(robot), self._read_views)
+
+    def _positions_of_track(self, track: JointTrack, at: int) -> tuple[NDArray[np.float64], int]:
+        return RobotJoints(track, self._read_views, own=True).positions(at)
 
     def snapshot(
         self, at: int | None = None, *, robots: Collection[str] = (), hold_s: float = 0.0
@@ -423,7 +418,7 @@ class TransformBuffer(BufferCore):
         ``robots`` restricts it to the frames of these, and those above them. A track is still read at its
         newest sample for ``hold_s`` after that. Beyond its samples poses are not known, with a reason.
         """
-        return self._snapshot_reader(robots).read(self._joint_positions, at, round(hold_s * 1e9))
+        return self._snapshot_reader(robots).read(self._positions_of_track, at, round(hold_s * 1e9))
 
     def frame_table(self, robots: Collection[str] = ()) -> FrameTable:
         """The frames that ``snapshot`` reads; the same object while neither the tree nor a writer changes."""

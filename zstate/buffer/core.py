@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from numbers import Real
 from typing import NamedTuple, get_args
@@ -147,9 +147,41 @@ class BufferCore:
             track.owner = None
             for name, edge in list(self._tree.frames.items()):
                 if edge is not None and edge.robot is track:
+                    if edge.track is not None:
+                        edge.track.owner = None
                     self._tree.detach(name)
             if self._tree.robots.get(track.prefix) is track:
                 self._tree.robots[track.prefix] = None
+
+    def add_part(self, robot: JointTrack, joints: Sequence[str], writer: str | None = None) -> JointTrack:
+        """A track for some ``joints`` of a robot, which one of its drivers publishes.
+
+        Its positions are in the order of ``joints``. It moves no edge before ``assign_joints``. Raises
+        InvalidInput as ``RobotModel.part``, InsertRefused for a track that is not of this buffer.
+        """
+        track = JointTrack(robot.model.part(joints), robot.prefix, self._span_ns, robot.interpolation)
+        with self._lock:
+            self._check_owned(robot)
+            track.owner, track.writer, track.model_writer = self._owner, writer, robot.model_writer
+        return track
+
+    def assign_joints(self, robot: JointTrack, parts: Mapping[str, JointTrack]) -> None:
+        """Set which of a robot's parts moves which of its driven joints; the track ``robot`` moves the rest.
+
+        Lookups read each joint, and the joints that mimic it, from the samples of its own part. Raises
+        InsertRefused for a track that is not of this buffer.
+        """
+        with self._lock:
+            self._check_owned(robot)
+            robot.parts = dict(parts)
+            for form, joint in zip(robot.forms, robot.model.joints, strict=True):
+                parent, child = robot.edge(form)
+                edge = self._tree.frames[child]
+                track = parts.get(robot.model.mimic_of(joint).joint, robot)
+                if form.kind != "fixed" and (edge is None or edge.track is not track):
+                    index = [part.name for part in track.model.joints].index(joint.name)
+                    self._tree.attach(Edge(parent, child, "joint", track=track, index=index, robot=robot))
+        self._waiters.notify()
 
     def name_robot(self, prefix: str) -> None:
         """Let inserts use bare names for frames ``prefix/...``, as they may for a robot's."""

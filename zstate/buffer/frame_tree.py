@@ -49,7 +49,7 @@ class Edge:
     def writer(self) -> str | None:
         """The writer of this edge, if known."""
         if self.robot is not None:
-            writer = self.robot.model_writer if self.kind == "static" else self.robot.writer
+            writer = self.robot.model_writer if self.track is None else self.track.writer
             return writer or f"the model of {self.robot.model.name!r}"
         return self.track.writer if self.track is not None else self.static_writer
 
@@ -60,7 +60,8 @@ class FrameInfo:
 
     ``kind`` is "joint" or "pose" for moving edges, "static", or "root" for a frame without a parent.
     ``oldest`` and ``newest`` [ns], ``rate_hz`` and ``count`` are of the samples kept. ``domain`` is the clock
-    domain of the stamps: "system", the name of a simulated time, or None if that is not known.
+    domain of the stamps: "system", the name of a simulated time, or None if that is not known. ``joint`` is
+    the driven joint that moves the frame, of the edges of a model.
     """
 
     name: str
@@ -72,6 +73,7 @@ class FrameInfo:
     newest: int | None
     count: int
     domain: str | None = None
+    joint: str | None = None
 
     def newest_in(self, domain: str) -> int | None:
         """The newest stamp [ns] if it can be compared with a clock of ``domain``, else None."""
@@ -309,7 +311,11 @@ class FrameTree:
             return FrameInfo(name, edge.parent, "static", edge.writer, None, None, None, 0)
         oldest, newest, rate_hz, count = coverage(edge.track.history.view)
         facts = (edge.parent, edge.kind, edge.writer, rate_hz, oldest, newest, count)
-        return FrameInfo(name, *facts, self.domain_of(edge) or None)
+        joint = None
+        if isinstance(edge.track, JointTrack):
+            model = edge.track.model
+            joint = model.mimic_of(model.joints[edge.index]).joint
+        return FrameInfo(name, *facts, self.domain_of(edge) or None, joint)
 
     def snapshot(self) -> TreeSnapshot:
         """A copy of all frames and robots."""

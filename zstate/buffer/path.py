@@ -358,15 +358,6 @@ def _has_covariances(edge: Edge) -> bool:
     return isinstance(edge.track, PoseTrack) and edge.track.has_covariances
 
 
-def joints_path(track: JointTrack, read_views: ViewReader) -> TransformPath:
-    """A path without steps that reads every joint of a robot."""
-    joints = [(index, joint) for index, joint in enumerate(track.model.joints) if joint.driven]
-    interpolators = [one for index, _ in joints for one in _joint_interpolators(track, index)]
-    root = track.frame(track.model.root)
-    edge = track.edge(track.forms[joints[0][0]]) if joints else (root, root)
-    return TransformPath(root, root, (), (), [TrackUse(track, interpolators, edge)], read_views)
-
-
 def _steps(edges: Sequence[Edge], uses: dict[Track, TrackUse]) -> list[Step]:
     """One step for each edge; consecutive static ones multiplied. Adds what they read to ``uses``."""
     steps: list[Step] = []
@@ -387,7 +378,7 @@ def _step(edge: Edge, uses: dict[Track, TrackUse]) -> Step:
     if isinstance(track, PoseTrack):
         form, interpolators = None, [PoseInterpolator(7 * edge.index)]
     else:
-        form, interpolators = track.forms[edge.index], _joint_interpolators(track, edge.index)
+        form, interpolators = track.forms[edge.index], joint_interpolators(track, edge.index)
     known = uses.setdefault(track, TrackUse(track, [], edge.names)).interpolators
     if interpolators[0] not in known:
         known.extend(interpolators)
@@ -397,7 +388,8 @@ def _step(edge: Edge, uses: dict[Track, TrackUse]) -> Step:
     return JointStep(form, *place)
 
 
-def _joint_interpolators(track: JointTrack, index: int) -> list[Interpolator]:
+def joint_interpolators(track: JointTrack, index: int) -> list[Interpolator]:
+    """What reads the positions of ``track.model.joints[index]``."""
     form = track.forms[index]
     column, velocity = form.column, -1
     if track.has_velocities:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, NamedTuple, TypeAlias
@@ -38,6 +38,9 @@ class JointTrack:
     that were not published are NaN. ``prefix`` precedes the names of all links. ``writer`` publishes the
     positions and ``model_writer`` the model, where they are known. ``owner`` is the buffer; None once the
     robot was removed from it.
+
+    If a driver publishes only some of the joints, these have a track of their own, whose ``model`` is that
+    part of the robot's (``RobotModel.part``): ``parts`` of the robot's own track has them by joint.
     """
 
     def __init__(
@@ -47,10 +50,11 @@ class JointTrack:
         self.prefix = prefix
         self._table = JointTransforms(model)
         self.forms = self._table.forms
-        self.interpolation = interpolation
+        self.interpolation: Interpolation = interpolation
         self.writer: str | None = None
         self.model_writer: str | None = None
         self.owner: TrackOwner | None = None
+        self.parts: Mapping[str, JointTrack] = {}
         self.history = History(model.position_count, span_ns)
         self.position_count = model.position_count
         self.has_plain_joints = not self._table.has_floats

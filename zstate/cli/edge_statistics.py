@@ -60,8 +60,10 @@ class EdgeStatistics(Closeable):
     """
 
     def __init__(self, session: Session, robot: str, wire: str, stream: Stream, clock: Clock) -> None:
-        def sources(robot: str, _: Stream, sample: Sample) -> Iterator[str]:
-            if isinstance(sample, JointState):
+        def sources(robot: str, published: Stream, sample: Sample) -> Iterator[str]:
+            if isinstance(sample, JointState) and published == "partial_joint_states":
+                yield from [f"{robot}//{joint}" for joint in sample.names or ()]
+            elif isinstance(sample, JointState):
                 yield f"{robot}/"
             elif isinstance(sample, TransformSample):
                 with suppress(InvalidInput):  # the listener reports it
@@ -73,13 +75,16 @@ class EdgeStatistics(Closeable):
         self.topic.subscribe(stream, robot)
         if wire_format.transforms != stream:
             self.topic.subscribe(wire_format.transforms, robot)
+        if stream == "joint_states" != wire_format.partial_joint_states:
+            self.topic.subscribe(wire_format.partial_joint_states, robot)
 
     def close(self) -> None:
         self.topic.close()
 
     def measure(self, edge: FrameInfo) -> EdgeMeasure | None:
         """The statistics of ``edge``; None if no sample has arrived."""
-        statistics, now = self.topic.get(_source(edge)), time.monotonic_ns()
+        by_joint = self.topic.get(f"{edge.name.partition('/')[0]}//{edge.joint}")
+        statistics, now = by_joint or self.topic.get(_source(edge)), time.monotonic_ns()
         if statistics is None:
             return None
         window = statistics.recent(_WINDOW_NS, now)
@@ -96,7 +101,7 @@ class EdgeStatistics(Closeable):
 
 
 def _source(edge: FrameInfo) -> str:
-    """The key of the samples of ``edge``; all joints of a robot have the same samples."""
+    """The key of the samples of ``edge``; all joints of a robot have the same ones if it has one driver."""
     return edge.name.partition("/")[0] + "/" if edge.kind == "joint" else edge.name
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from zstate.metrics.collectors import Listened
     from zstate.metrics.endpoint import BindAddress, MetricsCollector
     from zstate.net.session import Session
+    from zstate.nodes.partial_publisher import PartialStatePublisher
     from zstate.nodes.publisher import StatePublisher
     from zstate.nodes.transform_publisher import TransformPublisher
     from zstate.recording.recorder import Recorder
@@ -34,7 +35,7 @@ def serve_metrics(address: BindAddress | None, *factories: Factory) -> Generator
         yield
 
 
-def publisher_collector(*publishers: StatePublisher | TransformPublisher) -> Factory:
+def publisher_collector(*publishers: StatePublisher | PartialStatePublisher | TransformPublisher) -> Factory:
     """Metrics of publishers."""
     return lambda: _collectors().PublisherMetrics(publishers)
 

@@ -164,10 +164,13 @@ class RobotReadiness(Closeable):
         if not streams:
             return directory.messages.unknown(robot, directory.robots())
         from zstate.nodes.listener import TransformListener
+        from zstate.wire.keys import JOINT_STREAMS
 
         stream: Stream = "joint_states" if "robot_description" in streams else "robot_description"
         # Without a writer of joint states, transforms may be published instead.
-        follows: list[Follow] = ["joint_states"] if "joint_states" in streams else ["joint_states", "tf"]
+        follows: list[Follow] = (
+            ["joint_states", "tf"] if JOINT_STREAMS.isdisjoint(streams) else ["joint_states"]
+        )
         if is_ros(self._wire):
             stream, follows = "tf", ["tf"]
         if robot not in self._listeners:

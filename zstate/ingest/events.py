@@ -17,7 +17,7 @@ from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream
+from zstate.wire.keys import NAMED_STREAMS, Stream
 
 Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]
 
@@ -140,6 +140,7 @@ class CallbackThread(Closeable, Generic[T]):
                         threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
 
+_NAMED_SAMPLES = NAMED_STREAMS - {"tf_static"}
 _Place = tuple[str, Stream, str]
 
 
@@ -159,8 +160,8 @@ class EventLog(Closeable):
     ) -> None:
         self._streams = frozenset(streams)
         self._followed: Stream = followed
-        # In ROS many programs publish parts of tf, but only one publishes a robot's joints.
-        self._exclusive = self._streams - (frozenset(shared) - {"joint_states"})
+        # In ROS many programs publish parts of tf, and several may publish a robot's joints.
+        self._exclusive = self._streams - {"joint_states", *shared} if shared else self._streams
         self._events: deque[WriterEvent] = deque(maxlen=KEPT)
         self._alive: dict[_Place, dict[int, Announcement]] = {}
         self._former: BoundedDict[tuple[_Place, str, str], WriterId] = BoundedDict()
@@ -315,11 +316,11 @@ class EventLog(Closeable):
         self._add(kind, robot, announced.stream, announced.writer, text)
 
     def _sample_writer(self, robot: str, session: int) -> Announcement | None:
-        """The announced writer of samples with this session, of the followed stream or of ``transforms``."""
+        """The announced writer of samples with this session, of the followed stream or of a named one."""
         announced = self._alive.get((robot, self._followed, ""), {}).get(session)
         if announced is None:
             for (owner, stream, _), writers in self._alive.items():
-                if owner == robot and stream == "transforms" and session in writers:
+                if owner == robot and stream in _NAMED_SAMPLES and session in writers:
                     return writers[session]
         return announced
 
@@ -337,5 +338,5 @@ def _place(announced: Announcement) -> _Place:
 def _what(announced: Announcement) -> str:
     if not announced.name:
         return announced.stream
-    kind = "static edges" if announced.stream == "tf_static" else "transforms"
+    kind = "static edges" if announced.stream == "tf_static" else announced.stream.replace("_", " ")
     return f"{kind} as {announced.name!r}"

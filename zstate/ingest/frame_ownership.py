@@ -299,7 +299,7 @@ class FrameOwnership:
                     self._drop(claim)
                 return Admitted((), refusal)
             if refusal is not None and not source.is_model:
-                self._report_conflict("transforms", source, refusal)
+                self.report_conflict("transforms", source, refusal)
             for claim in fresh:
                 if claim.is_accepted:
                     self._add_frames(claim)
@@ -543,9 +543,10 @@ class FrameOwnership:
 
     def _report(self, source: EdgeSource, error: InsertRefused) -> None:
         self.counters.count_refusal(error.reason, f"static edge of {source.name!r}: {error}")
-        self._report_conflict("tf_static", source, error)
+        self.report_conflict("tf_static", source, error)
 
-    def _report_conflict(self, stream: Stream, source: EdgeSource, error: InsertRefused) -> None:
+    def report_conflict(self, stream: Stream, source: EdgeSource, error: InsertRefused) -> None:
+        """Call ``on_conflict`` if ``error`` refuses an edge of ``source`` because of another writer."""
         if error.reason in (*CONTESTED, FOREIGN_FRAME) and self._on_conflict is not None:
             self._on_conflict(stream, source, error)
 

@@ -8,7 +8,8 @@ from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, ModelError
 from zstate.ingest.base import ClockSetBack, StreamIngest
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.ingest.joint_parts import RobotParts, joint_order
+from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.messages import JointState, RobotDescription, Sample
@@ -20,18 +21,17 @@ def _parsed(urdf: str) -> RobotModel:
     return parse_urdf(urdf, "its URDF")
 
 
-def joint_order(model: RobotModel) -> JointOrder:
-    """Reader of the joint states of a robot with this model."""
-    return JointOrder(model.joint_names, coordinate_names(model), velocity_columns_by_position(model))
-
-
 class JointStateIngest(StreamIngest):
-    """Inserts joint states as positions of the joints of the robot's model."""
+    """Inserts joint states as positions of the joints of the robot's model.
+
+    ``parts`` has the drivers that publish only some of the joints.
+    """
 
     def __init__(
         self, robot: str, ownership: FrameOwnership, on_set_back: ClockSetBack | None = None
     ) -> None:
         super().__init__(robot, ownership, on_set_back)
+        self.parts = RobotParts(robot, ownership)
         self._digest = ""
         self._description_session: int | None = None
         self._track: JointTrack | None = None
@@ -60,6 +60,7 @@ class JointStateIngest(StreamIngest):
         self._order = joint_order(model)
         before, self._track = self._track, None
         self._track = self._ownership.place_model(self.robot, model, before)
+        self.parts.set_model(self._track)
 
     def _insert(self, sample: Sample) -> bool | None:
         track = self._track
@@ -79,6 +80,7 @@ class JointStateIngest(StreamIngest):
             self._buffer.restart(self._track)
 
     def _on_writer_changed(self) -> None:
+        self.parts.set_whole_writer(self._session)
         if self._track is not None:
             self._track.writer = self.writer
             self._track.model_writer = self._writers.get(self._description_session or 0)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from zstate.bridges.ros2 import Bridge
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
+    from zstate.nodes.partial_publisher import PartialStatePublisher
     from zstate.nodes.publisher import StatePublisher
     from zstate.nodes.transform_publisher import TransformPublisher
     from zstate.recording.recorder import Recorder
@@ -117,7 +118,9 @@ class MetricFamilies:
 class PublisherMetrics:
     """Metrics of publishers."""
 
-    def __init__(self, publishers: Sequence[StatePublisher | TransformPublisher]) -> None:
+    def __init__(
+        self, publishers: Sequence[StatePublisher | PartialStatePublisher | TransformPublisher]
+    ) -> None:
         self._publishers = publishers
         self._rates = CounterRates()
         self.sample()

@@ -25,7 +25,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cached_property
 from itertools import accumulate
@@ -185,6 +185,26 @@ class RobotModel:
     @cached_property
     def _joints_by_name(self) -> dict[str, Joint]:
         return {joint.name: joint for joint in self.joints}
+
+    def part(self, joints: Sequence[str]) -> RobotModel:
+        """The same model with the driven ``joints`` only, in this order, and the joints that mimic them.
+
+        Its position vectors are those of a driver of these joints. Raises InvalidInput for no joint, an
+        unknown one, with near misses, one without positions, and one that is given twice.
+        """
+        if isinstance(joints, str):
+            joints = (joints,)
+        problems = [
+            self._unknown_joint(name, self.joint_names) for name in joints if name not in self.columns
+        ]
+        problems += [f"{name!r} is given twice" for name, count in Counter(joints).items() if count > 1]
+        if problems or not joints:
+            raise InvalidInput(f"some joints of {self.name!r}: {'; '.join(problems) or 'none is given'}")
+        driven = tuple(self._joints_by_name[name] for name in joints)
+        followers = tuple(
+            joint for joint in self.joints if joint.mimic is not None and self.mimic_of(joint).joint in joints
+        )
+        return replace(self, joints=driven + followers)
 
     def positions(self, values: Mapping[str, float | Sequence[float]]) -> NDArray[np.float64]:
         """A position vector from numbers by joint name; every driven joint is required.

@@ -87,6 +87,9 @@ class Graph:
         return [StreamGroup(*ends, tuple(streams)) for ends, streams in groups.items()]
 
 
+_OPTIONAL: frozenset[Stream] = frozenset({"transforms", "partial_joint_states"})
+"""Streams that a robot with other ones does not lack."""
+
 RateLookup = Callable[[str, Stream, WriterId], float | None]
 """The measured rate [Hz] of a robot's stream, as one writer publishes it; None if it is unknown."""
 
@@ -96,28 +99,28 @@ def build_graph(
 ) -> Graph:
     """The graph of discovered writers and readers.
 
-    Static edges and transforms have a stream for each name under which they are written. The rate is that of
-    the first writer whose rate is known: usually there is only one.
+    A stream with names, such as static edges, is one stream for each name under which it is written. The rate
+    is that of the first writer whose rate is known: usually there is only one.
     """
 
     def programs(writers: Iterable[WriterId]) -> tuple[str, ...]:
         return tuple(sorted({str(writer) for writer in writers}))
 
     written: dict[tuple[str, Stream], dict[str, list[WriterId]]] = {}
-    """The writers of each stream, by the name under which they write edges; else ""."""
+    """The writers of each stream, by the name under which they write; else ""."""
     for robot in robots:
         for stream, writer in robot.writers:
             by_name = written.setdefault((robot.name, stream), {})
             names = [name for name in robot.names_of(writer, stream) if name != MODEL_WRITER]
             for name in names or ("",):
                 by_name.setdefault(name, []).append(writer)
-    # A reader of all robots does not miss a stream that one of them lacks, and no reader misses transforms.
+    # A reader of all robots does not miss a stream that one of them lacks, and no reader misses a named one.
     used: set[tuple[str, Stream]] = {
         *written,
         *(
             (one.robot, one.stream)
             for one in readers
-            if one.stream != "transforms" and (one.robot != ANY or not written)
+            if one.stream not in _OPTIONAL and (one.robot != ANY or not written)
         ),
     }
     unwritten: dict[str, list[WriterId]] = {"": []}

@@ -1,5 +1,7 @@
 """Exclusive ownership (DDS): one writer for each stream of a robot, one writer of edges for each child frame.
 
+A writer of some joints of a robot claims the edges that these move, and excludes a writer of all joints.
+
 ``WriterClaim`` owns streams, and the edges under one name; ``claim_edges`` owns new edges: static ones while
 they are published, because then their value shows them, moving ones as long as their writer is open.
 Conflicting writers are found by their liveliness tokens and raise SecondWriter.
@@ -62,8 +64,10 @@ CHECK_PERIOD_S = 0.05
 _STARTUP_S = 1.0
 """Each sample checks for this long: by then the tokens of writers that opened at the same time are here."""
 
-_ALL_TRANSFORM_HISTORIES = f"{stream_expression(ANY, 'transforms')}?session=0"
-"""A query that each transform publisher receives, and to which none has samples."""
+_ALL_HISTORIES_OF_EDGES = tuple(
+    f"{stream_expression(ANY, stream)}?session=0" for stream in ("transforms", "partial_joint_states")
+)
+"""Queries that each writer of moving edges or of some joints receives, and to which none has samples."""
 
 _Handler: TypeAlias = "zenoh.handlers.Handler[zenoh.Sample]"
 
@@ -101,7 +105,7 @@ class WriterClaim(Closeable):
             claims = _CLAIMS.setdefault(self._session, set())
             rivals = self._conflicting(other for claim in claims for other in claim._claimed)
             if rivals:
-                raise _second_writer(self._oldest(rivals))
+                raise self._second_writer(self._oldest(rivals))
             claims.add(self)
         try:
             wait_for_discovery(self._session)
@@ -145,7 +149,7 @@ class WriterClaim(Closeable):
             if not alive:
                 return
             self._first = self._oldest(alive)
-        raise _second_writer(self._first)
+        raise self._second_writer(self._first)
 
     def close(self) -> None:
         """Release the ownership. A second call does nothing."""
@@ -162,7 +166,7 @@ class WriterClaim(Closeable):
         while rivals := self._current_rivals():
             older = [rival for rival in rivals if raises_early and self._is_older(rival)]
             if older or time.monotonic() > deadline:
-                raise _second_writer(self._oldest(older or rivals))
+                raise self._second_writer(self._oldest(older or rivals))
             time.sleep(ROUND_S)
 
     def _update_rivals(self) -> None:
@@ -213,10 +217,32 @@ class WriterClaim(Closeable):
 
     def _oldest(self, rivals: Iterable[Announcement]) -> Announcement:
         streams = [claimed.stream for claimed in self._claimed]
-        return min(rivals, key=lambda rival: (seniority(rival), streams.index(rival.stream)))
+
+        def place(rival: Announcement) -> int:
+            return streams.index(rival.stream) if rival.stream in streams else len(streams)
+
+        return min(rivals, key=lambda rival: (seniority(rival), place(rival)))
 
     def _is_older(self, rival: Announcement) -> bool:
         return seniority(rival) < seniority(self._claimed[0])
+
+    def _second_writer(self, first: Announcement) -> SecondWriter:
+        what = f"{first.stream} of {first.robot!r}"
+        if first.stream in NAMED_STREAMS:
+            kind = "static edges" if first.stream == "tf_static" else first.stream.replace("_", " ")
+            what = f"{kind} of {first.robot!r} under the name {first.name!r}"
+        claimed = {claimed.stream for claimed in self._claimed}
+        if "partial_joint_states" in {first.stream, *claimed} and first.stream not in claimed:
+            advice = "stop it first, for it and this writer would publish the same joints"
+        elif first.stream in ("transforms", "partial_joint_states"):
+            advice = "stop it first, or give this writer another name"
+        else:
+            advice = (
+                "stop it first, or publish as well with takeover=True (--takeover): "
+                "readers use the newest writer"
+            )
+        text = f"{writer_text(first.writer)} already writes {what}; {advice}"
+        return SecondWriter(text, robot=first.robot, stream=first.stream, first=first.writer)
 
 
 def wait_for_discovery(session: Session) -> None:
@@ -228,20 +254,6 @@ def wait_for_discovery(session: Session) -> None:
 def seniority(announced: Announcement) -> tuple[int, int]:
     """Sort key of writers: the oldest first."""
     return announced.writer.since, announced.writer.session
-
-
-def _second_writer(first: Announcement) -> SecondWriter:
-    if first.stream in NAMED_STREAMS:
-        kind = "static edges" if first.stream == "tf_static" else "transforms"
-        stream = f"{kind} of {first.robot!r} under the name {first.name!r}"
-    else:
-        stream = f"{first.stream} of {first.robot!r}"
-    text = f"{writer_text(first.writer)} already writes {stream}; stop it first, or "
-    if first.stream == "transforms":
-        text += "give this writer another name"
-    else:
-        text += "publish as well with takeover=True (--takeover): readers use the newest writer"
-    return SecondWriter(text, robot=first.robot, stream=first.stream, first=first.writer)
 
 
 def writer_text(writer: WriterId) -> str:
@@ -274,8 +286,9 @@ def claim_edges(
         # check received tokens: a peer that has replied has received ours, and we have received its tokens.
         if not session.zenoh.info.routers_zid():
             check_edges(session, writer, edges, allowed)
-            for _ in query(session.zenoh, _ALL_TRANSFORM_HISTORIES, ANSWER_WITHIN_S):
-                pass
+            for histories in _ALL_HISTORIES_OF_EDGES:
+                for _ in query(session.zenoh, histories, ANSWER_WITHIN_S):
+                    pass
         for edge in edges:
             _wait_for_rival_claims(session, writer, edge[1], allowed)
         check_edges(session, writer, edges, allowed)
@@ -464,7 +477,7 @@ def frame_conflict(first: Announcement, edge: Edge, verb: str) -> SecondWriter:
     """The error of a writer whose edge excludes ``edge`` of the writer ``first``."""
     parent, child = edge
     advice = "stop or withdraw that first, or use takeover=True (--takeover)"
-    if first.stream == "transforms":
+    if first.stream in ("transforms", "partial_joint_states"):
         verb, advice = "places", "stop that first"
     text = (
         f"{writer_text(first.writer)} {verb} {child!r} on {parent!r} already, as {first.name!r} of "

@@ -58,13 +58,14 @@ class RobotInfo:
     """A robot with its writers as (stream, writer), sorted.
 
     ``static_names`` are (name, writer) for the names under which static edges are written, and
-    ``transform_names`` the same for moving edges.
+    ``transform_names`` and ``part_names`` the same for moving edges, and for drivers of some of its joints.
     """
 
     name: str
     writers: tuple[tuple[Stream, WriterId], ...]
     static_names: tuple[tuple[str, WriterId], ...] = ()
     transform_names: tuple[tuple[str, WriterId], ...] = ()
+    part_names: tuple[tuple[str, WriterId], ...] = ()
 
     def __repr__(self) -> str:
         streams: dict[str, list[str]] = {}
@@ -74,8 +75,12 @@ class RobotInfo:
         return f"<robot {self.name!r}: {written or 'no writer'}>"
 
     def names_of(self, writer: WriterId, stream: Stream) -> tuple[str, ...]:
-        """The names under which ``writer`` writes edges on ``stream``, sorted; empty for other streams."""
-        names = {"tf_static": self.static_names, "transforms": self.transform_names}.get(stream, ())
+        """The names under which ``writer`` writes on ``stream``, sorted; empty for streams without names."""
+        names = {
+            "tf_static": self.static_names,
+            "transforms": self.transform_names,
+            "partial_joint_states": self.part_names,
+        }.get(stream, ())
         return tuple(name for name, owner in names if owner == writer)
 
 
@@ -178,6 +183,7 @@ def by_robot(found: Iterable[Announcement]) -> tuple[RobotInfo, ...]:
             tuple(sorted(writers[robot])),
             sorted_names(robot, "tf_static"),
             sorted_names(robot, "transforms"),
+            sorted_names(robot, "partial_joint_states"),
         )
         for robot in sorted(writers)
     )

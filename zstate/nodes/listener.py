@@ -18,6 +18,7 @@ from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters, ListenerStats
 from zstate.ingest.events import EventLog, WriterEvent
 from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.joint_parts import PartialJointStateIngest, RobotParts
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.stamp_checks import StampCheck
 from zstate.ingest.transforms import StaticTransformIngest, TransformIngest
@@ -28,7 +29,7 @@ from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened, stream_key
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened, stream_from_key, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
@@ -55,6 +56,8 @@ class _SampleStream:
 
     stream: Stream
     is_shared: bool
+    has_parts: bool = False
+    """Whether its samples are joint states of some of the joints, or may be."""
     capacity: int = 0
     ingests: dict[tuple[str, int], StreamIngest] = field(default_factory=dict[tuple[str, int], StreamIngest])
     unannounced: dict[tuple[str, int], StreamIngest] = field(
@@ -77,9 +80,12 @@ class TransformListener(Closeable):
 
     Frames are named ``robot/frame`` in the buffer; bare names work while they are unique.
     ``follow="joint_states"`` subscribes to joint positions and the model and computes the kinematics here;
-    ``follow="tf"`` subscribes to transforms and needs no model. The edges of other writers of the robot, of a
-    ``StaticPublisher`` or a ``TransformPublisher``, come in either way; on the ROS wires these are all edges
-    of /tf and /tf_static but those of a model, which robot_state_publisher repeats. With ``history_on_join``
+    ``follow="tf"`` subscribes to transforms and needs no model. Joint positions may come from several
+    drivers, each with its own joints (``PartialStatePublisher``, in ROS any node): each joint is interpolated
+    between the samples of its own driver, and one that stops leaves exactly its own links behind. The edges
+    of other writers of the robot, of a ``StaticPublisher`` or a ``TransformPublisher``, come in either way;
+    on the ROS wires these are all edges of /tf and /tf_static but those of a model, which
+    robot_state_publisher repeats. With ``history_on_join``
     the buffer also gets the samples that publishers of the native wire cached in the seconds before (their
     ``cache_s``). A context manager.
 
@@ -128,10 +134,8 @@ class TransformListener(Closeable):
         self._counters = Counters()
         self._stamp_check = StampCheck(self.buffer, self._counters, is_described=not self._wire.shared)
         self._samples = _SampleStream(follow, is_shared=follow in self._wire.shared)
-        self._sample_streams: dict[Stream, _SampleStream] = {follow: self._samples}
-        if self._wire.transforms != follow:
-            others = _SampleStream(self._wire.transforms, is_shared=True)
-            self._sample_streams[others.stream] = others
+        self._parts = _SampleStream(self._wire.partial_joint_states, is_shared=True, has_parts=True)
+        self._sample_streams = self._received_streams()
         streams: tuple[Stream, ...] = ("robot_description", "tf_static", *self._sample_streams)
         self._events = EventLog(streams, follow, self._wire.shared, on_event)
         self._ownership = FrameOwnership(
@@ -178,6 +182,15 @@ class TransformListener(Closeable):
         self._pid = os.getpid()
         _LISTENERS.add(self)
 
+    def _received_streams(self) -> dict[Stream, _SampleStream]:
+        received: dict[Stream, _SampleStream] = {self._follow: self._samples}
+        if self._follow == "joint_states":
+            received[self._parts.stream] = self._parts  # in ROS any joint state may be a part
+        others = self._wire.transforms
+        if others != self._follow:
+            received[others] = _SampleStream(others, is_shared=True)
+        return received
+
     def _subscribe(self, session: Session, streams: Sequence[Stream]) -> ExitStack:
         """Receive the samples of ``streams`` until the stack is closed."""
         with ExitStack() as opening:
@@ -209,7 +222,7 @@ class TransformListener(Closeable):
         """The robots that sent any message so far, sorted by name."""
         ingests = [
             ingest
-            for samples in self._sample_streams.values()
+            for samples in {self._samples, *self._sample_streams.values()}
             for ingest in (*list(samples.ingests.values()), *list(samples.unannounced.values()))
         ]
         return tuple(sorted({ingest.robot for ingest in ingests if ingest.has_data}))
@@ -255,8 +268,7 @@ class TransformListener(Closeable):
         key = (robot, session if samples.is_shared else 0)
         ingest = samples.ingests.get(key) or samples.unannounced.get(key)
         if ingest is None:
-            make = JointStateIngest if samples.stream == "joint_states" else TransformIngest
-            ingest = make(robot, self._ownership, self._events.add_set_back)
+            ingest = self._new_ingest(samples, robot)
             self._ownership.add_robot(robot)
             if not samples.is_shared:
                 ingest = samples.ingests.setdefault(key, ingest)
@@ -266,6 +278,21 @@ class TransformListener(Closeable):
             else:
                 ingest = samples.add_unannounced(key, ingest)
         return ingest
+
+    def _new_ingest(self, samples: _SampleStream, robot: str) -> StreamIngest:
+        on_set_back = self._events.add_set_back
+        if samples.has_parts:
+            others = bool(self._wire.shared)
+            return PartialJointStateIngest(
+                robot, self._ownership, self._joint_parts(robot), on_set_back, others=others
+            )
+        make = JointStateIngest if samples.stream == "joint_states" else TransformIngest
+        return make(robot, self._ownership, on_set_back)
+
+    def _joint_parts(self, robot: str) -> RobotParts:
+        ingest = self._ingest_for(self._samples, robot, 0)
+        assert isinstance(ingest, JointStateIngest)
+        return ingest.parts
 
     def _on_samples(self, samples: _SampleStream, arrivals: list[SerializedSample]) -> None:
         is_full = len(arrivals) >= samples.capacity
@@ -297,7 +324,7 @@ class TransformListener(Closeable):
 
     def _on_history(self, arrivals: list[SerializedSample], writer: int) -> bool:
         robot = self._robot_from_key(arrivals[0].key)  # the key of the request
-        stream = self._follow if arrivals[0].key == stream_key(robot, self._follow) else "transforms"
+        stream = stream_from_key(arrivals[0].key)
         messages = (message for one in arrivals for message in self._decode(stream, one, robot))
         samples = [message for message in messages if isinstance(message, Sample)]
         if any(sample.session != writer for sample in samples):
@@ -319,6 +346,9 @@ class TransformListener(Closeable):
         for description in self._decode("robot_description", arrival, robot):
             if isinstance(description, RobotDescription):
                 self._ingest_for(self._samples, robot, description.session).describe(description)
+                for part in (*self._parts.ingests.values(), *self._parts.unannounced.values()):
+                    if part.robot == robot:
+                        part.describe(description)
 
     def _on_statics(self, arrival: SerializedSample) -> None:
         try:
@@ -400,6 +430,12 @@ class TransformListener(Closeable):
         robot, session = announced.robot, announced.writer.session
         if samples.stream == "transforms":
             (self._ownership.add_writer if alive else self._ownership.remove_writer)(robot, session)
+        elif self._follow == "joint_states":
+            parts = self._joint_parts(robot)
+            if alive:
+                parts.add_writer(session, announced.writer.since)
+            else:
+                parts.remove_writer(session)
         if self._clock_offsets is not None:
             self._clock_offsets.on_writer(announced, alive=alive)
         if alive and self._history is not None:

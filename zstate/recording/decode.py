@@ -10,7 +10,7 @@ from itertools import islice
 from typing import NamedTuple
 
 from zstate.errors import InvalidInput, MessageError, ModelError
-from zstate.ingest.joint_states import joint_order
+from zstate.ingest.joint_parts import joint_order
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from zstate.clock import SET_BACK_NS
 from zstate.errors import MessageError, ModelError
-from zstate.ingest.joint_states import joint_order
+from zstate.ingest.joint_parts import joint_order
 from zstate.model.joint_trajectory import JointTrajectory, concatenate
 from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position

@@ -13,7 +13,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, ManualClock
 from zstate.errors import InvalidInput, MessageError, ModelError
-from zstate.ingest.joint_states import joint_order
+from zstate.ingest.joint_parts import joint_order
 from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf

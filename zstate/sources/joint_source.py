@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput
-from zstate.ingest.joint_states import joint_order
+from zstate.ingest.joint_parts import joint_order
 from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import Joint, RobotModel, velocity_columns_by_position
 from zstate.wire.joint_order import JointNumbers
@@ -26,13 +26,15 @@ class JointReading:
     """The joints of a robot at one instant, in the order of its model's ``joint_names``.
 
     ``positions`` [rad] or [m], ``velocities`` per second, ``efforts`` [Nm] or [N]; the last two are
-    None when they are not known. ``stamp`` [ns] is None if the reading is of the requested instant.
+    None when they are not known. ``stamp`` [ns] is None if the reading is of the requested instant. Merged
+    from several drivers, ``stamp`` is that of the newest part and ``oldest_stamp`` that of the oldest one.
     """
 
     positions: NDArray[np.float64]
     velocities: NDArray[np.float64] | None = None
     efforts: NDArray[np.float64] | None = None
     stamp: int | None = None
+    oldest_stamp: int | None = None
 
 
 class JointSource(Protocol):

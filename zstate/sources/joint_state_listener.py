@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -17,8 +19,15 @@ from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.sources.joint_source import JointReading, JointStateValidator
+from zstate.sources.joint_state_merger import JointStateMerger
+from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, RobotDescription
 from zstate.wire.registry import get_wire
+
+_LOG = logging.getLogger("zstate")
+
+MAX_AGE_S = 0.5
+"""The greatest difference of the stamps of the values of one reading [s]."""
 
 # Samples kept for a slow reader, or until the model is known.
 _CAPACITY = 1024
@@ -31,6 +40,11 @@ class JointStateListener(Closeable):
     arrival, and end with ``close()``; ``read`` returns the newest unread one. Of more than 1024 unread
     samples the oldest are dropped. ``on_reading(reading)`` is called with each sample, from one thread: keep
     it short.
+
+    If the joints come from several drivers, each with its own joints (``PartialStatePublisher``, in ROS any
+    node), each sample of a driver gives one reading of all joints with the newest values of the others. A
+    reading is complete if no value is more than ``max_age_s`` [s] older than the newest, by their stamps;
+    ``incomplete`` counts samples that gave none. The log names the missing joints and their writers once.
 
     Numbers are in the order of ``model.joint_names``. The default model is the one in the robot's
     description; samples that arrive before it are kept. ``refused`` counts unusable samples by reason; the
@@ -45,27 +59,38 @@ class JointStateListener(Closeable):
         *,
         wire: str = "native",
         on_reading: Callable[[JointReading], object] | None = None,
+        max_age_s: float = MAX_AGE_S,
     ) -> None:
+        if not (math.isfinite(max_age_s) and max_age_s > 0.0):
+            raise InvalidInput(f"max_age_s is a positive number of seconds, not {max_age_s!r}")
         self.robot = robot
         self._refusals = Refusals("joint_states")
         self.refused: dict[str, int] = self._refusals.counts
         self._model = model
-        self._validator = None if model is None else JointStateValidator(model)
-        self._undescribed: deque[JointState] = deque(maxlen=_CAPACITY)
+        self._max_age_s = max_age_s
+        self._wire = get_wire(wire)
+        self._whole_key = self._wire.expression(robot, "joint_states")
+        self._validator: JointStateValidator | None = None
+        self._merger: JointStateMerger | None = None
+        self._explained: set[tuple[str, ...]] = set()
+        self._undescribed: deque[Received] = deque(maxlen=_CAPACITY)
         self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
         self._changed = threading.Condition()
         self._waiting_tasks: list[Callable[[], object]] = []
         self._closed = False
         self._on_reading = on_reading
-        wire_format = get_wire(wire)
+        streams: tuple[Stream, ...] = tuple(dict.fromkeys(("joint_states", self._wire.partial_joint_states)))
         with ExitStack() as opening:
             if model is None:
                 opening.enter_context(DescriptionSubscriber(session, robot, self._on_description, wire))
+            else:
+                self._set_model(model)
             on_error = self._refusals.count
-            opening.enter_context(
-                subscribe(session, wire_format, robot, "joint_states", self._on_messages, on_error=on_error)
-            )
-            for announcement in announce_reader(session, wire_format, robot, ["joint_states"]):
+            for stream in streams:
+                opening.enter_context(
+                    subscribe(session, self._wire, robot, stream, self._on_messages, on_error=on_error)
+                )
+            for announcement in announce_reader(session, self._wire, robot, streams):
                 opening.enter_context(announcement)
             self._opened = opening.pop_all()
 
@@ -77,36 +102,60 @@ class JointStateListener(Closeable):
         """The model of the robot; None before its description has arrived."""
         return self._model
 
+    @property
+    def incomplete(self) -> int:
+        """How many samples of drivers of some joints gave no reading, because of other joints."""
+        return 0 if self._merger is None else self._merger.incomplete
+
+    def _set_model(self, model: RobotModel) -> None:
+        self._model, self._validator = model, JointStateValidator(model)
+        self._merger = JointStateMerger(model, self._max_age_s, others=bool(self._wire.shared))
+
     def _on_description(self, _: str, model: RobotModel) -> None:
         with self._changed:
-            self._model, self._validator = model, JointStateValidator(model)
+            self._set_model(model)
             undescribed = list(self._undescribed)
             self._undescribed.clear()
             self._add(undescribed)  # before samples that arrive now
 
     def _on_messages(self, received: list[Received]) -> None:
-        self._add([one.message for one in received if isinstance(one.message, JointState)])
+        self._add(received)
 
-    def _add(self, states: list[JointState]) -> None:
+    def _add(self, received: list[Received]) -> None:
         with self._changed:
             if self._validator is None:
-                self._undescribed.extend(states)
+                self._undescribed.extend(received)
                 return
-            validator = self._validator
-            readings = [reading for state in states if (reading := self._reading(validator, state))]
+            readings = [reading for one in received if (reading := self._reading(one))]
             self._readings.extend(readings)
             self._wake()
         if self._on_reading is not None:
             for reading in readings:
                 self._on_reading(reading)
 
-    def _reading(self, validator: JointStateValidator, state: JointState) -> JointReading | None:
+    def _reading(self, received: Received) -> JointReading | None:
+        state, validator, merger = received.message, self._validator, self._merger
+        assert isinstance(state, JointState)
+        assert validator is not None
+        assert merger is not None
         try:
+            if self._wire.shared:
+                if not merger.has_all_joints(state):
+                    return self._merged(merger, state, f"the ROS node of session {state.session:016x}")
+            elif received.key != self._whole_key:
+                return self._merged(merger, state, repr(received.key.rpartition("/")[2]))
             return JointReading(*validator.read(state), stamp=state.stamp)
         except (MessageError, InvalidInput) as error:
             reason = error.reason if isinstance(error, MessageError) else "bad numbers"
             self._refusals.count(reason, error)
             return None
+
+    def _merged(self, merger: JointStateMerger, state: JointState, writer: str) -> JointReading | None:
+        reading = merger.add(state, writer)
+        if reading is None and (missing := merger.missing_joints()) and missing not in self._explained:
+            self._explained.add(missing)
+            _LOG.warning("%s: no whole joint states: %s", self.robot, merger.explanation())
+        return reading
 
     def _wake(self) -> None:
         self._changed.notify_all()

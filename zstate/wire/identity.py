@@ -8,6 +8,8 @@ from urllib.parse import quote, unquote
 from zstate.errors import InvalidInput, printable
 from zstate.wire.keys import MAX_NAME_LENGTH, NAMED_STREAMS, Stream, check_writer, shortened
 
+_ALL_AND_SOME_JOINTS = {"joint_states", "partial_joint_states"}
+
 _MAX_DIGITS = 20
 _MAX_IDENTITY_LENGTH = 4 * 12 * MAX_NAME_LENGTH
 
@@ -60,9 +62,9 @@ class WriterId:
 class Announcement:
     """The content of a liveliness token: ``writer`` writes ``stream`` of ``robot``.
 
-    ``name`` is the name under which it writes edges, on the ``NAMED_STREAMS``; empty for other streams, and
-    on wires without such names. ``node`` is the same for all streams of one ROS node, whose name other nodes
-    may have, too; empty where nodes are not announced.
+    ``name`` is the name under which it writes edges or joints, on the ``NAMED_STREAMS``; empty for other
+    streams, and on wires without such names. ``node`` is the same for all streams of one ROS node, whose name
+    other nodes may have, too; empty where nodes are not announced.
     """
 
     robot: str
@@ -90,8 +92,11 @@ class Announcement:
     def conflicts_with(self, other: Announcement) -> bool:
         """Whether the two are different writers of the same stream, of which only one may be active.
 
-        Writers of a named stream conflict if their names are equal; without a name they never do.
+        Writers of a named stream conflict if their names are equal; without a name they never do. A writer of
+        all joints conflicts with each writer of some of them.
         """
+        if self.robot == other.robot and {self.stream, other.stream} == _ALL_AND_SOME_JOINTS:
+            return self.writer.session != other.writer.session
         same = (self.robot, self.stream, self.name) == (other.robot, other.stream, other.name)
         is_exclusive = self.stream not in NAMED_STREAMS or bool(self.name)
         return same and is_exclusive and self.writer.session != other.writer.session

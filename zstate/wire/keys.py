@@ -1,21 +1,22 @@
 """The native key space: one prefix for each robot, one chunk for its name.
 
-==============================================  ==========================================
-``zstate/<robot>/joint_states``                 JointState, each sample; a query returns a HistoryPage
-``zstate/<robot>/tf``                           TransformSample, each sample; likewise
-``zstate/<robot>/tf_static/<writer>``           StaticTransforms, latched
-``zstate/<robot>/transforms/<writer>``          WriterTransforms, each sample; likewise
-``zstate/<robot>/robot_description``            RobotDescription, latched
-``zstate/<robot>/joint_commands``               JointCommand, to a driver
-``zstate/<robot>/lookup``                       a queryable
-``zstate/<robot>/status/<id>``                  Status of one writer, once a second while read
-``zstate/<robot>/@writer/<stream>/<id>``        liveliness token of one writer
-``zstate/<robot>/@clock/<id>``                  a queryable: the time by that writer's clock
-``zstate/<robot>/@edge/<child>/<parent>/<id>``  liveliness token of a writer that places a moving edge, or
-                                                is about to place a static one
-``zstate/@reader/<robot>/<stream>/<id>``        liveliness token of one reader
-``zstate/clock``                                ClockMessage
-==============================================  ==========================================
+================================================  ==========================================
+``zstate/<robot>/joint_states``                   JointState, each sample; a query returns a HistoryPage
+``zstate/<robot>/partial_joint_states/<writer>``  JointState with the names of its joints; likewise
+``zstate/<robot>/tf``                             TransformSample, each sample; likewise
+``zstate/<robot>/tf_static/<writer>``             StaticTransforms, latched
+``zstate/<robot>/transforms/<writer>``            WriterTransforms, each sample; likewise
+``zstate/<robot>/robot_description``              RobotDescription, latched
+``zstate/<robot>/joint_commands``                 JointCommand, to a driver
+``zstate/<robot>/lookup``                         a queryable
+``zstate/<robot>/status/<id>``                    Status of one writer, once a second while read
+``zstate/<robot>/@writer/<stream>/<id>``          liveliness token of one writer
+``zstate/<robot>/@clock/<id>``                    a queryable: the time by that writer's clock
+``zstate/<robot>/@edge/<child>/<parent>/<id>``    liveliness token of a writer that places a moving edge, or
+                                                  is about to place a static one
+``zstate/@reader/<robot>/<stream>/<id>``          liveliness token of one reader
+``zstate/clock``                                  ClockMessage
+================================================  ==========================================
 
 ``<id>`` is the identity of a writer or reader, already one chunk. Functions that build a key raise
 InvalidInput for names that are not one chunk of a key, and functions that parse one for any other key.
@@ -32,14 +33,24 @@ from urllib.parse import quote, unquote
 from zstate.errors import InvalidInput
 
 Stream = Literal[
-    "joint_states", "tf", "transforms", "tf_static", "robot_description", "joint_commands", "clock"
+    "joint_states",
+    "partial_joint_states",
+    "tf",
+    "transforms",
+    "tf_static",
+    "robot_description",
+    "joint_commands",
+    "clock",
 ]
 
 CLOCK_KEY = "zstate/clock"
 ANY = "*"
 
-NAMED_STREAMS: frozenset[Stream] = frozenset({"tf_static", "transforms"})
+NAMED_STREAMS: frozenset[Stream] = frozenset({"tf_static", "transforms", "partial_joint_states"})
 """The streams with one key for each of the writer names of a robot."""
+
+JOINT_STREAMS: frozenset[Stream] = frozenset({"joint_states", "partial_joint_states"})
+"""The streams of joint positions."""
 
 READERS = "zstate/@reader/*/*/*"
 """The key expression of the tokens of all readers."""
@@ -62,7 +73,7 @@ _RESERVED = frozenset("/*$?#")
 
 
 def check_writer(name: str) -> str:
-    """``check_robot`` for the name under which a writer publishes edges."""
+    """``check_robot`` for the name under which a writer publishes on a named stream."""
     return check_robot(name, "writer")
 
 
@@ -105,6 +116,16 @@ def stream_key(robot: str, stream: Stream, writer: str = "") -> str:
         return CLOCK_KEY
     key = f"zstate/{check_robot(robot)}/{stream}"
     return f"{key}/{check_writer(writer)}" if stream in NAMED_STREAMS else key
+
+
+def stream_from_key(key: str) -> Stream:
+    """The stream of a ``stream_key``. Raises InvalidInput for any other key."""
+    chunks = _chunks(key)
+    if len(chunks) > 2 and chunks[0] == "zstate" and chunks[2] in _STREAMS:
+        stream = _STREAMS[chunks[2]]
+        if len(chunks) == (4 if stream in NAMED_STREAMS else 3):
+            return stream
+    raise _form_error(key, "zstate/<robot>/<stream>")
 
 
 def stream_expression(robot: str, stream: Stream) -> str:
@@ -180,7 +201,7 @@ def parse_clock_key(key: str) -> tuple[str, str]:
 
 
 def edge_key(robot: str, edge: tuple[str, str], identity: str) -> str:
-    """The token of a writer of ``edge``: full names of parent and child."""
+    """The token of a writer of ``edge``, or of the joint that moves it: full names of parent and child."""
     parent, child = (quote(frame, safe="") for frame in edge)
     return f"zstate/{check_robot(robot)}/@edge/{child}/{parent}/{identity}"
 

@@ -79,10 +79,11 @@ class Sample(Message, frozen=True, array_like=True, gc=False):
 
 
 class JointState(Sample, frozen=True, array_like=True, gc=False):
-    """The joint positions of a whole robot at one instant, with velocities and efforts if known.
+    """The joint positions of a robot at one instant, with velocities and efforts if known.
 
     Blocks in the order with the digest ``order``. A writer without a model sends the ``names`` of
-    that order, one number for each.
+    that order, one number for each, and so does a writer of some of the joints: of the
+    coordinates, see ``coordinate_names``. Then NaN marks a velocity or effort that is not known.
     """
 
     positions: bytes
@@ -262,6 +263,7 @@ STATIC_EDGES = 10_000
 
 MAX_BYTES: Mapping[Stream, int] = {
     "joint_states": SAMPLE_BYTES,
+    "partial_joint_states": SAMPLE_BYTES,
     "tf": SAMPLE_BYTES,
     "transforms": SAMPLE_BYTES,
     "joint_commands": SAMPLE_BYTES,

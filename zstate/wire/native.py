@@ -49,6 +49,7 @@ ENCODINGS: dict[type[Message], str] = {
 }
 STREAM_TYPES: dict[Stream, type[Message]] = {
     "joint_states": JointState,
+    "partial_joint_states": JointState,
     "tf": TransformSample,
     "transforms": WriterTransforms,
     "tf_static": StaticTransforms,
@@ -117,6 +118,7 @@ class NativeWire:
     name = "native"
     shared: frozenset[Stream] = frozenset()
     transforms: Stream = "transforms"
+    partial_joint_states: Stream = "partial_joint_states"
 
     def node_token(self, node: WriterNode) -> None:
         return None

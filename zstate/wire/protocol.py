@@ -64,6 +64,13 @@ class StreamEncoder(Protocol):
         ...
 
 
+def carrier(wire: Wire, stream: Stream) -> Stream:
+    """The stream that carries ``stream`` on ``wire``: in ROS transforms are on /tf."""
+    if stream == "transforms":
+        return wire.transforms
+    return wire.partial_joint_states if stream == "partial_joint_states" else stream
+
+
 class Wire(Protocol):
     """One wire format for the streams of a robot: keys, encodings and bytes.
 
@@ -81,6 +88,9 @@ class Wire(Protocol):
     transforms: Stream
     """The stream that carries the edges of a ``TransformPublisher``."""
 
+    partial_joint_states: Stream
+    """The stream that carries the joints of a ``PartialStatePublisher``."""
+
     def node_token(self, node: WriterNode) -> str | None:
         """The liveliness token of a writer as a node of the ROS graph; None if there is no such graph."""
         ...
@@ -89,7 +99,7 @@ class Wire(Protocol):
         """The encoder of ``stream`` for the writer ``node``.
 
         ``number`` identifies the stream within the session; ``name`` is the one under which the writer
-        publishes edges. Raises InvalidInput for names that cannot be in a key.
+        publishes edges or joints. Raises InvalidInput for names that cannot be in a key.
         """
         ...
 

@@ -14,7 +14,7 @@ import pytest
 from helpers.cli_runner import ALL_STREAMS, RRBOT, Spawn, failure, published_robot, started, zstate
 from helpers.processes import find_free_port, repeated
 
-from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
+from zstate import PartialStatePublisher, StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import ManualClock, SystemClock
 from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
@@ -173,7 +173,21 @@ def test_silent_writer_of_transforms_is_named_and_the_rest_is_sound():
     ):
         found = warnings("rrbot")
     assert list(found) == ["transforms"]
-    assert "as 'camera', is announced, but no transform arrives" in found["transforms"]
+    assert "as 'camera', is announced, but no sample arrives" in found["transforms"]
+
+
+def test_joint_without_a_driver_is_named():
+    model = load_model(RRBOT)
+    with (
+        connect() as session,
+        StatePublisher(session, model, "rrbot", streams=("robot_description", "tf_static")),
+        PartialStatePublisher(session, model, ["elbow"], "rrbot") as gripper,
+        repeated(lambda: gripper.publish([0.0])),
+    ):
+        found = broken_link("rrbot")
+    assert found["name"] == "partial_joint_states"
+    assert found["text"].startswith("'shoulder' of 'rrbot' without a writer")
+    assert found["next"].startswith("zstate joints rrbot --only shoulder")
 
 
 def test_robot_with_transforms_only_is_sound():

@@ -29,7 +29,10 @@ def _check_amount(amount: float) -> float:
 @click.command("echo")
 @click.argument("robot", required=False)
 @click.option(
-    "--stream", type=click.Choice(["joint_states", "transforms"]), default="joint_states", show_default=True
+    "--stream",
+    type=click.Choice(["joint_states", "partial_joint_states", "transforms"]),
+    default="joint_states",
+    show_default=True,
 )
 @click.option("--once", is_flag=True, help="Print one document; fail after --timeout with the reason.")
 @options.timeout_option("How long --once waits [s].")
@@ -64,8 +67,8 @@ def echo_command(
 ) -> None:
     """Print the joint states or the transforms of ROBOT as they arrive, as YAML documents.
 
-    ROBOT may be left out if only one robot is announced. Transforms are those of all their writers; on a ROS
-    wire these are all messages of /tf.
+    ROBOT may be left out if only one robot is announced. Transforms, and partial joint states, are those of
+    all their writers; on a ROS wire these are all messages of /tf, or /joint_states.
 
     \b
     zstate echo
@@ -86,6 +89,7 @@ def echo_command(
     )
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
+    from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire
 
     table, changes = CsvFormatter(), ChangeFilter(by) if changed or by else None
@@ -110,11 +114,10 @@ def echo_command(
     ):
         selected = named_robot(session, robot, wire)
         document: Callable[[Any], Document] = transforms_document
-        if stream == "joint_states":
+        if stream != "transforms":
             document = opened.enter_context(DescribedJointStates(session, selected, wire)).document
-        else:
-            stream = get_wire(wire).transforms
-        reader = opened.enter_context(StreamReader(session, selected, stream, wire))
+        carrying = carrier(get_wire(wire), stream)
+        reader = opened.enter_context(StreamReader(session, selected, carrying, wire))
         received = reader.first(timeout if once else None)
         while True:
             if received is not None:

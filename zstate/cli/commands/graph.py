@@ -82,13 +82,13 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.wire.registry import get_wire
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
-        statistics.subscribe("joint_states")
-        statistics.subscribe("transforms")
+        always: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "transforms")
+        for stream in always:
+            statistics.subscribe(stream)
         robots = discover(session)
         readers = discover_readers(session, _READERS_WITHIN_S)
         # tf is published only while it is read: measuring must not make a publisher start.
         read = {one.robot for one in readers if one.stream == "tf"}
-        always: tuple[Stream, ...] = ("joint_states", "transforms")
         moving: set[tuple[str, Stream]] = {(robot.name, stream) for robot in robots for stream in always}
         for robot in robots:
             if read & {robot.name, ANY}:

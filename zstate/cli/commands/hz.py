@@ -24,7 +24,7 @@ _SETTLING_S = 0.1
 @click.argument("robot", required=False)
 @click.option(
     "--stream",
-    type=click.Choice(["joint_states", "tf", "transforms"]),
+    type=click.Choice(["joint_states", "partial_joint_states", "tf", "transforms"]),
     default="joint_states",
     show_default=True,
 )
@@ -55,7 +55,8 @@ def hz_command(
     """Print once a second the rate at which samples of ROBOT arrive.
 
     ROBOT may be left out if only one robot is announced. On a ROS wire this is the rate of the messages of a
-    topic, from all nodes together; that of transforms is the rate of all their writers together.
+    topic, from all nodes together; that of transforms, and of partial joint states, is the rate of all their
+    writers together.
 
     \b
     zstate hz
@@ -65,10 +66,12 @@ def hz_command(
     zstate hz --wire ros2 --stream tf --once           # /tf
     """
     from zstate.cli.stream_reader import StreamReader
+    from zstate.wire.keys import NAMED_STREAMS
+    from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire
 
-    of_all = is_ros(wire) or stream == "transforms"
-    stream = get_wire(wire).transforms if stream == "transforms" else stream
+    of_all = is_ros(wire) or stream in NAMED_STREAMS
+    stream = carrier(get_wire(wire), stream)
     refuse_topic(robot, wire)
     with (
         open_session(network, (wire,)) as session,

@@ -20,6 +20,12 @@ if TYPE_CHECKING:
 @click.command("joints")
 @click.argument("robot")
 @options.xacro_arguments
+@click.option(
+    "--only",
+    multiple=True,
+    metavar="NAME",
+    help="Publish this joint only, as the driver of a part of the robot. Repeatable.",
+)
 @options.rate_option
 @options.seconds_option
 @options.name_option
@@ -32,6 +38,7 @@ def joints_command(
     *,
     robot: str,
     xacro_args: dict[str, str],
+    only: tuple[str, ...],
     rate: float,
     seconds: float | None,
     name: str | None,
@@ -50,22 +57,29 @@ def joints_command(
     zstate joints panda
     zstate joints arm.urdf --rate 500 --seconds 10
     zstate joints panda --wire ros2                    # /joint_states, for a robot_state_publisher
+    zstate joints panda --only panda_finger_joint1     # a gripper's driver; another one publishes the rest
     """
     from zstate.cli.commands.publish import run_publisher
     from zstate.cli.options import open_clock
+    from zstate.nodes.partial_publisher import PartialStatePublisher
     from zstate.nodes.publisher import StatePublisher
     from zstate.sources import SineSource
+    from zstate.wire.registry import get_wire
 
     model, robot_name = load_robot(robot, name, xacro_args)
-    with (
-        open_session(network, (wire,)) as session,
-        open_clock(session, clock, wire) as time,
-        StatePublisher(
-            session, model, robot_name, (wire,), streams=("joint_states",), clock=time, takeover=takeover
-        ) as publisher,
-        serve_metrics(metrics, publisher_collector(publisher)),
-    ):
-        joints = count_text(len(model.joint_names), "joint")
-        place = messages_for(wire).place(robot_name, ("joint_states",))
-        print_wrapped(f"{robot_name}: a sine on {joints}, {rate:g} Hz, on {place}")
-        run_publisher(publisher, SineSource(model), rate, seconds)
+    if only and takeover:
+        raise click.UsageError("--takeover is for all joints; with --only a joint has one writer")
+    with open_session(network, (wire,)) as session, open_clock(session, clock, wire) as time:
+        if only:
+            publisher = PartialStatePublisher(session, model, only, robot_name, (wire,), clock=time)
+            shown = f"on {', '.join(only)}"
+            place = messages_for(wire).place(robot_name, (get_wire(wire).partial_joint_states,))
+        else:
+            publisher = StatePublisher(
+                session, model, robot_name, (wire,), streams=("joint_states",), clock=time, takeover=takeover
+            )
+            shown = f"on {count_text(len(model.joint_names), 'joint')}"
+            place = messages_for(wire).place(robot_name, ("joint_states",))
+        with publisher, serve_metrics(metrics, publisher_collector(publisher)):
+            print_wrapped(f"{robot_name}: a sine {shown}, {rate:g} Hz, on {place}")
+            run_publisher(publisher, SineSource(publisher.model), rate, seconds)

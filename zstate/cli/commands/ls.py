@@ -45,7 +45,7 @@ _REFRESH_S, _JSON_PERIOD_S = 0.5, 1.0
 _DISCOVERY_S = 0.5
 _HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
 _OPTIONAL = ("since", "age")
-_MEASURED: tuple[Stream, ...] = ("joint_states", "transforms")
+_MEASURED: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "transforms")
 
 
 @click.command("ls")

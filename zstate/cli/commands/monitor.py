@@ -30,7 +30,7 @@ from zstate.cli.output.console import (
 from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
-from zstate.wire.keys import ANY, Stream, check_robot
+from zstate.wire.keys import ANY, JOINT_STREAMS, Stream, check_robot
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
@@ -316,7 +316,7 @@ class RobotMonitor(Closeable):
         from zstate.metrics.buffer import MeteredBuffer
         from zstate.nodes.listener import TransformListener
 
-        follow: Follow = "joint_states" if "joint_states" in streams else "tf"
+        follow: Follow = "tf" if JOINT_STREAMS.isdisjoint(streams) else "joint_states"
         if is_ros(self._wire) and "tf" in streams:
             # All nodes share /tf. A selected robot means its joints, which need its model.
             is_described = self._robot is not None and {"joint_states", "robot_description"} <= streams
@@ -324,9 +324,9 @@ class RobotMonitor(Closeable):
         known = self._robots.get(robot)
         if known is not None and follow in (known.follow, "tf"):
             return
-        # A native listener also receives transforms, whatever it follows.
-        received: tuple[Stream, ...] = (follow,) if is_ros(self._wire) else (follow, "transforms")
-        shown: list[Stream] = [stream for stream in received if stream in streams]
+        # A native listener also receives transforms, and partial joint states as joint states.
+        others: tuple[Stream, ...] = () if is_ros(self._wire) else ("partial_joint_states", "transforms")
+        shown: list[Stream] = [stream for stream in (follow, *others) if stream in streams]
         if not shown:
             return
         if follow not in self._listeners:

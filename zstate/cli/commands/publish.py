@@ -19,10 +19,9 @@ from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
-    from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
     from zstate.rate import RateReport
-    from zstate.sources import JointReading
+    from zstate.sources import JointReading, JointStateListener
     from zstate.sources.joint_source import JointSource
     from zstate.wire.keys import Stream
 
@@ -54,6 +53,14 @@ def _check_source(source: str) -> str:
     type=options.RATE,
     help="Exact rate of samples. Default: every sample of joint_states; 100 for other sources.",
 )
+@click.option(
+    "--max-age",
+    type=options.SECONDS,
+    default=0.5,
+    show_default=True,
+    metavar="S",
+    help="Joints from several drivers: publish no reading with a value older than this.",
+)
 @options.wires_option
 @options.clock_option
 @options.seconds_option
@@ -67,6 +74,7 @@ def publish_command(
     xacro_args: dict[str, str],
     source: str,
     rate: float | None,
+    max_age: float,
     wires: tuple[str, ...],
     clock: str,
     seconds: float | None,
@@ -79,7 +87,8 @@ def publish_command(
 
     ROBOT is a name such as panda, or a URDF or xacro file; NAME:=VALUE are xacro arguments. By default
     subscribes to the robot's joint_states, which a driver or `zstate joints ROBOT` publishes, and publishes
-    the transforms of every sample. With another source it publishes joint_states as well.
+    the transforms of every sample. The joints may come from several drivers, each with its own joints
+    (`zstate joints ROBOT --only NAME`). With another source it publishes joint_states as well.
 
     On the native wire it keeps the last seconds for late joiners, and answers lookups on zstate/ROBOT/lookup
     for devices without a buffer.
@@ -98,7 +107,7 @@ def publish_command(
     zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
     from zstate.nodes.publisher import StatePublisher
-    from zstate.sources import SineSource
+    from zstate.sources import JointStateListener, SineSource
 
     model, robot_name = load_robot(robot, name, xacro_args)
     # Joint states are read from the first wire, which gets only what is derived from them.
@@ -125,7 +134,10 @@ def publish_command(
             print_status("ROS 2 nodes are behind their router; pass --connect, such as tcp/127.0.0.1:7447")
         rate_hz = rate or _RATE_HZ
         if derived_wires:
-            _publish_joint_states(session, derived_wires[0], derived, whole, rate, seconds)
+            source_joints = JointStateListener(
+                session, robot_name, model, wire=derived_wires[0], max_age_s=max_age
+            )
+            _publish_joint_states(source_joints, derived_wires[0], derived, whole, rate, seconds)
         elif source == "sine":
             run_publisher(whole, SineSource(model), rate_hz, seconds)
         else:
@@ -137,7 +149,7 @@ def publish_command(
 
 
 def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
-    session: Session,
+    joints: JointStateListener,
     wire: str,
     derived: StatePublisher,
     whole: StatePublisher,
@@ -146,7 +158,6 @@ def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
 ) -> None:
     """Publish the joint states of ``wire``: what they imply with ``derived``, everything with ``whole``."""
     from zstate.net.topic_statistics import mean_rate_hz
-    from zstate.sources import JointStateListener
 
     messages, robot = messages_for(wire), derived.robot
     place = messages.place(robot, ("joint_states",))
@@ -162,7 +173,7 @@ def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
         whole.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
 
     print_status(f"waiting for {place} ...")
-    with JointStateListener(session, robot, derived.model, wire=wire) as source:
+    with joints as source:
         if rate_hz is not None:
             run_publisher(derived, _ObservedSource(source, on_reading), rate_hz, seconds)
         else:

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     "--downsample",
     multiple=True,
     metavar="STREAM=HZ",
-    help="At most HZ samples per second of joint_states, tf or transforms to each neighbour; may be "
-    "repeated.",
+    help="At most HZ samples per second of joint_states, partial_joint_states, tf or transforms to each "
+    "neighbour; may be repeated.",
 )
 @click.option("--robot", multiple=True, metavar="NAME", help="Downsample this robot; may be repeated.")
 @click.option(

@@ -99,7 +99,7 @@ def _collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     from zstate.cli.robot_directory import announced_robots
     from zstate.cli.waiting import ConditionWaiter
     from zstate.net.presence import discover
-    from zstate.wire.keys import ANY, MODEL_WRITER
+    from zstate.wire.keys import ANY, JOINT_STREAMS, MODEL_WRITER
 
     # Models and static edges arrive during discovery, which is mostly waiting.
     find = partial(discover, session) if robot == ANY else partial(announced_robots, session, robot)
@@ -128,7 +128,7 @@ def _collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
         )
         for text in _missing(listener, robots):
             print_status(text)
-        moving = {robot.name for robot in robots if "joint_states" in _streams(robot)}
+        moving = {robot.name for robot in robots if not JOINT_STREAMS.isdisjoint(_streams(robot))}
 
         def has_rate(frame: FrameInfo) -> bool:
             if frame.kind != "joint" or frame.name.partition("/")[0] not in moving:

@@ -7,17 +7,18 @@ from collections.abc import Iterable, Iterator, Sequence, Set
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
-from zstate.cli.doctor.robot_probe import RobotProbe, WriterSamples
+from zstate.cli.doctor.robot_probe import RobotProbe, StreamSamples, WriterSamples
 from zstate.cli.frame_checks import similar_frames, without_program_advice
 from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import publish_command_for
 from zstate.errors import LookupFailed, ModelError, format_duration
 from zstate.model.joint_limits import JointLimits
-from zstate.model.robot import RobotModel, representative_links
+from zstate.model.robot import RobotModel, coordinate_names, representative_links
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
-from zstate.wire.keys import MODEL_WRITER, foreign_edge_problem
+from zstate.wire.identity import WriterId
+from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, foreign_edge_problem
 from zstate.wire.messages import Status
 
 _MIN_RECEIVED = 0.8
@@ -47,13 +48,16 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
             break
     model, check = model_check(probe)
     yield check
-    if not probe.has_only_transforms:
+    if probe.info.part_names and "joint_states" not in probe.streams:
+        yield from _parts_checks(probe, model)
+    elif not probe.has_only_transforms:
         yield _samples_check(probe)
-    yield from _transforms_checks(probe)
+    yield from _named_writers_checks(probe, "transforms", probe.transforms, probe.info.transform_names)
     yield clocks_check(probe)
     yield stamps_check(probe, session)
     if model is not None:
-        writers = probe.samples.writers.values()
+        parts = {} if probe.parts is None else probe.parts.writers
+        writers = (*probe.samples.writers.values(), *parts.values())
         yield from limits_check(probe, model, writers, f"zstate echo {probe.info.name}")
     yield statics_check(probe)
     yield poses_check(probe, model)
@@ -171,25 +175,50 @@ def _rate_check(probe: RobotProbe, writer: str, rate_hz: float) -> Check:
     return ok(stream, f"{text}, newest {silence} ago")
 
 
-def _transforms_checks(probe: RobotProbe) -> Iterator[Check]:
-    """Whether each announced writer of transforms publishes."""
-    samples = {} if probe.transforms is None else probe.transforms.writers
-    hz = f"zstate hz {probe.info.name} --stream transforms"
-    for name, writer in probe.info.transform_names:
+def _parts_checks(probe: RobotProbe, model: RobotModel | None) -> Iterator[Check]:
+    """Whether each driver of some joints publishes, and each joint has one."""
+    stream, robot = "partial_joint_states", probe.info.name
+    refused = refused_check(probe)
+    if refused is not None:
+        yield refused
+    yield from _named_writers_checks(probe, stream, probe.parts, probe.info.part_names)
+    parts = {} if probe.parts is None else probe.parts.writers
+    written = {name for samples in parts.values() for name in samples.names}
+    if model is not None and not written.issuperset(coordinate_names(model)):
+        missing = [
+            joint for joint in model.joint_names if written.isdisjoint(coordinate_names(model.part([joint])))
+        ]
+        text = (
+            f"{', '.join(map(repr, missing))} of {robot!r} without a writer: what moves with it has no pose"
+        )
+        only = " ".join(f"--only {joint}" for joint in missing)
+        yield broken(stream, text, f"{publish_command_for('joints', robot)} {only}  # until its driver runs")
+
+
+def _named_writers_checks(
+    probe: RobotProbe,
+    stream: Stream,
+    stream_samples: StreamSamples | None,
+    names: Sequence[tuple[str, WriterId]],
+) -> Iterator[Check]:
+    """Whether each announced writer of a stream with names publishes."""
+    samples = {} if stream_samples is None else stream_samples.writers
+    hz, what = f"zstate hz {probe.info.name} --stream {stream}", stream.replace("_", " ")
+    for name, writer in names:
         received, known_as = samples.get(writer.session), f"{writer}, as {name!r}"
         if received is None:
             stuck = ": it is stopped, or frozen" if writer in probe.unresponsive else ""
-            text = f"{known_as}, is announced, but no transform arrives{stuck}"
-            yield warning("transforms", text, hz)
+            text = f"{known_as}, is announced, but no sample arrives{stuck}"
+            yield warning(stream, text, hz)
             continue
         silence = format_duration(round(received.statistics.silent_s() * 1e9))
         window = received.statistics.window()
         if received.statistics.is_stale():
-            yield broken("transforms", f"the transforms of {known_as}, stopped {silence} ago", hz)
+            yield broken(stream, f"the {what} of {known_as}, stopped {silence} ago", hz)
         elif window is None or window.rate_hz is None:
-            yield ok("transforms", f"one sample from {known_as}, {silence} ago")
+            yield ok(stream, f"one sample from {known_as}, {silence} ago")
         else:
-            yield ok("transforms", f"{window.rate_hz:.1f} Hz from {known_as}, newest {silence} ago")
+            yield ok(stream, f"{window.rate_hz:.1f} Hz from {known_as}, newest {silence} ago")
 
 
 def _no_writer_check(probe: RobotProbe) -> Check:
@@ -275,7 +304,7 @@ def poses_check(probe: RobotProbe, model: RobotModel | None) -> Check:
     if len(roots) > 1:
         return _trees_check(probe, {frame.name for frame in frames}, roots)
     has_samples = bool(probe.sample_count)
-    is_driven = "joint_states" in probe.streams and model is not None
+    is_driven = not JOINT_STREAMS.isdisjoint(probe.streams) and model is not None
     if not (has_samples or is_driven or (model is not None and not model.joint_names)):
         return skipped("poses", "no joint positions")
     if not frames:

@@ -22,7 +22,7 @@ from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import Stream, clock_key
+from zstate.wire.keys import JOINT_STREAMS, Stream, clock_key
 from zstate.wire.messages import (
     JointState,
     RobotDescription,
@@ -122,8 +122,8 @@ class RobotProbe(Closeable):
     """Subscribes to the streams of ``info`` and to the status of its writers.
 
     ``neighbours`` are all announced robots. ``on_change()`` is called after each description and sample.
-    ``nodes`` are the samples of each stream by ROS node, on a ROS wire; ``transforms`` are the samples of
-    that stream by writer, on the native wire.
+    ``nodes`` are the samples of each stream by ROS node, on a ROS wire; ``transforms`` and ``parts``, the
+    partial joint states, are the samples of these streams by writer, on the native wire.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class RobotProbe(Closeable):
         self.info, self.neighbours = info, neighbours
         self.streams = frozenset(stream for stream, _ in info.writers)
         is_native = wire == "native"
-        moves_by_joints = "joint_states" in self.streams or "tf" not in self.streams
+        moves_by_joints = not JOINT_STREAMS.isdisjoint(self.streams) or "tf" not in self.streams
         self.followed: Follow = "joint_states" if is_native and moves_by_joints else "tf"
         self.description: RobotDescription | None = None
         self.statuses: dict[int, Status] = {}
@@ -154,7 +154,10 @@ class RobotProbe(Closeable):
             samples = StreamSamples(session, info.name, self.followed, wire_format, on_change)
             self.samples = opening.enter_context(samples)
             self.transforms: StreamSamples | None = None
+            self.parts: StreamSamples | None = None
             if is_native:
+                parts = StreamSamples(session, info.name, "partial_joint_states", wire_format, on_change)
+                self.parts = opening.enter_context(parts)
                 transforms = StreamSamples(session, info.name, "transforms", wire_format)
                 self.transforms = opening.enter_context(transforms)
                 opening.enter_context(StatusSubscriber(session, info.name, self._on_status))
@@ -200,6 +203,8 @@ class RobotProbe(Closeable):
     def is_incomplete(self) -> bool:
         """Whether announced data has not arrived yet."""
         lacks_model = "robot_description" in self.streams and self.description is None
+        if self.parts is not None and len(self.parts.writers) < len(self.info.part_names):
+            return True
         return lacks_model or (self.followed in self.streams and self.samples.statistics.count < 2)
 
     @property
@@ -210,14 +215,14 @@ class RobotProbe(Closeable):
 
     @property
     def sample_count(self) -> int:
-        """How many samples of the followed stream and of transforms have arrived."""
-        transforms = 0 if self.transforms is None else self.transforms.statistics.count
-        return self.samples.statistics.count + transforms
+        """How many samples of the followed stream, of transforms and of partial joint states have arrived."""
+        all_samples = [self.samples, self.transforms, self.parts]
+        return sum(samples.statistics.count for samples in all_samples if samples is not None)
 
     @property
     def has_only_transforms(self) -> bool:
         """Whether its writers publish moving edges, and no joints or model."""
-        others = {"joint_states", "tf", "robot_description"}
+        others = {*JOINT_STREAMS, "tf", "robot_description"}
         return "transforms" in self.streams and self.streams.isdisjoint(others)
 
     def find_unresponsive(self) -> None:

@@ -81,7 +81,9 @@ class NativeMessages:
             fact = f"{robot!r} is announced with {stream}, but no {'new ' * ended}sample arrives"
             return f"{fact}; `zstate doctor {robot}` finds the reason"
         command = f"zstate transform TARGET SOURCE --xyz X Y Z --robot {robot}"
-        if stream != "transforms":
+        if stream == "partial_joint_states":
+            command = f"{publish_command_for('joints', robot)} --only NAME"
+        elif stream != "transforms":
             command = publish_command_for("joints" if stream == "joint_states" else "publish", robot)
         return f"{stream} of {robot!r} has no writer{' any more' * ended}; start one: `{command}`"
 

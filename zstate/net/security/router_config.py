@@ -18,7 +18,7 @@ from zstate.net.security.acl import AclRoles, access_control, check_namespace
 from zstate.net.security.credentials import Credentials
 from zstate.wire.keys import Stream, check_robot, stream_expression
 
-DOWNSAMPLED: tuple[Stream, ...] = ("joint_states", "tf", "transforms")
+DOWNSAMPLED: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "tf", "transforms")
 """Streams that may lose samples: each is replaced by a newer one."""
 
 _WIDTH = 100
@@ -31,8 +31,9 @@ class Downsampling:
     """Limits on the samples per second that a router forwards to each neighbour.
 
     ``rates_hz`` is the limit by stream, for each of ``robots``; ``interfaces`` are the network interfaces
-    that it applies to (default: all). The limit of ``transforms`` is that of all their writers of one robot
-    together. Latched values are never dropped. Readers count dropped samples as missed. Raises InvalidInput.
+    that it applies to (default: all). The limits of ``transforms`` and ``partial_joint_states`` are those of
+    all their writers of one robot together. Latched values are never dropped. Readers count dropped samples
+    as missed. Raises InvalidInput.
     """
 
     rates_hz: Mapping[str, float]

@@ -1,0 +1,104 @@
+"""All joints of a robot at one instant, or at many, from the tracks of its drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate.buffer.path import TrackUse, TransformPath, ViewReader, joint_interpolators
+from zstate.buffer.tracks import JointTrack
+from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.robot import POSITION_COUNTS, coordinate_names, velocity_columns_by_position
+
+Floats = NDArray[np.float64]
+
+
+class RobotJoints:
+    """Reads the joints of ``robot``, each from the track that moves it, and interpolated as in lookups.
+
+    Positions are in the order of the robot's ``joint_names``. With ``own`` only the joints of this track
+    are read, though parts of the robot may move some of them.
+    """
+
+    def __init__(self, robot: JointTrack, read_views: ViewReader, *, own: bool = False) -> None:
+        self._robot = robot
+        parts: Mapping[str, JointTrack] = {} if own else robot.parts
+        joints: dict[JointTrack, list[str]] = {}
+        for name in robot.model.joint_names:
+            joints.setdefault(parts.get(name, robot), []).append(name)
+        self._tracks = tuple(joints)
+        root = robot.frame(robot.model.root)
+        uses = [_use(track, names) for track, names in joints.items()] or [TrackUse(robot, [], (root, root))]
+        # A path without steps: it reads the values, and its errors name the limiting joint's edge.
+        self._path = TransformPath(root, root, (), (), uses, read_views)
+        self._columns = [_columns(robot, names) for names in joints.values()]
+
+    def positions(self, at: int | None) -> tuple[Floats, int]:
+        """All positions (nq,) at a stamp [ns], and that stamp; by default the newest that all tracks reach.
+
+        Raises NoData, InPast, InFuture, Stale or NotFinite.
+        """
+        values, stamp, *_ = self._path.read(at)
+        positions = np.empty(self._robot.position_count)
+        for columns, numbers in zip(self._columns, values, strict=False):
+            positions[columns] = np.hstack(numbers)
+        if not np.isfinite(positions).all():
+            raise self._path.not_finite(values, stamp)
+        return positions, stamp
+
+    def positions_many(self, stamps: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
+        """All positions at each stamp, (T, nq), NaN where they are not known, and (T,) where they are."""
+        positions = np.full((len(stamps), self._robot.position_count), np.nan)
+        values, valid = self._path.values_at(stamps)
+        for columns, numbers in zip(self._columns, values, strict=False):
+            rows = [row for number in numbers for row in np.atleast_2d(number)]
+            positions[np.ix_(valid, columns)] = np.stack(rows, axis=-1)
+        unusable = ~np.isfinite(positions).all(axis=1)
+        positions[unusable] = np.nan
+        return positions, valid & ~unusable
+
+    def samples(self, start: int | None, end: int | None) -> JointTrajectory:
+        """Copies of the samples in [start, end) [ns].
+
+        With several tracks, an instant for each of their samples that all of them cover: positions are
+        interpolated between a track's own samples, and velocities known at its samples only.
+        """
+        if self._tracks in ((), (self._robot,)):
+            return self._robot.samples(start, end)
+        parts = [track.samples(start, end) for track in self._tracks]
+        stamps = np.unique(np.concatenate([part.stamps for part in parts]))
+        positions, valid = self.positions_many(stamps)
+        model = self._robot.model
+        coordinates, slots = coordinate_names(model), velocity_columns_by_position(model)
+        slot_names = tuple(coordinates[slot] for slot in slots)
+        whole = JointTrajectory(model.joint_names, coordinates, slot_names, stamps, positions)
+        if any(part.velocities is not None for part in parts):
+            velocities = np.full((len(stamps), len(slots)), np.nan)
+            for part, columns in zip(parts, self._columns, strict=True):
+                if part.velocities is not None:
+                    own = frozenset(coordinates[int(column)] for column in columns)
+                    known = [name for name in part.velocity_coordinates if name in own]
+                    sources = np.array([part.velocity_coordinates.index(name) for name in known], np.intp)
+                    places = np.array([slot_names.index(name) for name in known], np.intp)
+                    rows = stamps.searchsorted(part.stamps)
+                    velocities[np.ix_(rows, places)] = part.velocities[:, sources]
+            whole = replace(whole, velocities=velocities)
+        return whole.select(np.flatnonzero(valid))
+
+
+def _columns(robot: JointTrack, names: list[str]) -> NDArray[np.intp]:
+    """The columns of these joints in the positions of the robot."""
+    counts = {joint.name: POSITION_COUNTS[joint.type] for joint in robot.model.driven_joints}
+    firsts = robot.model.columns
+    columns = [firsts[name] + number for name in names for number in range(counts[name])]
+    return np.array(columns, dtype=np.intp)
+
+
+def _use(track: JointTrack, names: list[str]) -> TrackUse:
+    """How a path reads these joints of a track; its errors name the edge of the first."""
+    indices = {joint.name: index for index, joint in enumerate(track.model.joints)}
+    interpolators = [one for name in names for one in joint_interpolators(track, indices[name])]
+    return TrackUse(track, interpolators, track.edge(track.forms[indices[names[0]]]))

@@ -1,0 +1,287 @@
+"""Several drivers of one robot: which of them moves which joint, and the ingest of their joint states.
+
+A driver of some joints publishes a *part* of the robot's joint states. Each joint has one writer. Of writers
+that contradict each other the first in this list moves the joints they have in common:
+
+1. an announced writer; of two the one that started later, as among writers of all joints,
+2. a writer that has left: its samples stay until an announced one moves the joint,
+3. a writer that is not announced.
+
+A part in which such a joint is missing would be half a robot at an instant, so it is refused as a whole, and
+accepted once the other writer has left. A writer of all joints keeps those that no part moves. The result
+depends on the writers, not on the order of arrival.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from zstate._util.bounded import BoundedDict
+from zstate._util.fork_safe import fork_safe
+from zstate.buffer.tracks import JointTrack
+from zstate.errors import InsertRefused, MessageError
+from zstate.ingest.base import ClockSetBack, StreamIngest
+from zstate.ingest.frame_ownership import EdgeSource, FrameOwnership
+from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.wire.joint_order import JointOrder
+from zstate.wire.keys import Stream
+from zstate.wire.messages import JointState, RobotDescription, Sample
+
+_ANNOUNCED, _LEFT, _UNANNOUNCED, _NO_WRITER = range(4)
+
+_MAX_SETS = 16
+"""Sets of joints that one writer may publish; a driver publishes one."""
+
+
+def joint_order(model: RobotModel) -> JointOrder:
+    """Reader of the joint states of a robot with this model, or of the drivers of this part of one."""
+    return JointOrder(model.joint_names, coordinate_names(model), velocity_columns_by_position(model))
+
+
+class JointNames:
+    """The driven joints of a model by the names of their coordinates in messages."""
+
+    def __init__(self, model: RobotModel) -> None:
+        self._robot = model.name
+        self._coordinates = {joint: coordinate_names(model.part([joint])) for joint in model.joint_names}
+        self._joints = {name: joint for joint, names in self._coordinates.items() for name in names}
+
+    def joints(self, names: Sequence[str], *, others: bool = False) -> tuple[str, ...]:
+        """The joints whose coordinates a message ``names``, in its order.
+
+        With ``others`` it may name further ones, as in ROS. Raises MessageError for unknown joints, for none,
+        and for a joint of which a coordinate is missing.
+        """
+        found = tuple(dict.fromkeys(self._joints[name] for name in names if name in self._joints))
+        unknown = [name for name in names if name not in self._joints]
+        if unknown and not others:
+            text = f"{', '.join(map(repr, unknown))}, no driven joint of {self._robot!r}"
+            raise MessageError(f"a partial joint state of {text}", reason="unknown joints")
+        missing = [name for joint in found for name in self._coordinates[joint] if name not in names]
+        if missing or not found:
+            text = ", ".join(map(repr, missing)) or f"any joint of {self._robot!r}"
+            raise MessageError(f"a partial joint state without {text}", reason="missing joints")
+        return found
+
+
+@dataclass(eq=False, slots=True)
+class JointPart:
+    """The joints that the writer of a ``session`` publishes together; ``track`` has their samples.
+
+    The session is None if there is no writer yet.
+    """
+
+    session: int | None
+    joints: tuple[str, ...]
+    track: JointTrack
+    order: JointOrder
+    refusal: InsertRefused | None = None
+
+
+class RobotParts:
+    """The writers of the joints of ``robot``, and which of them moves which joint in the buffer.
+
+    The writer of all joints is one of them. Any thread may call it.
+    """
+
+    def __init__(self, robot: str, ownership: FrameOwnership) -> None:
+        self._robot = robot
+        self._ownership = ownership
+        self._buffer = ownership.buffer
+        self._counters = ownership.counters.for_robot(robot)
+        self._names = ownership.live
+        self._whole: JointPart | None = None
+        self._whole_session: int | None = None
+        self._joint_names: JointNames | None = None
+        self._parts: dict[tuple[int, frozenset[str]], JointPart] = {}
+        # The same by the order of the names in samples; a writer may change it.
+        self._by_order: BoundedDict[tuple[int, bytes], JointPart] = BoundedDict()
+        self._since: dict[int, int] = {}
+        self._departed: BoundedDict[int, int] = BoundedDict()
+        self._lock = fork_safe(threading.RLock())
+
+    def set_model(self, track: JointTrack) -> None:
+        """Set the track of the whole robot. The parts of an earlier model have ended with it."""
+        with self._lock:
+            order = joint_order(track.model)
+            self._whole = JointPart(self._whole_session, track.model.joint_names, track, order)
+            self._joint_names = JointNames(track.model)
+            self._parts.clear()
+            self._by_order.clear()
+
+    def set_whole_writer(self, session: int | None) -> None:
+        """Set the writer of all joints, None if there is none."""
+        with self._lock:
+            if session != self._whole_session:
+                self._whole_session = session
+                if self._whole is not None:
+                    self._whole.session = session
+                    self._resolve()
+
+    def add_writer(self, session: int, since: int) -> None:
+        """Add an announced writer that started at ``since`` [ns]."""
+        with self._lock:
+            self._since[session] = since
+            self._departed.pop(session, None)
+            for part in self._parts_of(session):
+                part.track.writer = self._names.get((self._robot, session))
+            self._resolve()
+
+    def remove_writer(self, session: int) -> None:
+        """Remove a writer that has left. Its samples stay until another writer moves the joints."""
+        with self._lock:
+            since = self._since.pop(session, None)
+            if since is not None:
+                self._departed[session] = since
+                self._resolve()
+
+    def drop(self, session: int) -> None:
+        """Remove the parts of a writer, with their samples."""
+        with self._lock:
+            for key in [key for key in self._parts if key[0] == session]:
+                del self._parts[key]
+            for order in [key for key in self._by_order if key[0] == session]:
+                del self._by_order[order]
+            self._resolve()
+
+    def restart(self, session: int) -> None:
+        """Remove the samples of a writer: its clock was set back."""
+        with self._lock:
+            for part in self._parts_of(session):
+                self._buffer.restart(part.track)
+
+    def part_of(self, state: JointState, *, others: bool) -> JointPart | None:
+        """The part that a sample belongs to; None while the model is not known.
+
+        With ``others`` it may name joints that are not of the model. Raises MessageError for a sample whose
+        joints cannot be used, InsertRefused for one with a joint of another part.
+        """
+        part = self._by_order.get((state.session, state.order))
+        if part is None:
+            with self._lock:
+                part = self._add_part(state, others=others)
+        if part is not None and part.refusal is not None:
+            raise part.refusal.with_traceback(None)  # it is raised for each sample
+        return part
+
+    def _add_part(self, state: JointState, *, others: bool) -> JointPart | None:
+        if self._whole is None or self._joint_names is None:
+            return None
+        if state.names is None:
+            raise MessageError("a partial joint state without the names of its joints", reason="no names")
+        whole, session = self._whole.track, state.session
+        joints = self._joint_names.joints(state.names, others=others)
+        part = self._parts.get((session, frozenset(joints)))
+        if part is None:
+            if len(self._parts_of(session)) >= _MAX_SETS:
+                text = f"a writer of more than {_MAX_SETS} sets of joints; now {', '.join(map(repr, joints))}"
+                raise MessageError(text, reason="too many sets of joints")
+            track = self._buffer.add_part(whole, joints, self._names.get((self._robot, session)))
+            part = JointPart(session, joints, track, joint_order(track.model))
+            track.check_positions(part.order.read(state).positions)  # unusable ones take no joint
+            self._parts[session, frozenset(joints)] = part
+            self._resolve()
+        self._by_order[session, state.order] = part
+        return part
+
+    def _parts_of(self, session: int) -> list[JointPart]:
+        return [part for part in self._parts.values() if part.session == session]
+
+    def _resolve(self) -> None:
+        """Assign each joint to one part, and refuse the parts that contradict it."""
+        whole = self._whole
+        if whole is None or not (self._parts or whole.track.parts):
+            return
+        movers: dict[str, JointPart] = {}
+        for part in sorted((whole, *self._parts.values()), key=self._precedence):
+            taken = [joint for joint in part.joints if joint in movers]
+            if taken and self._precedence(part)[0] in (_ANNOUNCED, _UNANNOUNCED):
+                self._refuse(part, taken[0], movers[taken[0]])
+            else:
+                part.refusal = None
+                movers.update({joint: part for joint in part.joints if joint not in movers})
+        tracks = {joint: part.track for joint, part in movers.items() if part is not whole}
+        self._buffer.assign_joints(whole.track, tracks)
+
+    def _precedence(self, part: JointPart) -> tuple[int, int, int, int, tuple[str, ...]]:
+        """Sort key: the first moves a joint. Of a writer's own parts that is the one with more joints."""
+        session = part.session or 0
+        rank, since = _UNANNOUNCED, 0
+        if part.session is None:
+            rank = _NO_WRITER
+        elif session in self._departed:
+            rank, since = _LEFT, self._departed[session]
+        elif session in self._since:
+            rank, since = _ANNOUNCED, self._since[session]
+        return rank, -since, session, -len(part.joints), part.joints
+
+    def _refuse(self, part: JointPart, joint: str, first: JointPart) -> None:
+        text, reason = f"joint {joint!r} is published by {self._writer(first)}", "second writer"
+        if first.session == part.session:
+            missing = ", ".join(repr(name) for name in first.joints if name not in part.joints)
+            text, reason = f"{text} together with {missing}, refused: without", "missing joints"
+        else:
+            text = f"{text}; refused: {self._writer(part)}; one joint has one writer"
+        track = part.track
+        forms = dict(zip([one.name for one in track.model.joints], track.forms, strict=True))
+        error = InsertRefused(text, reason=reason, edge=track.edge(forms[joint]))
+        if part.refusal is None:
+            if part is self._whole:  # the samples of others are counted one by one
+                self._counters.count_refusal(error.reason, f"{self._robot!r}: {text}")
+            stream: Stream = "joint_states" if part is self._whole else "partial_joint_states"
+            source = EdgeSource(self._robot, self._writer(part), part.session or 0)
+            self._ownership.report_conflict(stream, source, error)
+        part.refusal = error
+
+    def _writer(self, part: JointPart) -> str:
+        return self._names.get((self._robot, part.session or 0)) or f"a writer of session {part.session}"
+
+
+class PartialJointStateIngest(StreamIngest):
+    """Inserts the joint states of one driver, which publishes a part of the robot.
+
+    ``others`` means that its messages may name joints that are not of the model, as in ROS.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        ownership: FrameOwnership,
+        parts: RobotParts,
+        on_set_back: ClockSetBack | None = None,
+        *,
+        others: bool = False,
+    ) -> None:
+        super().__init__(robot, ownership, on_set_back)
+        self._parts = parts
+        self._others = others
+
+    def describe(self, description: RobotDescription) -> None:
+        """Insert the samples that arrived before the model, which ``parts`` has now."""
+        with self._lock:
+            self._insert_early()
+
+    def drop(self) -> None:
+        with self._lock:
+            self._parts.drop(self._session or 0)
+
+    def _insert(self, sample: Sample) -> bool | None:
+        assert isinstance(sample, JointState)
+        part = self._parts.part_of(sample, others=self._others)
+        if part is None:
+            return None
+        if sample.order == part.order.digest and sample.velocities is None:
+            return self._buffer.insert_joints(part.track, sample.stamp, sample.positions)
+        numbers = part.order.read(sample)
+        return self._buffer.insert_joints(part.track, sample.stamp, numbers.positions, numbers.velocities)
+
+    def _may_restart_epoch(self) -> bool:
+        return True  # other writers have tracks of their own
+
+    def _drop_history(self) -> None:
+        self._parts.restart(self._session or 0)
+
+    def _on_writer_changed(self) -> None:
+        pass  # ``RobotParts`` has the writers
