@@ -28,7 +28,8 @@ from zstate import se3
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.frame_tree import FrameTree, PathDependencies
-from zstate.buffer.tracks import Track
+from zstate.buffer.history import FastPath
+from zstate.buffer.tracks import JointTrack, Track
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.transform import Transform
 
@@ -152,6 +153,21 @@ class WaiterRegistry:
             for waiter in self._waiting_for(tracks):
                 if waiter.condition.is_met():
                     waiter.wake()
+
+    def fast_path(self, counts: dict[str, int], *sources: object) -> FastPath[Waiter]:
+        """A fast path for samples of one track; ``counts`` and ``sources`` as in ``FastPath``."""
+        return FastPath(self._by_track, counts, (self.tree, *sources))
+
+    def expect_next(
+        self, fast_path: FastPath[Waiter], track: Track, message: bytes, versions: tuple[int, ...]
+    ) -> None:
+        """Let ``fast_path`` insert the message after ``message``, whose sample was inserted into ``track``.
+
+        Ends with the next change of the tree, because ``notify`` checks all waiters after one.
+        """
+        position_count = track.position_count if isinstance(track, JointTrack) else -1
+        versions = self._notified_version, *versions
+        fast_path.expect(message, track, track.history, position_count, versions)
 
     def notify_restart(self, *tracks: Track) -> None:
         """Wake all waiters for ``tracks``: their samples are gone, and newer ones may have older stamps."""
