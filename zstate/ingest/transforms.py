@@ -154,6 +154,16 @@ class TransformIngest(StreamIngest):
         newest = self._newest_by_order.get(sample.order)
         return None if newest is None else newest[0]
 
+    def _set_newest(self, order: bytes, stamp: int) -> None:
+        self._newest_by_order[order] = [stamp]
+
+    def _fast_place(self, sample: Sample) -> Edges | None:
+        if self._version != self._ownership.version:
+            return None
+        if isinstance(sample, WriterTransforms) and sample.covariances is not None:
+            return None
+        return self._all_admitted.get(sample.order)
+
     def _drop_history(self) -> None:
         self._newest_by_order.clear()
         self._release(self._described)
