@@ -91,6 +91,21 @@ class Waiter:
         if self._registry.tree.version != version or condition.is_met():
             self.wake()
 
+    def expect_newer(
+        self, dependencies: PathDependencies, track: Track, stamp: int | None, version: int
+    ) -> bool:
+        """Raise the required stamp of ``track`` if nothing else of the condition changes; else False.
+
+        Only for a waiter that looks again when it is woken during the call: a sample that arrives then meets
+        the condition as it is before or after.
+        """
+        required = self.condition.required
+        is_same = self.condition.dependencies is dependencies and self._registry.tree.version == version
+        if not is_same or not isinstance(required, dict) or required.keys() != {track}:
+            return False
+        required[track] = stamp
+        return True
+
 
 class WaiterRegistry:
     """All waiters of a buffer, by the tracks they wait for.
