@@ -8,6 +8,7 @@ ends with a non-zero exit at the first crash, bad access, undefined operation or
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import math
 import os
@@ -22,8 +23,9 @@ from collections import Counter
 from collections.abc import Callable
 from importlib.machinery import ExtensionFileLoader
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 
 SOURCE = Path(__file__).parent.parent / "zstate" / "buffer" / "_kernel.c"
@@ -60,6 +62,28 @@ def run_under_sanitizers(seconds: float) -> int:
         return subprocess.run(command, env=environment, check=False).returncode
 
 
+class Versioned:
+    """A source of versions for a fast path; reading one may run any code, for instance change that."""
+
+    reenter: ClassVar[Callable[[], object]]
+
+    def __init__(self, fuzz: Fuzz) -> None:
+        self.fuzz = fuzz
+        self.value = object()
+
+    @property
+    def version(self) -> object:
+        choice = self.fuzz.random.random()
+        if choice < 0.03:
+            Versioned.reenter()
+        elif choice < 0.06:
+            for fast_path in self.fuzz.fast_paths:
+                fast_path.stop()
+        elif choice < 0.08:
+            raise ValueError("no version")
+        return self.value if choice < 0.97 else object()
+
+
 class Fuzz:
     """One seed's worth of calls; histories and paths made on the way are used again."""
 
@@ -67,6 +91,8 @@ class Fuzz:
         self.kernel = kernel
         self.random = random.Random(seed)
         self.numbers = np.random.default_rng(seed)
+        self.fast_paths: list[Any] = []
+        self.sources: dict[int, tuple[Versioned, ...]] = {}
         self.histories: list[Any] = [kernel.History(width, 10**9) for width in (0, 1, 7, 14, 40)]
         self.paths: list[Any] = []
         self.kept: list[Any] = []
@@ -76,6 +102,8 @@ class Fuzz:
             *(self.write,) * 8,
             self.replace,
             self.clear,
+            self.make_fast_path,
+            *(self.insert_next,) * 6,
             self.write_together,
             self.make_path,
             self.make_good_path,
@@ -145,6 +173,53 @@ class Fuzz:
 
     def clear(self) -> None:
         self.history().clear()
+
+    def mostly(self, good: Any, *bad: Any) -> Any:
+        return good if self.random.random() < 0.95 else self.pick(*bad, *ODD)
+
+    def make_fast_path(self) -> None:
+        sources = tuple(Versioned(self) for _ in range(self.random.randrange(3)))
+        counts = self.pick({}, {"received": 2**63 - 1}, {"received": "many"})
+        waiters = self.mostly({"track": (1, 2)}, {}, {"track": None})
+        self.fast_paths.append(self.kernel.FastPath(waiters, self.mostly(counts), self.mostly(sources)))
+        self.sources[id(self.fast_paths[-1])] = sources
+        del self.fast_paths[: max(0, len(self.fast_paths) - 6)]
+
+    def message(self, history: Any, stamp: int, seq: int, counts: tuple[int, ...]) -> Any:
+        """Mostly a message of the native wire; at times a damaged one."""
+        numbers = [self.numbers.normal(size=count) for count in counts]
+        for block in numbers:
+            if len(block) % 7 == 0:
+                block.reshape(-1, 7)[:, 3:] = (1.0, 0.0, 0.0, 0.0)
+        head = [self.mostly(stamp, *STAMPS[:6]), seq, 7, b"\0" * 8]
+        good = msgspec.msgpack.encode([*head, *(block.tobytes() for block in numbers), None])
+        at = self.random.randrange(len(good))
+        flipped = good[:at] + bytes([self.random.randrange(256)]) + good[at + 1 :]
+        return self.mostly(good, good[:at], flipped, flipped, good + b"\0", bytearray(good), b"")
+
+    def insert_next(self) -> None:
+        """A run of messages, of which each should be the one after the last."""
+        if not self.fast_paths:
+            self.make_fast_path()
+        fast_path, history = self.random.choice(self.fast_paths), self.history()
+        width = min(history.width, 100)
+        counts = self.pick((width,), (width // 2, width - width // 2), (width // 2, width - width // 2, 3))
+        place = self.pick(counts[0], counts[0], -1)
+        if place == -1:
+            counts = self.pick((width,), (width // 4,))
+        sources = self.sources[id(fast_path)]
+        Versioned.reenter = lambda: fast_path.expect(message, track, history, place, versions)
+        versions, track = tuple(source.value for source in sources), self.mostly("track")
+        stamp, seq = self.mostly(10**9, 2**62), self.pick(0, 5, 100, 2**31, 2**63 - 3)
+        message = self.message(history, stamp, seq, counts)
+        fast_path.expect(message, track, history, self.mostly(place, 2**62, -(2**62)), self.mostly(versions))
+        for step in range(1, self.random.randrange(2, 6)):
+            limits = self.mostly((-(2**63), 2**63 - 1), (0, 10**6), (self.stamp(), self.stamp()), ())
+            message = self.message(history, stamp + step, seq + step, counts)
+            fast_path.insert(message, *limits)
+            if self.random.random() < 0.1:
+                self.pick(history.close, history.clear, fast_path.stop, gc.collect)()
+        fast_path.stop()
 
     def write_together(self) -> None:
         some = tuple(self.random.choices(self.histories, k=self.random.randrange(4)))

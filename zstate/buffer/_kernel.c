@@ -2,8 +2,8 @@
  *
  * Each type is specified by its reference in Python, which stays complete:
  * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
- * (TransformFields), zstate/model/joint_transforms.py (Edges). Differences to those are bugs, and
- * tests compare both.
+ * (TransformFields), zstate/model/joint_transforms.py (Edges), zstate/ingest/base.py with
+ * zstate/wire/native.py (FastPath). Differences to those are bugs, and tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
  * covers are never written again, so a batch that holds references to its blocks reads them without
@@ -27,6 +27,7 @@
 #include "_kernel/input.h"
 #include "_kernel/block.h"
 #include "_kernel/history.h"
+#include "_kernel/fast_path.h"
 #include "_kernel/motion.h"
 #include "_kernel/transform_fields.h"
 #include "_kernel/step.h"
@@ -35,7 +36,7 @@
 
 /* Raised with every change of the interface to Python, so that a library built from older source
  * (an editable install that was not rebuilt) is recognised and not used. */
-#define REVISION 7
+#define REVISION 9
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,
@@ -54,15 +55,19 @@ static struct PyModuleDef kernel_module = {
 static int
 fill_module(PyObject *module)
 {
-    PyTypeObject *types[] = {&Block_type, &History_type, &TransformFields_type, &Path_type,
-                             &Edges_type};
+    PyTypeObject *types[] = {&Block_type,           &History_type, &FastPath_type,
+                             &TransformFields_type, &Path_type,    &Edges_type};
     for (size_t i = 0; i < sizeof(types) / sizeof(types[0]); i++)
         if (PyModule_AddType(module, types[i]) < 0)
             return -1;
     kind_static = PyUnicode_InternFromString("static");
     kind_exact = PyUnicode_InternFromString("exact");
     kind_interpolated = PyUnicode_InternFromString("interpolated");
-    if (kind_static == NULL || kind_exact == NULL || kind_interpolated == NULL)
+    version_name = PyUnicode_InternFromString("version");
+    received_name = PyUnicode_InternFromString("received");
+    no_waiters = PyTuple_New(0);
+    if (kind_static == NULL || kind_exact == NULL || kind_interpolated == NULL ||
+        version_name == NULL || received_name == NULL || no_waiters == NULL)
         return -1;
     return PyModule_AddIntConstant(module, "REVISION", REVISION);
 }

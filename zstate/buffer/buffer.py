@@ -296,10 +296,13 @@ class TransformBuffer(BufferCore):
         version = self._tree.version
         try:
             _, path, dependencies = self._cached_path(query.target, query.source)
-            transform = path.transform(None)
+            transform = path.at(None) or path.transform(None)
         except LookupFailed as reason:
             return self._expect_change(query, reason, waiter, version)
         newer = None if transform.stamp is None else transform.stamp + 1
+        uses = path.uses
+        if len(uses) == 1 and waiter.expect_newer(dependencies, uses[0].track, newer, version):
+            return transform
         waiter.expect(WakeCondition(dependencies, {use.track: newer for use in path.uses}), version)
         return transform
 

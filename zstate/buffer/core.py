@@ -15,7 +15,7 @@ from zstate._util.fork_safe import fork_safe
 from zstate._util.format import did_you_mean
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreeSnapshot
-from zstate.buffer.history import HistoryView, insert_together, keep_only_around
+from zstate.buffer.history import FastPath, HistoryView, insert_together, keep_only_around
 from zstate.buffer.path import TrackUse, TransformPath, compile_path
 from zstate.buffer.pose_tracks import (
     EdgeNames,
@@ -27,7 +27,7 @@ from zstate.buffer.pose_tracks import (
     second_writer,
 )
 from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack, Track, TrackOwner
-from zstate.buffer.waiting import WaiterRegistry
+from zstate.buffer.waiting import Waiter, WaiterRegistry
 from zstate.checks import check_names, name_problem
 from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import (
@@ -145,6 +145,7 @@ class BufferCore:
         with self._lock:
             self._check_owned(track)
             track.owner = None
+            track.history.close()
             for name, edge in list(self._tree.frames.items()):
                 if edge is not None and edge.robot is track:
                     if edge.track is not None:
@@ -243,6 +244,31 @@ class BufferCore:
             if track.has_velocities != had_velocities:
                 self._tree.invalidate(track)
         return self._count(track, inserted=inserted)
+
+    def fast_path(self, counts: dict[str, int], *sources: object) -> FastPath[Waiter]:
+        """A fast path into this buffer for the messages of one writer, see ``FastPath``."""
+        return self._waiters.fast_path(counts, *sources)
+
+    def expect_next(
+        self,
+        fast_path: FastPath[Waiter],
+        place: JointTrack | tuple[EdgeNames, ...],
+        message: bytes,
+        *versions: int,
+    ) -> None:
+        """Let ``fast_path`` insert the message after ``message``, whose sample was inserted just now.
+
+        ``place`` is the track of its joints, or its edges. None is expected if the samples need further
+        checks: those of floating joints, of edges in several tracks, or any unless the clock is the system's.
+        """
+        if type(self.clock) is not SystemClock:
+            return
+        if not isinstance(place, JointTrack):
+            track = self._pose_tracks.whole_track(place)
+        else:
+            track = place if place.has_plain_joints else None
+        if track is not None:
+            self._waiters.expect_next(fast_path, track, message, versions)
 
     def _check_owned(self, track: Track) -> None:
         if track.owner is self._owner:
@@ -452,6 +478,7 @@ class BufferCore:
                 "give both the same, or a buffer without a clock"
             )
         self.clock, self.domain.given = clock, clock.domain
+        self._tree.version += 1  # ends the fast paths, which compare stamps with the system's clock
 
     def domain_between(self, target: str, source: str) -> str | None:
         """The clock domain of transforms between two frames, None if not known. Raises as ``plan``."""

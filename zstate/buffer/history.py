@@ -9,8 +9,8 @@ one stamp, no capacity left) writes a new copy. The new view is then published b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from zstate.extension import kernel
 
 _MIN_CAPACITY = 16
+
+W = TypeVar("W")
 
 
 class HistoryView(NamedTuple):
@@ -90,6 +92,9 @@ class ReferenceHistory:
         """Remove every sample."""
         self.view = self._empty(_MIN_CAPACITY)
 
+    def close(self) -> None:
+        """Refuse samples of a ``FastPath``: another history takes the place of this one."""
+
     def reaches(self, stamp: int) -> bool:
         """Whether a sample of that stamp would be kept: at most ``span_ns`` older than the newest."""
         return not self.view.size or stamp >= self.view.newest - self.span_ns
@@ -133,8 +138,54 @@ class ReferenceHistory:
         return True
 
 
+class ReferenceFastPath(Generic[W]):
+    """Inserts the usual next message of one writer into a history, in one call of the extension.
+
+    The usual next message is the last one, byte for byte, but for a newer stamp, the next sequence number and
+    other numbers of the same count: what was checked of the last message holds for it. Each other message
+    ends this, until ``expect`` is called again. The reference inserts none.
+
+    ``waiters`` are the waiting threads and tasks by track. ``counts["received"]`` grows with each message.
+    ``sources`` are objects whose ``version`` is compared with that of the last message.
+
+    Calls are atomic and take no lock: code that changes what a fast path depends on calls ``stop`` or
+    ``History.close`` first, or raises a version.
+    """
+
+    def __init__(
+        self, waiters: Mapping[Any, tuple[W, ...]], counts: dict[str, int], sources: tuple[object, ...]
+    ) -> None:
+        pass
+
+    def expect(
+        self,
+        message: bytes,
+        track: object,
+        history: ReferenceHistory,
+        position_count: int,
+        versions: tuple[int, ...],
+    ) -> bool:
+        """Expect the message after ``message``, whose sample was inserted into ``history`` of ``track``.
+
+        ``position_count`` is the number of joint positions, -1 for poses. False if none can be expected.
+        """
+        return False
+
+    def insert(self, message: bytes | None, earliest: int, latest: int) -> tuple[W, ...] | None:
+        """Insert a message with a stamp from ``earliest`` to ``latest`` [ns]; the waiters for its track.
+
+        None if it is not the usual next message; then nothing was changed.
+        """
+        return None
+
+    def stop(self) -> tuple[int, int] | None:
+        """Expect no message. The sequence number after the last message, and its stamp; None without one."""
+        return None
+
+
 if TYPE_CHECKING or kernel == "reference":
     History = ReferenceHistory
+    FastPath = ReferenceFastPath
 
     def insert_together(
         histories: Sequence[History], stamp: int, rows: Sequence[NDArray[np.float64]]
@@ -147,6 +198,7 @@ else:
     from zstate import _kernel
 
     insert_together = _kernel.insert_together
+    FastPath = _kernel.FastPath
 
     class History(_kernel.History):
         """``ReferenceHistory`` over memory of the extension."""

@@ -112,6 +112,7 @@ class JointTrack:
     ) -> bool:
         """Insert one instant; False if it is older than the history reaches."""
         if velocities is not None and not self.has_velocities:
+            self.history.close()
             old = self.history.view
             missing = np.full((old.size, self.model.velocity_count), np.nan)
             wider = History(self.history.width + self.model.velocity_count, self.history.span_ns)
@@ -190,6 +191,7 @@ class PoseTrack:
     def row(self, poses: NDArray[np.float64], covariances: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """A row of the history: ``poses`` (N, 7), and ``covariances`` (N, 21) if they are known."""
         if covariances is not None and not self.has_covariances:
+            self.history.close()
             old = self.history.view
             missing = np.full((old.size, COVARIANCE_NUMBERS * len(self.edges)), np.nan)
             wider = History((7 + COVARIANCE_NUMBERS) * len(self.edges), self.history.span_ns)
@@ -203,6 +205,7 @@ class PoseTrack:
 
     def split(self) -> list[PoseTrack]:
         """The same samples as one track for each edge."""
+        self.history.close()
         view = self.history.view
         rows = view.kept_rows()
         singles: list[PoseTrack] = []

@@ -28,7 +28,8 @@ from zstate import se3
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.frame_tree import FrameTree, PathDependencies
-from zstate.buffer.tracks import Track
+from zstate.buffer.history import FastPath
+from zstate.buffer.tracks import JointTrack, Track
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.transform import Transform
 
@@ -89,6 +90,21 @@ class Waiter:
             self._registry.update(self)
         if self._registry.tree.version != version or condition.is_met():
             self.wake()
+
+    def expect_newer(
+        self, dependencies: PathDependencies, track: Track, stamp: int | None, version: int
+    ) -> bool:
+        """Raise the required stamp of ``track`` if nothing else of the condition changes; else False.
+
+        Only for a waiter that looks again when it is woken during the call: a sample that arrives then meets
+        the condition as it is before or after.
+        """
+        required = self.condition.required
+        is_same = self.condition.dependencies is dependencies and self._registry.tree.version == version
+        if not is_same or not isinstance(required, dict) or required.keys() != {track}:
+            return False
+        required[track] = stamp
+        return True
 
 
 class WaiterRegistry:
@@ -152,6 +168,21 @@ class WaiterRegistry:
             for waiter in self._waiting_for(tracks):
                 if waiter.condition.is_met():
                     waiter.wake()
+
+    def fast_path(self, counts: dict[str, int], *sources: object) -> FastPath[Waiter]:
+        """A fast path for samples of one track; ``counts`` and ``sources`` as in ``FastPath``."""
+        return FastPath(self._by_track, counts, (self.tree, *sources))
+
+    def expect_next(
+        self, fast_path: FastPath[Waiter], track: Track, message: bytes, versions: tuple[int, ...]
+    ) -> None:
+        """Let ``fast_path`` insert the message after ``message``, whose sample was inserted into ``track``.
+
+        Ends with the next change of the tree, because ``notify`` checks all waiters after one.
+        """
+        position_count = track.position_count if isinstance(track, JointTrack) else -1
+        versions = self._notified_version, *versions
+        fast_path.expect(message, track, track.history, position_count, versions)
 
     def notify_restart(self, *tracks: Track) -> None:
         """Wake all waiters for ``tracks``: their samples are gone, and newer ones may have older stamps."""

@@ -9,11 +9,12 @@ from typing import TypeAlias
 
 from zstate._util.bounded import BoundedDict, BoundedQueue
 from zstate._util.fork_safe import fork_safe
+from zstate.buffer.tracks import JointTrack
 from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput, MessageError, format_duration
 from zstate.ingest.counters import MissingSamples
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.wire.messages import RobotDescription, Sample, message_size
+from zstate.wire.messages import Edges, RobotDescription, Sample, message_size
 
 # Bounds on the samples that wait for the robot's description, which takes milliseconds.
 _EARLY = 1024
@@ -25,11 +26,29 @@ ClockSetBack: TypeAlias = Callable[[str, int, str], None]
 """Called with a robot, the session of its writer, and a description of what happened."""
 
 
+class _IngestLock:
+    """The lock of an ingest; the fast path is stopped before the state that it shares is used."""
+
+    def __init__(self, stop_fast_path: Callable[[], None]) -> None:
+        self._lock = fork_safe(threading.RLock())
+        self._stop_fast_path = stop_fast_path
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+        self._stop_fast_path()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
 class StreamIngest(ABC):
     """Inserts one robot's samples into the buffer of ``ownership``. Any thread may call it.
 
     Only samples of the newest writer are inserted. If that writer's clock is set back, a new epoch begins,
     and ``on_set_back(robot, session, text)`` is called.
+
+    ``insert_next`` inserts nearly all samples of a writer, by a ``FastPath`` of the buffer. ``insert_sample``
+    handles all others, and gives the same result for any.
     """
 
     def __init__(
@@ -58,8 +77,15 @@ class StreamIngest(ABC):
         self._domain: str | None = None
         self._has_joined_domain = False
         self._departed_session: int | None = None
-        self._lock = fork_safe(threading.RLock())
+        self._fast_order = b""
+        self._fast_path = self._buffer.fast_path(self._counters.fast_counts, ownership)
+        self._lock = _IngestLock(self._stop_fast_path)
         self._buffer.name_robot(robot)
+
+    @property
+    def session(self) -> int | None:
+        """The session whose samples are inserted now."""
+        return self._session
 
     @property
     def writer(self) -> str | None:
@@ -88,8 +114,26 @@ class StreamIngest(ABC):
         with self._lock:
             self._drop_history()
 
-    def insert_sample(self, sample: Sample, *, overflowed: bool) -> None:
-        """Insert a live sample; ``overflowed`` if the receiver's ring lost samples before it."""
+    def insert_next(self, message: bytes | None, earliest: int, latest: int) -> bool:
+        """Insert the live sample encoded in ``message`` if it is the usual next one; else nothing is done.
+
+        The usual next sample has the sequence number after the last, which ``insert_sample`` inserted or this
+        method, a newer stamp from ``earliest`` to ``latest`` [ns], and the same other fields but for finite
+        numbers. None is a sample that cannot be it.
+        """
+        waiters = self._fast_path.insert(message, earliest, latest)
+        if waiters is None:
+            return False
+        for waiter in waiters:
+            if waiter.condition.is_met():
+                waiter.wake()
+        return True
+
+    def insert_sample(self, sample: Sample, *, overflowed: bool, message: bytes | None = None) -> None:
+        """Insert a live sample; ``overflowed`` if the receiver's ring lost samples before it.
+
+        With the encoded ``message`` of the sample, ``insert_next`` expects the sample after it.
+        """
         self.has_data = True
         with self._lock:
             if sample.session != self._session and not self._accept_session(sample):
@@ -110,9 +154,27 @@ class StreamIngest(ABC):
                     self._missing.add(expected, seq)
                     self._counters.count("dropped" if overflowed else "missed", seq - expected)
                 self._next_seq = max(seq + 1, expected or 0)
-            if not self._insert_counted(sample, is_in_order=is_in_order):
+            inserted = self._insert_counted(sample, is_in_order=is_in_order)
+            if inserted is None:
                 for _ in range(self._early.append(sample, message_size(sample))):
                     self._refuse_undescribed()
+            elif inserted and message is not None and sample.seq + 1 == self._next_seq:
+                self._expect_next(sample, message)
+
+    def _expect_next(self, sample: Sample, message: bytes) -> None:
+        """Let ``insert_next`` insert the sample after this one, if it would be inserted unchanged."""
+        version = self._ownership.version  # before the decision that depends on it
+        place = self._fast_place(sample)
+        if place is not None and self._has_joined_domain and self._newest_of(sample) == sample.stamp:
+            self._fast_order = sample.order
+            self._buffer.expect_next(self._fast_path, place, message, version)
+
+    def _stop_fast_path(self) -> None:
+        """Take over the state that the fast path has advanced."""
+        advanced = self._fast_path.stop()
+        if advanced is not None:
+            self._next_seq, stamp = advanced
+            self._set_newest(self._fast_order, stamp)
 
     def insert_history(self, samples: Sequence[Sample]) -> bool:
         """Insert samples from the writer's cache, oldest first; True if still older ones are wanted.
@@ -157,10 +219,10 @@ class StreamIngest(ABC):
         early, self._early = self._early, BoundedQueue(_EARLY, EARLY_BYTES)
         largest = 0
         for sample in early:
-            if self._insert_counted(sample, is_in_order=sample.seq >= largest):
-                largest = max(largest, sample.seq)
-            else:
+            if self._insert_counted(sample, is_in_order=sample.seq >= largest) is None:
                 self._refuse_undescribed()
+            else:
+                largest = max(largest, sample.seq)
         history = self._early_history
         self._clear_early_history()
         for sample in history:
@@ -176,12 +238,12 @@ class StreamIngest(ABC):
             "no description", f"{self.robot!r}: no robot_description fits its samples"
         )
 
-    def _insert_counted(self, sample: Sample, *, is_in_order: bool) -> bool:
-        """Insert a sample and count it; False if its description has not arrived yet."""
+    def _insert_counted(self, sample: Sample, *, is_in_order: bool) -> bool | None:
+        """Insert a sample and count it: False if it was not inserted, None without a description."""
         try:
             inserted = self._insert(sample)
             if inserted is None:
-                return False
+                return None
             newest, stamp = self._newest, sample.stamp
             if inserted and newest is not None and stamp >= newest:
                 self._newest = stamp  # nearly always; saves the calls below
@@ -189,12 +251,12 @@ class StreamIngest(ABC):
                 inserted = self._restart_epoch(sample) or inserted
         except (InvalidInput, MessageError) as error:
             self._count_refusal(error)
-        else:
-            self._counters.count("received" if inserted else "late")
-            if not self._has_joined_domain and sample.session != self._departed_session:
-                self._has_joined_domain = True
-                self._buffer.domain.join(self.robot)
-        return True
+            return False
+        self._counters.count("received" if inserted else "late")
+        if not self._has_joined_domain and sample.session != self._departed_session:
+            self._has_joined_domain = True
+            self._buffer.domain.join(self.robot)
+        return inserted
 
     def _count_refusal(self, error: InvalidInput | MessageError) -> None:
         reason = error.reason if isinstance(error, InsertRefused | MessageError) else "bad numbers"
@@ -253,6 +315,10 @@ class StreamIngest(ABC):
         """The newest stamp before ``sample`` in its epoch, if known."""
         return self._newest
 
+    def _set_newest(self, order: bytes, stamp: int) -> None:
+        """Set the newest stamp of the samples with this ``order``."""
+        self._newest = stamp
+
     def _accept_session(self, sample: Sample) -> bool:
         """Whether samples of this session are inserted: those of the newest writer to appear."""
         session = sample.session
@@ -288,6 +354,10 @@ class StreamIngest(ABC):
 
         Raises InvalidInput or MessageError if the sample cannot be used.
         """
+
+    @abstractmethod
+    def _fast_place(self, sample: Sample) -> JointTrack | Edges | None:
+        """The track or the edges for ``sample``, inserted just now, if its numbers are a row unchanged."""
 
     @abstractmethod
     def _drop_history(self) -> None:

@@ -49,6 +49,8 @@ class Counters:
         self._parent = parent
         self._robots: dict[str, Counters] = {}
         self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
+        self.fast_counts: dict[str, int] = {}
+        """The part of these counts that the extension adds, in atomic calls and without the lock."""
         self._refusals = Refusals(parent=None if parent is None else parent._refusals)
         self._warned: BoundedDict[str, None] = BoundedDict()
 
@@ -91,6 +93,7 @@ class Counters:
             everything = [self, *self._robots.values()]
         for one in everything:
             counts.update(one._counts.copy())
+            counts.update(one.fast_counts.copy())
             refused.update(one._refusals.counts.copy())
         return ListenerStats(refused=dict(refused), **{what: counts[what] for what in _COUNTED})
 

@@ -277,6 +277,11 @@ class PartialJointStateIngest(StreamIngest):
         numbers = part.order.read(sample)
         return self._buffer.insert_joints(part.track, sample.stamp, numbers.positions, numbers.velocities)
 
+    def _fast_place(self, sample: Sample) -> JointTrack | None:
+        assert isinstance(sample, JointState)
+        part = self._parts.part_of(sample, others=self._others)
+        return part.track if part is not None and sample.order == part.order.digest else None
+
     def _may_restart_epoch(self) -> bool:
         return True  # other writers have tracks of their own
 

@@ -75,9 +75,10 @@ class TransformIngest(StreamIngest):
     def _named(self, edges: Edges) -> Edges:
         return tuple((full_name(self.robot, parent), full_name(self.robot, child)) for parent, child in edges)
 
-    def _insert_counted(self, sample: Sample, *, is_in_order: bool) -> bool:
-        # What the joint states give again is neither received nor late.
-        return self._repeats_models(sample) or super()._insert_counted(sample, is_in_order=is_in_order)
+    def _insert_counted(self, sample: Sample, *, is_in_order: bool) -> bool | None:
+        if self._repeats_models(sample):
+            return False  # what the joint states give again is neither received nor late
+        return super()._insert_counted(sample, is_in_order=is_in_order)
 
     def _repeats_models(self, sample: Sample) -> bool:
         """Whether all edges of a sample are those of models, which compute them."""
@@ -183,6 +184,16 @@ class TransformIngest(StreamIngest):
     def _newest_of(self, sample: Sample) -> int | None:
         newest = self._newest_by_order.get(sample.order)
         return None if newest is None else newest[0]
+
+    def _set_newest(self, order: bytes, stamp: int) -> None:
+        self._newest_by_order[order] = [stamp]
+
+    def _fast_place(self, sample: Sample) -> Edges | None:
+        if self._version != self._ownership.version:
+            return None
+        if isinstance(sample, WriterTransforms) and sample.covariances is not None:
+            return None
+        return self._all_admitted.get(sample.order)
 
     def _drop_history(self) -> None:
         self._newest_by_order.clear()

@@ -60,11 +60,16 @@ def call_for_each(batch: Iterable[T], function: Callable[[T], object]) -> None:
 class Receiver(Closeable, Generic[T]):
     """Calls ``_on_batch`` with all waiting items, oldest first.
 
+    ``_is_handled`` is called first with the oldest item, and the batch is without it if that returns True.
+    There is no batch then unless the receiver ``_needs_batches``.
+
     The ring in between holds ``capacity`` items: if it is full the oldest are lost. A batch that fills it is
     counted in ``full_batches``, which distinguishes a gap before or in it from a loss in the network. An
     exception of ``_on_batch`` is counted in ``failures``, once for items that arrived together, and the first
     goes to ``threading.excepthook``; the thread continues.
     """
+
+    _needs_batches = True
 
     def __init__(self, session: Session, subscribed: Subscribed[T], capacity: int) -> None:
         self.full_batches = 0
@@ -80,6 +85,9 @@ class Receiver(Closeable, Generic[T]):
     @abstractmethod
     def _on_batch(self, batch: list[T]) -> None: ...
 
+    def _is_handled(self, item: T) -> bool:
+        return False
+
     def close(self) -> None:
         """Stop within a second, also from inside a callback, which is not called afterwards."""
         self._closed = True
@@ -91,21 +99,29 @@ class Receiver(Closeable, Generic[T]):
         handler = self._subscribed.handler
         while not self._closed:
             try:
-                batch = [handler.recv()]
-                while len(batch) < self._capacity and (sample := handler.try_recv()) is not None:
-                    batch.append(sample)
+                first = handler.recv()
+                is_handled = not self._closed and self._is_handled(first)
+                if is_handled and not self._needs_batches:
+                    continue
+                batch = [] if is_handled else [first]
+                while len(batch) < self._capacity and (item := handler.try_recv()) is not None:
+                    batch.append(item)
             except zenoh.ZError:
                 return  # undeclared, or the session was closed
             if len(batch) >= self._capacity:
                 self.full_batches += 1
-            if self._closed:
-                return
+            if self._closed or not batch:
+                continue
             try:
                 self._on_batch(batch)
             except Exception:
-                self.failures += 1
-                if self.failures == 1:
-                    threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
+                self._count_failure()
+
+    def _count_failure(self) -> None:
+        """Count the exception that is handled now; report the first."""
+        self.failures += 1
+        if self.failures == 1:
+            threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
 
 def capacity_for(keyexpr: str) -> int:
@@ -173,6 +189,10 @@ class StreamSubscriber(Receiver[zenoh.Sample]):
 
     It is called from one thread of this subscriber. ``Receiver`` describes slow and failing callbacks.
 
+    ``insert_next(key, payload)`` is called before it with each sample by itself, and returns True if it
+    handled the sample: then ``on_samples`` does not get it. ``payload`` is None if the sample has an
+    attachment, or another encoding than ``encoding``. Samples of a full batch go to ``on_samples`` only.
+
     The keys of received samples, up to 4096, are declared to Zenoh, which keeps the route of samples on
     declared keys. On others it searches all declarations under them for each sample: with the tokens of 100
     robots that is a quarter of what a reader's sample costs.
@@ -184,15 +204,39 @@ class StreamSubscriber(Receiver[zenoh.Sample]):
         keyexpr: str,
         on_samples: Callable[[list[SerializedSample]], None],
         capacity: int | None = None,
+        *,
+        insert_next: Callable[[str, bytes | None], bool] | None = None,
+        encoding: str = "",
     ) -> None:
         self._key = "" if "*" in keyexpr else keyexpr
         self._declared: dict[str, _DeclaredKey] = {}
         self._on_samples = on_samples
+        self._insert_next = insert_next
+        # A sample after a gap is not handled at once. What a full ring has lost leaves a gap before the next
+        # sample of a single key; of many keys, the next sample may be of another one.
+        self._needs_batches = not self._key
+        self._encoding = zenoh.Encoding(encoding)
         capacity = capacity or capacity_for(keyexpr)
         ring: Ring = zenoh.handlers.RingChannel(capacity)
         super().__init__(session, session.zenoh.declare_subscriber(keyexpr, ring), capacity)
 
+    def _is_handled(self, item: zenoh.Sample) -> bool:
+        if self._insert_next is None:
+            return False
+        payload = item.payload
+        is_usual = (
+            len(payload) <= SAMPLE_BYTES and item.attachment is None and item.encoding == self._encoding
+        )
+        try:
+            key = self._key or str(item.key_expr)
+            return self._insert_next(key, payload.to_bytes() if is_usual else None)
+        except Exception:
+            self._count_failure()
+            return True
+
     def _on_batch(self, batch: list[zenoh.Sample]) -> None:
+        if self._insert_next is not None and len(batch) < self._capacity:
+            batch = [sample for sample in batch if not self._is_handled(sample)]
         samples = [to_serialized(sample, self._key, 4 * SAMPLE_BYTES) for sample in batch]
         if not all(sample.payload for sample in samples):
             # A delete has no payload; reading the kind of every sample would cost as much as its key.
@@ -202,7 +246,8 @@ class StreamSubscriber(Receiver[zenoh.Sample]):
             for key in {sample.key for sample in samples}.difference(self._declared):
                 with suppress(Closed, zenoh.ZError):  # closed at the same time: no more samples will arrive
                     self._declared[key] = _DeclaredKey(self._session.zenoh, key)
-        self._on_samples(samples)
+        if samples:
+            self._on_samples(samples)
 
     def close(self) -> None:
         super().close()

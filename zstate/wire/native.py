@@ -69,6 +69,11 @@ _DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in ENCODINGS}
 _ENCODING = re.compile(r"zstate/(\w+);v=([1-9]\d{0,8})")
 
 
+def stream_encoding(stream: Stream) -> str:
+    """The Zenoh encoding of the messages of a stream."""
+    return ENCODINGS[STREAM_TYPES[stream]]
+
+
 def encode(message: Message) -> bytes:
     """The payload of ``message``; its Zenoh encoding is ``ENCODINGS[type(message)]``."""
     return _ENCODER.encode(message)
@@ -101,7 +106,7 @@ class NativeStreamEncoder:
 
     def __init__(self, robot: str, writer: WriterId, stream: Stream, name: str) -> None:
         self.key = keys.stream_key(robot, stream, name)
-        self.encoding = ENCODINGS[STREAM_TYPES[stream]]
+        self.encoding = stream_encoding(stream)
         identity = Announcement(robot, stream, writer, name if stream in keys.NAMED_STREAMS else "").identity
         self.token = None if stream == "clock" else keys.writer_key(robot, stream, identity)
 

@@ -10,6 +10,7 @@ typedef struct {
     Py_ssize_t end;
     Py_ssize_t width;
     int64_t span_ns;
+    bool is_closed; /* another history takes its place */
 } History;
 
 static PyTypeObject History_type;
@@ -243,6 +244,13 @@ history_clear(History *self, PyObject *Py_UNUSED(ignored))
 }
 
 static PyObject *
+history_close(History *self, PyObject *Py_UNUSED(ignored))
+{
+    self->is_closed = true;
+    Py_RETURN_NONE;
+}
+
+static PyObject *
 history_reaches_stamp(History *self, PyObject *number)
 {
     int64_t stamp;
@@ -280,6 +288,13 @@ history_insert(History *self, PyObject *const *args, Py_ssize_t count)
     return inserted;
 }
 
+static void
+fill_unknown(double *row, Py_ssize_t first, Py_ssize_t end)
+{
+    for (Py_ssize_t i = first; i < end; i++)
+        row[i] = Py_NAN;
+}
+
 /* Writes positions, then velocities, NaN without. 1 inserted, 0 too old, -1 MemoryError. */
 static int
 insert_numbers(History *self, int64_t stamp, const Py_buffer *positions,
@@ -295,8 +310,7 @@ insert_numbers(History *self, int64_t stamp, const Py_buffer *positions,
     if (velocities != NULL)
         memmove(row + count_of(positions), velocities->buf, (size_t)velocities->len);
     else
-        for (Py_ssize_t i = count_of(positions); i < self->width; i++)
-            row[i] = Py_NAN;
+        fill_unknown(row, count_of(positions), self->width);
     slot_publish(self, &slot);
     return 1;
 }
@@ -353,6 +367,17 @@ are_poses(const char *block, Py_ssize_t count)
     return true;
 }
 
+static void
+normalise_poses(double *row, Py_ssize_t count)
+{
+    for (Py_ssize_t i = 0; i < count; i += 7) {
+        double *q = row + i + 3;
+        double norm = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        for (int k = 0; k < 4; k++)
+            q[k] /= norm;
+    }
+}
+
 static PyObject *
 history_try_insert_poses(History *self, PyObject *const *args, Py_ssize_t count)
 {
@@ -375,14 +400,8 @@ history_try_insert_poses(History *self, PyObject *const *args, Py_ssize_t count)
         return NULL;
     double *row = slot_write_stamp(&slot, stamp);
     memcpy(row, PyBytes_AS_STRING(args[1]), (size_t)PyBytes_GET_SIZE(args[1]));
-    for (Py_ssize_t i = 0; i < numbers; i += 7) {
-        double *q = row + i + 3;
-        double norm = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-        for (int k = 0; k < 4; k++)
-            q[k] /= norm;
-    }
-    for (Py_ssize_t i = numbers; i < self->width; i++)
-        row[i] = Py_NAN;
+    normalise_poses(row, numbers);
+    fill_unknown(row, numbers, self->width);
     slot_publish(self, &slot);
     Py_RETURN_TRUE;
 }
@@ -474,6 +493,8 @@ static PyMethodDef history_methods[] = {
     {"reaches", (PyCFunction)history_reaches_stamp, METH_O,
      "reaches(stamp): whether a sample of that stamp would be kept."},
     {"clear", (PyCFunction)history_clear, METH_NOARGS, "clear(): remove every sample."},
+    {"close", (PyCFunction)history_close, METH_NOARGS,
+     "close(): accept no more samples from a FastPath."},
     {NULL},
 };
 
