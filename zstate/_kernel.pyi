@@ -13,6 +13,9 @@ StepTuple: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
 FailureTuple: TypeAlias = tuple[int, int, int | None, int | None, int | None, float | None]
 
 def block_of(numbers: object, count: int, /) -> bytes | None: ...
+def placement_poses(
+    placements: NDArray[Any], rows: NDArray[Any], parents: NDArray[Any], poses: NDArray[Any], /
+) -> None: ...
 
 class Block(Buffer):
     @property

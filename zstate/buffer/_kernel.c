@@ -1,9 +1,10 @@
-/* The hot loops of the buffer: histories of samples, and compiled paths over them.
+/* The hot loops of the buffer: histories of samples, and compiled paths over them; and those of the
+ * publisher.
  *
  * Each type is specified by its reference in Python, which stays complete:
  * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
- * (TransformFields), zstate/model/joint_transforms.py (Edges). Differences to those are bugs, and
- * tests compare both.
+ * (TransformFields), zstate/model/joint_transforms.py (Edges), zstate/model/pinocchio_solver.py
+ * (placement_poses). Differences to those are bugs, and tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
  * covers are never written again, so a batch that holds references to its blocks reads them without
@@ -32,10 +33,11 @@
 #include "_kernel/step.h"
 #include "_kernel/path.h"
 #include "_kernel/edges.h"
+#include "_kernel/placements.h"
 
 /* Raised with every change of the interface to Python, so that a library built from older source
  * (an editable install that was not rebuilt) is recognised and not used. */
-#define REVISION 7
+#define REVISION 8
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,
@@ -43,6 +45,8 @@ static PyMethodDef kernel_methods[] = {
     {"block_of", (PyCFunction)(void (*)(void))block_of, METH_FASTCALL,
      "block_of(numbers, count): the block of an array of so many finite doubles; None for anything "
      "else."},
+    {"placement_poses", (PyCFunction)(void (*)(void))placement_poses, METH_FASTCALL,
+     "placement_poses(placements, rows, parents, poses): parent * placement of each row."},
     {NULL},
 };
 
