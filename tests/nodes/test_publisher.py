@@ -4,13 +4,13 @@ import time
 
 import numpy as np
 import pytest
+from helpers.matrix_kinematics import matrices
 from helpers.processes import SOON_S, until
 from helpers.robots import RRBOT, STAMP, SampleCollector, wait_for_reader
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput
-from zstate.model.joint_transforms import JointTransforms
-from zstate.model.kinematics import Kinematics
+from zstate.model.kinematics import Kinematics, MovingEdges
 from zstate.model.load import load_model
 from zstate.net.presence import discover
 from zstate.net.session import connect
@@ -116,7 +116,8 @@ def test_both_streams_carry_the_same_instant_and_agree_with_kinematics(sessions)
     edges = dict(zip(kinematics.edges, kinematics.edge_poses([0.03, 0.4]), strict=True))
     moving = [(joint.parent, joint.child) for joint in model.joints if joint.type != "fixed"]
     assert list(named) == moving
-    assert poses_from_block(sample.poses).tolist() == [edges[edge].tolist() for edge in moving]
+    expected = matrices(np.array([edges[edge] for edge in moving]))
+    assert np.allclose(matrices(poses_from_block(sample.poses)), expected, rtol=0.0, atol=1e-15)
 
 
 def test_moving_and_fixed_edges_are_separate_and_complete(sessions):
@@ -131,10 +132,11 @@ def test_moving_and_fixed_edges_are_separate_and_complete(sessions):
 
 def test_transforms_are_computed_and_sent_only_while_they_have_a_reader(sessions, monkeypatch):
     computed = []
-    poses = JointTransforms.poses
-    monkeypatch.setattr(JointTransforms, "poses", lambda *given: computed.append(given) or poses(*given))
+    poses = MovingEdges.poses
+    monkeypatch.setattr(MovingEdges, "poses", lambda *given: computed.append(given) or poses(*given))
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher:
+        computed.clear()  # those of the comparison at opening
 
         def transform_stats() -> StreamStats:
             return publisher.stats.streams["native", "tf"]

@@ -271,9 +271,7 @@ def test_native_wire_implements_the_protocol_for_every_stream():
         message, encoder = by_type[kind], encoder_of(stream, "w")
         assert encoder.encoding == ENCODINGS[kind]
         assert encoder.key.startswith(wire.expression("r1", stream).rstrip("*"))
-        arrival = SerializedSample(
-            encoder.key, encoder.encode(message), encoder.encoding, encoder.attachment(0)
-        )
+        arrival = SerializedSample(encoder.key, encoder.encode(message), encoder.encoding, encoder.attachment)
         assert wire.decode(stream, arrival, "r1") == (message,)
 
 

@@ -4,7 +4,8 @@
  * Each type is specified by its reference in Python, which stays complete:
  * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
  * (TransformFields), zstate/model/joint_transforms.py (Edges), zstate/model/pinocchio_solver.py
- * (placement_poses). Differences to those are bugs, and tests compare both.
+ * (placement_poses), zstate/nodes/publisher.py (JointStateEncoder). Differences to those are bugs,
+ * and tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
  * covers are never written again, so a batch that holds references to its blocks reads them without
@@ -34,6 +35,7 @@
 #include "_kernel/path.h"
 #include "_kernel/edges.h"
 #include "_kernel/placements.h"
+#include "_kernel/joint_state.h"
 
 /* Raised with every change of the interface to Python, so that a library built from older source
  * (an editable install that was not rebuilt) is recognised and not used. */
@@ -42,9 +44,6 @@
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,
      "insert_together(histories, stamp, rows): one instant of several histories, at one moment."},
-    {"block_of", (PyCFunction)(void (*)(void))block_of, METH_FASTCALL,
-     "block_of(numbers, count): the block of an array of so many finite doubles; None for anything "
-     "else."},
     {"placement_poses", (PyCFunction)(void (*)(void))placement_poses, METH_FASTCALL,
      "placement_poses(placements, rows, parents, poses): parent * placement of each row."},
     {NULL},
@@ -58,8 +57,8 @@ static struct PyModuleDef kernel_module = {
 static int
 fill_module(PyObject *module)
 {
-    PyTypeObject *types[] = {&Block_type, &History_type, &TransformFields_type, &Path_type,
-                             &Edges_type};
+    PyTypeObject *types[] = {&Block_type, &History_type, &TransformFields_type,
+                             &Path_type,  &Edges_type,   &JointStateEncoder_type};
     for (size_t i = 0; i < sizeof(types) / sizeof(types[0]); i++)
         if (PyModule_AddType(module, types[i]) < 0)
             return -1;

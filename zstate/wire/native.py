@@ -93,10 +93,16 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
         raise MessageError(f"a malformed {_type_name(kind)}: {error}", reason="malformed") from None
 
 
+def decode_joint_state(payload: bytes) -> JointState:
+    """The joint state in ``payload``, which this process encoded."""
+    return decode(payload, ENCODINGS[JointState], JointState)
+
+
 class NativeStreamEncoder:
     """Encodes one stream of one writer as MessagePack."""
 
     can_withdraw = True
+    attachment = None
 
     def __init__(self, robot: str, writer: WriterId, stream: Stream, name: str) -> None:
         self.key = keys.stream_key(robot, stream, name)
@@ -106,9 +112,6 @@ class NativeStreamEncoder:
 
     def encode(self, message: Message) -> bytes:
         return _ENCODER.encode(message)
-
-    def attachment(self, now: int) -> None:
-        return None
 
 
 class NativeWire:
