@@ -43,6 +43,7 @@ def test_the_command_that_mends_pinocchio_depends_on_what_is_missing(
         load_pinocchio()
     assert text in str(missing.value)
     assert f"`{command}`" in str(missing.value)
+    assert missing.value.command == command
 
 
 def test_without_pinocchio_link_poses_raise_and_edge_poses_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,10 +57,10 @@ def test_without_pinocchio_link_poses_raise_and_edge_poses_do_not(monkeypatch: p
 def test_the_engine_has_the_version_of_pinocchio_or_the_reason_why_it_is_not_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert select_engine() == (f"Pinocchio {load_pinocchio().__version__}", "")
+    assert select_engine() == (f"Pinocchio {load_pinocchio().__version__}", "", "")
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    name, reason = select_engine()
-    assert name == "closed forms"
+    name, reason, command = select_engine()
+    assert (name, command) == ("closed forms", "pip install pin")
     assert "`pip install pin`" in reason
 
 

@@ -16,7 +16,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import did_you_mean
 from zstate.errors import InvalidInput, LibraryMissing, ModelError
 from zstate.model.joint_transforms import Floats, JointTransforms
-from zstate.model.pinocchio_solver import CLOSED_FORMS, Engine, PinocchioSolver
+from zstate.model.pinocchio_solver import PinocchioSolver, closed_forms
 from zstate.model.robot import RobotModel
 
 _TOLERANCE = 1e-9
@@ -107,7 +107,7 @@ class MovingEdges:
             self._solver = PinocchioSolver(model, self._table.forms)
             self.engine = self._solver.engine
         except LibraryMissing as error:
-            self.engine = Engine(CLOSED_FORMS, str(error))
+            self.engine = closed_forms(error)
         else:
             self._compare()
 

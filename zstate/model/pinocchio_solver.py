@@ -24,26 +24,40 @@ if TYPE_CHECKING or kernel == "c":
 
 Indices = NDArray[np.int64]
 
-CLOSED_FORMS = "closed forms"
+_SUPPORTED = "pip install 'pin>=4.1,<5'"
 
 
 class Engine(NamedTuple):
-    """What computes a publisher's transforms: "Pinocchio 4.1.0", or "closed forms" and the reason."""
+    """What computes a publisher's transforms: "Pinocchio 4.1.0", or "closed forms".
+
+    For closed forms ``reason`` describes why, and ``command`` mends it.
+    """
 
     name: str
     reason: str = ""
+    command: str = ""
 
 
 def select_engine() -> Engine:
     """The engine of publishers on this machine. Loads Pinocchio."""
     try:
-        return Engine(f"Pinocchio {load_pinocchio().__version__}")
+        return pinocchio_engine(load_pinocchio())
     except LibraryMissing as error:
-        return Engine(CLOSED_FORMS, str(error))
+        return closed_forms(error)
+
+
+def pinocchio_engine(pinocchio: Any) -> Engine:
+    """The engine of a loaded Pinocchio."""
+    return Engine(f"Pinocchio {pinocchio.__version__}")
+
+
+def closed_forms(error: LibraryMissing) -> Engine:
+    """The engine without Pinocchio, because of ``error``."""
+    return Engine("closed forms", str(error), error.command)
 
 
 def load_pinocchio() -> Any:
-    """Pinocchio's module. Raises LibraryMissing, with the command that mends it."""
+    """Pinocchio's module. Raises LibraryMissing."""
     try:
         import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs] - readers do not need it
     except ImportError as error:
@@ -52,9 +66,8 @@ def load_pinocchio() -> Any:
             command = "apt-get install libgomp1"
         elif isinstance(error, ModuleNotFoundError) and error.name == "pinocchio":
             command = "pip install pin"
-        raise LibraryMissing(
-            f"Pinocchio cannot be loaded: {error}; `{command}` installs what is missing"
-        ) from error
+        text = f"Pinocchio cannot be loaded: {error}; `{command}` installs what is missing"
+        raise LibraryMissing(text, command=command) from error
     return pinocchio
 
 
@@ -69,7 +82,7 @@ class PinocchioSolver:
 
     def __init__(self, model: RobotModel, forms: tuple[JointTransform, ...]) -> None:
         self._pin = load_pinocchio()
-        self.engine = Engine(f"Pinocchio {self._pin.__version__}")
+        self.engine = pinocchio_engine(self._pin)
         self._model: Any = self._pin.Model()
         joints, parents = self._add_links(model, forms)
         rows = [
@@ -188,7 +201,8 @@ class PinocchioSolver:
         if not np.array_equal(memory[-1], _numbers(last)):
             raise LibraryMissing(
                 f"{self.engine.name} has another memory layout than the releases that zstate reads; "
-                "`pip install 'pin>=4.1,<5'` installs one of these"
+                f"`{_SUPPORTED}` installs one of these",
+                command=_SUPPORTED,
             )
         return _Placements(memory, rows, np.array([_numbers(parent) for parent in parents]).reshape(-1, 12))
 

@@ -281,7 +281,8 @@ class StatePublisher(Closeable):
                     self._check_open()
                 # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
                 payload = self._encoder.encode(positions, velocities, efforts, stamp, self._seq)
-                derived = self._encode_derived(payload)
+                readable = [writer for writer in self._transforms if writer.has_readers]
+                derived = self._encode_derived(payload, readable) if readable or self._ros_joints else ()
                 if self._recent is not None:
                     # Before sending: a reader that misses this sample can then request it as history.
                     self._recent.append(stamp, self._seq, payload)
@@ -309,11 +310,10 @@ class StatePublisher(Closeable):
             self._claim.check()
         self._next_check_s = math.inf if self._claim is None else self._claim.next_check_s
 
-    def _encode_derived(self, payload: bytes) -> list[tuple[SampleWriter, bytes]]:
-        """The joint state in ``payload`` for the ROS wires, and its transforms for streams with readers."""
-        readable = [writer for writer in self._transforms if writer.has_readers]
-        if not readable and not self._ros_joints:
-            return []
+    def _encode_derived(
+        self, payload: bytes, readable: Sequence[SampleWriter]
+    ) -> list[tuple[SampleWriter, bytes]]:
+        """The joint state in ``payload`` for the ROS wires, and its transforms for ``readable`` streams."""
         state = decode_joint_state(payload)
         payloads = [(writer, writer.encoder.encode(state)) for writer in self._ros_joints]
         if readable:
