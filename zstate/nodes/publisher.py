@@ -123,13 +123,16 @@ class StatePublisher(Closeable):
 
     Samples go out on ``joint_states``; the moving edges also on ``tf``, while that stream has a reader.
     The model (``robot_description``) and its fixed edges (``tf_static``) are latched, so that listeners
-    receive them whenever they join. ``robot`` is the name on the network; default: the model's name.
-    ``streams`` lists what this publisher writes, if another program writes the rest. ``program`` is the
-    writer's name for others; default: the script's name.
+    receive them whenever they join. Transforms are computed by Pinocchio, whose model is built on opening and
+    compared with zstate's closed forms; these serve, with a warning, if Pinocchio cannot be loaded
+    (``stats.kinematics``). Without the stream ``tf`` it is not loaded. ``robot`` is the name on the network;
+    default: the model's name. ``streams`` lists what this publisher writes, if another program writes the
+    rest. ``program`` is the writer's name for others; default: the script's name.
 
     Raises SecondWriter, which names the first writer, if another writer of one of its streams is active
     on the native wire. If two open at once, ``publish`` of the later one raises it and closes that
-    publisher. With ``takeover`` it publishes nevertheless, and listeners use the newest writer.
+    publisher. With ``takeover`` it publishes nevertheless, and listeners use the newest writer. Raises
+    ModelError, which names the joint, if Pinocchio and the closed forms differ.
 
     On the native wire it publishes its status once a second while that has a reader
     (``zstate.net.status``), caches the last ``cache_s`` seconds of samples for joining listeners

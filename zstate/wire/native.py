@@ -98,6 +98,24 @@ def decode_joint_state(payload: bytes) -> JointState:
     return decode(payload, ENCODINGS[JointState], JointState)
 
 
+class _JointPositions(msgspec.Struct, array_like=True, gc=False):
+    """The fields of a JointState as far as its positions."""
+
+    stamp: int
+    seq: int
+    session: int
+    order: bytes
+    positions: memoryview
+
+
+_POSITIONS_DECODER = msgspec.msgpack.Decoder(_JointPositions)
+
+
+def joint_positions(payload: bytes) -> memoryview:
+    """The positions of ``decode_joint_state(payload)``, in less than half of its time."""
+    return _POSITIONS_DECODER.decode(payload).positions
+
+
 class NativeStreamEncoder:
     """Encodes one stream of one writer as MessagePack."""
 
