@@ -95,6 +95,8 @@ class Fuzz:
         self.sources: dict[int, tuple[Versioned, ...]] = {}
         self.histories: list[Any] = [kernel.History(width, 10**9) for width in (0, 1, 7, 14, 40)]
         self.paths: list[Any] = []
+        self.encoders: list[Any] = [kernel.JointStateEncoder(7, bytes(8), 7, 6, (3,))]
+        self.widths: list[Any] = [(7, 6)]
         self.kept: list[Any] = []
         self.transform = type("Transform", (kernel.TransformFields,), {"__slots__": ()})
         self.calls: tuple[Callable[[], object], ...] = (
@@ -111,6 +113,9 @@ class Fuzz:
             *(self.lookup_many,) * 2,
             self.make_facts,
             self.edges,
+            self.make_encoder,
+            *(self.encode,) * 4,
+            self.placements,
             self.keep_memory,
         )
 
@@ -160,7 +165,6 @@ class Fuzz:
             if isinstance(numbers, np.ndarray) and self.random.random() < 0.4:
                 numbers = numbers.tobytes()[self.pick(0, 0, 0, 1, 8) :]
             history.try_insert(self.stamp(), numbers, rates, count)
-            self.kernel.block_of(numbers, count)
             history.try_insert_poses(self.stamp(), numbers)
         history.reaches(self.stamp())
 
@@ -285,6 +289,39 @@ class Fuzz:
         edges = self.kernel.Edges(width, steps)
         rows = self.random.randrange(4)
         edges.poses(self.array(rows * width), self.array(rows * 7 * len(steps)))
+
+    def make_encoder(self) -> None:
+        counts = (self.pick(0, 1, 7, 40, 9000, -1, 2**62, *ODD), self.pick(0, 1, 6, 40, -1, 2**20 + 1, *ODD))
+        quaternions = self.pick((), (), (0,), (3,), (36, 0), (-1,), (2**62,), (2**70,), ODD, *ODD)
+        order = self.pick(bytes(8), bytes(8), bytes(7), *ODD)
+        session = self.pick(0, 7, 2**32, 2**64 - 1, 2**64, -1, *ODD)
+        self.encoders.append(self.kernel.JointStateEncoder(session, order, *counts, quaternions))
+        self.widths.append(counts)
+        del self.encoders[:-4], self.widths[:-4]
+
+    def encode(self) -> None:
+        number = self.random.randrange(len(self.encoders))
+        encoder, (positions, velocities) = self.encoders[number], self.widths[number]
+        numbers = self.array(positions)
+        if isinstance(numbers, np.ndarray) and numbers.size == 7 and numbers.dtype == np.float64:
+            numbers = numbers / 1e5
+            numbers.flat[6] = 1.0
+        rates = [self.pick(None, self.array(velocities)) for _ in range(2)]
+        seq = self.pick(0, 5, 2**40, 2**63 - 1, -1, 2**63, *ODD)
+        payload = encoder.encode(numbers, *rates, self.stamp(), self.pick(3, seq))
+        assert payload is None or (type(payload) is bytes and payload[0] == 0x98)
+        encoder.encode(*self.pick((), (numbers,), (numbers,) * 6))
+
+    def placements(self) -> None:
+        count, rows = self.random.randrange(1, 6), self.random.randrange(4)
+        chosen = self.numbers.integers(-1 if self.random.random() < 0.1 else 0, count, rows)
+        poses = self.array(7 * rows)
+        if self.random.random() < 0.1:
+            chosen = np.zeros(7, np.int64)  # rows in the memory that is written
+            rows, poses = 1, chosen.view(np.float64)
+            chosen = self.pick(chosen[:1], chosen)
+        given = self.array(12 * count), self.pick(chosen, chosen, self.array(rows)), self.array(12 * rows)
+        self.kernel.placement_poses(*given, poses)
 
     def make_facts(self) -> None:
         pose = tuple(self.numbers.normal(size=self.pick(7, 7, 6)))

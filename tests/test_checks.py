@@ -38,13 +38,13 @@ def doors(numbers: Callable[[Any], Any]) -> dict[str, tuple[Callable[[], object]
     """Every call that takes numbers, with what its refusal has to name."""
     buffer = TransformBuffer()
     track = buffer.add_robot(MODEL)
-    encoder = RobotEncoder(MODEL, "r")
+    encoder = RobotEncoder(MODEL, "r", 7)
     two, seven = numbers([1, 0]), numbers([1, 0, 0, 0, 0, 0, 1])
     three = numbers([1, 0, 0])
     return {
         "positions": (lambda: buffer.insert_joints(track, 0, two), "positions"),
         "velocities": (lambda: buffer.insert_joints(track, 0, [0.0, 0.0], two), "velocities"),
-        "published": (lambda: encoder.encode_positions(two), "positions"),
+        "published": (lambda: encoder.encode(two, None, None, 0, 0), "positions"),
         "checked": (lambda: MODEL.check_positions(two), "positions"),
         "efforts": (lambda: MODEL.check_efforts(two), "efforts"),
         "kinematics": (lambda: Kinematics(MODEL).edge_poses(two), "positions"),

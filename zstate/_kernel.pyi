@@ -12,7 +12,9 @@ REVISION: int
 StepTuple: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
 FailureTuple: TypeAlias = tuple[int, int, int | None, int | None, int | None, float | None]
 
-def block_of(numbers: object, count: int, /) -> bytes | None: ...
+def placement_poses(
+    placements: NDArray[Any], rows: NDArray[Any], parents: NDArray[Any], poses: NDArray[Any], /
+) -> None: ...
 
 class Block(Buffer):
     @property
@@ -60,6 +62,14 @@ class FastPath:
 class Edges:
     def __init__(self, width: int, steps: tuple[StepTuple, ...]) -> None: ...
     def poses(self, positions: NDArray[Any], out: NDArray[Any], /) -> None: ...
+
+class JointStateEncoder:
+    def __init__(
+        self, session: int, order: bytes, positions: int, velocities: int, quaternions: tuple[int, ...]
+    ) -> None: ...
+    def encode(
+        self, positions: object, velocities: object, efforts: object, stamp: object, seq: int, /
+    ) -> bytes | None: ...
 
 class Path:
     def __init__(

@@ -153,7 +153,14 @@ class UnknownModel(ModelError):
 
 
 class LibraryMissing(ZStateError, ImportError):
-    """A library that this call needs cannot be loaded; the text names the package to install."""
+    """A library that this call needs cannot be loaded; the text names the package to install.
+
+    ``command`` installs it, if known.
+    """
+
+    def __init__(self, message: str, *, command: str = "") -> None:
+        super().__init__(message)
+        self.command = command
 
 
 class MessageError(ZStateError, ValueError):

@@ -13,6 +13,7 @@ from helpers.processes import SOON_S
 
 from zstate import connect, load_model
 from zstate.cli import main, usage_hints
+from zstate.model.pinocchio_solver import load_pinocchio
 from zstate.sources import JointStateListener
 
 pytestmark = pytest.mark.processes
@@ -175,10 +176,26 @@ def test_closed_output_ends_a_command_quietly():
     assert ended.stderr == ""
 
 
-def test_version_names_the_kernel():
+def test_version_names_the_kernel_and_the_engine_of_publishers():
     from zstate import __version__, kernel
 
-    assert zstate("--version").stdout.decode() == f"zstate {__version__} (kernel: {kernel})\n"
+    engine = f"Pinocchio {load_pinocchio().__version__}"
+    expected = f"zstate {__version__} (kernel: {kernel}, transforms of publishers: {engine})\n"
+    assert zstate("--version").stdout.decode() == expected
+
+
+def test_version_and_doctor_name_the_closed_forms_where_pinocchio_cannot_be_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "pinocchio.py").write_text(
+        "raise ImportError('libgomp.so.1: cannot open shared object file')"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    assert zstate("--version").stdout.decode().endswith("transforms of publishers: closed forms)\n")
+    check = zstate("doctor").stdout.decode()
+    assert "closed forms" in check
+    assert "libgomp.so.1" in check
+    assert "apt-get install libgomp1" in check
 
 
 def test_ctrl_c_during_publishing_prints_the_achieved_rate(spawn: Spawn):

@@ -10,8 +10,9 @@ import pytest
 from helpers.matrix_kinematics import MatrixKinematics, matrices
 from helpers.model_samples import every_joint, local_model, random_positions
 
-from zstate.errors import InvalidInput, LibraryMissing
-from zstate.model.kinematics import Kinematics
+from zstate.errors import InvalidInput, ModelError
+from zstate.model.kinematics import Kinematics, MovingEdges
+from zstate.model.pinocchio_solver import PinocchioSolver
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 
@@ -198,9 +199,81 @@ def test_edge_poses_need_no_pinocchio() -> None:
     assert subprocess.run([sys.executable, "-c", program], input=urdf, text=True, check=False).returncode == 0
 
 
-def test_without_openmp_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def moving_poses(model: RobotModel, positions: np.ndarray) -> np.ndarray:
+    """The closed forms of the edges that joints move."""
+    moves = [joint.type != "fixed" for joint in model.joints]
+    return Kinematics(model).edge_poses(positions)[moves]
+
+
+@pytest.mark.robots
+@pytest.mark.parametrize("path", example_urdfs(), ids=lambda path: path.stem)
+def test_moving_edges_of_every_robot_agree_with_the_closed_forms(path: Path) -> None:
+    model = parse_urdf(path.read_bytes(), path.name)
+    edges = MovingEdges(model)
+    assert edges.engine.name.startswith("Pinocchio")
+    for seed in range(3):
+        positions = random_positions(model, seed)
+        expected = matrices(moving_poses(model, positions))
+        assert np.allclose(matrices(edges.poses(positions)), expected, rtol=0, atol=1e-12)
+
+
+def test_moving_edges_of_every_joint_type_agree_with_the_closed_forms() -> None:
+    model = every_joint().model
+    edges = MovingEdges(model)
+    moved = [(joint.parent, joint.child) for joint in model.joints if joint.type != "fixed"]
+    assert [(form.parent, form.child) for form in edges.forms] == moved
+    for seed in range(5):
+        positions = random_positions(model, seed)
+        expected = matrices(moving_poses(model, positions))
+        assert np.allclose(matrices(edges.poses(positions)), expected, rtol=0, atol=TOLERANCE)
+
+
+def test_moving_edges_normalise_a_slightly_long_quaternion_and_refuse_another() -> None:
+    edges = MovingEdges(every_joint().model)
+    positions = random_positions(every_joint().model, 6)
+    scaled = positions.copy()
+    scaled[3:7] *= 1.0005
+    assert np.allclose(edges.poses(scaled), edges.poses(positions), rtol=0, atol=1e-13)
+    scaled[3:7] *= 2.0
+    with pytest.raises(InvalidInput, match="of length 2"):
+        edges.poses(scaled)
+
+
+def test_a_robot_without_moving_edges_has_no_poses() -> None:
+    rock = parse_urdf('<robot name="rock"><link name="rock"/></robot>', "rock")
+    assert MovingEdges(rock).poses(np.empty(0)).shape == (0, 7)
+
+
+def test_moving_edges_come_from_the_closed_forms_without_pinocchio(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    kinematics = local_model("rrbot")
-    kinematics.edge_poses([0.0, 0.0])
-    with pytest.raises(LibraryMissing, match="apt-get install libgomp1"):
-        kinematics.link_poses([0.0, 0.0])
+    model = every_joint().model
+    edges = MovingEdges(model)
+    assert edges.engine.name == "closed forms"
+    assert "`pip install pin`" in edges.engine.reason
+    positions = random_positions(model, 1)
+    assert np.array_equal(edges.poses(positions), moving_poses(model, positions))
+
+
+def test_a_joint_that_pinocchio_places_otherwise_is_named_at_opening(monkeypatch: pytest.MonkeyPatch) -> None:
+    compute = PinocchioSolver.moving_edges
+
+    def shifted(self: PinocchioSolver, positions: np.ndarray) -> np.ndarray:
+        poses = compute(self, positions)
+        poses[1, 2] += 2e-9
+        return poses
+
+    monkeypatch.setattr(PinocchioSolver, "moving_edges", shifted)
+    with pytest.raises(ModelError, match=r"differ by 2e-09 at joint 'elbow' of 'rrbot'"):
+        MovingEdges(local_model("rrbot").model)
+
+
+def test_threads_that_share_moving_edges_get_correct_poses() -> None:
+    edges = MovingEdges(every_joint().model)
+    questions = [random_positions(every_joint().model, seed) for seed in range(8)]
+    alone = [edges.poses(question) for question in questions]
+
+    def ask(index: int) -> bool:
+        return all(np.array_equal(edges.poses(questions[index]), alone[index]) for _ in range(200))
+
+    with ThreadPoolExecutor(8) as pool:
+        assert all(pool.map(ask, range(8)))

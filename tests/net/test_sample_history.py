@@ -16,6 +16,7 @@ from zstate.net.sample_history import (
     MAX_PAGE_BYTES,
     PAGE_BYTES,
     PAGE_SAMPLES,
+    CachedSample,
     HistoryReader,
     SampleCache,
     serve_history,
@@ -37,11 +38,15 @@ def state(seq: int, stamp: int | None = None, session: int = 7, numbers: int = 2
 def cache_of(count: int, span_s: float = 1e6, numbers: int = 2, session: int = 7) -> SampleCache:
     cache = SampleCache(span_s, numbers, session)
     for seq in range(count):
-        cache.append(state(seq, session=session, numbers=numbers))
+        append(cache, state(seq, session=session, numbers=numbers))
     return cache
 
 
-def seqs(states: list[JointState]) -> list[int]:
+def append(cache: SampleCache, sample: JointState) -> None:
+    cache.append(sample.stamp, sample.seq, encode(sample))
+
+
+def seqs(states: list[CachedSample]) -> list[int]:
     return [one.seq for one in states]
 
 
@@ -68,34 +73,34 @@ def test_pages_go_back_from_the_newest_sample():
 
 def test_cache_restarts_when_the_clock_is_set_back():
     cache = cache_of(10, span_s=1.0)
-    cache.append(state(10, STAMP - 3600 * SECOND))
-    cache.append(state(11, STAMP - 3600 * SECOND + MS))
+    append(cache, state(10, STAMP - 3600 * SECOND))
+    append(cache, state(11, STAMP - 3600 * SECOND + MS))
     assert seqs(cache.since(0)) == [10, 11]
 
 
 def test_cache_restarts_when_the_clock_is_set_back_by_less_than_the_span():
     cache = cache_of(10, span_s=10.0)
-    cache.append(state(10, STAMP - 5 * SECOND))
-    cache.append(state(11, STAMP - 5 * SECOND + MS))
+    append(cache, state(10, STAMP - 5 * SECOND))
+    append(cache, state(11, STAMP - 5 * SECOND + MS))
     assert seqs(cache.since(0)) == [10, 11]
 
 
 def test_cache_restarts_when_the_clock_is_set_forward():
     cache = cache_of(10, span_s=1.0)
-    cache.append(state(10, STAMP + 3600 * SECOND))
+    append(cache, state(10, STAMP + 3600 * SECOND))
     assert seqs(cache.since(0)) == [10]
 
 
 def test_slightly_older_stamp_keeps_the_cache():
     cache = cache_of(10, span_s=1.0)
-    cache.append(state(10, STAMP - 85_000))
+    append(cache, state(10, STAMP - 85_000))
     assert seqs(cache.since(0)) == list(range(11))
 
 
 def test_cache_size_is_bounded_for_any_stamps():
     cache = SampleCache(1e6, 100_000, 7)
     for seq in range(100):
-        cache.append(state(seq, STAMP, numbers=1))
+        append(cache, state(seq, STAMP, numbers=1))
     kept = seqs(cache.since(0))
     assert kept == list(range(100 - len(kept), 100))
     assert 1 <= len(kept) <= MAX_CACHE_BYTES // 800_000
@@ -134,7 +139,7 @@ def test_reader_receives_every_sample_as_sent_newest_page_first(sessions: tuple[
     writer, reader = sessions
     cache = cache_of(PAGE_SAMPLES + 3)
     received = Pages(reader)
-    with serve_history(writer, "r1", "joint_states", cache, encode), received.reader:
+    with serve_history(writer, "r1", "joint_states", cache), received.reader:
         wait_for_queryable(reader)
         received.reader.request(KEY, 7)
         until(lambda: len(received.pages) == 2)
@@ -149,7 +154,7 @@ def test_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Sess
     for numbers in (100, 10_000):
         cache = cache_of(100, numbers=numbers)
         received = Pages(reader, limit=3)
-        with serve_history(writer, "r1", "joint_states", cache, encode), received.reader:
+        with serve_history(writer, "r1", "joint_states", cache), received.reader:
             wait_for_queryable(reader)
             received.reader.request(KEY, 7)
             until(lambda received=received: len(received.pages) == 3)
@@ -162,7 +167,7 @@ def test_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Sess
 
 def test_writer_without_samples_replies_once_with_an_empty_page(sessions):
     writer, reader = sessions
-    with serve_history(writer, "r1", "joint_states", SampleCache(1.0, 2, 7), encode) as service:
+    with serve_history(writer, "r1", "joint_states", SampleCache(1.0, 2, 7)) as service:
         wait_for_queryable(reader)
         before = service.answered
         received = Pages(reader)
@@ -199,8 +204,8 @@ def test_each_writer_of_a_key_is_requested_separately(sessions: tuple[Session, S
     one, other = cache_of(3, session=7), cache_of(5, session=8)
     received = Pages(reader)
     with (
-        serve_history(writer, "r1", "joint_states", one, encode),
-        serve_history(writer, "r1", "joint_states", other, encode),
+        serve_history(writer, "r1", "joint_states", one),
+        serve_history(writer, "r1", "joint_states", other),
         received.reader,
     ):
         wait_for_queryable(reader)
@@ -214,7 +219,7 @@ def test_more_writers_than_the_in_flight_limit_are_all_requested(sessions: tuple
     writer, reader = sessions
     cache = cache_of(2)
     received = Pages(reader)
-    with serve_history(writer, "r1", "joint_states", cache, encode), received.reader:
+    with serve_history(writer, "r1", "joint_states", cache), received.reader:
         wait_for_queryable(reader)
         for _ in range(30):
             received.reader.request(KEY, 7)
@@ -295,7 +300,7 @@ def test_silent_writers_of_one_robot_do_not_delay_the_history_of_another(session
     kept: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(10_000)
     silent = writer.zenoh.declare_queryable("zstate/r2/joint_states", kept)
     received = Pages(reader)
-    with serve_history(writer, "r1", "joint_states", cache_of(PAGE_SAMPLES + 3), encode), received.reader:
+    with serve_history(writer, "r1", "joint_states", cache_of(PAGE_SAMPLES + 3)), received.reader:
         wait_for_queryable(reader)
         for session in range(500):
             received.reader.request("zstate/r2/joint_states", session)
@@ -366,7 +371,7 @@ def test_failing_page_callback_does_not_end_other_requests(sessions, monkeypatch
         return True
 
     reader_ = HistoryReader(reader, take, lambda *_: None)
-    with serve_history(writer, "r1", "joint_states", cache_of(3), encode), reader_:
+    with serve_history(writer, "r1", "joint_states", cache_of(3)), reader_:
         wait_for_queryable(reader)
         reader_.request(KEY, 7)
         reader_.request(KEY, 7)

@@ -336,7 +336,7 @@ def test_history_equals_the_published_samples_byte_for_byte(sessions: tuple[Sess
         expected = tap.payloads(2)
         pages: list[list[SerializedSample]] = []
         with HistoryReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
-            past.request(JOINTS, publisher.cache.since(0)[0].session)
+            past.request(JOINTS, publisher.cache.writer)
             until(lambda: pages)
     assert [one.payload for one in pages[0]] == expected
     assert {one.encoding for one in pages[0]} == {ENCODINGS[JointState]}
@@ -365,11 +365,11 @@ def test_history_of_another_session_is_refused(sessions):
     writer, reader = sessions
     memory = SampleCache(10.0, 2, 8)
     order = order_digest(RRBOT.joint_names)
-    memory.append(JointState(STAMP, 0, 9, order, to_block([0.5, 0.25])))
+    memory.append(STAMP, 0, encode(JointState(STAMP, 0, 9, order, to_block([0.5, 0.25]))))
     announced = Announcement("r1", "joint_states", WriterId("driver", "nuc", 1, 2, 8))
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
-        serve_history(writer, "r1", "joint_states", memory, encode),
+        serve_history(writer, "r1", "joint_states", memory),
         announce(writer, f"zstate/r1/@writer/joint_states/{announced.identity}"),
         TransformListener(reader, "r1") as listener,
     ):

@@ -1,19 +1,23 @@
 import logging
+import subprocess
+import sys
 import threading
 import time
 
 import numpy as np
 import pytest
+from helpers.matrix_kinematics import matrices
 from helpers.processes import SOON_S, until
 from helpers.robots import RRBOT, STAMP, SampleCollector, wait_for_reader
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput
-from zstate.model.joint_transforms import JointTransforms
-from zstate.model.kinematics import Kinematics
+from zstate.model.kinematics import Kinematics, MovingEdges
 from zstate.model.load import load_model
+from zstate.model.pinocchio_solver import select_engine
 from zstate.net.presence import discover
 from zstate.net.session import connect
+from zstate.nodes import publisher as publisher_module
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.nodes.publisher_status import StreamStats
 from zstate.wire.messages import TransformSample, from_block, poses_from_block
@@ -116,7 +120,8 @@ def test_both_streams_carry_the_same_instant_and_agree_with_kinematics(sessions)
     edges = dict(zip(kinematics.edges, kinematics.edge_poses([0.03, 0.4]), strict=True))
     moving = [(joint.parent, joint.child) for joint in model.joints if joint.type != "fixed"]
     assert list(named) == moving
-    assert poses_from_block(sample.poses).tolist() == [edges[edge].tolist() for edge in moving]
+    expected = matrices(np.array([edges[edge] for edge in moving]))
+    assert np.allclose(matrices(poses_from_block(sample.poses)), expected, rtol=0.0, atol=1e-15)
 
 
 def test_moving_and_fixed_edges_are_separate_and_complete(sessions):
@@ -131,10 +136,11 @@ def test_moving_and_fixed_edges_are_separate_and_complete(sessions):
 
 def test_transforms_are_computed_and_sent_only_while_they_have_a_reader(sessions, monkeypatch):
     computed = []
-    poses = JointTransforms.poses
-    monkeypatch.setattr(JointTransforms, "poses", lambda *given: computed.append(given) or poses(*given))
+    poses = MovingEdges.poses
+    monkeypatch.setattr(MovingEdges, "poses", lambda *given: computed.append(given) or poses(*given))
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher:
+        computed.clear()  # those of the comparison at opening
 
         def transform_stats() -> StreamStats:
             return publisher.stats.streams["native", "tf"]
@@ -263,3 +269,51 @@ def test_first_sample_outside_limits_is_logged_at_once(sessions, caplog):
         assert publisher.stats.outside_limits == 1
     (record,) = caplog.records
     assert "'lift' at -3.5 rad is outside -2 to 2; further" in record.getMessage()
+
+
+def test_stats_name_the_engine_of_transforms_and_nothing_without_the_stream(sessions):
+    with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
+        assert publisher.stats.kinematics == select_engine().name
+    with StatePublisher(sessions[0], RRBOT, "r1", streams=["joint_states"]) as publisher:
+        assert publisher.stats.kinematics == ""
+
+
+def test_without_pinocchio_closed_forms_serve_and_one_warning_names_what_mends_it(
+    sessions, monkeypatch, caplog
+):
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    publisher_module._warn_of_closed_forms.cache_clear()
+    writer, reader = sessions
+    transforms = SampleCollector(reader, TF)
+    with caplog.at_level(logging.WARNING, "zstate"):
+        for robot in ("r1", "r2"):
+            with StatePublisher(writer, RRBOT, robot) as publisher:
+                assert publisher.stats.kinematics == "closed forms"
+                if robot == "r1":
+                    wait_for_reader(writer, TF)
+                    publisher.publish([0.25, -0.5])
+    (record,) = [one for one in caplog.records if "closed forms" in one.message]
+    assert "`pip install pin`" in record.message
+    moves = [joint.type != "fixed" for joint in RRBOT.joints]
+    sample = decode(transforms.payloads(1)[0], ENCODINGS[TransformSample], TransformSample)
+    expected = Kinematics(RRBOT).edge_poses([0.25, -0.5])[moves]
+    assert poses_from_block(sample.poses).tolist() == expected.tolist()
+    publisher_module._warn_of_closed_forms.cache_clear()
+
+
+WITHOUT_TRANSFORMS = """
+import sys
+from zstate import StatePublisher, connect, load_model
+with connect() as session:
+    with StatePublisher(session, load_model("rrbot"), streams=["joint_states"]) as publisher:
+        publisher.publish([0.0, 0.0])
+        print("pinocchio" in sys.modules)
+    with StatePublisher(session, load_model("rrbot")):
+        print("pinocchio" in sys.modules)
+"""
+
+
+def test_pinocchio_is_loaded_when_a_publisher_of_transforms_opens():
+    command = [sys.executable, "-c", WITHOUT_TRANSFORMS]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert ended.stdout.split() == ["False", "True"]

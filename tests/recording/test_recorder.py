@@ -18,7 +18,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from zstate.errors import InvalidInput, RecordingError
-from zstate.model.kinematics import Kinematics
+from zstate.model.kinematics import MovingEdges
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session, connect
@@ -106,12 +106,13 @@ def ten_thousand(sessions, tmp_path: Path, panda: RobotModel) -> tuple[Path, lis
 @pytest.mark.robots
 def test_other_readers_get_ten_thousand_identical_transforms(ten_thousand, panda: RobotModel):
     path, sent = ten_thousand
-    kinematics = Kinematics(panda)
+    moving = MovingEdges(panda)
+    edges = [(form.parent, form.child) for form in moving.forms]
     for reader in OTHERS:
         compared = 0
         samples = (message for topic, message in reader(path) if topic == "/tf")
         for k, message in enumerate(samples):
-            poses = dict(zip(kinematics.edges, kinematics.edge_poses(sent[k]), strict=True))
+            poses = dict(zip(edges, moving.poses(sent[k]), strict=True))
             for edge in message.transforms:
                 move, turn = edge.transform.translation, edge.transform.rotation
                 pose = [move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w]

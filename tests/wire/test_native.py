@@ -23,7 +23,15 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
-from zstate.wire.native import ENCODINGS, STREAM_TYPES, NativeWire, decode, encode
+from zstate.wire.native import (
+    ENCODINGS,
+    STREAM_TYPES,
+    NativeWire,
+    decode,
+    decode_joint_state,
+    encode,
+    joint_positions,
+)
 from zstate.wire.protocol import SerializedSample, StreamEncoder, Wire, WriterNode
 
 WRITER = WriterId("arm", "jetson", 412, 5, 7)
@@ -271,9 +279,7 @@ def test_native_wire_implements_the_protocol_for_every_stream():
         message, encoder = by_type[kind], encoder_of(stream, "w")
         assert encoder.encoding == ENCODINGS[kind]
         assert encoder.key.startswith(wire.expression("r1", stream).rstrip("*"))
-        arrival = SerializedSample(
-            encoder.key, encoder.encode(message), encoder.encoding, encoder.attachment(0)
-        )
+        arrival = SerializedSample(encoder.key, encoder.encode(message), encoder.encoding, encoder.attachment)
         assert wire.decode(stream, arrival, "r1") == (message,)
 
 
@@ -283,3 +289,11 @@ def test_native_token_announces_writer_and_stream():
     assert encoder.token is not None
     assert wire.parse_token(encoder.token, "r1") == Announcement("r1", "tf", WRITER)
     assert wire.parse_token("zstate/r1/@writer/tf/nonsense", "r1") is None
+
+
+@pytest.mark.parametrize("rates", [None, b"", bytes(8)])
+def test_joint_positions_are_those_of_the_decoded_message(rates: bytes | None):
+    for numbers in (0, 1, 7, 40, 9000):
+        positions = np.arange(float(numbers)).tobytes()
+        payload = encode(JointState(-(2**40), 70_000, 2**32 - 1, bytes(8), positions, rates, rates))
+        assert bytes(joint_positions(payload)) == positions == decode_joint_state(payload).positions

@@ -14,7 +14,7 @@ _LOCKS: weakref.WeakSet[Any] = weakref.WeakSet()
 def fork_safe(lock: _Lock) -> _Lock:
     """``lock`` (also an RLock, Condition or Event), which is re-initialised in a forked child.
 
-    The threads that hold or set it do not exist there.
+    The threads that hold or set it do not exist there. Other objects may have its method, too.
     """
     _LOCKS.add(lock)
     return lock

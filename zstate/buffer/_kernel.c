@@ -1,8 +1,10 @@
-/* The hot loops of the buffer: histories of samples, and compiled paths over them.
+/* The hot loops of the buffer: histories of samples, and compiled paths over them; and those of the
+ * publisher.
  *
  * Each type is specified by its reference in Python, which stays complete:
  * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
- * (TransformFields), zstate/model/joint_transforms.py (Edges), zstate/ingest/base.py with
+ * (TransformFields), zstate/model/joint_transforms.py (Edges), zstate/model/pinocchio_solver.py
+ * (placement_poses), zstate/nodes/publisher.py (JointStateEncoder), zstate/ingest/base.py with
  * zstate/wire/native.py (FastPath). Differences to those are bugs, and tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
@@ -33,17 +35,18 @@
 #include "_kernel/step.h"
 #include "_kernel/path.h"
 #include "_kernel/edges.h"
+#include "_kernel/placements.h"
+#include "_kernel/joint_state.h"
 
 /* Raised with every change of the interface to Python, so that a library built from older source
  * (an editable install that was not rebuilt) is recognised and not used. */
-#define REVISION 9
+#define REVISION 10
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,
      "insert_together(histories, stamp, rows): one instant of several histories, at one moment."},
-    {"block_of", (PyCFunction)(void (*)(void))block_of, METH_FASTCALL,
-     "block_of(numbers, count): the block of an array of so many finite doubles; None for anything "
-     "else."},
+    {"placement_poses", (PyCFunction)(void (*)(void))placement_poses, METH_FASTCALL,
+     "placement_poses(placements, rows, parents, poses): parent * placement of each row."},
     {NULL},
 };
 
@@ -55,8 +58,9 @@ static struct PyModuleDef kernel_module = {
 static int
 fill_module(PyObject *module)
 {
-    PyTypeObject *types[] = {&Block_type,           &History_type, &FastPath_type,
-                             &TransformFields_type, &Path_type,    &Edges_type};
+    PyTypeObject *types[] = {
+        &Block_type, &History_type, &FastPath_type,         &TransformFields_type,
+        &Path_type,  &Edges_type,   &JointStateEncoder_type};
     for (size_t i = 0; i < sizeof(types) / sizeof(types[0]); i++)
         if (PyModule_AddType(module, types[i]) < 0)
             return -1;

@@ -223,8 +223,11 @@ def _settings(ctx: click.Context, incomplete: str) -> Iterator[str]:
 def _print_version(ctx: click.Context, _: click.Parameter, is_set: bool) -> None:
     if is_set:
         from zstate import __version__, kernel
+        from zstate.model.pinocchio_solver import select_engine
 
-        click.echo(f"zstate {__version__} (kernel: {kernel})")
+        click.echo(
+            f"zstate {__version__} (kernel: {kernel}, transforms of publishers: {select_engine().name})"
+        )
         ctx.exit()
 
 

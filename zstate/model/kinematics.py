@@ -1,25 +1,26 @@
 """Forward kinematics: poses and velocities of links from positions.
 
-Poses of links in their parents come from closed forms (``joint_transforms.py``) and need numpy only.
-Pinocchio computes poses in the root and velocities; it is imported at the first such call. It gets
-numbers, never names or text: its model is built joint by joint from the RobotModel, depth first as its
-algorithms expect.
+Readers get the poses of links in their parents from closed forms (``joint_transforms.py``), which need numpy
+only. Pinocchio (``pinocchio_solver.py``) computes poses in the root, velocities and what publishers send.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from functools import cached_property
-from typing import Any
+from random import Random
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import did_you_mean
-from zstate.errors import InvalidInput, LibraryMissing
-from zstate.model.joint_transforms import Floats, JointTransform, JointTransforms
+from zstate.errors import InvalidInput, LibraryMissing, ModelError
+from zstate.model.joint_transforms import Floats, JointTransforms
+from zstate.model.pinocchio_solver import PinocchioSolver, closed_forms
 from zstate.model.robot import RobotModel
+
+_TOLERANCE = 1e-9
+"""The largest difference of Pinocchio and closed forms [m], or of numbers of a unit quaternion."""
 
 
 class Kinematics:
@@ -78,8 +79,8 @@ class Kinematics:
             return self._solver.twist(frame, seen_from, checked, rates)
 
     @cached_property
-    def _solver(self) -> _Solver:
-        return _Solver(self.model, self._table.forms)
+    def _solver(self) -> PinocchioSolver:
+        return PinocchioSolver(self.model, self._table.forms)
 
     def _row(self, link: str) -> int:
         if link not in self.model.links:
@@ -88,120 +89,68 @@ class Kinematics:
         return self.model.links.index(link)
 
 
-class _Solver:
-    """Pinocchio's model and workspace of one robot. Not thread-safe.
+class MovingEdges:
+    """The edges of a robot that joints move, for publishers: ``forms`` in the order of ``model.joints``.
 
-    Frame i + 1 of Pinocchio is link i, frame 0 its universe, which is the root link. Continuous joints
-    are ordinary revolute joints here: Pinocchio computes cosine and sine of any angle itself.
+    Poses come from Pinocchio, or from the closed forms if it cannot be loaded (``engine.reason``). Raises
+    ModelError, which names the joint, if both differ by more than 1e-9. Any thread may call; the workspace
+    is locked, and as large as that of ``Kinematics``.
     """
 
-    def __init__(self, model: RobotModel, forms: tuple[JointTransform, ...]) -> None:
-        # Imported here because edge_poses does not need it; it comes without types.
+    def __init__(self, model: RobotModel) -> None:
+        self._model, self._table = model, JointTransforms(model)
+        self._rows = np.flatnonzero([form.kind != "fixed" for form in self._table.forms])
+        self.forms = tuple(self._table.forms[row] for row in self._rows)
+        self._lock = fork_safe_lock()
+        self._solver: PinocchioSolver | None = None
         try:
-            import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
-        except ImportError as error:
-            raise LibraryMissing(
-                f"link poses and twists need Pinocchio, which cannot be loaded: {error}; "
-                "its wheel needs the system's OpenMP: apt-get install libgomp1"
-            ) from error
-        self._pin: Any = pinocchio
-        self._model: Any = self._pin.Model()
-        rows = [
-            (form, self._model.idx_qs[joint_id], self._model.idx_vs[joint_id])
-            for form, joint_id in self._add_links(model, forms).items()
-        ]
-        self._data: Any = self._model.createData()
-        single = [row for row in rows if row[0].kind in ("revolute", "prismatic")]
-        self._q_rows = np.array([q_row for _, q_row, _ in single], dtype=np.intp)
-        self._v_rows = np.array([v_row for _, _, v_row in single], dtype=np.intp)
-        self._columns = np.array([form.column for form, _, _ in single], dtype=np.intp)
-        self._velocity_columns = np.array([form.velocity_column for form, _, _ in single], dtype=np.intp)
-        self._scale = np.array([form.scale for form, _, _ in single])
-        self._shift = np.array([form.shift for form, _, _ in single])
-        self._planar = [row for row in rows if row[0].kind == "planar"]
-        self._floating = [row for row in rows if row[0].kind == "floating"]
-        # A view of Pinocchio's placements, which are contiguous, twelve doubles each: the rotation by
-        # columns, then the translation. Reading them one by one from Python costs more than ten times
-        # what computing them does. The view keeps the workspace alive.
-        first = self._data.oMf[0].rotation
-        self._frames = np.lib.stride_tricks.as_strided(first, (len(model.links) + 1, 12), (96, 8))[1:]
+            self._solver = PinocchioSolver(model, self._table.forms)
+            self.engine = self._solver.engine
+        except LibraryMissing as error:
+            self.engine = closed_forms(error)
+        else:
+            self._compare()
 
-    def link_poses(self, positions: Floats, out: Floats) -> Floats:
-        self._pin.framesForwardKinematics(self._model, self._data, self._configuration(positions))
-        out[:, :3] = self._frames[:, 9:]
-        out[:, 3:] = _quaternions(self._frames[:, :9])
-        return out
+    def poses(self, positions: Floats) -> Floats:
+        """``parent_from_child`` of every moving edge: (M, 7), x y z [m], qx qy qz qw.
 
-    def twist(self, link: int, reference: int, positions: Floats, velocities: Floats) -> Floats:
-        q, v = self._configuration(positions), self._velocity(positions, velocities)
-        self._pin.forwardKinematics(self._model, self._data, q, v)
-        linear, angular, root_from_link = self._motion(link)
-        reference_linear, reference_angular, root_from_reference = self._motion(reference)
-        lever = root_from_link.translation - root_from_reference.translation
-        linear = linear - reference_linear - np.cross(reference_angular, lever)
-        rotation = root_from_reference.rotation.T
-        return np.concatenate((rotation @ linear, rotation @ (angular - reference_angular)))
+        Positions must be finite and of the right length (not checked). Raises InvalidInput for a floating
+        joint without a unit quaternion. The sign of a quaternion is arbitrary.
+        """
+        if self._solver is None:
+            return self._table.poses(positions).take(self._rows, axis=0)
+        positions = self._table.normalised(positions)
+        with self._lock:
+            return self._solver.moving_edges(positions)
 
-    def _motion(self, link: int) -> tuple[Floats, Floats, Any]:
-        """Linear velocity of a link's origin, its angular velocity and its pose, in the root."""
-        pose = self._pin.updateFramePlacement(self._model, self._data, link + 1).copy()
-        axes = self._pin.LOCAL_WORLD_ALIGNED
-        motion = self._pin.getFrameVelocity(self._model, self._data, link + 1, axes)
-        return motion.linear.copy(), motion.angular.copy(), pose
+    def _compare(self) -> None:
+        """Compare both ways at the neutral and three random configurations."""
+        draw = Random(self._model.digest)
+        for positions in (self._model.neutral, *(_random_positions(self._model, draw) for _ in range(3))):
+            expected, poses = self._table.poses(positions).take(self._rows, axis=0), self.poses(positions)
+            signs = np.sign(np.einsum("ij,ij->i", expected[:, 3:], poses[:, 3:]))
+            poses[:, 3:] *= signs[:, None]
+            differences = np.abs(poses - expected).max(axis=1, initial=0.0)
+            if not (differences <= _TOLERANCE).all():
+                row = int(differences.argmax())
+                edge = (self.forms[row].parent, self.forms[row].child)
+                joint = next(one for one in self._model.joints if (one.parent, one.child) == edge)
+                raise ModelError(
+                    self._model.name,
+                    message=f"{self.engine.name} and zstate's closed forms differ by {differences[row]:.3g} "
+                    f"at joint {joint.name!r} of {self._model.name!r}: {poses[row].tolist()} and "
+                    f"{expected[row].tolist()}; `pip install 'pin>=4.1,<5'` installs a release that zstate "
+                    "is tested with",
+                )
 
-    def _configuration(self, positions: Floats) -> Floats:
-        q = np.empty(self._model.nq)
-        q[self._q_rows] = positions[self._columns] * self._scale + self._shift
-        for form, row, _ in self._planar:
-            x, y, yaw = positions[form.column : form.column + 3].tolist()
-            q[row : row + 4] = x, y, np.cos(yaw), np.sin(yaw)
-        for form, row, _ in self._floating:
-            q[row : row + 7] = positions[form.column : form.column + 7]
-        return q
 
-    def _velocity(self, positions: Floats, velocities: Floats) -> Floats:
-        """Pinocchio's velocities: those of planar and floating joints are in the axes of the child."""
-        v = np.empty(self._model.nv)
-        v[self._v_rows] = velocities[self._velocity_columns] * self._scale
-        for form, _, row in self._planar:
-            x, y, yaw_rate = velocities[form.velocity_column : form.velocity_column + 3]
-            yaw = positions[form.column + 2]
-            cos, sin = np.cos(yaw), np.sin(yaw)
-            v[row : row + 3] = cos * x + sin * y, cos * y - sin * x, yaw_rate
-        for form, _, row in self._floating:
-            pose = self._pin.XYZQUATToSE3(positions[form.column : form.column + 7])
-            rates = velocities[form.velocity_column : form.velocity_column + 6]
-            v[row : row + 6] = (rates.reshape(2, 3) @ pose.rotation).ravel()
-        return v
-
-    def _add_links(self, model: RobotModel, forms: tuple[JointTransform, ...]) -> dict[JointTransform, int]:
-        """Add all joints and links to Pinocchio's model. Returns the ids of the joints that move."""
-        pin, joint_ids = self._pin, dict[JointTransform, int]()
-        below: defaultdict[str, list[JointTransform]] = defaultdict(list)
-        for form in forms:
-            below[form.parent].append(form)
-        # For each link Pinocchio's joint that carries it, and the link's pose in that joint.
-        placed: dict[str, tuple[int, Any]] = {model.root: (0, pin.SE3.Identity())}
-        waiting = below[model.root].copy()
-        while waiting:
-            form = waiting.pop()
-            waiting += below[form.child]
-            joint_id, placement = placed[form.parent]
-            placement = placement * pin.XYZQUATToSE3(np.array(form.origin))
-            if form.kind != "fixed":
-                if form.kind == "revolute":
-                    joint = pin.JointModelRevoluteUnaligned(np.array(form.axis))
-                elif form.kind == "prismatic":
-                    joint = pin.JointModelPrismaticUnaligned(np.array(form.axis))
-                else:
-                    joint = pin.JointModelPlanar() if form.kind == "planar" else pin.JointModelFreeFlyer()
-                joint_id = self._model.addJoint(joint_id, joint, placement, f"j{len(joint_ids)}")
-                joint_ids[form], placement = joint_id, pin.SE3.Identity()
-            placed[form.child] = joint_id, placement
-        for row, link in enumerate(model.links):
-            joint_id, placement = placed[link]
-            self._model.addFrame(pin.Frame(f"l{row}", joint_id, 0, placement, pin.FrameType.BODY))
-        return joint_ids
+def _random_positions(model: RobotModel, draw: Random) -> Floats:
+    positions = np.array([draw.uniform(-3.0, 3.0) for _ in range(model.position_count)])
+    for joint in model.driven_joints:
+        if joint.type == "floating":
+            start = model.columns[joint.name] + 3
+            positions[start : start + 4] /= np.linalg.norm(positions[start : start + 4])
+    return positions
 
 
 def _destination(out: Floats | None, rows: int) -> Floats:
@@ -210,31 +159,3 @@ def _destination(out: Floats | None, rows: int) -> Floats:
     if out.shape != (rows, 7) or out.dtype != np.float64:
         raise InvalidInput(f"out must be float64 of shape ({rows}, 7); got {out.dtype} of shape {out.shape}")
     return out
-
-
-def _quaternion_products() -> tuple[Floats, Floats]:
-    """``rotation @ matrix + offset`` is 4 q q^T for a rotation given as nine numbers by columns."""
-    matrix = np.zeros((3, 3, 4, 4))
-    offset = np.eye(4)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        matrix[i, i, range(4), range(4)] = -1.0
-        matrix[i, i, (i, 3), (i, 3)] = 1.0
-        matrix[i, j, (i, j), (j, i)] = matrix[j, i, (i, j), (j, i)] = 1.0
-        matrix[i, j, k, 3] = matrix[i, j, 3, k] = 1.0
-        matrix[j, i, k, 3] = matrix[j, i, 3, k] = -1.0
-    return matrix.reshape(9, 16), offset.reshape(16)
-
-
-_PRODUCTS, _PRODUCTS_OFFSET = _quaternion_products()
-
-
-def _quaternions(rotations: Floats) -> Floats:
-    """Unit quaternions x y z w of rotations given as (n, 9), by columns.
-
-    Each row of 4 q q^T is a multiple of q; the row of q's largest component is never near zero.
-    """
-    products = rotations @ _PRODUCTS + _PRODUCTS_OFFSET
-    largest: NDArray[np.intp] = products[:, ::5].argmax(axis=1)
-    rows = products.reshape(-1, 4, 4)[np.arange(len(largest)), largest]
-    return rows / np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]

@@ -95,7 +95,8 @@ class WriterClaim(Closeable):
         self._received: dict[tuple[Stream, str], zenoh.ext.AdvancedSubscriber[_Handler]] = {}
         self._publishing: set[int] = set()
         self._first: Announcement | None = None
-        self._next_check = 0.0
+        self.next_check_s = 0.0
+        """Until then [s, ``time.monotonic``] ``check`` has nothing to do."""
         self._established_at = 0.0
         self._expression = _WIRE.writers_expression(claimed[0].robot)
         # Not before the first ``check``: a router's replies leave out some of the tokens that are subscribed.
@@ -130,13 +131,13 @@ class WriterClaim(Closeable):
         """
         if self._first is None:
             now = time.monotonic()
-            if now < self._next_check:
+            if now < self.next_check_s:
                 return
             self._session.check()
             if self._tokens is None:
                 self._established_at = now + _STARTUP_S
             elif now > self._established_at:
-                self._next_check = now + CHECK_PERIOD_S
+                self.next_check_s = now + CHECK_PERIOD_S
             self._update_rivals()
             if not self._rivals:
                 return

@@ -28,7 +28,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import zenoh
 
@@ -39,12 +39,11 @@ from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
 from zstate.net.streams import JOIN_WITHIN_S, to_serialized
 from zstate.wire.keys import Stream, stream_key
-from zstate.wire.messages import HistoryPage, Sample
+from zstate.wire.messages import HistoryPage
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, decode, encode
 from zstate.wire.protocol import SerializedSample
 
 T = TypeVar("T")
-S = TypeVar("S", bound=Sample)
 
 PAGE_BYTES = 32_000
 PAGE_SAMPLES = 256
@@ -115,7 +114,15 @@ class RoundRobinQueue(Generic[T]):
         self._due.clear()
 
 
-class SampleCache(Generic[S]):
+class CachedSample(NamedTuple):
+    """A sample as published on the native wire, with its stamp [ns] and sequence number."""
+
+    stamp: int
+    seq: int
+    payload: bytes
+
+
+class SampleCache:
     """The samples of the session ``writer``: the last ``span_s`` seconds before the newest, by their stamps.
 
     Holds at most 8 MB, with ``numbers`` numbers in each sample. One thread at a time appends; any reads.
@@ -127,51 +134,55 @@ class SampleCache(Generic[S]):
         self.span_s = span_s
         self.writer = writer
         self._span_ns = round(span_s * 1e9)
-        self._states: deque[S] = deque(maxlen=MAX_CACHE_BYTES // (8 * numbers + _OVERHEAD))
+        # Plain tuples: a named one takes longer to create than all the rest of ``append``.
+        self._samples: deque[tuple[int, int, bytes]] = deque(
+            maxlen=MAX_CACHE_BYTES // (8 * numbers + _OVERHEAD)
+        )
         self._newest = 0
 
-    def append(self, state: S) -> None:
-        """Cache ``state``, whose ``seq`` is one more than that of the last."""
-        states, stamp = self._states, state.stamp
+    def append(self, stamp: int, seq: int, payload: bytes) -> None:
+        """Cache a sample, whose ``seq`` is one more than that of the last."""
+        samples = self._samples
         limit = stamp - self._span_ns
         if stamp >= self._newest:
             self._newest = stamp
-        elif states and stamp < self._newest - SET_BACK_NS:
-            states.clear()  # the clock was set back: readers start a new history, too
-        if not states:
+        elif samples and stamp < self._newest - SET_BACK_NS:
+            samples.clear()  # the clock was set back: readers start a new history, too
+        if not samples:
             self._newest = stamp
-        states.append(state)
-        while states[0].stamp < limit:
-            states.popleft()
+        samples.append((stamp, seq, payload))
+        while samples[0][0] < limit:
+            samples.popleft()
 
-    def since(self, seq: int) -> list[S]:
+    def since(self, seq: int) -> list[CachedSample]:
         """The cached samples from ``seq`` on."""
-        states = self._states.copy()  # atomic: the writer appends at the same time
-        first = seq - states[0].seq if states else 0
-        return list(islice(states, max(0, first), None))
+        samples = self._samples.copy()  # atomic: the writer appends at the same time
+        first = seq - samples[0][1] if samples else 0
+        return [CachedSample(*sample) for sample in islice(samples, max(0, first), None)]
 
-    def before(self, seq: int | None, count: int) -> tuple[list[S], bool]:
+    def before(self, seq: int | None, count: int) -> tuple[list[CachedSample], bool]:
         """The last ``count`` samples before ``seq``, or the newest, and whether there are older ones."""
-        states = self._states.copy()
-        if not states:
+        samples = self._samples.copy()
+        if not samples:
             return [], False
-        stop = len(states) if seq is None else min(max(0, seq - states[0].seq), len(states))
+        stop = len(samples) if seq is None else min(max(0, seq - samples[0][1]), len(samples))
         first = max(0, stop - count)
-        return list(islice(states, first, stop)), first > 0
+        return [CachedSample(*sample) for sample in islice(samples, first, stop)], first > 0
 
 
 def serve_history(
     session: Session,
     robot: str,
     stream: Stream,
-    cache: SampleCache[S],
-    encode_sample: Callable[[S], bytes],
+    cache: SampleCache,
+    convert: Callable[[bytes], bytes] | None = None,
     *,
     writer: str = "",
 ) -> Queryable:
     """Reply on the key of ``stream`` with the samples in ``cache``, in the encoding of the stream.
 
-    ``writer`` is the name in the key of a named stream.
+    ``convert`` makes a payload of the stream of a cached one, if they differ. ``writer`` is the name in the
+    key of a named stream.
     """
     encoding = ENCODINGS[STREAM_TYPES[stream]]
 
@@ -180,16 +191,16 @@ def serve_history(
             return None  # the query is for another writer of this key
         before = parameters.get("before", "")
         is_count = before.isascii() and before.isdecimal() and len(before) <= 19
-        states, more = cache.before(int(before) if is_count else None, PAGE_SAMPLES)
+        cached, more = cache.before(int(before) if is_count else None, PAGE_SAMPLES)
         samples: list[bytes] = []  # newest first, as many as fit into a page, at least one if there is any
         room = PAGE_BYTES
-        for state in reversed(states):
-            samples.append(encode_sample(state))
+        for sample in reversed(cached):
+            samples.append(sample.payload if convert is None else convert(sample.payload))
             room -= len(samples[-1])
             if room < len(samples[-1]):
                 break
-        is_all = not more and len(samples) == len(states)
-        next_before = None if is_all else states[-len(samples)].seq
+        is_all = not more and len(samples) == len(cached)
+        next_before = None if is_all else cached[-len(samples)].seq
         page = HistoryPage(encoding, tuple(reversed(samples)), next_before)
         return Reply(encode(page), ENCODINGS[HistoryPage])
 

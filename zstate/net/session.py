@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import zenoh
 
 from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe_lock
+from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.errors import Closed, ConfigError, InvalidInput, PortBusy
 from zstate.net.at_exit import close_at_exit, end_sessions, forked_text, join_at_exit, leak, session_opening
 from zstate.net.config import (
@@ -196,12 +196,15 @@ class Session(Closeable):
         self._companion = companion
         self._pid = os.getpid()
         self._closed = False
+        self.is_usable = True
+        """False once this session is closed, and in a forked process."""
         self._lock = fork_safe_lock()
         self._numbers = itertools.count()
         self.zid = str(raw.zid())
         self.opened_at = time.monotonic()
         self.probe = probe
         close_at_exit(self)
+        fork_safe(self)
 
     def __del__(self) -> None:
         self.close_blocking()
@@ -221,10 +224,14 @@ class Session(Closeable):
 
     def check(self) -> None:
         """Raise Closed if this session is closed, or belongs to the process that this one was forked from."""
+        if self.is_usable:
+            return
         if self._closed:
             raise Closed("this session is closed; connect() again")
-        if os.getpid() != self._pid:
-            raise Closed(forked_text(f"this session belongs to process {self._pid}"))
+        raise Closed(forked_text(f"this session belongs to process {self._pid}"))
+
+    def _at_fork_reinit(self) -> None:
+        self.is_usable = False
 
     def release(self, entity: Undeclarable) -> None:
         """Undeclare an entity of this session. Does nothing if the entity or the session is closed.
@@ -279,6 +286,7 @@ class Session(Closeable):
             if self._closed or os.getpid() != self._pid:
                 return False
             self._closed = True
+            self.is_usable = False
         return True
 
     def _close(self) -> None:

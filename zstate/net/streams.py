@@ -156,23 +156,24 @@ class StreamPublisher(Closeable):
             express=False,
         )
         self._has_readers = False
-        self._changes: zenoh.MatchingListener[zenoh.handlers.Handler[zenoh.MatchingStatus]] | None = None
+        self._changes: zenoh.MatchingListener[None] | None = None
 
     @property
     def has_readers(self) -> bool:
         """Whether this key has a subscriber now. Cheap enough to check before each sample."""
         if self._changes is None:
-            # Zenoh reports each change, beginning with the first subscriber; only the newest is kept.
-            ring: zenoh.handlers.RingChannel[zenoh.MatchingStatus] = zenoh.handlers.RingChannel(1)
-            self._changes = self._publisher.declare_matching_listener(ring)
-        change = self._changes.handler.try_recv()
-        if change is not None:
-            self._has_readers = change.matching
+            # Zenoh reports each change, beginning with the first subscriber, in a thread of its own.
+            handler = zenoh.handlers.Callback(self._on_change, indirect=False)
+            self._changes = self._publisher.declare_matching_listener(handler)
         return self._has_readers
+
+    def _on_change(self, status: zenoh.MatchingStatus) -> None:
+        self._has_readers = status.matching
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> None:
         """Send one sample with its attachment. Raises Closed."""
-        self._session.check()
+        if not self._session.is_usable:
+            self._session.check()
         try:
             self._publisher.put(payload, attachment=attachment)
         except zenoh.ZError:

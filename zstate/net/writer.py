@@ -43,10 +43,11 @@ class SampleWriter(StreamPublisher):
         self.encoder = encoder
         self.samples = 0
         self.bytes = 0
+        self._attachment = encoder.attachment
 
     def write(self, payload: bytes) -> None:
         """Send a payload of ``encoder``. Raises Closed."""
-        self.put(payload, self.encoder.attachment(time.time_ns()))
+        self.put(payload, self._attachment and self._attachment(time.time_ns()))
         self.samples += 1
         self.bytes += len(payload)
 
@@ -60,7 +61,8 @@ class LatchedWriter(LatchedPublisher):
 
     def write(self, payload: bytes) -> None:
         """Replace the value by a payload of ``encoder``. Raises Closed."""
-        self.set(payload, self.encoder.attachment(time.time_ns()))
+        attachment = self.encoder.attachment
+        self.set(payload, attachment and attachment(time.time_ns()))
 
     def withdraw(self) -> None:
         """Withdraw the value, if the wire format can. Does nothing once the session is closed."""

@@ -15,7 +15,8 @@ from zstate.net.session import Session
 from zstate.transform import Transform
 from zstate.wire.keys import full_name, lookup_key
 from zstate.wire.lookup_request import LookupRequest, error_to_json, to_json
-from zstate.wire.messages import JointState, from_block
+from zstate.wire.messages import from_block
+from zstate.wire.native import decode_joint_state
 
 _JSON = "application/json"
 
@@ -54,7 +55,7 @@ class RecentBuffer:
     Created at the first query, so that a publisher without queries pays nothing.
     """
 
-    def __init__(self, model: RobotModel, robot: str, memory: SampleCache[JointState]) -> None:
+    def __init__(self, model: RobotModel, robot: str, memory: SampleCache) -> None:
         self._model, self._robot = model, robot
         self._memory = memory
         self._state: tuple[TransformBuffer, JointTrack] | None = None
@@ -68,12 +69,13 @@ class RecentBuffer:
                 made = TransformBuffer(self._memory.span_s)
                 self._state = made, made.add_robot(self._model, self._robot)
             buffer, track = self._state
-            for state in self._memory.since(self._next_seq):
+            for cached in self._memory.since(self._next_seq):
+                state = decode_joint_state(cached.payload)
                 rates = None if state.velocities is None else from_block(state.velocities)
                 sample = (track, state.stamp, from_block(state.positions), rates)
                 if not buffer.insert_joints(*sample):
                     # The writer's clock was set back: earlier samples are another epoch.
                     buffer.restart(track)
                     buffer.insert_joints(*sample)
-                self._next_seq = state.seq + 1
+                self._next_seq = cached.seq + 1
         return buffer

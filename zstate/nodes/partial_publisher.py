@@ -23,7 +23,7 @@ from zstate.net.sample_history import SampleCache, serve_history
 from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
 from zstate.net.writer import SampleWriter, WireWriter
-from zstate.nodes.publisher import Positions, RobotEncoder
+from zstate.nodes.publisher import Positions, positions_block
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
 from zstate.nodes.static_publisher import edge_writer_name
 from zstate.rate import Rate, RateReport
@@ -76,7 +76,6 @@ class PartialStatePublisher(Closeable):
         self.writer = edge_writer_name(writer, identity)
         self._session_id = identity.session
         self._clock: Clock = clock or SystemClock()
-        self._encoder = RobotEncoder(self.model, self.robot)
         self._names = coordinate_names(self.model)
         self._order = order_digest(self._names)
         self._slots = np.array(velocity_columns_by_position(self.model), dtype=np.intp)
@@ -90,7 +89,7 @@ class PartialStatePublisher(Closeable):
         self._last_refusal = ""
         self._rate: Rate | None = None
         self._claim: WriterClaim | None = None
-        self._cache: SampleCache[JointState] | None = None
+        self._cache: SampleCache | None = None
         self._writers: dict[tuple[str, Stream], SampleWriter] = {}
         with ExitStack() as opening:
             if "native" in self._wires:
@@ -120,8 +119,8 @@ class PartialStatePublisher(Closeable):
         # Its queryable is also how writers that claim joints at the same time find each other.
         numbers = 3 * self.model.position_count
         self._cache = SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
-        history = (session, self.robot, "partial_joint_states", self._cache, encode)
-        opening.enter_context(serve_history(*history, writer=self.writer))
+        history = serve_history(session, self.robot, "partial_joint_states", self._cache, writer=self.writer)
+        opening.enter_context(history)
         movers = {f"{self.robot}/{joint.child}": joint for joint in self.model.joints}
         edges = [(f"{self.robot}/{joint.parent}", child) for child, joint in movers.items()]
         try:
@@ -164,7 +163,7 @@ class PartialStatePublisher(Closeable):
         ``StatePublisher.publish``; SecondWriter; and Closed. If it raises, nothing was sent.
         """
         try:
-            block = self._encoder.encode_positions(positions)
+            block = positions_block(self.model, positions)
             rates = None if velocities is None else self._spread(self.model.check_velocities(velocities))
             forces = None if efforts is None else self._spread(self.model.check_efforts(efforts))
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
@@ -176,15 +175,16 @@ class PartialStatePublisher(Closeable):
                 head = (stamp, self._seq, self._session_id, self._order)
                 state = JointState(*head, block, rates, forces, self._names)
                 # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
-                payloads = [(writer, writer.encoder.encode(state)) for writer in self._writers.values()]
+                payloads = {place: writer.encoder.encode(state) for place, writer in self._writers.items()}
+                native = payloads.get(("native", "partial_joint_states")) or encode(state)
                 self._seq += 1
                 if self._cache is not None:
                     # Before sending: a reader that misses this sample can then request it as history.
-                    self._cache.append(state)
-                for writer, payload in payloads:
-                    writer.write(payload)
+                    self._cache.append(stamp, state.seq, native)
+                for place, writer in self._writers.items():
+                    writer.write(payloads[place])
                 if self._limits is not None:
-                    self._limits.add(stamp, block)
+                    self._limits.add(stamp, native)
         except InvalidInput as error:
             self._last_refusal = str(error)
             self._refused += 1

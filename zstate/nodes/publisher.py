@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import secrets
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from functools import cache
 from typing import TYPE_CHECKING, TypeAlias
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from zstate._util.closeable import Closeable
@@ -17,7 +20,8 @@ from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.extension import kernel
 from zstate.model.joint_limits import JointLimits
-from zstate.model.joint_transforms import JointTransforms
+from zstate.model.joint_transforms import edge_forms
+from zstate.model.kinematics import MovingEdges
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.net.clock_offset import ClockService
 from zstate.net.ownership import WriterClaim
@@ -42,15 +46,13 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
+from zstate.wire.native import decode_joint_state, encode
 from zstate.wire.registry import as_wire_names, get_wire
 
 if TYPE_CHECKING or kernel == "c":
-    from zstate._kernel import block_of
-else:
+    from zstate._kernel import JointStateEncoder
 
-    def block_of(numbers: object, count: int) -> None:
-        """None: the caller checks them with numpy."""
-
+_LOG = logging.getLogger("zstate")
 
 Positions: TypeAlias = ArrayLike | Mapping[str, float | Sequence[float]]
 
@@ -63,45 +65,60 @@ _NEWEST_ONLY_S = 1e-9
 """Span of the cache that serves lookups when there is no cache for joining listeners."""
 
 
+def positions_block(model: RobotModel, positions: Positions) -> bytes:
+    """``positions`` as in messages. Raises InvalidInput unless they are a configuration of the robot."""
+    is_named = isinstance(positions, Mapping)
+    return to_block(model.positions(positions) if is_named else model.check_positions(positions))
+
+
 class RobotEncoder:
-    """Checks and encodes the samples of a model published under the name ``robot``.
+    """Checks and encodes the samples that one ``session`` publishes of a model, under the name ``robot``.
 
     ``names`` are the moving edges (parent, child) in the order of a transform sample's poses, with the
     frame names of the wire; ``order`` is their digest.
     """
 
-    def __init__(self, model: RobotModel, robot: str) -> None:
-        self._model = model
-        self._count = model.position_count
-        self._table = JointTransforms(model)
-        forms = self._table.forms
+    def __init__(self, model: RobotModel, robot: str, session: int) -> None:
+        self._model, self._session = model, session
+        forms = edge_forms(model)
         names = [(wire_name(robot, form.parent), wire_name(robot, form.child)) for form in forms]
         fixed = [form.kind == "fixed" for form in forms]
-        self._rows = np.flatnonzero(~np.array(fixed, dtype=np.bool_))
-        self.names = tuple(names[row] for row in self._rows)
+        self.names = tuple(name for name, is_fixed in zip(names, fixed, strict=True) if not is_fixed)
         self.order = order_digest(self.names)
         self._fixed_names = tuple(name for name, is_fixed in zip(names, fixed, strict=True) if is_fixed)
         self._fixed_poses = [form.origin for form in forms if form.kind == "fixed"]
+        self._joint_order = order_digest(model.joint_names)
+        quaternions = tuple(form.column + 3 for form in forms if form.kind == "floating")
+        counts = (model.position_count, model.velocity_count)
+        self._compiled = (
+            JointStateEncoder(session, self._joint_order, *counts, quaternions) if kernel == "c" else None
+        )
 
-    def encode_positions(self, positions: Positions) -> bytes:
-        """``positions`` as a block. Raises InvalidInput unless they are a configuration of the robot."""
-        block = block_of(positions, self._count)
-        if block is None:
-            model = self._model
-            is_named = isinstance(positions, Mapping)
-            block = to_block(model.positions(positions) if is_named else model.check_positions(positions))
-        if self._table.has_floats:
-            self._table.normalised(from_block(block))
-        return block
+    def encode(
+        self,
+        positions: Positions,
+        velocities: ArrayLike | None,
+        efforts: ArrayLike | None,
+        stamp: int,
+        seq: int,
+    ) -> bytes:
+        """The payload of a JointState on the native wire.
 
-    def transform_sample(self, state: JointState) -> TransformSample:
-        """The pose of each moving edge, ``parent_from_child``, in ``state``."""
-        poses = self._table.poses(from_block(state.positions)).take(self._rows, axis=0)
-        return TransformSample(state.stamp, state.seq, state.session, self.order, to_block(poses))
+        Raises InvalidInput unless ``positions`` are a configuration of the robot, and the others fit it.
+        """
+        if self._compiled is not None:
+            payload = self._compiled.encode(positions, velocities, efforts, stamp, seq)
+            if payload is not None:
+                return payload
+        model = self._model
+        block = positions_block(model, positions)
+        rates = None if velocities is None else to_block(model.check_velocities(velocities))
+        forces = None if efforts is None else to_block(model.check_efforts(efforts))
+        return encode(JointState(stamp, seq, self._session, self._joint_order, block, rates, forces))
 
-    def statics(self, session: int) -> StaticTransforms:
+    def statics(self) -> StaticTransforms:
         """The fixed edges of the model."""
-        return StaticTransforms(session, self._fixed_names, to_block(self._fixed_poses))
+        return StaticTransforms(self._session, self._fixed_names, to_block(self._fixed_poses))
 
 
 class StatePublisher(Closeable):
@@ -109,13 +126,16 @@ class StatePublisher(Closeable):
 
     Samples go out on ``joint_states``; the moving edges also on ``tf``, while that stream has a reader.
     The model (``robot_description``) and its fixed edges (``tf_static``) are latched, so that listeners
-    receive them whenever they join. ``robot`` is the name on the network; default: the model's name.
-    ``streams`` lists what this publisher writes, if another program writes the rest. ``program`` is the
-    writer's name for others; default: the script's name.
+    receive them whenever they join. Transforms are computed by Pinocchio, whose model is built on opening and
+    compared with zstate's closed forms; these serve, with a warning, if Pinocchio cannot be loaded
+    (``stats.kinematics``). Without the stream ``tf`` it is not loaded. ``robot`` is the name on the network;
+    default: the model's name. ``streams`` lists what this publisher writes, if another program writes the
+    rest. ``program`` is the writer's name for others; default: the script's name.
 
     Raises SecondWriter, which names the first writer, if another writer of one of its streams is active
     on the native wire. If two open at once, ``publish`` of the later one raises it and closes that
-    publisher. With ``takeover`` it publishes nevertheless, and listeners use the newest writer.
+    publisher. With ``takeover`` it publishes nevertheless, and listeners use the newest writer. Raises
+    ModelError, which names the joint, if Pinocchio and the closed forms differ.
 
     On the native wire it publishes its status once a second while that has a reader
     (``zstate.net.status``), caches the last ``cache_s`` seconds of samples for joining listeners
@@ -143,17 +163,18 @@ class StatePublisher(Closeable):
         self._lock = fork_safe_lock()
         self._stop = fork_safe(threading.Event())
         self._opened = ExitStack()
-        self._encoder = RobotEncoder(model, self.robot)
         self._session_id = secrets.randbits(32)
+        self._encoder = RobotEncoder(model, self.robot, self._session_id)
         self._seq = 0
         self._refused = 0
         self._last_refusal = ""
         self._rate: Rate | None = None
+        self._next_check_s = -math.inf
         self._wires = wires = as_wire_names(wires)
-        self._joint_order = order_digest(model.joint_names)
         for stream in streams:
             if stream not in STREAMS:
                 raise InvalidInput(f"{stream!r} is not one of the streams {', '.join(map(repr, STREAMS))}")
+        self._edges = _moving_edges(model) if "tf" in streams and wires else None
         limits = JointLimits(model)
         self._limits = LimitWatch(limits, self.robot) if limits and wires else None
         sample_names = SampleLayout(
@@ -186,7 +207,9 @@ class StatePublisher(Closeable):
                 for stream in _SAMPLED:
                     if stream in streams:
                         self._writers[wire, stream] = wire_writer.open_stream(stream)
-            self._joints = [one for (_, stream), one in self._writers.items() if stream == "joint_states"]
+            self._native = self._writers.get(("native", "joint_states"))
+            joints = [one for (_, stream), one in self._writers.items() if stream == "joint_states"]
+            self._ros_joints = [one for one in joints if one is not self._native]
             self._transforms = [one for (_, stream), one in self._writers.items() if stream == "tf"]
             if "native" in wires and self._writers:
                 status = StatusReporter(writer, lambda: self.stats).status
@@ -202,22 +225,20 @@ class StatePublisher(Closeable):
         closed = ", closed" if self._stop.is_set() else ""
         return f"<StatePublisher of {self.robot!r} on {', '.join(self._wires)}: {self._seq} samples{closed}>"
 
-    def _open_cache(
-        self, session: Session, cache_s: float, opening: ExitStack
-    ) -> SampleCache[JointState] | None:
+    def _open_cache(self, session: Session, cache_s: float, opening: ExitStack) -> SampleCache | None:
         if "native" not in self._wires:
             return None
         numbers = self.model.position_count + 2 * self.model.velocity_count
-        cache: SampleCache[JointState] = SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
+        cache = SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
         if cache_s:
-            robot, writers = self.robot, self._writers
-            if joints := writers.get(("native", "joint_states")):
-                encode = joints.encoder.encode
-                opening.enter_context(serve_history(session, robot, "joint_states", cache, encode))
-            if transforms := writers.get(("native", "tf")):
-                sample, encode_tf = self._encoder.transform_sample, transforms.encoder.encode
-                service = serve_history(session, robot, "tf", cache, lambda state: encode_tf(sample(state)))
-                opening.enter_context(service)
+            if self._native is not None:
+                opening.enter_context(serve_history(session, self.robot, "joint_states", cache))
+            if transforms := self._writers.get(("native", "tf")):
+
+                def convert(payload: bytes) -> bytes:
+                    return transforms.encoder.encode(self._transform_sample(decode_joint_state(payload)))
+
+                opening.enter_context(serve_history(session, self.robot, "tf", cache, convert))
         return cache
 
     def description(self) -> RobotDescription:
@@ -227,18 +248,21 @@ class StatePublisher(Closeable):
 
     def statics(self) -> StaticTransforms:
         """The robot's fixed edges, latched for listeners without its model."""
-        return self._encoder.statics(self._session_id)
+        return self._encoder.statics()
 
     @property
     def stats(self) -> PublisherStats:
-        """Counts of published, suppressed and refused samples."""
+        """Counts of published, suppressed and refused samples, and what computes transforms."""
         streams = {
             stream: StreamStats(writer.samples, writer.bytes, self._seq - writer.samples)
             for stream, writer in self._writers.items()
         }
         rate = None if self._rate is None else self._rate.report()
         outside, excess = (0, "") if self._limits is None else (self._limits.count, self._limits.last)
-        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate, outside, excess)
+        engine = "" if self._edges is None else self._edges.engine.name
+        return PublisherStats(
+            self._seq, self._refused, self._last_refusal, streams, rate, outside, excess, engine
+        )
 
     def publish(
         self,
@@ -257,31 +281,24 @@ class StatePublisher(Closeable):
         nothing was sent.
         """
         try:
-            block = self._encoder.encode_positions(positions)
-            rates = None if velocities is None else to_block(self.model.check_velocities(velocities))
-            forces = None if efforts is None else to_block(self.model.check_efforts(efforts))
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
             with self._lock:
-                if self._stop.is_set():
-                    raise Closed(f"the publisher of {self.robot!r} is closed")
-                if self._claim is not None:
-                    self._claim.check()
-                head = (stamp, self._seq, self._session_id)
-                state = JointState(*head, self._joint_order, block, rates, forces)
+                if time.monotonic() >= self._next_check_s:
+                    self._check_open()
                 # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
-                payloads = [(writer, writer.encoder.encode(state)) for writer in self._joints]
+                payload = self._encoder.encode(positions, velocities, efforts, stamp, self._seq)
                 readable = [writer for writer in self._transforms if writer.has_readers]
-                if readable:
-                    sample = self._encoder.transform_sample(state)
-                    payloads += [(writer, writer.encoder.encode(sample)) for writer in readable]
-                self._seq += 1
+                derived = self._encode_derived(payload, readable) if readable or self._ros_joints else ()
                 if self._recent is not None:
                     # Before sending: a reader that misses this sample can then request it as history.
-                    self._recent.append(state)
-                for writer, payload in payloads:
-                    writer.write(payload)
+                    self._recent.append(stamp, self._seq, payload)
+                self._seq += 1
+                if self._native is not None:
+                    self._native.write(payload)
+                for writer, other in derived:
+                    writer.write(other)
                 if self._limits is not None:
-                    self._limits.add(stamp, block)
+                    self._limits.add(stamp, payload)
         except InvalidInput as error:
             self._last_refusal = str(error)
             self._refused += 1
@@ -290,6 +307,31 @@ class StatePublisher(Closeable):
             with self._lock:
                 self._opened.close()  # latched values too
             raise
+
+    def _check_open(self) -> None:
+        """Raise Closed or SecondWriter; until ``_next_check_s`` neither can be the case."""
+        if self._stop.is_set():
+            raise Closed(f"the publisher of {self.robot!r} is closed")
+        if self._claim is not None:
+            self._claim.check()
+        self._next_check_s = math.inf if self._claim is None else self._claim.next_check_s
+
+    def _encode_derived(
+        self, payload: bytes, readable: Sequence[SampleWriter]
+    ) -> list[tuple[SampleWriter, bytes]]:
+        """The joint state in ``payload`` for the ROS wires, and its transforms for ``readable`` streams."""
+        state = decode_joint_state(payload)
+        payloads = [(writer, writer.encoder.encode(state)) for writer in self._ros_joints]
+        if readable:
+            sample = self._transform_sample(state)
+            payloads += [(writer, writer.encoder.encode(sample)) for writer in readable]
+        return payloads
+
+    def _transform_sample(self, state: JointState) -> TransformSample:
+        """The pose of each moving edge, ``parent_from_child``, in ``state``."""
+        assert self._edges is not None, "the stream tf is published"
+        poses = to_block(self._edges.poses(from_block(state.positions)))
+        return TransformSample(state.stamp, state.seq, state.session, self._encoder.order, poses)
 
     def run(self, source: JointSource, rate_hz: float = 100.0, *, seconds: float | None = None) -> RateReport:
         """Publish the readings of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
@@ -312,4 +354,18 @@ class StatePublisher(Closeable):
         """Stop publishing; ``run`` returns. A second call does nothing."""
         self._stop.set()
         with self._lock:
+            self._next_check_s = -math.inf
             self._opened.close()
+
+
+def _moving_edges(model: RobotModel) -> MovingEdges:
+    edges = MovingEdges(model)
+    if edges.engine.reason:
+        _warn_of_closed_forms(edges.engine.reason)
+    return edges
+
+
+@cache
+def _warn_of_closed_forms(reason: str) -> None:
+    """Log, once in a process, why Pinocchio does not compute the transforms."""
+    _LOG.warning("transforms of publishers come from closed forms instead of Pinocchio: %s", reason)

@@ -15,15 +15,16 @@ from zstate.model.joint_limits import JointLimits
 from zstate.rate import RateReport
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import Stream
-from zstate.wire.messages import Level, Status
+from zstate.wire.messages import Level, Status, from_block
+from zstate.wire.native import joint_positions
 
 _LOG = logging.getLogger("zstate")
 
 _QUIET_NS = 2_000_000_000
 """A publisher without a commanded rate is stale after this long without a sample."""
 
-_CHECKED_EVERY_NS, _CHECKED_AT_ONCE = 1_000_000_000, 1000
-"""Positions are checked against joint limits in groups of one second, at most 1000 samples."""
+_CHECKED_EVERY_NS, _CHECKED_AT_ONCE = 1_000_000_000, 250
+"""Positions are checked against joint limits in groups of one second, at most 250 samples."""
 
 ARE_OUTSIDE = "samples are outside joint limits"
 """Part of the text of a ``Status`` that warns about joint limits."""
@@ -44,7 +45,8 @@ class PublisherStats:
     ``sent`` samples were published, ``refused`` ones were not; ``last_refusal`` is the newest reason.
     ``streams`` has the counts by (wire, stream). ``rate`` is the report of the last ``run``, None before
     the first. ``outside_limits`` published samples had joints outside their limits, the newest described
-    by ``last_excess``; they are checked in groups of one second or 1000 samples.
+    by ``last_excess``; they are checked in groups of one second or 250 samples. ``kinematics`` is what
+    computes transforms: "Pinocchio 4.1.0", for instance, or "closed forms"; empty without the stream tf.
     """
 
     sent: int
@@ -54,12 +56,13 @@ class PublisherStats:
     rate: RateReport | None
     outside_limits: int = 0
     last_excess: str = ""
+    kinematics: str = ""
 
 
 class LimitWatch:
     """Counts the samples whose positions exceed joint limits, and logs the first.
 
-    The first sample is checked at once, later ones in groups, which takes about 0.1 us per sample.
+    The first sample is checked at once, later ones in groups, which takes about 0.3 us per sample.
     Not thread-safe.
     """
 
@@ -67,17 +70,18 @@ class LimitWatch:
         self.count = 0
         self.last = ""
         self._limits, self._robot = limits, robot
-        self._blocks: list[bytes] = []
+        self._payloads: list[bytes] = []
         self._began = self._due = 0
 
-    def add(self, stamp: int, block: bytes) -> None:
-        """Count the sample with ``stamp`` [ns] and the positions ``block``, now or with its group."""
-        self._blocks.append(block)
-        if self._began <= stamp < self._due and len(self._blocks) < _CHECKED_AT_ONCE:
+    def add(self, stamp: int, payload: bytes) -> None:
+        """Count the JointState with ``stamp`` [ns] in ``payload``, now or with its group."""
+        self._payloads.append(payload)
+        if self._began <= stamp < self._due and len(self._payloads) < _CHECKED_AT_ONCE:
             return
         self._began, self._due = stamp, stamp + _CHECKED_EVERY_NS
-        positions = np.frombuffer(b"".join(self._blocks), "<f8").reshape(len(self._blocks), -1)
-        self._blocks.clear()
+        block = b"".join(map(joint_positions, self._payloads))
+        positions = from_block(block).reshape(len(self._payloads), -1)
+        self._payloads.clear()
         # Usually nothing is outside, and these two rows are sufficient to show it.
         extremes = np.stack((positions.min(axis=0), positions.max(axis=0)))
         if not self._limits.are_exceeded(extremes).any():

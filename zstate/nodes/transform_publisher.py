@@ -96,7 +96,7 @@ class TransformPublisher(Closeable):
         self._claim: WriterClaim | None = None
         self._edge_monitor: EdgeMonitor | None = None
         self._second_writer: SecondWriter | None = None
-        self._cache: SampleCache[WriterTransforms] | None = None
+        self._cache: SampleCache | None = None
         self._lock = fork_safe_lock()
         self._stop = fork_safe(threading.Event())
         self._seq = 0
@@ -121,9 +121,8 @@ class TransformPublisher(Closeable):
                 opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
                 # Its queryable is also how writers that claim edges at the same time find each other.
                 self._cache = SampleCache(cache_s or _NEWEST_ONLY_S, _TYPICAL_EDGES * 28, self._session_id)
-                encode, name = native.encoder.encode, self.writer
                 opening.enter_context(
-                    serve_history(session, self.robot, "transforms", self._cache, encode, writer=name)
+                    serve_history(session, self.robot, "transforms", self._cache, writer=self.writer)
                 )
             opening.enter_context(self._edge_tokens)
             self._opened = opening.pop_all()
@@ -171,13 +170,13 @@ class TransformPublisher(Closeable):
                 head = (stamp, self._seq, self._session_id)
                 sample = WriterTransforms(*head, order, poses, names, covariances)
                 # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
-                payloads = [(writer, writer.encoder.encode(sample)) for writer in self._writers.values()]
+                payloads = {stream: writer.encoder.encode(sample) for stream, writer in self._writers.items()}
                 self._seq += 1
                 if self._cache is not None:
                     # Before sending: a reader that misses this sample can then request it as history.
-                    self._cache.append(sample)
-                for writer, payload in payloads:
-                    writer.write(payload)
+                    self._cache.append(stamp, sample.seq, payloads["native", "transforms"])
+                for stream, payload in payloads.items():
+                    self._writers[stream].write(payload)
         except InvalidInput as error:
             self._last_refusal = str(error)
             self._refused += 1

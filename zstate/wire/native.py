@@ -99,10 +99,34 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
         raise MessageError(f"a malformed {_type_name(kind)}: {error}", reason="malformed") from None
 
 
+def decode_joint_state(payload: bytes) -> JointState:
+    """The joint state in ``payload``, which this process encoded."""
+    return decode(payload, ENCODINGS[JointState], JointState)
+
+
+class _JointPositions(msgspec.Struct, array_like=True, gc=False):
+    """The fields of a JointState as far as its positions."""
+
+    stamp: int
+    seq: int
+    session: int
+    order: bytes
+    positions: memoryview
+
+
+_POSITIONS_DECODER = msgspec.msgpack.Decoder(_JointPositions)
+
+
+def joint_positions(payload: bytes) -> memoryview:
+    """The positions of ``decode_joint_state(payload)``, in less than half of its time."""
+    return _POSITIONS_DECODER.decode(payload).positions
+
+
 class NativeStreamEncoder:
     """Encodes one stream of one writer as MessagePack."""
 
     can_withdraw = True
+    attachment = None
 
     def __init__(self, robot: str, writer: WriterId, stream: Stream, name: str) -> None:
         self.key = keys.stream_key(robot, stream, name)
@@ -112,9 +136,6 @@ class NativeStreamEncoder:
 
     def encode(self, message: Message) -> bytes:
         return _ENCODER.encode(message)
-
-    def attachment(self, now: int) -> None:
-        return None
 
 
 class NativeWire:

@@ -59,8 +59,9 @@ class StreamEncoder(Protocol):
         """The payload of ``message``. Raises InvalidInput if the wire format cannot represent it."""
         ...
 
-    def attachment(self, now: int) -> bytes | None:
-        """The attachment of the next payload, which is sent at ``now`` [ns]."""
+    @property
+    def attachment(self) -> Callable[[int], bytes | None] | None:
+        """Returns the attachment of the next payload for the time of sending [ns]; None if there are none."""
         ...
 
 

@@ -23,7 +23,7 @@ from helpers.raw_ros_nodes import (
 )
 from helpers.robots import RRBOT, STAMP, wait_for_reader
 
-from zstate.model.kinematics import Kinematics
+from zstate.model.kinematics import MovingEdges
 from zstate.model.robot import RobotModel
 from zstate.net.presence import discover
 from zstate.net.session import Session
@@ -54,10 +54,9 @@ def endpoints(session: Session, number: int, domain: int = 0) -> dict[str, list[
 
 
 def moving_poses(model: RobotModel, positions) -> dict[tuple[str, str], list[float]]:
-    kinematics = Kinematics(model)
-    moving = {(joint.parent, joint.child) for joint in model.joints if joint.type != "fixed"}
-    poses = zip(kinematics.edges, kinematics.edge_poses(positions).tolist(), strict=True)
-    return {edge: pose for edge, pose in poses if edge in moving}
+    moving = MovingEdges(model)
+    poses = moving.poses(positions).tolist()
+    return {(form.parent, form.child): pose for form, pose in zip(moving.forms, poses, strict=True)}
 
 
 def decoded_poses(message) -> dict[tuple[str, str], list[float]]:

@@ -104,22 +104,3 @@ plain_block(PyObject *object, Py_buffer *view, Py_ssize_t count)
     PyBuffer_Release(view);
     return false;
 }
-
-/* The bytes of a flat array of `count` finite doubles; None for anything else. */
-static PyObject *
-block_of(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t count)
-{
-    Py_buffer numbers;
-    if (count != 2) {
-        PyErr_SetString(PyExc_TypeError, "block_of(numbers, count)");
-        return NULL;
-    }
-    Py_ssize_t wanted = PyLong_AsSsize_t(args[1]);
-    if (wanted == -1 && PyErr_Occurred())
-        return NULL;
-    if (!PY_LITTLE_ENDIAN || !plain_numbers(args[0], &numbers, wanted))
-        Py_RETURN_NONE;
-    PyObject *block = PyBytes_FromStringAndSize(numbers.buf, numbers.len);
-    PyBuffer_Release(&numbers);
-    return block;
-}

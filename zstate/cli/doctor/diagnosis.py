@@ -23,6 +23,7 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
+from zstate.model.pinocchio_solver import select_engine
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.net.presence import RobotInfo, announce, connections, discover
 from zstate.net.rendezvous import rendezvous_addresses, rendezvous_key, silent_addresses
@@ -110,13 +111,16 @@ def with_same_options(command: str, network: SessionOptions, wire: str) -> str:
 
 
 def _installation_check() -> Check:
-    """The versions in use."""
-    zenoh = metadata.version("eclipse-zenoh")
-    text = f"zstate {__version__}, kernel {kernel}, Zenoh {zenoh}, Python {platform.python_version()}"
-    if kernel == "c" or kernel.reason.startswith(VARIABLE):
-        return ok("zstate", text)
-    text += f": {kernel.reason}; lookups return the same results and take longer"
-    return warning("zstate", text, "pip install --force-reinstall --no-deps zstate")
+    """The versions in use, and what computes lookups and the transforms of publishers."""
+    zenoh, engine = metadata.version("eclipse-zenoh"), select_engine()
+    python = platform.python_version()
+    text = f"zstate {__version__}, kernel {kernel}, {engine.name}, Zenoh {zenoh}, Python {python}"
+    if kernel != "c" and not kernel.reason.startswith(VARIABLE):
+        text += f": {kernel.reason}; lookups return the same results and take longer"
+        return warning("zstate", text, "pip install --force-reinstall --no-deps zstate")
+    if engine.reason:
+        return warning("zstate", f"{text}: {engine.reason}", engine.command)
+    return ok("zstate", text)
 
 
 def _refused_check(error: ZStateError, network: SessionOptions) -> Check:

@@ -1,0 +1,239 @@
+/* JointStateEncoder: from positions to the payload of a JointState in one call, for RobotEncoder in
+ * zstate/nodes/publisher.py. The payload is a MessagePack array of eight: stamp, seq, session,
+ * order, positions, velocities, efforts, names. */
+
+/* The longest parts of a payload: array and three integers, digest, then a block without its
+ * numbers (three of them), nil. */
+#define LONGEST_HEAD (1 + 3 * 9 + 10 + 3 * 5 + 1)
+
+/* Quaternions this close to unit length need no decision; the reference makes it for others. */
+#define CLEARLY_UNIT 0.5e-3
+
+typedef struct {
+    PyObject_HEAD
+    Py_ssize_t positions; /* how many numbers there are of each kind */
+    Py_ssize_t velocities;
+    Py_ssize_t *quaternions; /* the first columns of the quaternions of floating joints */
+    Py_ssize_t quaternion_count;
+    uint64_t session;
+    char order[8];
+} JointStateEncoder;
+
+static PyTypeObject JointStateEncoder_type;
+
+static int
+encoder_fill(JointStateEncoder *self, PyObject *quaternions)
+{
+    Py_ssize_t count = PyTuple_GET_SIZE(quaternions);
+    self->quaternions = PyMem_New(Py_ssize_t, (size_t)count + 1);
+    if (self->quaternions == NULL) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    for (Py_ssize_t i = 0; i < count; i++) {
+        Py_ssize_t column = PyLong_AsSsize_t(PyTuple_GET_ITEM(quaternions, i));
+        if (column == -1 && PyErr_Occurred())
+            return -1;
+        if (column < 0 || column > self->positions - 4) {
+            PyErr_Format(PyExc_ValueError, "there is no quaternion at column %zd", column);
+            return -1;
+        }
+        self->quaternions[i] = column;
+    }
+    self->quaternion_count = count;
+    return 0;
+}
+
+static PyObject *
+encoder_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
+{
+    static char *names[] = {"session", "order", "positions", "velocities", "quaternions", NULL};
+    PyObject *session, *quaternions;
+    const char *order;
+    Py_ssize_t order_size, positions, velocities;
+    if (!PyArg_ParseTupleAndKeywords(args, keywords, "O!y#nnO!:JointStateEncoder", names,
+                                     &PyLong_Type, &session, &order, &order_size, &positions,
+                                     &velocities, &PyTuple_Type, &quaternions))
+        return NULL;
+    uint64_t number = PyLong_AsUnsignedLongLong(session);
+    if (number == (uint64_t)-1 && PyErr_Occurred())
+        return NULL;
+    if (order_size != 8 || positions < 0 || positions > LARGEST_WIDTH || velocities < 0 ||
+        velocities > LARGEST_WIDTH) {
+        PyErr_SetString(PyExc_ValueError,
+                        "an order has 8 bytes, and a robot up to 2**20 numbers of each kind");
+        return NULL;
+    }
+    JointStateEncoder *self = (JointStateEncoder *)type->tp_alloc(type, 0);
+    if (self == NULL)
+        return NULL;
+    self->session = number;
+    self->positions = positions;
+    self->velocities = velocities;
+    memcpy(self->order, order, sizeof(self->order));
+    if (encoder_fill(self, quaternions) < 0) {
+        Py_DECREF(self);
+        return NULL;
+    }
+    return (PyObject *)self;
+}
+
+static void
+encoder_dealloc(JointStateEncoder *self)
+{
+    PyMem_Free(self->quaternions);
+    Py_TYPE(self)->tp_free(self);
+}
+
+/* A type byte and the low bytes of a number, the highest first. Returns the end. */
+static char *
+put_typed(char *at, int type, uint64_t number, int bytes)
+{
+    *at++ = (char)type;
+    while (bytes-- > 0)
+        *at++ = (char)(number >> (8 * bytes));
+    return at;
+}
+
+/* The shortest form of a number that is not negative. */
+static char *
+put_unsigned(char *at, uint64_t number)
+{
+    if (number < 0x80)
+        return put_typed(at, (int)number, 0, 0);
+    if (number <= UINT8_MAX)
+        return put_typed(at, 0xcc, number, 1);
+    if (number <= UINT16_MAX)
+        return put_typed(at, 0xcd, number, 2);
+    if (number <= UINT32_MAX)
+        return put_typed(at, 0xce, number, 4);
+    return put_typed(at, 0xcf, number, 8);
+}
+
+static char *
+put_signed(char *at, int64_t number)
+{
+    if (number >= 0)
+        return put_unsigned(at, (uint64_t)number);
+    if (number >= -32)
+        return put_typed(at, (int)number, 0, 0);
+    if (number >= INT8_MIN)
+        return put_typed(at, 0xd0, (uint64_t)number, 1);
+    if (number >= INT16_MIN)
+        return put_typed(at, 0xd1, (uint64_t)number, 2);
+    if (number >= INT32_MIN)
+        return put_typed(at, 0xd2, (uint64_t)number, 4);
+    return put_typed(at, 0xd3, (uint64_t)number, 8);
+}
+
+static char *
+put_bytes(char *at, const void *bytes, size_t size)
+{
+    if (size <= UINT8_MAX)
+        at = put_typed(at, 0xc4, size, 1);
+    else if (size <= UINT16_MAX)
+        at = put_typed(at, 0xc5, size, 2);
+    else
+        at = put_typed(at, 0xc6, size, 4);
+    if (size != 0)
+        memcpy(at, bytes, size);
+    return at + size;
+}
+
+/* The numbers of a buffer, or nil for none. */
+static char *
+put_block(char *at, const Py_buffer *numbers)
+{
+    return numbers->obj == NULL ? put_typed(at, 0xc0, 0, 0)
+                                : put_bytes(at, numbers->buf, (size_t)numbers->len);
+}
+
+/* As plain_numbers, or a buffer without an object for None. */
+static bool
+plain_or_none(PyObject *object, Py_buffer *view, Py_ssize_t count)
+{
+    if (object != Py_None)
+        return plain_numbers(object, view, count);
+    memset(view, 0, sizeof(*view));
+    return true;
+}
+
+static bool
+quaternions_are_unit(const JointStateEncoder *self, const double *positions)
+{
+    for (Py_ssize_t i = 0; i < self->quaternion_count; i++) {
+        const double *q = positions + self->quaternions[i];
+        double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        if (!(fabs(length - 1.0) <= CLEARLY_UNIT))
+            return false;
+    }
+    return true;
+}
+
+static PyObject *
+encoder_payload(const JointStateEncoder *self, const Py_buffer *positions,
+                const Py_buffer *velocities, const Py_buffer *efforts, int64_t stamp, uint64_t seq)
+{
+    Py_ssize_t size = LONGEST_HEAD + positions->len + velocities->len + efforts->len;
+    PyObject *payload = PyBytes_FromStringAndSize(NULL, size);
+    if (payload == NULL)
+        return NULL;
+    char *begin = PyBytes_AS_STRING(payload), *at = begin;
+    at = put_typed(at, 0x98, 0, 0);
+    at = put_signed(at, stamp);
+    at = put_unsigned(at, seq);
+    at = put_unsigned(at, self->session);
+    at = put_bytes(at, self->order, sizeof(self->order));
+    at = put_block(at, positions);
+    at = put_block(at, velocities);
+    at = put_block(at, efforts);
+    at = put_typed(at, 0xc0, 0, 0);
+    _PyBytes_Resize(&payload, at - begin);
+    return payload;
+}
+
+static PyObject *
+encoder_encode(JointStateEncoder *self, PyObject *const *args, Py_ssize_t count)
+{
+    Py_buffer positions, velocities, efforts;
+    int64_t stamp, seq;
+    PyObject *payload = Py_None;
+    if (count != 5) {
+        PyErr_SetString(PyExc_TypeError, "encode(positions, velocities, efforts, stamp, seq)");
+        return NULL;
+    }
+    if (!PY_LITTLE_ENDIAN || !plain_stamp(args[3], &stamp) || !plain_stamp(args[4], &seq) ||
+        seq < 0 || !plain_numbers(args[0], &positions, self->positions))
+        Py_RETURN_NONE;
+    if (quaternions_are_unit(self, positions.buf) &&
+        plain_or_none(args[1], &velocities, self->velocities)) {
+        if (plain_or_none(args[2], &efforts, self->velocities)) {
+            payload =
+                encoder_payload(self, &positions, &velocities, &efforts, stamp, (uint64_t)seq);
+            PyBuffer_Release(&efforts);
+        }
+        PyBuffer_Release(&velocities);
+    }
+    PyBuffer_Release(&positions);
+    if (payload == Py_None)
+        Py_RETURN_NONE;
+    return payload;
+}
+
+static PyMethodDef encoder_methods[] = {
+    {"encode", (PyCFunction)(void (*)(void))encoder_encode, METH_FASTCALL,
+     "encode(positions, velocities, efforts, stamp, seq): the payload; None for anything but flat "
+     "arrays of finite doubles in the right number."},
+    {NULL},
+};
+
+static PyTypeObject JointStateEncoder_type = {
+    PyVarObject_HEAD_INIT(NULL, 0)
+    .tp_name = "zstate._kernel.JointStateEncoder",
+    .tp_doc = "The joint states of one writer as bytes.",
+    .tp_basicsize = sizeof(JointStateEncoder),
+    .tp_new = encoder_new,
+    .tp_dealloc = (destructor)encoder_dealloc,
+    .tp_flags = Py_TPFLAGS_DEFAULT,
+    .tp_methods = encoder_methods,
+};
