@@ -40,7 +40,7 @@ class Aggregate:
     def rate_hz(self) -> float:
         """Samples answered by a reader's buffer, per second and robot."""
         slowest = self._median(lambda run: min(reader["rate_hz"] for reader in run["readers"]))
-        return slowest / self.scenario.fleet
+        return slowest / self.scenario.followed
 
     @property
     def sent(self) -> int:

@@ -16,8 +16,11 @@ class Job:
     the robot. ``rate_hz`` is 0 for as fast as possible.
 
     ``robots`` are all robots on the network, by name; a writer process publishes the robots in ``mine``, with
-    one ``Writer`` each. ``load`` is "none", "busy" (a thread of the reader holds the GIL) or "slow" (the
-    reader sleeps 10 ms after each answer).
+    one ``Writer`` each, which share one link if ``one_link``. Readers follow the first ``follows`` robots, or
+    all if it is 0. ``routers`` is the number of routers in a row between writers and readers.
+
+    ``load`` is "none", "busy" (a thread of the reader holds the GIL) or "slow" (the reader sleeps 10 ms after
+    each answer).
 
     ``ports`` are free loopback ports reserved for this run; ``folder`` is an empty temporary folder.
     """
@@ -33,6 +36,9 @@ class Job:
     robots: tuple[str, ...] = ("robot",)
     mine: tuple[str, ...] = ("robot",)
     readers: int = 1
+    follows: int = 0
+    routers: int = 1
+    one_link: bool = False
     load: str = "none"
     ports: tuple[int, ...] = ()
     folder: str = ""
@@ -42,6 +48,15 @@ class Job:
     def robot(self) -> str:
         """The first robot of this writer; the only one, except in a fleet."""
         return self.mine[0]
+
+    @property
+    def followed(self) -> tuple[str, ...]:
+        """The robots that readers follow."""
+        return self.robots[: self.follows or None]
+
+    def router_port(self, role: str) -> int:
+        """The port of the router that a "writer" or a "reader" connects to."""
+        return self.ports[0 if role == "writer" else self.routers - 1]
 
     def for_robots(self, *mine: str) -> Job:
         """The same job for a writer of the robots ``mine``."""

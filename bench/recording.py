@@ -67,6 +67,11 @@ class Recording:
         stamps, robots, ticks = (np.concatenate(part) for part in zip(*parts, strict=True))
         return cls(stamps, robots, ticks=ticks)
 
+    def of_robots(self, count: int) -> Recording:
+        """The samples of the first ``count`` robots, as sent."""
+        of = self.robots < count
+        return Recording(self.stamps[of], self.robots[of], ticks=self.ticks[of])
+
     def keys(self, begin: int) -> Numbers:
         """A key per sample, unique per stamp and robot within minutes of ``begin``."""
         return (self.stamps - begin) * _ROBOTS + self.robots

@@ -160,7 +160,7 @@ def _readers(results: Results) -> Iterator[str]:
         "readers": "{0.readers} readers of {0.robot} at {0.rate}; their CPU is the sum",
         "busy": "A thread holds the reader's GIL: {0.robot} at {0.rate}",
         "slow": "The reader sleeps 10 ms after each answer: {0.robot} at {0.rate}; lost: samples passed over",
-        "fleet": "{0.fleet} x {0.robot} at {0.rate} each, through one router, one reader of all",
+        "fleet": "{0.fleet} x {0.robot} at {0.rate} each; one reader of {0.followed}; routers: {0.routers}",
     }
     for scenario in results.scenarios:
         title = titles.get(scenario.load if scenario.group == "load" else scenario.group)

@@ -14,7 +14,7 @@ from zstate.model.kinematics import Kinematics
 ROWS = 600
 ROW_NS = 10_000_000
 
-MODELS = {"panda": "panda", "g1": "g1", "talos": "talos_full_v2", "tiago_dual": "tiago_dual"}
+MODELS = {"panda": "panda", "g1": "g1", "talos": "talos_full_v2", "tiago_dual": "tiago_dual", "a1": "a1"}
 """The robots of the scenarios, and their names in zstate's catalog."""
 
 

@@ -20,6 +20,10 @@ class Scenario:
     ``rate_hz`` is 0 for as fast as possible; ``seconds`` is the measured window; ``fleet`` is the number
     of robots, published by ``writers`` processes; ``joins`` the number of late joiners. Runs in ``repeats``
     rounds, each with fresh processes.
+
+    Of a fleet, each reader follows all robots, or the first ``follows``. Writers are clients of the first and
+    readers of the last of ``routers`` in a row. With ``one_link`` the robots of a process share its link to
+    the router; otherwise each has its own.
     """
 
     group: Group
@@ -28,6 +32,9 @@ class Scenario:
     readers: int = 1
     load: Load = "none"
     fleet: int = 1
+    follows: int = 0
+    routers: int = 1
+    one_link: bool = False
     writers: int = 1
     joins: int = 0
     seconds: float = 4.0
@@ -43,9 +50,18 @@ class Scenario:
             parts.append(self.load)
         if self.fleet > 1:
             parts.append(f"fleet{self.fleet}")
+        if self.follows:
+            parts.append(f"follow{self.follows}")
+        if self.routers > 1:
+            parts.append(f"routers{self.routers}")
         if self.joins:
             parts.append("late")
         return "-".join(parts)
+
+    @property
+    def followed(self) -> int:
+        """The number of robots that each reader follows."""
+        return self.follows or self.fleet
 
     @property
     def rate(self) -> str:
@@ -77,6 +93,9 @@ FULL: tuple[Scenario, ...] = (
     Scenario("load", "talos", 200.0, load="slow"),
     Scenario("late", "talos", 100.0, joins=7),
     Scenario("fleet", "panda", 50.0, fleet=100, writers=4, seconds=8.0),
+    Scenario("fleet", "a1", 10.0, fleet=1000, writers=4, one_link=True, seconds=8.0),
+    Scenario("fleet", "a1", 10.0, fleet=1000, follows=50, routers=2, writers=4, one_link=True, seconds=8.0),
+    Scenario("fleet", "a1", 10.0, fleet=50, routers=2, writers=4, one_link=True, seconds=8.0),
 )
 """All scenarios: about three quarters of an hour with every subject installed."""
 

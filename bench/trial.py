@@ -75,12 +75,13 @@ class Trial:
             reader.send_command(do="stop", **ends)
         poses = [pose for one in readers for pose in one.wait_for_event("result", START_WITHIN_S)["poses"]]
         folder = self._job.folder
-        sent = Recording.read_writers(folder, shares)
+        everything = Recording.read_writers(folder, shares)
+        sent = everything.of_robots(self._scenario.followed)
         answered = [Recording.read_reader(folder, f"reader{n}") for n in range(len(readers))]
         return {
             "window_s": round(window.seconds, 4),
             "sent": int(window.holds(sent.stamps).sum()),
-            "sent_hz": round(rate_in(sent.stamps, window), 3),
+            "sent_hz": round(rate_in(everything.stamps, window), 3),
             "readers": [reader_figures(sent, one, window, self._scenario.rate_hz) for one in answered],
             **costs.figures(),
             "poses": pose_errors(sent, self._robot.poses, poses, window.begin),
@@ -175,6 +176,9 @@ def build_job(subject: Subject, scenario: Scenario, robot: BenchRobot, folder: s
         robots=robots,
         mine=robots[:1],
         readers=scenario.readers,
+        follows=scenario.follows,
+        routers=scenario.routers,
+        one_link=scenario.one_link,
         load=scenario.load,
         ports=free_ports(PORTS),
         folder=folder,

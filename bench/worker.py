@@ -75,7 +75,7 @@ class SampleLog:
         self.stamps, self.times, self.robots = array("q"), array("q"), array("q")
         self.complete = threading.Event()
         self._answered_robots: set[int] = set()
-        self._robot_count = len(job.robots)
+        self._robot_count = len(job.followed)
         self._is_slow = job.load == "slow"
 
     def on_answer(self, stamp: int, robot: int = 0) -> None:

@@ -26,9 +26,22 @@ def settings(job: Job, *, listens: bool) -> dict[str, object]:
     }
 
 
-def through_router(job: Job) -> dict[str, object]:
-    """Settings of a client of the router at the job's first port."""
-    return {"mode": "client", "connect/endpoints": [f"tcp/127.0.0.1:{job.ports[0]}"]}
+def through_router(job: Job, role: str) -> dict[str, object]:
+    """Settings of a client of the router for a "writer" or a "reader"."""
+    return {"mode": "client", "connect/endpoints": [f"tcp/127.0.0.1:{job.router_port(role)}"]}
+
+
+_SHARED: list[zenoh.Session] = []
+"""The session of the writers of this process, if they share one."""
+
+
+def writer_session(job: Job, config: dict[str, object]) -> zenoh.Session:
+    """A session of its own, or the one of all writers of this process."""
+    if not job.one_link:
+        return open_session(config)
+    if not _SHARED:
+        _SHARED.append(open_session(config))
+    return _SHARED[0]
 
 
 def open_session(config: dict[str, object]) -> zenoh.Session:
@@ -43,7 +56,7 @@ class Writer:
     """Publishes bytes."""
 
     def __init__(self, job: Job, config: dict[str, object] | None = None) -> None:
-        self._session = open_session(settings(job, listens=True) if config is None else config)
+        self._session = writer_session(job, settings(job, listens=True) if config is None else config)
         self._publisher = self._session.declare_publisher(f"bench/{job.robot}/joint_states")
         numbers = [struct.pack(f"<{len(row)}d", *row) for row in job.rows]
         self._tails = [bytes(OVERHEAD - STAMP.size) + block for block in numbers]
@@ -64,10 +77,10 @@ class Reader:
         self._session = open_session(settings(job, listens=False) if config is None else config)
         self._answered = answered
         self._received: set[int] = set()
-        self._robot_count = len(job.robots)
+        self._robot_count = len(job.followed)
         self._subscribers = [
             self._session.declare_subscriber(f"bench/{robot}/joint_states", self._on_sample(number))
-            for number, robot in enumerate(job.robots)
+            for number, robot in enumerate(job.followed)
         ]
 
     def _on_sample(self, number: int) -> zenoh.handlers.Callback[zenoh.Sample]:

@@ -30,8 +30,14 @@ def zstate_versions() -> dict[str, str]:
     return {package: version(package) for package in PACKAGES}
 
 
-def router(job: Job, *options: str, protocol: str = "tcp") -> Service:
-    """``zstate router`` at the job's first port."""
-    endpoint = f"{protocol}/127.0.0.1:{job.ports[0]}"
-    command = (sys.executable, "-m", "zstate", "router", "--listen", endpoint, *options)
-    return Service("router", command, ready_text="listens at", port=job.ports[0])
+def router(job: Job, *options: str, protocol: str = "tcp", number: int = 0) -> Service:
+    """``zstate router`` at one of the job's ports, connected to the router before it."""
+    endpoints = [f"{protocol}/127.0.0.1:{port}" for port in job.ports]
+    row = ("--connect", endpoints[number - 1]) if number else ()
+    command = (sys.executable, "-m", "zstate", "router", "--listen", endpoints[number], *row, *options)
+    return Service("router", command, ready_text="listens at", port=job.ports[number])
+
+
+def router_row(job: Job) -> tuple[Service, ...]:
+    """The routers of the job, each connected to the one before it."""
+    return tuple(router(job, number=number) for number in range(job.routers))

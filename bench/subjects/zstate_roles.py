@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.job import Job
 from bench.subjects.subject import Answered, Roles
-from zstate import StatePublisher, Transform, TransformListener, load_model
+from zstate import StatePublisher, Transform, TransformBuffer, TransformListener, load_model
 from zstate._util.closeable import Closeable
 from zstate.errors import LookupFailed
 from zstate.net.session import Session
@@ -25,6 +25,19 @@ def roles(connect: Connect, wire: str = "native") -> Roles:
     return partial(Writer, connect, wire), partial(Reader, connect, wire)
 
 
+_SHARED: list[Session] = []
+"""The session of the writers of this process, if they share one."""
+
+
+def _writer_session(connect: Connect, job: Job) -> Session:
+    """A session of its own, or the one of all writers of this process."""
+    if not job.one_link:
+        return connect(job, "writer")
+    if not _SHARED:
+        _SHARED.append(connect(job, "writer"))
+    return _SHARED[0]
+
+
 class Writer(Closeable):
     """Publishes positions and a stamp with a ``StatePublisher``."""
 
@@ -32,7 +45,7 @@ class Writer(Closeable):
         model = load_model(Path(job.urdf))
         columns = [job.joints.index(name) for name in model.joint_names]
         self._rows = list(np.array(job.rows)[:, columns])
-        self._session = connect(job, "writer")
+        self._session = _writer_session(connect, job)
         self._publisher = StatePublisher(self._session, model, job.robot, wires=(wire,))
 
     def send(self, row: int, stamp: int) -> None:
@@ -53,10 +66,12 @@ class Reader(Closeable):
         self._job = job
         self._answered = answered
         self._session = connect(job, "reader")
-        robot = job.robots[0] if len(job.robots) == 1 else "*"
-        self._listener = TransformListener(self._session, robot, wire=wire)
-        self._buffer = self._listener.buffer
-        self._ends = [(f"{robot}/{job.base}", f"{robot}/{job.tip}") for robot in job.robots]
+        self._buffer = TransformBuffer()
+        expressions = job.followed if job.follows or len(job.robots) == 1 else ("*",)
+        self._listeners = [
+            TransformListener(self._session, robot, self._buffer, wire=wire) for robot in expressions
+        ]
+        self._ends = [(f"{robot}/{job.base}", f"{robot}/{job.tip}") for robot in job.followed]
         self._closed = threading.Event()
         if job.load == "slow":
             threading.Thread(target=self._loop, daemon=True).start()
@@ -91,11 +106,12 @@ class Reader(Closeable):
         can_lookup, job = self._buffer.can_lookup, self._job
         return all(
             can_lookup(f"{robot}/{job.base}", f"{robot}/{link}")
-            for robot in reversed(job.robots)
+            for robot in reversed(job.followed)
             for link in reversed(job.links)
         )
 
     def close(self) -> None:
         self._closed.set()
-        self._listener.close()
+        for listener in self._listeners:
+            listener.close()
         self._session.close()

@@ -26,7 +26,8 @@ def test_full_run_covers_all_robots_rates_and_loads() -> None:
     assert {one.robot for one in FULL if one.rate_hz == 1000.0} == {"panda", "g1", "talos", "tiago_dual"}
     assert {one.readers for one in FULL} == {1, 5, 20}
     assert {one.load for one in FULL} == {"none", "busy", "slow"}
-    assert [(one.fleet, one.rate_hz, one.readers) for one in FULL if one.fleet > 1] == [(100, 50.0, 1)]
+    fleets = [(one.fleet, one.rate_hz, one.followed, one.routers) for one in FULL if one.fleet > 1]
+    assert fleets == [(100, 50.0, 100, 1), (1000, 10.0, 1000, 1), (1000, 10.0, 50, 2), (50, 10.0, 50, 2)]
     assert any(one.joins for one in FULL)
 
 

@@ -1,4 +1,5 @@
 import pytest
+import zenoh
 from helpers.processes import Child, until
 
 from zstate.errors import Closed, InvalidInput
@@ -136,6 +137,36 @@ def test_late_join_works_through_a_router(spawn, free_port: int):
         with connect(mode="client", endpoints=endpoint) as reader:
             values = Values(reader)
             until(lambda: values.values == {key("a"): b"a"})
+
+
+def test_values_of_many_publishers_are_requested_a_few_at_a_time(free_port: int):
+    endpoint, robots = f"tcp/127.0.0.1:{free_port}", 40
+    with (
+        connect(mode="router", listen=endpoint),
+        connect(mode="client", endpoints=endpoint) as writer,
+        connect(mode="client", endpoints=endpoint) as reader,
+    ):
+        caches = writer.zenoh.declare_queryable(
+            "zstate/*/tf_static/*/@adv/**", zenoh.handlers.FifoChannel(2 * robots)
+        )
+        tokens = [
+            writer.zenoh.liveliness().declare_token(f"zstate/r{number}/tf_static/a/@adv/pub/{writer.zid}/7/_")
+            for number in range(robots)
+        ]
+        values = Values(reader)
+        pending: list[zenoh.Query] = []
+
+        def has_requests() -> bool:
+            pending.extend(iter(caches.try_recv, None))
+            return bool(pending)
+
+        for _ in range(robots):
+            until(has_requests)
+            assert len(pending) <= 8
+            with pending.pop(0) as received:
+                received.reply(str(received.key_expr).partition("/@adv")[0], b"value")
+        until(lambda: len(values.values) == robots)
+        assert len(tokens) == robots
 
 
 def test_set_after_close_raises_closed():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 from helpers.processes import SOON_S, until
@@ -112,6 +114,25 @@ def test_slow_answer_delays_no_subscription_and_overflows_are_counted(
 
 def next_reply(get) -> bool:
     return bool(list(get))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_thread_of_a_queryable_without_queries_does_not_wake_up(sessions: tuple[Session, Session]):
+    before = set(threading.enumerate())
+    with Queryable(sessions[0], KEY, lambda _: Reply(b"x", "")):
+        assert answered(sessions[1], KEY) == [(True, b"x", "zenoh/bytes")]
+        (thread,) = set(threading.enumerate()) - before
+        status = Path(f"/proc/self/task/{thread.native_id}/status")
+        counts = [_voluntary_switches(status)]
+        for _ in range(4):
+            threading.Event().wait(0.25)
+            counts.append(_voluntary_switches(status))
+    assert counts[-1] == counts[1]  # in three quarters of a second; a channel of Zenoh wakes it seven times
+
+
+def _voluntary_switches(status: Path) -> int:
+    lines = status.read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("voluntary_ctxt_switches"))
 
 
 def test_close_is_quick_and_may_be_repeated(sessions: tuple[Session, Session]):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.buffer.history import History, HistoryView
 from zstate.clock import ClockOffset
 from zstate.model.joint_trajectory import JointTrajectory
-from zstate.model.joint_transforms import JointTransform, JointTransforms
+from zstate.model.joint_transforms import JointTransform, shared_transforms
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 
@@ -48,7 +48,7 @@ class JointTrack:
     ) -> None:
         self.model = model
         self.prefix = prefix
-        self._table = JointTransforms(model)
+        self._table = shared_transforms(model)
         self.forms = self._table.forms
         self.interpolation: Interpolation = interpolation
         self.writer: str | None = None

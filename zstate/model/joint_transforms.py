@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -135,6 +136,12 @@ class JointTransforms:
         """The lengths of the quaternions, (..., floating joints, 1)."""
         norms: Floats = np.sqrt(np.square(positions[..., self._quaternions]).sum(axis=-1, keepdims=True))
         return norms
+
+
+@lru_cache(maxsize=16)
+def shared_transforms(model: RobotModel) -> JointTransforms:
+    """The table of ``model``; the robots of a fleet that have one model share it."""
+    return JointTransforms(model)
 
 
 def _rotations(edges: _Rows) -> _Write:

@@ -39,6 +39,10 @@ _TIMEOUTS_S = (0.1, 0.2, 0.5)
 Longer if the writer did not reply before.
 """
 
+_ROUNDS = 8
+_FIRST_ROUNDS = 2
+"""Fewer when a writer is first watched: a listener of a thousand robots measures all of them at once."""
+
 _DISCOVERY_S = 0.05
 
 
@@ -70,7 +74,7 @@ class ClockService(Queryable):
 def measure_offsets(
     session: Session,
     robot: str,
-    rounds: int = 8,
+    rounds: int = _ROUNDS,
     *,
     clock: Clock | None = None,
     timeout_s: float = 0.5,
@@ -182,7 +186,8 @@ class ClockOffsetMonitor(Closeable):
                     return
             timeout_s = _TIMEOUTS_S[min(offset.unanswered, len(_TIMEOUTS_S) - 1)]
             try:
-                measured = _measure(self._session, offset.key, 8, self._clock, timeout_s)
+                rounds = _FIRST_ROUNDS if offset.known is None else _ROUNDS
+                measured = _measure(self._session, offset.key, rounds, self._clock, timeout_s)
             except (Closed, zenoh.ZError):
                 self.close()  # with the session
                 continue

@@ -1,19 +1,38 @@
-"""Latched values (ROS 1; transient local in DDS): late joiners receive the current value of each key."""
+"""Latched values (ROS 1; transient local in DDS): late joiners receive the current value of each key.
+
+Zenoh's advanced publisher caches its value and announces itself by a liveliness token. Zenoh's advanced
+subscriber queries all caches at once when it opens: a reader of a thousand robots then receives tens of
+megabytes in one burst, and the router forwards no robot's samples until they are through. So the caches are
+queried here, a few at a time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 
 import zenoh
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.errors import Closed, InvalidInput
+from zstate.net.queryable import query
+from zstate.net.sample_history import RoundRobinQueue
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, Ring, call_for_each, to_serialized
 from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 4096
 HEARTBEAT_S = 0.5
+
+_TOKENS = 16_384
+"""Waiting announcements of publishers; more arrive together only if so many publishers exist."""
+_MAX_IN_FLIGHT = 8
+_MAX_ATTEMPTS = 3
+_ANSWER_WITHIN_S = 2.0
 
 
 class LatchedPublisher(Closeable):
@@ -62,22 +81,116 @@ class LatchedPublisher(Closeable):
 class LatchedSubscriber(Receiver[zenoh.Sample]):
     """Subscriber to the current value of every matching key, then to each change.
 
-    ``on_value(sample)`` is called from one thread of this subscriber; the payload is empty if the value was
-    withdrawn. ``Receiver`` describes slow and failing callbacks.
+    ``on_value(sample)`` is called for one sample at a time, from one of two threads of this subscriber; the
+    payload is empty if the value was withdrawn. ``Receiver`` describes slow and failing callbacks.
     """
 
     def __init__(self, session: Session, keyexpr: str, on_value: Callable[[SerializedSample], None]) -> None:
         self._on_value = on_value
+        self._numbers: BoundedDict[str, int | zenoh.Timestamp] = BoundedDict()
+        self._lock = threading.Lock()
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
         subscriber = zenoh.ext.declare_advanced_subscriber(
             session.zenoh,
             keyexpr,
             ring,
-            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
             recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
         super().__init__(session, subscriber, CAPACITY)
+        try:
+            # After subscribing, so that no change falls between a cached value and the live ones.
+            self._cached = _CachedValues(session, keyexpr, self._on_sample)
+        except BaseException:
+            super().close()
+            raise
 
     def _on_batch(self, batch: list[zenoh.Sample]) -> None:
-        # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
-        call_for_each(batch, lambda sample: self._on_value(to_serialized(sample)))
+        call_for_each(batch, self._on_sample)
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            if self._is_newer(sample):
+                # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
+                self._on_value(to_serialized(sample))
+
+    def _is_newer(self, sample: zenoh.Sample) -> bool:
+        """Whether ``sample`` is newer than the others of its publisher: a cached one may come after them."""
+        source, number = sample.source_info, sample.timestamp
+        if source is not None:
+            publisher, number = str(source.source_id), source.source_sn
+        elif number is not None:  # another program's: its publishers have no numbers
+            publisher = f"{sample.key_expr} {number.get_id()}"
+        else:
+            return True
+        before = self._numbers.get(publisher)
+        if before is not None and number <= before:  # pyright: ignore[reportOperatorIssue] # both of one kind
+            return False
+        self._numbers[publisher] = number
+        return True
+
+    def close(self) -> None:
+        self._cached.close()
+        super().close()
+
+
+@dataclass(eq=False)
+class _Request:
+    """The requests to the cache of one publisher, on the key of its token."""
+
+    token: str
+    attempts: int = 0
+    replies: Iterator[zenoh.Reply] | None = None
+
+
+class _CachedValues(Receiver[zenoh.Sample]):
+    """Requests the cached value of each publisher on ``keyexpr`` once it is announced, now or later.
+
+    At most eight requests are in flight. Keys take turns, so that many silent publishers of one key do not
+    delay the others. A request that times out is repeated twice.
+    """
+
+    def __init__(self, session: Session, keyexpr: str, on_value: Callable[[zenoh.Sample], None]) -> None:
+        self._on_value = on_value
+        ring: Ring = zenoh.handlers.RingChannel(_TOKENS)
+        liveliness = session.zenoh.liveliness()
+        tokens = liveliness.declare_subscriber(f"{keyexpr}/@adv/pub/**", ring, history=True)
+        super().__init__(session, tokens, _TOKENS)
+
+    def _on_batch(self, batch: list[zenoh.Sample]) -> None:
+        call_for_each(self._values(batch), self._on_value)
+
+    def _values(self, tokens: list[zenoh.Sample]) -> Iterator[zenoh.Sample]:
+        """The values of the publishers with these ``tokens``, and of those announced while waiting."""
+        waiting: RoundRobinQueue[_Request] = RoundRobinQueue()
+        in_flight: deque[_Request] = deque()
+        with suppress(Closed, zenoh.ZError):  # undeclared, or the session was closed
+            while not self._closed:
+                for token in tokens:
+                    if token.kind == zenoh.SampleKind.PUT:
+                        self._add(waiting, _Request(str(token.key_expr)))
+                while len(in_flight) < _MAX_IN_FLIGHT and (request := waiting.pop(0.0)) is not None:
+                    self._send(request)
+                    in_flight.append(request)
+                if not in_flight:
+                    return
+                request = in_flight.popleft()
+                for reply in request.replies or ():
+                    if reply.ok is not None:
+                        yield reply.ok
+                    elif request.attempts < _MAX_ATTEMPTS:  # Zenoh's own reply at the timeout
+                        self._add(waiting, request)
+                tokens = list(iter(self._subscribed.handler.try_recv, None))
+
+    @staticmethod
+    def _add(waiting: RoundRobinQueue[_Request], request: _Request) -> None:
+        waiting.add(request.token.partition("/@adv/")[0], request)
+
+    def _send(self, request: _Request) -> None:
+        request.attempts += 1
+        request.replies = query(
+            self._session.zenoh,
+            f"{request.token}?_max=1",
+            _ANSWER_WITHIN_S,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+        )

@@ -10,6 +10,7 @@ into a channel that is never full, and the limit is applied where they are read.
 from __future__ import annotations
 
 import logging
+import queue
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -91,6 +92,56 @@ class Reply(NamedTuple):
     is_error: bool = False
 
 
+class _WaitingQueries:
+    """A queryable and the queries that wait for its thread: the newest ``capacity``.
+
+    A thread that waits for a channel of Zenoh wakes ten times a second, to check for signals. A robot has
+    several queryables that are rarely queried: in a process with a few hundred robots, their threads would
+    compete for the interpreter lock without a single query, and leave no time to publish.
+    """
+
+    def __init__(self, session: Session, key: str, capacity: int) -> None:
+        self._queries: queue.SimpleQueue[zenoh.Query | None] = queue.SimpleQueue()
+        self._capacity = capacity
+        callback = zenoh.handlers.Callback(self._add, self._end, indirect=False)
+        self._queryable = session.zenoh.declare_queryable(key, callback)
+
+    @property
+    def handler(self) -> _WaitingQueries:
+        """The channel is this object itself."""
+        return self
+
+    def _add(self, received: zenoh.Query) -> None:
+        if self._queries.qsize() >= self._capacity:
+            self.try_recv()  # the oldest: a query that is freed ends for its sender
+        self._queries.put(received)
+
+    def _end(self) -> None:
+        self._queries.put(None)
+
+    def recv(self) -> zenoh.Query:
+        """The oldest query, once there is one. Raises ZError after the end of the queryable."""
+        return self._checked(self._queries.get())
+
+    def try_recv(self) -> zenoh.Query | None:
+        """The oldest query; None without any. Raises ZError after the end of the queryable."""
+        try:
+            received = self._queries.get_nowait()
+        except queue.Empty:
+            return None
+        return self._checked(received)
+
+    def _checked(self, received: zenoh.Query | None) -> zenoh.Query:
+        if received is None:
+            self._end()  # for later calls
+            raise zenoh.ZError("the queryable is closed")
+        return received
+
+    def undeclare(self) -> None:
+        """End the queryable."""
+        self._queryable.undeclare()
+
+
 class Queryable(Receiver[zenoh.Query]):
     """Replies to queries on ``key``, until it is closed.
 
@@ -110,8 +161,7 @@ class Queryable(Receiver[zenoh.Query]):
         self.answered = 0
         self._key = key
         self._answer = answer
-        ring: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(capacity)
-        super().__init__(session, session.zenoh.declare_queryable(key, ring), capacity)
+        super().__init__(session, _WaitingQueries(session, key, capacity), capacity)
 
     def _on_batch(self, batch: list[zenoh.Query]) -> None:
         start = time.monotonic()

@@ -36,13 +36,22 @@ _MAX_KEYS = 4096
 Ring: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Sample]"
 
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
-class Subscribed(Undeclarable, Protocol[T]):
-    """A Zenoh subscriber or queryable of any kind that delivers into a channel."""
+class Channel(Protocol[T_co]):
+    """Waiting items, oldest first; ZError after its end."""
+
+    def recv(self) -> T_co: ...
+
+    def try_recv(self) -> T_co | None: ...
+
+
+class Subscribed(Undeclarable, Protocol[T_co]):
+    """A subscriber or queryable of any kind that delivers into a channel."""
 
     @property
-    def handler(self) -> zenoh.Handler[T]: ...
+    def handler(self) -> Channel[T_co]: ...
 
 
 def call_for_each(batch: Iterable[T], function: Callable[[T], object]) -> None:
