@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import secrets
-import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe, fork_safe_lock
-from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
+from zstate.clock import SYSTEM, Clock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.model.joint_limits import JointLimits
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
@@ -22,22 +19,20 @@ from zstate.net.presence import local_writer
 from zstate.net.sample_history import SampleCache, serve_history
 from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
-from zstate.net.writer import SampleWriter, WireWriter
+from zstate.net.writer import WireWriter
 from zstate.nodes.publisher import Positions, positions_block
-from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
+from zstate.nodes.publisher_status import LimitWatch, StatusReporter
+from zstate.nodes.sample_publisher import NEWEST_ONLY_S, SamplePublisher
 from zstate.nodes.static_publisher import edge_writer_name
-from zstate.rate import Rate, RateReport
-from zstate.sources.joint_source import JointSource
+from zstate.rate import RateReport
+from zstate.sources.joint_source import JointReading, JointSource
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream, check_robot
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import encode
-from zstate.wire.registry import as_wire_names, get_wire
-
-_NEWEST_ONLY_S = 1e-9
+from zstate.wire.registry import get_wire
 
 
-class PartialStatePublisher(Closeable):
+class PartialStatePublisher(SamplePublisher):
     """Publishes the joint states of some ``joints`` of a robot; other drivers publish the rest.
 
     ``model`` is the whole robot's. Listeners interpolate each joint between the samples of its own driver;
@@ -70,27 +65,17 @@ class PartialStatePublisher(Closeable):
         cache_s: float = 2.0,
     ) -> None:
         identity = local_writer(secrets.randbits(32), program)
+        super().__init__(robot or model.name, wires, clock, identity.session)
         self.model = model.part(joints)
         """The part of the model that this publisher moves; its ``joint_names`` are the joints in order."""
-        self.robot = check_robot(robot or model.name)
         self.writer = edge_writer_name(writer, identity)
-        self._session_id = identity.session
-        self._clock: Clock = clock or SystemClock()
         self._names = coordinate_names(self.model)
         self._order = order_digest(self._names)
         self._slots = np.array(velocity_columns_by_position(self.model), dtype=np.intp)
         limits = JointLimits(self.model)
         self._limits = LimitWatch(limits, self.robot) if limits else None
-        self._wires = as_wire_names(wires)
-        self._lock = fork_safe_lock()
-        self._stop = fork_safe(threading.Event())
-        self._seq = 0
-        self._refused = 0
-        self._last_refusal = ""
-        self._rate: Rate | None = None
         self._claim: WriterClaim | None = None
         self._cache: SampleCache | None = None
-        self._writers: dict[tuple[str, Stream], SampleWriter] = {}
         with ExitStack() as opening:
             if "native" in self._wires:
                 self._own_joints(session, identity, cache_s, opening)
@@ -118,7 +103,7 @@ class PartialStatePublisher(Closeable):
             opening.enter_context(ClockService(session, self.robot, identity, self._clock))
         # Its queryable is also how writers that claim joints at the same time find each other.
         numbers = 3 * self.model.position_count
-        self._cache = SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
+        self._cache = SampleCache(cache_s or NEWEST_ONLY_S, numbers, self._session_id)
         history = serve_history(session, self.robot, "partial_joint_states", self._cache, writer=self.writer)
         opening.enter_context(history)
         movers = {f"{self.robot}/{joint.child}": joint for joint in self.model.joints}
@@ -136,17 +121,6 @@ class PartialStatePublisher(Closeable):
                 first=error.first,
                 edge=error.edge,
             ) from None
-
-    @property
-    def stats(self) -> PublisherStats:
-        """Counts of published and refused samples."""
-        streams = {
-            stream: StreamStats(writer.samples, writer.bytes, self._seq - writer.samples)
-            for stream, writer in self._writers.items()
-        }
-        rate = None if self._rate is None else self._rate.report()
-        outside, excess = (0, "") if self._limits is None else (self._limits.count, self._limits.last)
-        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate, outside, excess)
 
     def publish(
         self,
@@ -186,8 +160,7 @@ class PartialStatePublisher(Closeable):
                 if self._limits is not None:
                     self._limits.add(stamp, native)
         except InvalidInput as error:
-            self._last_refusal = str(error)
-            self._refused += 1
+            self._count_refusal(error)
             raise
         except SecondWriter:
             with self._lock:
@@ -204,19 +177,9 @@ class PartialStatePublisher(Closeable):
 
     def run(self, source: JointSource, rate_hz: float = 100.0, *, seconds: float | None = None) -> RateReport:
         """Publish the readings of ``source``, of these joints, as ``StatePublisher.run``."""
-        self._rate = rate = Rate(rate_hz, self._clock, self._stop, seconds)
-        for now in rate:
-            reading = source.read(now)
-            if reading is not None:
-                stamp = now if reading.stamp is None else reading.stamp
-                try:
-                    self.publish(reading.positions, reading.velocities, reading.efforts, stamp)
-                except Closed:
-                    break
-        return rate.report()
 
-    def close(self) -> None:
-        """Stop publishing; ``run`` returns. A second call does nothing."""
-        self._stop.set()
-        with self._lock:
-            self._opened.close()
+        def publish(reading: JointReading, now: int) -> None:
+            stamp = now if reading.stamp is None else reading.stamp
+            self.publish(reading.positions, reading.velocities, reading.efforts, stamp)
+
+        return self._publish_at(rate_hz, seconds, source.read, publish)

@@ -5,18 +5,16 @@ from __future__ import annotations
 import logging
 import math
 import secrets
-import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, TypeAlias
 
 from numpy.typing import ArrayLike
 
-from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe, fork_safe_lock
-from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
+from zstate.clock import SYSTEM, Clock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.extension import kernel
 from zstate.model.joint_limits import JointLimits
@@ -31,12 +29,13 @@ from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
 from zstate.net.writer import SampleWriter, WireWriter, write_all
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
-from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
-from zstate.rate import Rate, RateReport
-from zstate.sources.joint_source import JointSource
+from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter
+from zstate.nodes.sample_publisher import NEWEST_ONLY_S, SamplePublisher
+from zstate.rate import RateReport
+from zstate.sources.joint_source import JointReading, JointSource
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import MODEL_WRITER, Stream, check_robot, wire_name
+from zstate.wire.keys import MODEL_WRITER, Stream, wire_name
 from zstate.wire.messages import (
     JointState,
     RobotDescription,
@@ -47,7 +46,7 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.native import decode_joint_state, encode
-from zstate.wire.registry import as_wire_names, get_wire
+from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING or kernel == "c":
     from zstate._kernel import JointStateEncoder
@@ -60,9 +59,6 @@ STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_descrip
 """The streams of a robot's state."""
 
 _SAMPLED: tuple[Stream, ...] = ("joint_states", "tf")
-
-_NEWEST_ONLY_S = 1e-9
-"""Span of the cache that serves lookups when there is no cache for joining listeners."""
 
 
 def positions_block(model: RobotModel, positions: Positions) -> bytes:
@@ -121,7 +117,7 @@ class RobotEncoder:
         return StaticTransforms(self._session, self._fixed_names, to_block(self._fixed_poses))
 
 
-class StatePublisher(Closeable):
+class StatePublisher(SamplePublisher):
     """Publishes the state of one robot: each sample is the whole robot at one instant.
 
     Samples go out on ``joint_states``; the moving edges also on ``tf``, while that stream has a reader.
@@ -157,20 +153,11 @@ class StatePublisher(Closeable):
         takeover: bool = False,
         cache_s: float = 2.0,
     ) -> None:
+        super().__init__(robot or model.name, wires, clock, secrets.randbits(32))
         self.model = model
-        self.robot = check_robot(robot or model.name)
-        self._clock: Clock = clock or SystemClock()
-        self._lock = fork_safe_lock()
-        self._stop = fork_safe(threading.Event())
-        self._opened = ExitStack()
-        self._session_id = secrets.randbits(32)
         self._encoder = RobotEncoder(model, self.robot, self._session_id)
-        self._seq = 0
-        self._refused = 0
-        self._last_refusal = ""
-        self._rate: Rate | None = None
         self._next_check_s = -math.inf
-        self._wires = wires = as_wire_names(wires)
+        wires = self._wires
         for stream in streams:
             if stream not in STREAMS:
                 raise InvalidInput(f"{stream!r} is not one of the streams {', '.join(map(repr, STREAMS))}")
@@ -197,7 +184,6 @@ class StatePublisher(Closeable):
                 opening.enter_context(WireWriter(session, get_wire(wire), self.robot, writer, sample_names))
                 for wire in wires
             ]
-            self._writers: dict[tuple[str, Stream], SampleWriter] = {}
             for wire, wire_writer in zip(wires, wire_writers, strict=True):
                 if "robot_description" in streams:
                     description = wire_writer.open_latched("robot_description", MODEL_WRITER)
@@ -229,7 +215,7 @@ class StatePublisher(Closeable):
         if "native" not in self._wires:
             return None
         numbers = self.model.position_count + 2 * self.model.velocity_count
-        cache = SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
+        cache = SampleCache(cache_s or NEWEST_ONLY_S, numbers, self._session_id)
         if cache_s:
             if self._native is not None:
                 opening.enter_context(serve_history(session, self.robot, "joint_states", cache))
@@ -253,16 +239,8 @@ class StatePublisher(Closeable):
     @property
     def stats(self) -> PublisherStats:
         """Counts of published, suppressed and refused samples, and what computes transforms."""
-        streams = {
-            stream: StreamStats(writer.samples, writer.bytes, self._seq - writer.samples)
-            for stream, writer in self._writers.items()
-        }
-        rate = None if self._rate is None else self._rate.report()
-        outside, excess = (0, "") if self._limits is None else (self._limits.count, self._limits.last)
         engine = "" if self._edges is None else self._edges.engine.name
-        return PublisherStats(
-            self._seq, self._refused, self._last_refusal, streams, rate, outside, excess, engine
-        )
+        return replace(super().stats, kinematics=engine)
 
     def publish(
         self,
@@ -300,8 +278,7 @@ class StatePublisher(Closeable):
                 if self._limits is not None:
                     self._limits.add(stamp, payload)
         except InvalidInput as error:
-            self._last_refusal = str(error)
-            self._refused += 1
+            self._count_refusal(error)
             raise
         except SecondWriter:
             with self._lock:
@@ -339,23 +316,19 @@ class StatePublisher(Closeable):
         Each tick has an absolute deadline; ``Rate`` describes late ticks. If the source has no new
         reading, the tick publishes nothing. Raises SecondWriter.
         """
-        self._rate = rate = Rate(rate_hz, self._clock, self._stop, seconds)
-        for now in rate:
-            reading = source.read(now)
-            if reading is not None:
-                stamp = now if reading.stamp is None else reading.stamp
-                try:
-                    self.publish(reading.positions, reading.velocities, reading.efforts, stamp)
-                except Closed:
-                    break
-        return rate.report()
+
+        def publish(reading: JointReading, now: int) -> None:
+            stamp = now if reading.stamp is None else reading.stamp
+            self.publish(reading.positions, reading.velocities, reading.efforts, stamp)
+
+        return self._publish_at(rate_hz, seconds, source.read, publish)
 
     def close(self) -> None:
         """Stop publishing; ``run`` returns. A second call does nothing."""
         self._stop.set()
         with self._lock:
             self._next_check_s = -math.inf
-            self._opened.close()
+        super().close()
 
 
 def _moving_edges(model: RobotModel) -> MovingEdges:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Protocol, cast
@@ -11,10 +10,8 @@ from typing import Protocol, cast
 import numpy as np
 
 from zstate._util.bounded import BoundedDict
-from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.buffer.buffer import TransformBuffer
-from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
+from zstate.clock import SYSTEM, Clock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net.clock_offset import ClockService
 from zstate.net.edge_monitor import EdgeMonitor
@@ -23,20 +20,19 @@ from zstate.net.presence import local_writer
 from zstate.net.sample_history import SampleCache, serve_history
 from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
-from zstate.net.writer import SampleWriter, WireWriter
-from zstate.nodes.publisher_status import PublisherStats, StatusReporter, StreamStats
+from zstate.net.writer import WireWriter
+from zstate.nodes.publisher_status import StatusReporter
+from zstate.nodes.sample_publisher import NEWEST_ONLY_S, SamplePublisher
 from zstate.nodes.static_publisher import edge_writer_name
-from zstate.rate import Rate, RateReport
+from zstate.rate import RateReport
 from zstate.transform import UPPER_TRIANGLE, Transform
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import Stream, check_robot, full_name
+from zstate.wire.keys import full_name
 from zstate.wire.messages import Edges, WriterTransforms, order_digest, to_block
-from zstate.wire.registry import as_wire_names, get_wire
+from zstate.wire.registry import get_wire
 
 # Edges of a sample for which the cache has room for 2000 samples.
 _TYPICAL_EDGES = 16
-
-_NEWEST_ONLY_S = 1e-9
 
 _IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -49,7 +45,7 @@ class TransformSource(Protocol):
         ...
 
 
-class TransformPublisher(Closeable):
+class TransformPublisher(SamplePublisher):
     """Publishes moving edges under one writer's name: odom -> base_link, a tracked object, a marker.
 
     A robot may have several such writers, and a ``StatePublisher``; listeners receive the edges of all.
@@ -80,12 +76,9 @@ class TransformPublisher(Closeable):
         cache_s: float = 2.0,
     ) -> None:
         identity = local_writer(secrets.randbits(32), program)
-        self.robot = check_robot(robot)
+        super().__init__(robot, wires, clock, identity.session)
         self.writer = edge_writer_name(writer, identity)
         self._session = session
-        self._session_id = identity.session
-        self._clock: Clock = clock or SystemClock()
-        self._wires = as_wire_names(wires)
         self._announced = Announcement(self.robot, "transforms", identity, self.writer)
         # The digests of the edges that were published together.
         self._orders: BoundedDict[Edges, bytes] = BoundedDict()
@@ -97,13 +90,6 @@ class TransformPublisher(Closeable):
         self._edge_monitor: EdgeMonitor | None = None
         self._second_writer: SecondWriter | None = None
         self._cache: SampleCache | None = None
-        self._lock = fork_safe_lock()
-        self._stop = fork_safe(threading.Event())
-        self._seq = 0
-        self._refused = 0
-        self._last_refusal = ""
-        self._rate: Rate | None = None
-        self._writers: dict[tuple[str, Stream], SampleWriter] = {}
         with ExitStack() as opening:
             if "native" in self._wires:
                 self._claim = opening.enter_context(WriterClaim(session, [self._announced]))
@@ -120,7 +106,7 @@ class TransformPublisher(Closeable):
                 status = StatusReporter(identity, lambda: self.stats).status
                 opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
                 # Its queryable is also how writers that claim edges at the same time find each other.
-                self._cache = SampleCache(cache_s or _NEWEST_ONLY_S, _TYPICAL_EDGES * 28, self._session_id)
+                self._cache = SampleCache(cache_s or NEWEST_ONLY_S, _TYPICAL_EDGES * 28, self._session_id)
                 opening.enter_context(
                     serve_history(session, self.robot, "transforms", self._cache, writer=self.writer)
                 )
@@ -130,16 +116,6 @@ class TransformPublisher(Closeable):
     def __repr__(self) -> str:
         closed = ", closed" if self._stop.is_set() else ""
         return f"<TransformPublisher {self.writer!r} of {self.robot!r}: {self._seq} samples{closed}>"
-
-    @property
-    def stats(self) -> PublisherStats:
-        """Counts of published and refused samples."""
-        streams = {
-            stream: StreamStats(writer.samples, writer.bytes, self._seq - writer.samples)
-            for stream, writer in self._writers.items()
-        }
-        rate = None if self._rate is None else self._rate.report()
-        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate)
 
     def publish(self, transforms: Sequence[Transform], stamp: int | None = None) -> None:
         """Publish one sample: each transform places its ``source`` on its ``target``, at ``stamp`` [ns].
@@ -178,8 +154,7 @@ class TransformPublisher(Closeable):
                 for stream, payload in payloads.items():
                     self._writers[stream].write(payload)
         except InvalidInput as error:
-            self._last_refusal = str(error)
-            self._refused += 1
+            self._count_refusal(error)
             raise
 
     def _stamp(self, transforms: Sequence[Transform]) -> int:
@@ -234,22 +209,12 @@ class TransformPublisher(Closeable):
         Each tick has an absolute deadline; ``Rate`` describes late ticks. If the source has nothing new, the
         tick publishes nothing. Raises as ``publish``.
         """
-        self._rate = rate = Rate(rate_hz, self._clock, self._stop, seconds)
-        for now in rate:
-            transforms = source.read(now)
-            if transforms is not None:
-                own = {transform.stamp for transform in transforms}
-                try:
-                    self.publish(transforms, now if own == {None} else None)
-                except Closed:
-                    break
-        return rate.report()
 
-    def close(self) -> None:
-        """Stop publishing; ``run`` returns. A second call does nothing."""
-        self._stop.set()
-        with self._lock:
-            self._opened.close()
+        def publish(transforms: Sequence[Transform], now: int) -> None:
+            own = {transform.stamp for transform in transforms}
+            self.publish(transforms, now if own == {None} else None)
+
+        return self._publish_at(rate_hz, seconds, source.read, publish)
 
 
 def _check_transforms(transforms: object) -> None:

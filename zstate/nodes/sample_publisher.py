@@ -1,0 +1,84 @@
+"""What the publishers of samples have in common: counts, samples at a fixed rate, and the end."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import TypeVar
+
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe, fork_safe_lock
+from zstate.clock import Clock, SystemClock
+from zstate.errors import Closed
+from zstate.net.writer import SampleWriter
+from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StreamStats
+from zstate.rate import Rate, RateReport
+from zstate.wire.keys import Stream, check_robot
+from zstate.wire.registry import as_wire_names
+
+T = TypeVar("T")
+
+NEWEST_ONLY_S = 1e-9
+"""Span of a cache that has no room for a second sample."""
+
+
+class SamplePublisher(Closeable):
+    """Base of the publishers of one robot's samples, numbered from 0 on in the session ``session_id``."""
+
+    def __init__(self, robot: str, wires: str | Sequence[str], clock: Clock | None, session_id: int) -> None:
+        self.robot = check_robot(robot)
+        self._wires = as_wire_names(wires)
+        self._clock: Clock = clock or SystemClock()
+        self._session_id = session_id
+        self._writers: dict[tuple[str, Stream], SampleWriter] = {}
+        self._limits: LimitWatch | None = None
+        self._seq: int = 0
+        self._refused = 0
+        self._last_refusal = ""
+        self._rate: Rate | None = None
+        self._opened = ExitStack()
+        self._lock = fork_safe_lock()
+        self._stop = fork_safe(threading.Event())
+
+    @property
+    def stats(self) -> PublisherStats:
+        """Counts of published, suppressed and refused samples."""
+        streams = {
+            place: StreamStats(writer.samples, writer.bytes, self._seq - writer.samples)
+            for place, writer in self._writers.items()
+        }
+        rate = None if self._rate is None else self._rate.report()
+        outside, excess = (0, "") if self._limits is None else (self._limits.count, self._limits.last)
+        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate, outside, excess)
+
+    def _count_refusal(self, error: Exception) -> None:
+        self._last_refusal = str(error)
+        self._refused += 1
+
+    def _publish_at(
+        self,
+        rate_hz: float,
+        seconds: float | None,
+        read: Callable[[int], T | None],
+        publish: Callable[[T, int], None],
+    ) -> RateReport:
+        """Publish what ``read`` returns at ``rate_hz``, for ``seconds`` or until ``close()``.
+
+        Both get the present instant [ns].
+        """
+        self._rate = rate = Rate(rate_hz, self._clock, self._stop, seconds)
+        for now in rate:
+            sample = read(now)
+            if sample is not None:
+                try:
+                    publish(sample, now)
+                except Closed:
+                    break
+        return rate.report()
+
+    def close(self) -> None:
+        """Stop publishing; ``run`` returns. A second call does nothing."""
+        self._stop.set()
+        with self._lock:
+            self._opened.close()
