@@ -8,7 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from helpers.processes import DEADLINE_S, Child
+import pytest
+from helpers.cli_runner import zstate
+from helpers.processes import DEADLINE_S, Child, find_free_port
 
 SLACK = 3.0
 """Factor on the stated bounds, as a CI machine is busy with other tests; beyond it, recovery has failed.
@@ -67,6 +69,31 @@ def starter(spawn: Callable[..., Child]) -> Start:
 
 def client(*endpoints: str) -> dict[str, Any]:
     return {"mode": "client", "endpoints": endpoints}
+
+
+class Site:
+    """A router with TLS and access control: the robots r1 and r2, and the viewer desk."""
+
+    def __init__(self, folder: Path, start: Start) -> None:
+        certificates = pytest.importorskip("zstate.net.security.certificates")
+        certificates.issue_identities(folder, ["router", "r1", "r2", "desk", "stranger"])
+        self.folder = folder
+        self.endpoint = f"tls/127.0.0.1:{find_free_port()}"
+        self._start = start
+        self.router = self.start_router()
+
+    def start_router(self) -> FaultProcess:
+        roles = {"robots": ["r1", "r2"], "viewers": ["desk"]}
+        certificates = (str(self.folder), "router")
+        self.router = self._start("router", listen=self.endpoint, certificates=certificates, roles=roles)
+        return self.router
+
+    def join(self, identity: str) -> dict[str, Any]:
+        return client(self.endpoint) | {"certificates": (str(self.folder), identity)}
+
+    def doctor(self, identity: str, *arguments: str) -> Any:
+        certs = ("--certs", str(self.folder), "--identity", identity)
+        return zstate("doctor", "r1", "--connect", self.endpoint, *certs, "--timeout", "2", *arguments)
 
 
 def assert_no_growth(before: dict[str, int], after: dict[str, int], *, rss_kb: int = 30_000) -> None:

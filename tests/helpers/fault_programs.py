@@ -15,7 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from helpers.fault_queries import ArmMotion, OdometryMotion, ReaderQueries
+import numpy as np
+from helpers.fault_queries import MAX_AGE_S, ArmMotion, JointsMotion, OdometryMotion, ReaderQueries
 
 from zstate import (
     SineSource,
@@ -30,11 +31,15 @@ from zstate.clock import SystemClock
 from zstate.net.security.acl import AclRoles, access_control
 from zstate.net.security.credentials import Credentials
 from zstate.net.security.router_config import RouterConfig
+from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.recording.recorder import Recorder
+from zstate.sources.joint_source import JointReading
 from zstate.transform import Transform
 
 CLONE_NEWNET = 0x40000000
+REACH = 2.0
+"""Of rrbot, at most [m]."""
 
 Session = dict[str, Any]
 Answer = Callable[..., Any]
@@ -48,6 +53,8 @@ def main() -> None:
     roles: dict[str, Answer] = {
         "publisher": publisher,
         "odometry": odometry,
+        "driver": driver,
+        "claimant": claimant,
         "reader": reader,
         "recorder": recorder,
         "router": router,
@@ -194,6 +201,44 @@ def odometry(
         )
 
 
+def driver(
+    robot: str, session: Session, joint: str, writer: str | None = None, rate_hz: float = 100.0
+) -> None:
+    """Publishes one joint of ``JointsMotion``."""
+    model, motion = load_model("rrbot"), JointsMotion()
+    column = model.joint_names.index(joint)
+    source = PausableSource(lambda stamp: JointReading(np.array([motion.positions(stamp)[column]])))
+    with (
+        join(session) as opened,
+        PartialStatePublisher(opened, model, [joint], robot, writer=writer, cache_s=60.0) as writing,
+    ):
+        threading.Thread(target=writing.run, args=(source, rate_hz), daemon=True).start()
+        _serve_queries(sent=lambda: writing.stats.sent, pause=source.pause)
+
+
+def claimant(robot: str, session: Session, joint: str) -> None:
+    """Claims a joint at the time [ns] of the query "claim", until the query "release"."""
+    model, claims = load_model("rrbot"), list[PartialStatePublisher]()
+
+    def claim(at: int) -> str:
+        """The error, or an empty string."""
+        while time.time_ns() < at:
+            pass
+        try:
+            claims.append(PartialStatePublisher(opened, model, [joint], robot))
+            claims[-1].publish([0.0])
+        except ZStateError as error:
+            return f"{type(error).__name__}: {error}"
+        return ""
+
+    def release() -> None:
+        while claims:
+            claims.pop().close()
+
+    with join(session) as opened:
+        _serve_queries(claim=claim, release=release)
+
+
 def recorder(session: Session, path: str) -> None:
     with join(session) as opened, Recorder(opened, path, ["r1"]) as recording:
 
@@ -224,8 +269,11 @@ def router(
 def reader(session: Session, robot: str = "*", follow: str = "joint_states", busy_ms: float = 0.0) -> None:
     """Listens to robots; with ``busy_ms`` each insert blocks the process for that long.
 
-    Replies to the queries of ``ReaderQueries`` about the arm, and as ``odometry NAME`` about the odometry.
+    Replies to the queries of ``ReaderQueries`` about the arm, as ``odometry NAME`` about the odometry, and as
+    ``joints NAME``, ``shoulder NAME`` and ``elbow NAME`` about ``JointsMotion``, all of it and of one joint.
     """
+    # Merged readings are of one instant, some of their positions up to the age limit older.
+    tolerance = 1e-9 if follow == "joint_states" else sum(map(abs, JointsMotion.RATES)) * MAX_AGE_S * REACH
     with (
         join(session) as opened,
         TransformListener(opened, robot, follow=follow, history_s=60.0, on_event=lambda _: None) as listener,
@@ -233,6 +281,9 @@ def reader(session: Session, robot: str = "*", follow: str = "joint_states", bus
         answers = {
             "": ReaderQueries(listener, ArmMotion()),
             "odometry ": ReaderQueries(listener, OdometryMotion()),
+            "joints ": ReaderQueries(listener, JointsMotion(tolerance=tolerance)),
+            "shoulder ": ReaderQueries(listener, JointsMotion("world", "upper")),
+            "elbow ": ReaderQueries(listener, JointsMotion("upper", "lower")),
         }
         if busy_ms:
             _slow_down_inserts(listener, busy_ms)
@@ -247,6 +298,7 @@ def reader(session: Session, robot: str = "*", follow: str = "joint_states", bus
             "latencies",
             "count",
             "wrong",
+            "problem",
             "lane",
             "events",
         )

@@ -82,6 +82,39 @@ class OdometryMotion:
         return are_close(transform, OdometryMotion(lane).pose(transform.stamp))
 
 
+class JointsMotion:
+    """rrbot whose joints turn at constant rates: interpolation is exact, however large the gap.
+
+    ``target`` and ``source`` are the ends of the arm, or of a part of it. ``tolerance`` [m] is for poses
+    from merged readings, whose joints are of different instants.
+    """
+
+    RATES = (0.02, -0.03)
+    """Of shoulder and elbow [rad/s]."""
+    _period_ns = OdometryMotion._period_ns
+
+    def __init__(self, target: str = "world", source: str = "tool", tolerance: float = 1e-9) -> None:
+        self.target, self.source = target, source
+        self._tolerance = tolerance
+        self._model = load_model("rrbot")
+        self._kinematics = Kinematics(self._model)
+
+    def positions(self, stamp: int) -> list[float]:
+        """The positions of all joints [rad]."""
+        elapsed_s = stamp % self._period_ns * 1e-9
+        return [rate * elapsed_s for rate in self.RATES]
+
+    def includes(self, transform: Transform) -> bool:
+        assert transform.stamp is not None
+        poses = self._kinematics.link_poses(self.positions(transform.stamp))
+        target, source = (
+            Transform.from_pose7("world", link, poses[self._model.links.index(link)])
+            for link in (self.target, self.source)
+        )
+        truth = target.inverse() @ source
+        return np.allclose(transform.matrix, truth.matrix, rtol=0.0, atol=self._tolerance)
+
+
 def are_close(one: Transform, other: Transform) -> bool:
     return np.allclose(one.matrix, other.matrix, rtol=0.0, atol=1e-9)
 
@@ -157,6 +190,14 @@ class ReaderQueries:
             if answer is None or not self.motion.includes(answer):
                 found.append(str(problem or answer))
         return found
+
+    def problem(self, robot: str) -> str:
+        """The kind and text of the error of a fresh lookup; empty if there is none."""
+        try:
+            self.fresh(robot)
+        except ZStateError as error:
+            return f"{type(error).__name__}: {error}"
+        return ""
 
     def lane(self, robot: str) -> int:
         """The lane of the newest odometry."""

@@ -59,17 +59,20 @@ class Drivers:
     def part(
         self, session: int, names: tuple[str, ...], numbers: list[float], rates: list[float] | None = None
     ) -> None:
-        if session not in self.parts:
-            self.parts[session] = PartialJointStateIngest(
+        self.insert(self.state(session, names, numbers, rates))
+
+    def insert(self, state: JointState) -> None:
+        if state.session not in self.parts:
+            self.parts[state.session] = PartialJointStateIngest(
                 "r1", self.ownership, self.whole.parts, others=self._others
             )
-        self.parts[session].insert_sample(self._state(session, names, numbers, rates), overflowed=False)
+        self.parts[state.session].insert_sample(state, overflowed=False)
 
     def all_joints(self, session: int, numbers: list[float]) -> None:
-        state = self._state(session, self.model.joint_names, numbers)
+        state = self.state(session, self.model.joint_names, numbers)
         self.whole.insert_sample(state, overflowed=False)
 
-    def _state(self, session, names, numbers, rates=None) -> JointState:
+    def state(self, session, names, numbers, rates=None) -> JointState:
         self._seq += 1
         block = None if rates is None else to_block(rates)
         head = (STAMP, self._seq, session, order_digest(names))
@@ -150,6 +153,35 @@ def test_refused_driver_is_counted_with_both_names_and_accepted_later():
     drivers.part(1, ("elbow",), [0.3])
     assert drivers.movers()["elbow"] == "driver 1"
     assert drivers.counters.stats().received == 2
+
+
+def test_samples_of_a_new_driver_count_before_its_announcement_if_the_former_one_has_left():
+    drivers = Drivers()
+    drivers.describe()
+    drivers.announce(1, since=100)
+    drivers.part(1, ("elbow",), [0.1])
+    drivers.leave(1)
+    drivers.part(2, ("elbow",), [0.2])
+    drivers.part(3, ("shoulder",), [0.3])
+    assert drivers.counters.stats().refused == {}
+    positions, _ = drivers.buffer.joint_positions("r1", STAMP)
+    assert positions == pytest.approx([0.3, 0.2])
+
+
+def test_samples_that_arrive_before_the_tokens_of_a_handover_are_recalled():
+    drivers = Drivers()
+    drivers.describe()
+    drivers.announce(1, since=100)
+    drivers.part(1, ("elbow",), [0.1])
+    early = [drivers.state(2, ("elbow",), [0.2]) for _ in range(3)]
+    for state in early:
+        drivers.insert(state)  # the first driver's token is still there
+    assert drivers.counters.stats().refused == {"second writer": 3}
+    drivers.leave(1)
+    drivers.announce(2, since=200)
+    drivers.parts[2].insert_history(early)
+    assert drivers.counters.stats().recalled == 3
+    assert drivers.movers()["elbow"] == "driver 2"
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,7 @@ def path_text(rows: Sequence[EdgeRow], *, width: int | None = None) -> str:
     """
     robots = {row.frame.partition("/")[0] for row in rows if "/" in row.frame}
     cells: _Cells = []
-    shown: set[str] = set()
+    shown: set[tuple[str, str | None]] = set()
     for row in rows:
         frame, edge = row.frame, row.edge
         if len(robots) == 1:
@@ -151,7 +151,7 @@ def path_text(rows: Sequence[EdgeRow], *, width: int | None = None) -> str:
             cells.append((frame, "", *_NO_NUMBERS, ""))
         elif edge.kind == "static":
             cells.append((frame, edge.kind, *_NO_NUMBERS, edge.writer or ""))
-        elif (source := _source(edge)) in shown:
+        elif (source := (_source(edge), edge.writer)) in shown:
             cells.append((frame, edge.kind, *_NO_NUMBERS, ""))
         else:
             cells.append((frame, edge.kind, *_measured_cells(row), edge.writer or ""))

@@ -251,6 +251,9 @@ class StreamIngest(ABC):
                 inserted = self._restart_epoch(sample) or inserted
         except (InvalidInput, MessageError) as error:
             self._count_refusal(error)
+            if isinstance(error, InsertRefused) and sample.session not in self._writers:
+                # Its token may be on the way; then its history has this sample again.
+                self._missing.add(sample.seq, sample.seq + 1)
             return False
         self._counters.count("received" if inserted else "late")
         if not self._has_joined_domain and sample.session != self._departed_session:

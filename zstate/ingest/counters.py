@@ -112,6 +112,8 @@ class MissingSamples:
 
     def add(self, first: int, end: int) -> None:
         """Add the samples from ``first`` up to, without, ``end``."""
+        if self._ranges and self._ranges[-1].stop == first:
+            first = self._ranges.pop().start
         self._ranges.append(range(first, end))
 
     def stop_at(self, seq: int) -> None:

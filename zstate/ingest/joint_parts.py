@@ -4,8 +4,8 @@ A driver of some joints publishes a *part* of the robot's joint states. Each joi
 that contradict each other the first in this list moves the joints they have in common:
 
 1. an announced writer; of two the one that started later, as among writers of all joints,
-2. a writer that has left: its samples stay until an announced one moves the joint,
-3. a writer that is not announced.
+2. a writer that is not announced: the first samples of a new one may arrive before its token,
+3. a writer that has left: its samples stay until another one moves the joint.
 
 A part in which such a joint is missing would be half a robot at an instant, so it is refused as a whole, and
 accepted once the other writer has left. A writer of all joints keeps those that no part moves. The result
@@ -29,7 +29,7 @@ from zstate.wire.joint_order import JointOrder
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, RobotDescription, Sample
 
-_ANNOUNCED, _LEFT, _UNANNOUNCED, _NO_WRITER = range(4)
+_ANNOUNCED, _UNANNOUNCED, _LEFT, _NO_WRITER = range(4)
 
 _MAX_SETS = 16
 """Sets of joints that one writer may publish; a driver publishes one."""

@@ -19,13 +19,14 @@ from zstate.bridges.ros1.messages import (
     JointStateWriter,
     Ros1FrameNames,
     get_stamp,
+    partial_joint_state,
     read_transforms,
     set_stamp,
 )
 from zstate.bridges.ros1.node import RospyModules
 from zstate.errors import MessageError
 from zstate.wire.joint_order import JointNumbers
-from zstate.wire.messages import to_block
+from zstate.wire.messages import from_block, to_block
 
 MODEL = load_model(RRBOT)
 BARE = st.text("abc_/", min_size=1, max_size=8).filter(lambda name: not name.startswith("/"))
@@ -89,6 +90,7 @@ def test_joints_are_found_by_name_in_any_order():
     reader = JointStateReader(MODEL)
     message = joint_state(("wheel", "elbow", "shoulder"), (9.0, 0.2, 0.1), (), (0.0, 4.0, 3.0))
     numbers = reader.read(message)
+    assert numbers is not None
     assert np.array_equal(numbers.positions, [0.1, 0.2])
     assert numbers.velocities is None
     assert numbers.efforts is not None
@@ -99,17 +101,32 @@ def test_joints_are_found_by_name_in_any_order():
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
-        (joint_state(["shoulder"], [0.0]), "missing joints"),
         (joint_state(["shoulder", "elbow", "elbow"], [0.0, 1.0, 2.0]), "names"),
         (joint_state(JOINTS), "sizes"),
         (joint_state(JOINTS, [0.0]), "sizes"),
         (joint_state(JOINTS, [0.0, 0.0], [0.0]), "sizes"),
     ],
 )
-def test_a_joint_state_that_is_not_the_whole_robot_is_refused(message: Any, reason: str):
+def test_a_joint_state_that_cannot_be_read_is_refused(message: Any, reason: str):
     with pytest.raises(MessageError) as caught:
         JointStateReader(MODEL).read(message)
     assert caught.value.reason == reason
+
+
+def test_part_of_a_robot_is_read_as_a_state_of_the_joints_it_names():
+    message = joint_state(("wheel", "elbow"), (9.0, 0.2), (), (0.0, 4.0))
+    assert JointStateReader(MODEL).read(message) is None
+    state = partial_joint_state(message, 5, "/gripper")
+    assert (state.stamp, state.names, state.velocities) == (5, ("wheel", "elbow"), None)
+    assert state.efforts is not None
+    assert (from_block(state.positions).tolist(), from_block(state.efforts).tolist()) == (
+        [9.0, 0.2],
+        [0.0, 4.0],
+    )
+    for wrong in (joint_state(("elbow",)), joint_state(("elbow",), (0.0, 1.0))):
+        with pytest.raises(MessageError) as caught:
+            partial_joint_state(wrong, 5, "/gripper")
+        assert caught.value.reason == "sizes"
 
 
 def test_each_number_of_a_floating_joint_has_a_name_in_ros():
@@ -124,6 +141,7 @@ def test_each_number_of_a_floating_joint_has_a_name_in_ros():
     message = JointStateWriter(ROS, model).message(1, JointNumbers(positions, velocities, None))
     assert message.name == [*(f"flight.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")), "spin"]
     read = JointStateReader(model).read(message)
+    assert read is not None
     assert np.array_equal(read.positions, positions)
     assert read.velocities is not None
     assert np.array_equal(read.velocities, velocities)

@@ -14,7 +14,8 @@ pytestmark = pytest.mark.processes
 
 def test_two_drivers_move_one_robot_and_publish_merges_them(spawn: Spawn):
     arm = started(spawn, "joints", "rrbot", "--only", "shoulder")
-    assert arm.line() == "rrbot: a sine on shoulder, 100 Hz, on zstate/rrbot/partial_joint_states"
+    on_stream = "rrbot: a sine on shoulder, 100 Hz, on zstate/rrbot/partial_joint_states/zstate-joints."
+    assert arm.line().startswith(on_stream)
     gripper = started(spawn, "joints", "rrbot", "--only", "elbow")
     gripper.line()
     publisher = started(spawn, "publish", "rrbot")
@@ -29,6 +30,9 @@ def test_two_drivers_move_one_robot_and_publish_merges_them(spawn: Spawn):
         until(lambda: own.buffer.can_lookup("world", "tool"))
         (info,) = discover(session)
         assert len(info.part_names) == 2
+    assert "receiving zstate/rrbot/partial_joint_states: 2 positions" in publisher.stderr
+    reason = failure("echo", "rrbot", "--once", "--timeout", "0.5")
+    assert "`zstate echo rrbot --stream partial_joint_states`" in reason
     for child in (publisher, gripper, arm):
         interrupted(child)
 

@@ -55,6 +55,14 @@ def test_joints_of_one_robot_have_their_numbers_once():
     ]
 
 
+def test_each_of_two_drivers_of_a_robot_has_its_own_numbers():
+    other = frame("r1/hand", "r1/left", writer="hand@jetson pid 413")
+    *_, left, hand = path_text([*rows()[:3], EdgeRow("r1/hand", other, MEASURE, None)]).splitlines()
+    assert left.endswith(DRIVER)
+    assert hand.split()[:4] == ["hand", "joint", "100.0", "Hz"]
+    assert hand.endswith("hand@jetson pid 413")
+
+
 def test_wrong_clock_gets_a_note():
     *table, note = path_text(rows(ClockOffset(-1_200_000_000, 100_000))).splitlines()
     assert "  -1.2 s  " in table[3]

@@ -190,6 +190,22 @@ def test_joint_without_a_driver_is_named():
     assert found["next"].startswith("zstate joints rrbot --only shoulder")
 
 
+def test_stamps_of_one_of_several_drivers_are_reported():
+    model = load_model(RRBOT)
+    with (
+        connect() as session,
+        StatePublisher(session, model, "rrbot", streams=("robot_description", "tf_static")),
+        PartialStatePublisher(session, model, ["shoulder"], "rrbot", program="arm.py") as arm,
+        PartialStatePublisher(session, model, ["elbow"], "rrbot", program="gripper.py") as gripper,
+        repeated(lambda: arm.publish([0.0])),
+        repeated(lambda: gripper.publish([0.0], stamp=time.time_ns() + 5 * SECOND)),
+    ):
+        found = broken_link("rrbot")
+    assert found["name"] == "stamps"
+    assert found["text"].startswith("gripper.py@")
+    assert "in the future" in found["text"]
+
+
 def test_robot_with_transforms_only_is_sound():
     edge = [Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))]
     with (
@@ -201,6 +217,7 @@ def test_robot_with_transforms_only_is_sound():
     found = {check["name"]: check["text"] for check in report["checks"]}
     assert report["sound"]
     assert "as 'odometry'" in found["transforms"]
+    assert found["stamps"].endswith("old on arrival")
     assert found["poses"].endswith("cart/base in cart/odom is known")
 
 

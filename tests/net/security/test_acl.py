@@ -27,6 +27,7 @@ from zstate.net.security.acl import AclRoles, access_control
 from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
+from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.wire import keys
@@ -73,6 +74,8 @@ WRITES = [
     ("r1", "zstate/r1/joint_commands", True),
     ("r1", "zstate/r1/transforms/odometry", True),
     ("r1", "zstate/r2/transforms/odometry", False),
+    ("r1", "zstate/r1/partial_joint_states/gripper", True),
+    ("r1", "zstate/r2/partial_joint_states/gripper", False),
     ("r1", "zstate/r2/joint_states", False),
     ("r1", "zstate/*/joint_states", False),
     ("r1", "zstate/$*1/joint_states", False),
@@ -89,7 +92,9 @@ WRITES = [
     ("stranger", "zstate/r1/joint_states", False),
     ("site", "zstate/site/tf_static/map", True),
     ("site", "zstate/site/joint_states", False),
+    ("desk", "zstate/r1/partial_joint_states/gripper", False),
     ("site", "zstate/site/transforms/map", False),
+    ("site", "zstate/site/partial_joint_states/gripper", False),
     ("site", "zstate/r1/tf_static/map", False),
 ]
 
@@ -131,6 +136,26 @@ def test_late_viewer_receives_the_transforms_of_a_robot_and_one_writer_owns_an_e
     for user in ("r2", "desk", "site", "stranger"):
         with pytest.raises(AccessDenied, match="'r1'"):
             TransformPublisher(site.join(user), "r1", "odometry")
+
+
+def test_late_viewer_receives_the_parts_of_a_robot_and_one_driver_owns_a_joint(site: Site):
+    joints = RRBOT.joint_names
+    with (
+        StatePublisher(site.join("r1"), RRBOT, "r1", streams=("robot_description",)),
+        PartialStatePublisher(site.join("r1"), RRBOT, joints[:1], "r1") as arm,
+        PartialStatePublisher(site.join("r1"), RRBOT, joints[1:], "r1", program="hand.py") as hand,
+    ):
+        stamp = time.time_ns()
+        arm.publish([0.25], stamp=stamp)
+        hand.publish([0.5], stamp=stamp)
+        with TransformListener(site.join("desk"), "*") as late:
+            late.buffer.wait("world", RRBOT.links[-1], timeout_s=5.0)
+            assert late.buffer.joint_states("r1").positions[-1].tolist() == [0.25, 0.5]
+        with pytest.raises(SecondWriter, match=r"hand\.py"):
+            PartialStatePublisher(site.join("r1"), RRBOT, joints[1:], "r1")
+    for user in ("r2", "desk"):
+        with pytest.raises(AccessDenied, match=r"'r1 writes'.*`zstate acl --robot r1`"):
+            PartialStatePublisher(site.join(user), RRBOT, joints[:1], "r1")
 
 
 def test_robot_receives_only_the_clock_of_others(site: Site):

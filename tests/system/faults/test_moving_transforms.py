@@ -9,12 +9,10 @@ import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
-from helpers.cli_runner import zstate
-from helpers.fault_processes import SLACK, FaultProcess, Start, client, print_figures
-from helpers.processes import find_free_port, until
+from helpers.fault_processes import SLACK, FaultProcess, Site, Start, client, print_figures
+from helpers.processes import until
 
 pytestmark = pytest.mark.processes
 
@@ -23,31 +21,6 @@ RATE_HZ = 100.0
 BOUND_S = 1.0
 TOKEN_EXPIRY_S = 0.5
 HOUR = 3600 * 1_000_000_000
-
-
-class Site:
-    """A router with TLS and access control: the robots r1 and r2, and the viewer desk."""
-
-    def __init__(self, folder: Path, start: Start) -> None:
-        certificates = pytest.importorskip("zstate.net.security.certificates")
-        certificates.issue_identities(folder, ["router", "r1", "r2", "desk", "stranger"])
-        self.folder = folder
-        self.endpoint = f"tls/127.0.0.1:{find_free_port()}"
-        self._start = start
-        self.router = self.start_router()
-
-    def start_router(self) -> FaultProcess:
-        roles = {"robots": ["r1", "r2"], "viewers": ["desk"]}
-        certificates = (str(self.folder), "router")
-        self.router = self._start("router", listen=self.endpoint, certificates=certificates, roles=roles)
-        return self.router
-
-    def join(self, identity: str) -> dict[str, Any]:
-        return client(self.endpoint) | {"certificates": (str(self.folder), identity)}
-
-    def doctor(self, identity: str, *arguments: str) -> Any:
-        certs = ("--certs", str(self.folder), "--identity", identity)
-        return zstate("doctor", "r1", "--connect", self.endpoint, *certs, "--timeout", "2", *arguments)
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from zstate.bridges.ros1.messages import (
     Ros1FrameNames,
     TransformsWriter,
     get_stamp,
+    partial_joint_state,
     pose_from_ros,
     read_transforms,
     refusal_reason,
@@ -33,9 +34,11 @@ from zstate.net.subscription import Received, subscribe
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.sources.joint_state_listener import MAX_AGE_S
+from zstate.sources.joint_state_merger import JointStateMerger
 from zstate.transform import Transform
-from zstate.wire.joint_order import Floats
-from zstate.wire.keys import MODEL_WRITER
+from zstate.wire.joint_order import Floats, JointNumbers
+from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER
 from zstate.wire.messages import (
     Edges,
     JointState,
@@ -52,10 +55,11 @@ _LOG = logging.getLogger("zstate")
 class NativeToRos1(Closeable):
     """Publishes a robot of zstate in ROS, every sample at its own stamp.
 
-    Joints go to ``joint_states``, moving edges of the model and of other writers to ``/tf``, without
-    covariances, and all static edges together, latched, to ``/tf_static``; ``with_description`` sets the
-    parameter ``robot_description`` if it is not set. Messages for which ``is_own(session, writer)`` holds,
-    and transforms for which ``is_own_writer(writer)`` does, came from ROS and are skipped. ``carried`` counts
+    Joints go to ``joint_states``, those of several drivers as merged readings, moving edges of the model and
+    of other writers to ``/tf``, without covariances, and all static edges together, latched, to
+    ``/tf_static``; ``with_description`` sets the parameter ``robot_description`` if it is not set. Messages
+    for which ``is_own(session, writer)`` holds, and transforms for which ``is_own_writer(writer)`` does, came
+    from ROS and are skipped. ``carried`` counts
     joint states. Each stream has a thread of its own.
     """
 
@@ -81,11 +85,14 @@ class NativeToRos1(Closeable):
         self._wire = NativeWire()
         self._statics: dict[str, dict[tuple[str, str], Floats]] = {}
         self._transforms: BoundedDict[Edges, TransformsWriter] = BoundedDict()
+        self._whole_key = self._wire.expression(names.robot, "joint_states")
+        self._merger: JointStateMerger | None = None
+        self._joints_lock = threading.Lock()  # joint states come on two streams
         self._joints = node.publisher("joint_states", node.ros.JointState)
         self._moving = node.publisher("/tf", node.ros.TFMessage)
         self._fixed = node.publisher("/tf_static", node.ros.TFMessage, latch=True)
         with ExitStack() as opening:
-            for stream in ("robot_description", "tf_static", "joint_states", "transforms"):
+            for stream in ("robot_description", "tf_static", *JOINT_STREAMS, "transforms"):
                 opening.enter_context(
                     subscribe(
                         session,
@@ -103,7 +110,7 @@ class NativeToRos1(Closeable):
         for _, key, message in received:
             try:
                 if isinstance(message, JointState):
-                    self._publish_joints(message)
+                    self._publish_joints(key, message)
                 elif isinstance(message, WriterTransforms):
                     self._publish_transforms(self._wire.edge_writer_name(key), message)
                 elif isinstance(message, StaticTransforms):
@@ -128,7 +135,9 @@ class NativeToRos1(Closeable):
         except ModelError as error:
             self._refusals.count("robot description", str(error))
             return
-        self.robot = RobotWriter(model, self._node.ros, self._names)
+        with self._joints_lock:
+            self.robot = RobotWriter(model, self._node.ros, self._names)
+            self._merger = JointStateMerger(model, MAX_AGE_S)
         if not self._with_description:
             return
         name, master = self._node.resolved("robot_description"), self._node.master
@@ -172,21 +181,44 @@ class NativeToRos1(Closeable):
             encoder = self._transforms[sample.edges] = TransformsWriter(self._node.ros, edges)
         self._moving.publish(encoder.message(sample.stamp, poses))
 
-    def _publish_joints(self, state: JointState) -> None:
-        """Publish one sample. Samples before the description are skipped."""
-        robot = self.robot
-        if robot is None or self._is_own(state.session, ""):
-            return
-        numbers = robot.validator.read(state)
-        if self._joints.has_readers:
-            self._joints.publish(robot.joints.message(state.stamp, numbers))
-        if self._moving.has_readers and robot.has_moving_edges:
-            self._moving.publish(robot.transforms(state.stamp, numbers.positions))
-        self.carried += 1
+    def _publish_joints(self, key: str, state: JointState) -> None:
+        """Publish one sample, or the reading with it. Samples before the description are skipped."""
+        with self._joints_lock:
+            robot = self.robot
+            if robot is None or self._merger is None or self._is_own(state.session, ""):
+                return
+            if key == self._whole_key:
+                stamp, numbers = state.stamp, robot.validator.read(state)
+            else:
+                merged = _merge(self._merger, state, self._wire.edge_writer_name(key), self._refusals)
+                if merged is None:
+                    return
+                stamp, numbers = merged
+            if self._joints.has_readers:
+                self._joints.publish(robot.joints.message(stamp, numbers))
+            if self._moving.has_readers and robot.has_moving_edges:
+                self._moving.publish(robot.transforms(stamp, numbers.positions))
+            self.carried += 1
 
     def close(self) -> None:
         """Stop. A second call does nothing."""
         self._opened.close()
+
+
+def _merge(
+    merger: JointStateMerger, state: JointState, writer: str, refusals: Refusals
+) -> tuple[int, JointNumbers] | None:
+    """The stamp and the numbers of all joints once ``state``, of ``writer``, completes them.
+
+    Counts states that do not while joints are missing for long. Raises as ``JointStateMerger.add``.
+    """
+    reading = merger.add(state, writer)
+    if reading is not None:
+        assert reading.stamp is not None
+        return reading.stamp, JointNumbers(reading.positions, reading.velocities, reading.efforts)
+    if merger.missing_joints():
+        refusals.count("missing joints", f"no whole joint states: {merger.explanation()}")
+    return None
 
 
 _SILENT_S = 10.0
@@ -196,9 +228,10 @@ _SILENT_S = 10.0
 class Ros1ToNative(Closeable):
     """Publishes a robot of ROS 1, whose ``model`` is known, in zstate.
 
-    ``joint_states`` become joint states at their own stamps, and zstate computes the kinematics; the edges
-    on ``/tf_static`` that are not the model's become static edges, and those on ``/tf`` transforms under the
-    name of their node. ``at_once`` publishes the model at once, not with the first joint state. ``carried``
+    ``joint_states`` become joint states at their own stamps, those of several nodes merged into whole ones,
+    and zstate computes the kinematics; the edges on ``/tf_static`` that are not the model's become static
+    edges, and those on ``/tf`` transforms under the name of their node. ``at_once`` publishes the model at
+    once, not with the first joint state. ``carried``
     counts joint states. Messages of bridges are skipped.
     """
 
@@ -223,13 +256,15 @@ class Ros1ToNative(Closeable):
         self._links = frozenset(model.links)
         self._model_children = frozenset(joint.child for joint in model.joints)
         self._reader = JointStateReader(model)
+        self._merger = JointStateMerger(model, MAX_AGE_S, others=True)
         self._lock = threading.Lock()
         self._closed = False
         self._opened = ExitStack()
         self._states: StatePublisher | None = None
         self._statics: StaticPublisher | None = None
         self._edges: dict[str, tuple[str, tuple[float, ...]]] = {}
-        self._joint_names: list[str] = []
+        self._known_names: BoundedDict[tuple[str, ...], None] = BoundedDict()
+        self._joints_lock = threading.Lock()  # rospy has a thread for each node
         self._transforms = self._opened.enter_context(
             TransformRelay(names.robot, model, self._open_transforms, refusals.count)
         )
@@ -274,16 +309,29 @@ class Ros1ToNative(Closeable):
             return
         try:
             stamp = get_stamp(message.header)
-            if message.name != self._joint_names:
-                self._joint_names = message.name
-                if unknown := ", ".join(map(repr, self._reader.unknown(message))):
-                    self._refusals.count("unknown joints", f"{self._model.name!r} has no {unknown}, left out")
-            self._publisher().publish(*self._reader.read(message), stamp)
-            self.carried += 1
+            with self._joints_lock:
+                self._publish_joints(message, stamp)
         except (MessageError, InvalidInput, SecondWriter) as error:
             self._refusals.count(refusal_reason(error), f"joint_states of {sender(message)!r}: {error}")
         except Closed:
             pass  # received while closing
+
+    def _publish_joints(self, message: Any, stamp: int) -> None:
+        names = tuple(message.name)
+        if names not in self._known_names:
+            self._known_names[names] = None
+            if unknown := ", ".join(map(repr, self._reader.unknown(message))):
+                self._refusals.count("unknown joints", f"{self._model.name!r} has no {unknown}, left out")
+        numbers = self._reader.read(message)
+        if numbers is None:
+            node = sender(message)
+            state = partial_joint_state(message, stamp, node)
+            merged = _merge(self._merger, state, repr(node), self._refusals)
+            if merged is None:
+                return
+            stamp, numbers = merged
+        self._publisher().publish(*numbers, stamp)
+        self.carried += 1
 
     def _on_statics(self, message: Any) -> None:
         if self._is_of_a_bridge(message):

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate._util.bounded import BoundedDict
 from zstate.bridges.ros1.node import RospyModules
 from zstate.errors import InsertRefused, MessageError, SecondWriter
 from zstate.model.joint_transforms import JointTransforms
@@ -20,7 +21,7 @@ from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by
 from zstate.sources.joint_source import JointStateValidator
 from zstate.wire.joint_order import Floats, JointNumbers
 from zstate.wire.keys import wire_name
-from zstate.wire.messages import POSE_BYTES
+from zstate.wire.messages import POSE_BYTES, JointState, order_digest, to_block
 
 _SECOND = 1_000_000_000
 _COUNT = Struct("<I")
@@ -175,16 +176,22 @@ class JointStateReader:
         self._coordinates = coordinate_names(model)
         self._slots = np.array(velocity_columns_by_position(model), dtype=np.intp)
         self._names = frozenset(self._coordinates) | {joint.name for joint in model.joints}
-        self._picks: dict[tuple[str, ...], NDArray[np.intp]] = {}
+        # By the names in a message; None if joints are missing.
+        self._picks: BoundedDict[tuple[str, ...], NDArray[np.intp] | None] = BoundedDict()
 
-    def read(self, message: Any) -> JointNumbers:
-        """The numbers of all joints of the model. Raises MessageError if one is missing."""
+    def read(self, message: Any) -> JointNumbers | None:
+        """The numbers of all joints of the model; None for a message without some of them.
+
+        Raises MessageError for a message that cannot be used.
+        """
         pick = self._pick(tuple(message.name))
+        if pick is None:
+            return None
         count = len(message.name)
         rates = pick[self._slots]
         positions = _picked("position", message.position, count, pick)
         if positions is None:
-            raise MessageError("a JointState without positions", reason="sizes")
+            raise _without_positions()
         velocities = _picked("velocity", message.velocity, count, rates)
         return JointNumbers(positions, velocities, _picked("effort", message.effort, count, rates))
 
@@ -192,22 +199,31 @@ class JointStateReader:
         """The joints in ``message`` that the model does not have."""
         return tuple(name for name in message.name if name not in self._names)
 
-    def _pick(self, names: tuple[str, ...]) -> NDArray[np.intp]:
-        pick = self._picks.get(names)
-        if pick is None:
+    def _pick(self, names: tuple[str, ...]) -> NDArray[np.intp] | None:
+        if names not in self._picks:
             if len(set(names)) < len(names):
                 raise MessageError(f"a JointState that names a joint twice: {names}", reason="names")
-            missing = [name for name in self._coordinates if name not in names]
-            if missing:
-                raise MessageError(
-                    f"a JointState without {', '.join(map(repr, missing))}, and a sample of zstate is the "
-                    "whole robot; let joint_state_publisher merge the parts (its parameter source_list)",
-                    reason="missing joints",
-                )
-            pick = np.array([names.index(name) for name in self._coordinates], dtype=np.intp)
-            # Only the last order, so that a writer with changing orders does not fill the memory.
-            self._picks = {names: pick}
-        return pick
+            is_whole = set(names).issuperset(self._coordinates)
+            columns = [names.index(name) for name in self._coordinates] if is_whole else ()
+            self._picks[names] = np.array(columns, dtype=np.intp) if is_whole else None
+        return self._picks[names]
+
+
+def partial_joint_state(message: Any, stamp: int, node: str) -> JointState:
+    """The joint state of ``node``, which publishes some of the joints. Raises MessageError."""
+    names = tuple(message.name)
+    in_order = np.arange(len(names))
+    values = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
+    blocks = [_picked(what, numbers, len(names), in_order) for what, numbers in values.items()]
+    positions, velocities, efforts = (None if block is None else to_block(block) for block in blocks)
+    if positions is None:
+        raise _without_positions()
+    # The session only distinguishes nodes.
+    return JointState(stamp, 0, hash(node), order_digest(names), positions, velocities, efforts, names)
+
+
+def _without_positions() -> MessageError:
+    return MessageError("a JointState without positions", reason="sizes")
 
 
 def _picked(what: str, values: Sequence[float], count: int, pick: NDArray[np.intp]) -> Floats | None:

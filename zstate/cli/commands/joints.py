@@ -74,6 +74,7 @@ def joints_command(
             publisher = PartialStatePublisher(session, model, only, robot_name, (wire,), clock=time)
             shown = f"on {', '.join(only)}"
             place = messages_for(wire).place(robot_name, (get_wire(wire).partial_joint_states,))
+            place += f"/{publisher.writer}" if wire == "native" else ""
         else:
             publisher = StatePublisher(
                 session, model, robot_name, (wire,), streams=("joint_states",), clock=time, takeover=takeover

@@ -158,6 +158,7 @@ def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
 ) -> None:
     """Publish the joint states of ``wire``: what they imply with ``derived``, everything with ``whole``."""
     from zstate.net.topic_statistics import mean_rate_hz
+    from zstate.wire.registry import get_wire
 
     messages, robot = messages_for(wire), derived.robot
     place = messages.place(robot, ("joint_states",))
@@ -168,7 +169,9 @@ def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
         assert reading.stamp is not None
         if not count:
             first = reading.stamp
-            print_status(f"receiving {place}: {len(reading.positions)} positions")
+            is_merged = reading.oldest_stamp is not None
+            parts = messages.place(robot, (get_wire(wire).partial_joint_states,))
+            print_status(f"receiving {parts if is_merged else place}: {len(reading.positions)} positions")
         count, last = count + 1, reading.stamp
         whole.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
 

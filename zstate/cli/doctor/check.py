@@ -8,11 +8,13 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from zstate.cli.output.console import colored, count_text, output_width
+from zstate.wire.keys import JOINT_STREAMS
 
 State = Literal["ok", "warning", "broken", "skipped"]
 
 _COLORS = {"ok": "green", "warning": "yellow", "broken": "red", "skipped": None}
 _STATE, _NAME, _MIN_TEXT = 7, 12, 20  # widths
+_MOVING = {*JOINT_STREAMS, "tf", "transforms"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +76,8 @@ def robot_lines(robot: str, checks: Sequence[Check], *, in_full: bool) -> Iterat
         yield robot
         yield from map(check_text, shown)
     else:
-        moves = [check.text for check in checks if check.name in ("joint_states", "tf")]
-        yield check_text(Check(robot, "ok", moves[0] if moves else "sound"))
+        moves = [check.text for check in checks if check.name in _MOVING]
+        yield check_text(Check(robot, "ok", "; ".join(moves) or "sound"))
 
 
 def conclusion_text(checks: Sequence[Check]) -> str:

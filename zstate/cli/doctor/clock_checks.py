@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
+from zstate.cli.doctor.check import Check, broken, first_broken, ok, skipped, warning
 from zstate.cli.doctor.robot_probe import RobotProbe
 from zstate.clock import SYSTEM, format_stamp
 from zstate.errors import NoClock, format_duration
 from zstate.ingest.stamp_checks import FAR_NS, likely_cause
 from zstate.net.clock_offset import MeasuredOffset
 from zstate.net.session import Session
+from zstate.net.topic_statistics import Window
 from zstate.nodes.clock import SimulatedClock
 
 _DISTURBS_NS = 20_000_000
@@ -51,10 +52,9 @@ def domains_check(clocks: Mapping[str, str]) -> Iterator[Check]:
 
 
 def stamps_check(probe: RobotProbe, session: Session) -> Check:
-    """Whether the stamps of samples are plausible sampling times."""
-    statistics = probe.samples.statistics
-    window = statistics.window()
-    if window is None:
+    """Whether the stamps of all writers' samples are plausible sampling times."""
+    sampled = [(one.session, window) for one in probe.statistics() if (window := one.window()) is not None]
+    if not sampled:
         return skipped("stamps", "there is no sample")
     if probe.description is not None and (domain := probe.description.clock) not in ("", SYSTEM):
         with SimulatedClock(session) as clock:
@@ -63,7 +63,17 @@ def stamps_check(probe: RobotProbe, session: Session) -> Check:
             except NoClock as error:
                 return broken("stamps", f"simulated time {domain!r}: {error}", "zstate replay FILE --clock")
         return ok("stamps", f"simulated time {domain!r}, which is now {format_stamp(now)}")
-    writer, least = probe.writer_name(statistics.session), window.delays[0]
+    problems = [problem for one in sampled if (problem := _stamps_problem(probe, *one)) is not None]
+    if problems:
+        return first_broken(problems) or problems[0]
+    least, greatest = zip(*(window.delays for _, window in sampled), strict=True)
+    low, high = (format_duration(max(delay, 0)) for delay in (min(least), max(greatest)))
+    return ok("stamps", f"{low} to {high} old on arrival")
+
+
+def _stamps_problem(probe: RobotProbe, session: int, window: Window) -> Check | None:
+    """What is wrong with the stamps of one writer; None if they are plausible."""
+    writer, least = probe.writer_name(session), window.delays[0]
     stamp, stamps = window.received[-1].stamp, {one.stamp for one in window.received}
     if abs(least) > FAR_NS:
         size = f"{format_duration(abs(least))} {'before' if least > 0 else 'after'}"
@@ -73,13 +83,12 @@ def stamps_check(probe: RobotProbe, session: Session) -> Check:
     if len(window.received) > 2 and len(stamps) == 1:
         text = f"{writer} gives every sample the same stamp, {format_stamp(stamp)}: its source stands still"
         return broken("stamps", text, f"zstate echo {probe.info.name}")
-    return _delay_check(probe, statistics.session, window.delays)
+    return _delay_problem(probe, session, least)
 
 
-def _delay_check(probe: RobotProbe, session: int, delays: tuple[int, int]) -> Check:
-    """Whether samples arrive soon after their stamps; ``delays`` are the least and the greatest [ns]."""
-    writer, (least, greatest) = probe.writer_name(session), delays
-    cause, then = "", _SET_CLOCKS
+def _delay_problem(probe: RobotProbe, session: int, least: int) -> Check | None:
+    """A writer whose samples do not arrive soon after their stamps; ``least`` is the least delay [ns]."""
+    writer, cause, then = probe.writer_name(session), "", _SET_CLOCKS
     for measured in probe.offsets:
         if measured.writer.session == session and abs(measured.offset_ns) > _DISTURBS_NS:
             cause = f": {_offset_text(measured)}"
@@ -94,5 +103,4 @@ def _delay_check(probe: RobotProbe, session: int, delays: tuple[int, int]) -> Ch
     if least > _BREAKS_NS:
         text = f"samples of {writer} arrive {format_duration(least)} after their stamps{cause}"
         return warning("stamps", text, then)
-    low, high = (format_duration(max(delay, 0)) for delay in (least, greatest))
-    return ok("stamps", f"{low} to {high} old on arrival")
+    return None

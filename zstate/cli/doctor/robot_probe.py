@@ -219,6 +219,12 @@ class RobotProbe(Closeable):
         all_samples = [self.samples, self.transforms, self.parts]
         return sum(samples.statistics.count for samples in all_samples if samples is not None)
 
+    def statistics(self) -> list[IntervalStatistics]:
+        """Those of the followed stream, and of each writer of partial joint states and of transforms."""
+        named = [samples for samples in (self.parts, self.transforms) if samples is not None]
+        writers = [writer for samples in named for writer in samples.writers.values()]
+        return [self.samples.statistics, *(writer.statistics for writer in writers)]
+
     @property
     def has_only_transforms(self) -> bool:
         """Whether its writers publish moving edges, and no joints or model."""

@@ -80,6 +80,9 @@ class NativeMessages:
         if stream in streams:
             fact = f"{robot!r} is announced with {stream}, but no {'new ' * ended}sample arrives"
             return f"{fact}; `zstate doctor {robot}` finds the reason"
+        if stream == "joint_states" and "partial_joint_states" in streams:
+            fact = f"the joints of {robot!r} come from drivers of some joints each"
+            return f"{fact}; `zstate echo {robot} --stream partial_joint_states` prints them"
         command = f"zstate transform TARGET SOURCE --xyz X Y Z --robot {robot}"
         if stream == "partial_joint_states":
             command = f"{publish_command_for('joints', robot)} --only NAME"
