@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import threading
-from array import array
 from collections.abc import Callable
 
 import numpy as np
@@ -21,10 +20,8 @@ from zstate.buffer.tracks import JointTrack
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.extension import kernel
 from zstate.model.load import load_model
-from zstate.nodes.publisher import block_of
 from zstate.se3 import ARRAYS, conjugate, multiply, quaternion_from_rpy, unstack
 from zstate.transform import Transform
-from zstate.wire.messages import to_block
 
 pytestmark = pytest.mark.skipif(kernel != "c", reason=f"runs on the reference: {kernel.reason}")
 
@@ -203,7 +200,6 @@ def test_unusual_input_falls_back_to_the_reference() -> None:
         "abc",
     ):
         assert history.try_insert(1, numbers, None, 3) is None
-        assert block_of(numbers, 3) is None
     for block in (b"", b"x" * 24 + b"y", row.tobytes()[8:], (row * np.nan).tobytes(), bytearray(24)):
         assert history.try_insert(1, block, None, 3) is None
     assert history.try_insert(1, row, None, 3) is True
@@ -251,22 +247,6 @@ def test_block_that_holds_no_pose_is_refused(block: bytes, match: str) -> None:
     assert buffer.latest("odom", "base") == 1
     with pytest.raises(InvalidInput, match="stamp"):
         buffer.insert_many(edges, 2.5, good)  # type: ignore[arg-type]
-
-
-def test_block_of_accepts_plain_numbers_and_nothing_else() -> None:
-    row = np.array([0.5, -1.0, 3.0])
-    for numbers in (row, memoryview(row), array("d", row)):
-        assert block_of(numbers, 3) == to_block(row)
-    for numbers in (
-        row[:2],
-        row[::-1],
-        row.astype("f4"),
-        row[None],
-        row * np.inf,
-        row.tolist(),
-        to_block(row),
-    ):
-        assert block_of(numbers, 3) is None
 
 
 def test_views_are_read_only_and_outlive_their_history() -> None:
