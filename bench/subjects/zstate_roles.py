@@ -67,10 +67,8 @@ class Reader(Closeable):
         self._answered = answered
         self._session = connect(job, "reader")
         self._buffer = TransformBuffer()
-        expressions = job.followed if job.follows or len(job.robots) == 1 else ("*",)
-        self._listeners = [
-            TransformListener(self._session, robot, self._buffer, wire=wire) for robot in expressions
-        ]
+        robots = job.followed if job.follows or len(job.robots) == 1 else "*"
+        self._listener = TransformListener(self._session, robots, self._buffer, wire=wire)
         self._ends = [(f"{robot}/{job.base}", f"{robot}/{job.tip}") for robot in job.followed]
         self._closed = threading.Event()
         if job.load == "slow":
@@ -112,6 +110,5 @@ class Reader(Closeable):
 
     def close(self) -> None:
         self._closed.set()
-        for listener in self._listeners:
-            listener.close()
+        self._listener.close()
         self._session.close()

@@ -5,13 +5,16 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Literal
 
+import pytest
 from helpers.link_meter import LinkMeter
 from helpers.processes import until
 from helpers.robots import RRBOT
 
 from zstate import StatePublisher, TransformBuffer, TransformListener, connect
 from zstate.net.latched import HEARTBEAT_S
+from zstate.net.session import Session
 
 TICKS = 50
 
@@ -34,9 +37,11 @@ def fleet(port: int, count: int) -> Iterator[list[StatePublisher]]:
         yield robots
 
 
-def link_bytes(robots: list[StatePublisher], port: int, followed: list[str]) -> tuple[int, int]:
+def link_bytes(
+    robots: list[StatePublisher], port: int, followed: list[str] | Literal["*"], *, one_listener: bool = True
+) -> tuple[int, int]:
     """Bytes to a reader of the robots ``followed``: until it has their models, and for 50 ticks."""
-    names = [robot.robot for robot in robots] if followed == ["*"] else followed
+    names = [robot.robot for robot in robots] if followed == "*" else followed
     buffer = TransformBuffer()
     with (
         LinkMeter(port) as meter,
@@ -45,7 +50,7 @@ def link_bytes(robots: list[StatePublisher], port: int, followed: list[str]) -> 
     ):
         listeners = [
             opened.enter_context(TransformListener(session, robot, buffer, history_on_join=False))
-            for robot in followed
+            for robot in ([followed] if one_listener else followed)
         ]
         until(lambda: all(buffer.can_lookup(f"{name}/world", f"{name}/base") for name in names))
         wait_until_quiet(meter)
@@ -65,12 +70,15 @@ def wait_until_quiet(meter: LinkMeter) -> None:
         quiet.wait(0.2)
 
 
-def test_reader_of_three_robots_receives_no_more_bytes_if_there_are_ten_times_as_many(free_port: int):
+@pytest.mark.parametrize("one_listener", [True, False], ids=["one listener", "a listener each"])
+def test_reader_of_three_robots_receives_no_more_bytes_if_there_are_ten_times_as_many(
+    free_port: int, one_listener: bool
+):
     followed = ["r0", "r1", "r2"]
     with fleet(free_port, 3) as robots:
-        joining_alone, running_alone = link_bytes(robots, free_port, followed)
+        joining_alone, running_alone = link_bytes(robots, free_port, followed, one_listener=one_listener)
     with fleet(free_port, 30) as robots:
-        joining, running = link_bytes(robots, free_port, followed)
+        joining, running = link_bytes(robots, free_port, followed, one_listener=one_listener)
     # Numbers and keys are one digit longer at most; keep-alives depend on the duration.
     assert joining < 1.25 * joining_alone
     assert running < 1.25 * running_alone
@@ -78,8 +86,17 @@ def test_reader_of_three_robots_receives_no_more_bytes_if_there_are_ten_times_as
 
 def test_joining_a_fleet_costs_the_same_bytes_for_each_robot_of_forty_as_of_ten(free_port: int):
     with fleet(free_port, 10) as robots:
-        joining_ten, running_ten = link_bytes(robots, free_port, ["*"])
+        joining_ten, running_ten = link_bytes(robots, free_port, "*")
     with fleet(free_port, 40) as robots:
-        joining_forty, running_forty = link_bytes(robots, free_port, ["*"])
+        joining_forty, running_forty = link_bytes(robots, free_port, "*")
     assert joining_forty / 40 < 1.25 * joining_ten / 10
     assert running_forty / 40 < 1.25 * running_ten / 10
+
+
+def test_listener_of_several_robots_has_no_more_threads_than_of_two(sessions: tuple[Session, Session]):
+    def threads(count: int) -> int:
+        before = threading.active_count()
+        with TransformListener(sessions[1], [f"r{number}" for number in range(count)]):
+            return threading.active_count() - before
+
+    assert threads(20) == threads(2)

@@ -119,6 +119,74 @@ def test_listener_of_one_robot_receives_nothing_of_another(sessions):
         assert all(frame.name.startswith("r1/") for frame in listener.buffer.frames())
 
 
+@pytest.mark.parametrize("follow", ["joint_states", "tf"])
+def test_listener_of_several_robots_receives_exactly_these(sessions, follow):
+    writer, reader = sessions
+    names = ["r1", "r2", "r3"]
+    with (
+        StatePublisher(writer, RRBOT, "r1") as first,
+        StatePublisher(writer, RRBOT, "r2") as other,
+        TransformListener(reader, ["r1", "r3"], follow=follow) as listener,
+        StatePublisher(writer, RRBOT, "r3") as later,  # joins after the listener
+        TransformListener(reader, follow=follow) as everything,
+    ):
+        until(lambda: {event.robot for event in listener.events()} == {"r1", "r3"})
+        stamps = iter(range(STAMP, STAMP + 10_000 * PERIOD, PERIOD))
+
+        def all_received_twenty() -> bool:
+            stamp = next(stamps)
+            for publisher in (first, other, later):
+                publisher.publish([0.1, 0.2], stamp=stamp)
+            counts = [everything.stats_of(name).received for name in names]
+            return min(*counts, *(listener.stats_of(name).received for name in ("r1", "r3"))) >= 20
+
+        until(all_received_twenty)
+        assert listener.stats_of("r2").received == 0
+        assert listener.robots() == ("r1", "r3")
+        for name in ("r1", "r3"):
+            assert_pose(
+                listener.buffer.lookup(f"{name}/world", f"{name}/camera_link"),
+                kinematic_pose(RRBOT, [0.1, 0.2], "world", "camera_link"),
+            )
+        later.close()
+        until(lambda: any(event.kind == "left" and event.robot == "r3" for event in listener.events()))
+
+
+def test_listener_of_several_robots_gets_the_samples_that_each_cached(sessions):
+    writer, reader = sessions
+    now = time.time_ns()
+    with StatePublisher(writer, RRBOT, "r1") as first, StatePublisher(writer, RRBOT, "r2") as second:
+        for publisher in (first, second):
+            publisher.publish([0.1, 0.2], stamp=now)
+        with TransformListener(reader, ("r1", "r2")) as listener:
+            for name in ("r1", "r2"):
+                listener.buffer.wait(f"{name}/world", f"{name}/camera_link", timeout_s=SOON_S)
+                assert listener.buffer.latest(f"{name}/world", f"{name}/camera_link") == now
+
+
+def test_sequence_of_one_robot_is_that_robot(sessions):
+    with TransformListener(sessions[1], ["r1"]) as listener:
+        assert listener.robot == "r1"
+    with TransformListener(sessions[1], ["r1"], wire="ros2") as listener:
+        assert listener.robot == "r1"
+
+
+@pytest.mark.parametrize(
+    ("robots", "wire", "problem"),
+    [
+        ([], "native", "empty"),
+        (["r1", "*"], "native", r"'\*' is in a sequence"),
+        (["r1", "r2", "r1"], "native", "has 'r1' more than once"),
+        (["r1", "a/b"], "native", "'a/b' contains '/'"),
+        (["r1", ""], "native", "is empty"),
+        (["r1", "r2"], "ros2", "share topics"),
+    ],
+)
+def test_unusable_sequences_of_robots_are_refused(sessions, robots, wire, problem):
+    with pytest.raises(InvalidInput, match=problem):
+        TransformListener(sessions[1], robots, wire=wire)
+
+
 def test_two_listeners_fill_one_given_buffer(sessions):
     writer, reader = sessions
     buffer = TransformBuffer(history_s=3.0, clock=ManualClock(5))

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import zenoh
 
@@ -22,7 +23,7 @@ from zstate.errors import Closed, InvalidInput
 from zstate.net.queryable import query
 from zstate.net.sample_history import RoundRobinQueue
 from zstate.net.session import Session
-from zstate.net.streams import Receiver, Ring, call_for_each, to_serialized
+from zstate.net.streams import Receiver, call_for_each, subscribe_to_all, to_serialized
 from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 4096
@@ -82,24 +83,23 @@ class LatchedSubscriber(Receiver[zenoh.Sample]):
     """Subscriber to the current value of every matching key, then to each change.
 
     ``on_value(sample)`` is called for one sample at a time, from one of two threads of this subscriber; the
-    payload is empty if the value was withdrawn. ``Receiver`` describes slow and failing callbacks.
+    payload is empty if the value was withdrawn. Several key expressions share these threads. ``Receiver``
+    describes slow and failing callbacks.
     """
 
-    def __init__(self, session: Session, keyexpr: str, on_value: Callable[[SerializedSample], None]) -> None:
+    def __init__(
+        self, session: Session, keyexprs: str | Sequence[str], on_value: Callable[[SerializedSample], None]
+    ) -> None:
         self._on_value = on_value
         self._numbers: BoundedDict[str, int | zenoh.Timestamp] = BoundedDict()
         self._lock = threading.Lock()
-        ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
-        subscriber = zenoh.ext.declare_advanced_subscriber(
-            session.zenoh,
-            keyexpr,
-            ring,
-            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-        )
-        super().__init__(session, subscriber, CAPACITY)
+        keyexprs = (keyexprs,) if isinstance(keyexprs, str) else keyexprs
+        recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        declare = partial(zenoh.ext.declare_advanced_subscriber, session.zenoh, recovery=recovery)
+        super().__init__(session, subscribe_to_all(keyexprs, CAPACITY, declare), CAPACITY)
         try:
             # After subscribing, so that no change falls between a cached value and the live ones.
-            self._cached = _CachedValues(session, keyexpr, self._on_sample)
+            self._cached = _CachedValues(session, keyexprs, self._on_sample)
         except BaseException:
             super().close()
             raise
@@ -143,18 +143,19 @@ class _Request:
 
 
 class _CachedValues(Receiver[zenoh.Sample]):
-    """Requests the cached value of each publisher on ``keyexpr`` once it is announced, now or later.
+    """Requests the cached value of each publisher on ``keyexprs`` once it is announced, now or later.
 
     At most eight requests are in flight. Keys take turns, so that many silent publishers of one key do not
     delay the others. A request that times out is repeated twice.
     """
 
-    def __init__(self, session: Session, keyexpr: str, on_value: Callable[[zenoh.Sample], None]) -> None:
+    def __init__(
+        self, session: Session, keyexprs: Sequence[str], on_value: Callable[[zenoh.Sample], None]
+    ) -> None:
         self._on_value = on_value
-        ring: Ring = zenoh.handlers.RingChannel(_TOKENS)
-        liveliness = session.zenoh.liveliness()
-        tokens = liveliness.declare_subscriber(f"{keyexpr}/@adv/pub/**", ring, history=True)
-        super().__init__(session, tokens, _TOKENS)
+        tokens = [f"{keyexpr}/@adv/pub/**" for keyexpr in keyexprs]
+        declare = partial(session.zenoh.liveliness().declare_subscriber, history=True)
+        super().__init__(session, subscribe_to_all(tokens, _TOKENS, declare), _TOKENS)
 
     def _on_batch(self, batch: list[zenoh.Sample]) -> None:
         call_for_each(self._values(batch), self._on_value)

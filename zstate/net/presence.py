@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput
 from zstate.net.queryable import MAX_REPLIES, query_tokens
 from zstate.net.session import Session
-from zstate.net.streams import Receiver, Ring, call_for_each
+from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READERS, Stream, parse_reader_key, shortened
 from zstate.wire.protocol import Wire
@@ -231,7 +232,7 @@ class RouterLossDetector(Closeable):
 
 
 class WriterWatch(Receiver[zenoh.Sample]):
-    """Watches the writers of ``robot`` ("*": of all robots), beginning with the current ones.
+    """Watches the writers of ``robot`` ("*": of all robots; or of several), beginning with the current ones.
 
     ``callback(announced, alive)`` is called from one thread. The loss of a router removes every writer behind
     it; for these ``on_cut_off(announced)`` is called instead, if it is given. ``foreign`` counts tokens that
@@ -245,7 +246,7 @@ class WriterWatch(Receiver[zenoh.Sample]):
     def __init__(
         self,
         session: Session,
-        robot: str,
+        robot: str | Sequence[str],
         callback: Callable[[Announcement, bool], None],
         wire: str = "native",
         on_cut_off: Callable[[Announcement], None] | None = None,
@@ -256,12 +257,12 @@ class WriterWatch(Receiver[zenoh.Sample]):
         self._callback = callback
         self._on_cut_off = on_cut_off
         self._routers = None if on_cut_off is None else RouterLossDetector(session)
-        self._robot = robot
+        robots = (robot,) if isinstance(robot, str) else robot
+        self._robot = robots[0] if len(robots) == 1 else ANY
         self._wire = get_wire(wire)
-        ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
-        self._expression = self._wire.writers_expression(robot)
-        tokens = session.zenoh.liveliness().declare_subscriber(self._expression, ring, history=True)
-        super().__init__(session, tokens, CAPACITY)
+        self._expressions = [self._wire.writers_expression(one) for one in robots]
+        declare = partial(session.zenoh.liveliness().declare_subscriber, history=True)
+        super().__init__(session, subscribe_to_all(self._expressions, CAPACITY, declare), CAPACITY)
 
     def _on_batch(self, batch: list[zenoh.Sample]) -> None:
         if len(batch) < CAPACITY:
@@ -269,7 +270,8 @@ class WriterWatch(Receiver[zenoh.Sample]):
             changes = [(str(sample.key_expr), sample.kind == puts) for sample in batch]
         else:
             # Differences since the last batch; later changes are still in the ring.
-            current, known = confirmed_tokens(self._session, self._expression), self._known.keys()
+            tokens = (confirmed_tokens(self._session, expression) for expression in self._expressions)
+            current, known = frozenset[str]().union(*tokens), self._known.keys()
             changes = [(token, False) for token in known - current]
             changes += [(token, True) for token in current - known]
         is_loss = any(not alive for _, alive in changes)

@@ -1,16 +1,19 @@
 """Sample streams (best effort, keep last): the newest sample replaces older ones, and writers never wait.
 
-Subscribers and queryables are a ``Receiver``: one daemon thread that drains a Zenoh channel in batches.
+Subscribers and queryables are a ``Receiver``: one daemon thread that drains a channel in batches, Zenoh's own
+or a ``SharedRing`` of several subscribers.
 """
 
 from __future__ import annotations
 
+import queue
 import sys
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
 import zenoh
 
@@ -25,7 +28,7 @@ CAPACITY = 1024
 """Samples of one key that wait for a delayed reader: a second at 1 kHz."""
 
 WILDCARD_CAPACITY = 4096
-"""The same for an expression that matches many keys: 0.8 s of 100 robots at 50 Hz.
+"""The same for expressions that match many keys: 0.8 s of 100 robots at 50 Hz.
 
 Not more, because a waiting sample holds the memory it was received in, 10 to 20 kB.
 """
@@ -52,6 +55,82 @@ class Subscribed(Undeclarable, Protocol[T_co]):
 
     @property
     def handler(self) -> Channel[T_co]: ...
+
+
+class SharedRing(Generic[T]):
+    """The last ``capacity`` items: a Channel that several subscribers fill, for one receiving thread.
+
+    Zenoh's own channels belong to one subscriber each, and no key expression matches several robots, but not
+    all. ``put`` may be called from any thread.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._items: deque[T] = deque(maxlen=capacity)
+        self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._is_waiting = False
+        self._has_ended = False
+
+    def put(self, item: T) -> None:
+        """Add an item; the oldest is lost if the ring is full. Does not wait."""
+        self._items.append(item)
+        if self._is_waiting:
+            self._is_waiting = False
+            self._wakeups.put(None)
+
+    def close(self) -> None:
+        """Raise ZError in the receiving thread, now and later."""
+        self._has_ended = True
+        self._wakeups.put(None)
+
+    def recv(self) -> T:
+        while (item := self.try_recv()) is None:
+            # Set before the second look: an item that arrives after it puts a wakeup.
+            self._is_waiting = True
+            if not self._items:
+                self._wakeups.get()
+        return item
+
+    def try_recv(self) -> T | None:
+        if self._has_ended:
+            raise zenoh.ZError("the subscribers of this ring are closed")
+        return self._items.popleft() if self._items else None
+
+
+Declare: TypeAlias = Callable[[str, Any], Any]
+"""Declares a subscriber to a key expression with a handler; what it returns depends on the handler's type."""
+
+
+def subscribe_to_all(keyexprs: Sequence[str], capacity: int, declare: Declare) -> Subscribed[zenoh.Sample]:
+    """Subscribers to ``keyexprs`` that deliver into one ring of ``capacity`` samples.
+
+    Raises what ``declare`` raises, and leaves no subscriber then.
+    """
+    if len(keyexprs) == 1:
+        # Zenoh's own ring takes samples while other Python threads run.
+        return declare(keyexprs[0], zenoh.handlers.RingChannel(capacity))
+    return _SharedSubscription(keyexprs, capacity, declare)
+
+
+class _SharedSubscription:
+    def __init__(self, keyexprs: Sequence[str], capacity: int, declare: Declare) -> None:
+        self.handler: SharedRing[zenoh.Sample] = SharedRing(capacity)
+        self._subscribers: list[Undeclarable] = []
+        try:
+            for keyexpr in keyexprs:
+                # Called on Zenoh's thread, which must not wait; it also ends the ring with the session.
+                callback = zenoh.handlers.Callback(self.handler.put, self.handler.close, indirect=False)
+                self._subscribers.append(declare(keyexpr, callback))
+        except BaseException:
+            self.undeclare()
+            raise
+
+    def undeclare(self) -> None:
+        """Undeclare all subscribers. Raises RuntimeError while one is in use: then call it again."""
+        self.handler.close()
+        while self._subscribers:
+            with suppress(zenoh.ZError):  # the session was closed
+                self._subscribers[-1].undeclare()
+            self._subscribers.pop()
 
 
 def call_for_each(batch: Iterable[T], function: Callable[[T], object]) -> None:
@@ -133,9 +212,9 @@ class Receiver(Closeable, Generic[T]):
             threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
 
-def capacity_for(keyexpr: str) -> int:
-    """The number of samples of ``keyexpr`` that wait for their reader; beyond it the oldest are lost."""
-    return WILDCARD_CAPACITY if "*" in keyexpr else CAPACITY
+def capacity_for(keyexprs: Sequence[str]) -> int:
+    """The number of samples of ``keyexprs`` that wait for their reader; beyond it the oldest are lost."""
+    return WILDCARD_CAPACITY if len(keyexprs) > 1 or "*" in keyexprs[0] else CAPACITY
 
 
 def to_serialized(sample: zenoh.Sample, key: str = "", max_bytes: int = LATCHED_BYTES) -> SerializedSample:
@@ -195,9 +274,10 @@ class StreamPublisher(Closeable):
 
 
 class StreamSubscriber(Receiver[zenoh.Sample]):
-    """Subscriber to a key expression; ``on_samples`` is called with all waiting samples, oldest first.
+    """Subscriber to key expressions; ``on_samples`` is called with all waiting samples, oldest first.
 
-    It is called from one thread of this subscriber. ``Receiver`` describes slow and failing callbacks.
+    It is called from one thread of this subscriber, for all of its expressions. ``Receiver`` describes slow
+    and failing callbacks.
 
     ``insert_next(key, payload)`` is called before it with each sample by itself, and returns True if it
     handled the sample: then ``on_samples`` does not get it. ``payload`` is None if the sample has an
@@ -211,14 +291,15 @@ class StreamSubscriber(Receiver[zenoh.Sample]):
     def __init__(
         self,
         session: Session,
-        keyexpr: str,
+        keyexprs: str | Sequence[str],
         on_samples: Callable[[list[SerializedSample]], None],
         capacity: int | None = None,
         *,
         insert_next: Callable[[str, bytes | None], bool] | None = None,
         encoding: str = "",
     ) -> None:
-        self._key = "" if "*" in keyexpr else keyexpr
+        keyexprs = (keyexprs,) if isinstance(keyexprs, str) else keyexprs
+        self._key = "" if len(keyexprs) > 1 or "*" in keyexprs[0] else keyexprs[0]
         self._declared: dict[str, _DeclaredKey] = {}
         self._on_samples = on_samples
         self._insert_next = insert_next
@@ -226,9 +307,9 @@ class StreamSubscriber(Receiver[zenoh.Sample]):
         # sample of a single key; of many keys, the next sample may be of another one.
         self._needs_batches = not self._key
         self._encoding = zenoh.Encoding(encoding)
-        capacity = capacity or capacity_for(keyexpr)
-        ring: Ring = zenoh.handlers.RingChannel(capacity)
-        super().__init__(session, session.zenoh.declare_subscriber(keyexpr, ring), capacity)
+        capacity = capacity or capacity_for(keyexprs)
+        subscribed = subscribe_to_all(keyexprs, capacity, session.zenoh.declare_subscriber)
+        super().__init__(session, subscribed, capacity)
 
     def _is_handled(self, item: zenoh.Sample) -> bool:
         if self._insert_next is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 import weakref
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -33,9 +34,9 @@ from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.wire import native
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened, stream_from_key, stream_key
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot, shortened, stream_from_key, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
-from zstate.wire.protocol import SerializedSample
+from zstate.wire.protocol import SerializedSample, Wire
 from zstate.wire.registry import get_wire
 
 Follow = Literal["joint_states", "tf"]
@@ -82,7 +83,12 @@ class _SampleStream:
 
 
 class TransformListener(Closeable):
-    """Fills ``buffer`` with the transforms of one robot, or of all robots with ``robot="*"``.
+    """Fills ``buffer`` with the transforms of one robot, of several, or of all robots with ``robot="*"``.
+
+    On the native wire ``robot`` may be a sequence of names. Nothing of other robots crosses the link, and
+    the named robots share the threads of one listener; its attribute ``robot`` is then ``"*"``. Raises
+    InvalidInput if the sequence is empty, or contains ``"*"``, an invalid name or a name twice; on the ROS
+    wires if it has more than one name.
 
     Frames are named ``robot/frame`` in the buffer; bare names work while they are unique.
     ``follow="joint_states"`` subscribes to joint positions and the model and computes the kinematics here;
@@ -113,7 +119,7 @@ class TransformListener(Closeable):
     def __init__(  # noqa: PLR0917 - the order is that of the published contract
         self,
         session: Session,
-        robot: str = ANY,
+        robot: str | Sequence[str] = ANY,
         buffer: TransformBuffer | None = None,
         wire: str = "native",
         follow: Follow = "joint_states",
@@ -128,13 +134,14 @@ class TransformListener(Closeable):
             raise InvalidInput(f"placers is a collection of robot names, for instance {[placers]!r}")
         if follow not in ("joint_states", "tf"):
             raise InvalidInput(f"follow is 'joint_states' or 'tf', not {follow!r}")
-        self.robot = robot
+        self._wire = get_wire(wire)
+        self._robots = _robot_names(robot, self._wire)
+        self.robot = self._robots[0] if len(self._robots) == 1 else ANY
         self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
         if clock is not None:
             self.buffer.use_clock(clock)
-        self._wire = get_wire(wire)
         self._robot_from_key: Callable[[str], str] = (
-            self._wire.robot_from_key if robot == ANY else lambda _: robot
+            self._wire.robot_from_key if self.robot == ANY else lambda _: self.robot
         )
         is_on_system_clock = type(self.buffer.clock) is SystemClock
         self._has_fast_path = kernel == "c" and self._wire.name == "native" and is_on_system_clock
@@ -167,8 +174,7 @@ class TransformListener(Closeable):
                 "tf_static": self._on_statics,
             }
             for stream, handle in latched.items():
-                key = self._wire.expression(robot, stream)
-                opening.enter_context(LatchedSubscriber(session, key, self._observed(handle)))
+                opening.enter_context(LatchedSubscriber(session, self._keys(stream), self._observed(handle)))
             if len(self._sample_streams) > 1 and self._wire.shared:
                 subscribe = partial(self._subscribe, session, [self._wire.transforms])
                 self._tf_of_others = opening.enter_context(_TfOfOtherNodes(subscribe))
@@ -184,9 +190,10 @@ class TransformListener(Closeable):
                 self._clock_offsets = opening.enter_context(_WriterClockOffsets(session, self.buffer))
             # History is requested from each writer found: after subscribing, so that no sample falls between.
             on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
-            opening.enter_context(WriterWatch(session, robot, on_writer, wire, on_cut_off))
-            for announcement in announce_reader(session, self._wire, robot, streams):
-                opening.enter_context(announcement)
+            opening.enter_context(WriterWatch(session, self._robots, on_writer, wire, on_cut_off))
+            for name in self._robots:
+                for announcement in announce_reader(session, self._wire, name, streams):
+                    opening.enter_context(announcement)
             self._opened = opening.pop_all()
         self._pid = os.getpid()
         _LISTENERS.add(self)
@@ -204,14 +211,19 @@ class TransformListener(Closeable):
         """Receive the samples of ``streams`` until the stack is closed."""
         with ExitStack() as opening:
             for stream in streams:
-                samples, key = self._sample_streams[stream], self._wire.expression(self.robot, stream)
-                samples.capacity = capacity_for(key)
-                opening.enter_context(self._subscriber(session, key, samples))
+                samples, keys = self._sample_streams[stream], self._keys(stream)
+                samples.capacity = capacity_for(keys)
+                opening.enter_context(self._subscriber(session, keys, samples))
             return opening.pop_all()
+
+    def _keys(self, stream: Stream) -> list[str]:
+        """The key expressions of ``stream`` of the robots."""
+        return [self._wire.expression(robot, stream) for robot in self._robots]
 
     def __repr__(self) -> str:
         robots, received = len(self.robots()), self.stats.received
-        return f"<TransformListener of {self.robot!r}: {robots} robots, {received} samples received>"
+        names = ", ".join(map(repr, self._robots))
+        return f"<TransformListener of {names}: {robots} robots, {received} samples received>"
 
     @property
     def stats(self) -> ListenerStats:
@@ -273,13 +285,13 @@ class TransformListener(Closeable):
             "or 'forkserver' method"
         )
 
-    def _subscriber(self, session: Session, key: str, samples: _SampleStream) -> StreamSubscriber:
+    def _subscriber(self, session: Session, keys: Sequence[str], samples: _SampleStream) -> StreamSubscriber:
         on_samples = partial(self._on_samples, samples)
         if not self._has_fast_path:
-            return StreamSubscriber(session, key, on_samples)
+            return StreamSubscriber(session, keys, on_samples)
         insert_next = partial(self._insert_next, samples)
         encoding = native.stream_encoding(samples.stream)
-        return StreamSubscriber(session, key, on_samples, insert_next=insert_next, encoding=encoding)
+        return StreamSubscriber(session, keys, on_samples, insert_next=insert_next, encoding=encoding)
 
     def _ingest_for(self, samples: _SampleStream, robot: str, session: int) -> StreamIngest:
         key = (robot, session if samples.is_shared else 0)
@@ -489,6 +501,29 @@ class TransformListener(Closeable):
         ingest.writer_left(session)
         if samples.is_shared:
             samples.add_unannounced(key, samples.ingests.pop(key))
+
+
+def _robot_names(robot: str | Sequence[str], wire: Wire) -> tuple[str, ...]:
+    """``robot`` as a tuple of names. Raises InvalidInput unless a sequence has different valid names."""
+    if isinstance(robot, str):
+        return (robot,)
+    names = tuple(robot)
+    if not names:
+        raise InvalidInput("robot is an empty sequence; name the robots, or give '*' for all")
+    if ANY in names:
+        raise InvalidInput("'*' is in a sequence of robots; give robot='*' for all, or the names alone")
+    for name in names:
+        check_robot(name)
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        text = ", ".join(map(repr, repeated))
+        raise InvalidInput(f"the sequence of robots has {text} more than once; name each robot once")
+    if wire.shared and len(names) > 1:
+        raise InvalidInput(
+            f"the sequence of robots has {len(names)} names; on the wire {wire.name!r} robots share topics "
+            "whose keys do not name one of them; open a listener for each robot, on one buffer"
+        )
+    return names
 
 
 class _TfOfOtherNodes(Closeable):

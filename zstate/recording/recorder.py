@@ -82,7 +82,7 @@ class MessageQueue(Closeable):
 
     def subscribe(self, stream: Stream, expression: str, robot: str | None) -> None:
         """Subscribe to a stream; an empty payload of a latched one is a withdrawn value."""
-        capacity = capacity_for(expression)
+        capacity = capacity_for((expression,))
 
         def put(arrivals: list[SerializedSample]) -> None:
             batch = Batch(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity)
