@@ -11,10 +11,17 @@ from helpers.robots import RRBOT, assert_pose, kinematic_pose
 from rosbags.rosbag2 import StoragePlugin
 
 from zstate.errors import InPast, NoData
+from zstate.model.urdf import parse_urdf
 from zstate.recording.recording import Recording
 
 SHOULDER, ELBOW = RRBOT.joint_names
 TOOL = RRBOT.links[-1]
+CHAIN = "".join(
+    f"""<joint name="{name}" type="continuous"> <parent link="l{n}"/> <child link="l{n + 1}"/>
+    <axis xyz="0 0 1"/> </joint> <link name="l{n + 1}"/>"""
+    for n, name in enumerate("abc")
+)
+CHAIN = f'<robot name="chain"> <link name="l0"/> {CHAIN} </robot>'
 
 
 def test_each_joint_is_interpolated_between_the_samples_of_its_own_driver(tmp_path: Path):
@@ -99,6 +106,26 @@ def test_of_two_writers_of_a_joint_the_one_that_appears_later_counts(tmp_path: P
                 write(n)
     positions, _ = recorded_buffer(tmp_path / "r.mcap").joint_positions("arm", START + 10 * MS)
     assert positions.tolist() == ([1.0, 1.0] if later == "both" else [1.0, 2.0])
+
+
+def test_replaced_driver_keeps_its_samples_of_other_joints(tmp_path: Path):
+    arm = parse_urdf(CHAIN, "a chain")
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm", arm)
+        for n in range(10):
+            at = START + n * 10 * MS
+            builder.part("arm", at, {"a": 1.0, "b": 2.0}, "both", session=4)
+            if n >= 5:
+                builder.part("arm", at, {"b": 3.0, "c": 4.0}, "later", session=5)
+    buffer = recorded_buffer(tmp_path / "r.mcap")
+    movers = {frame.name: (frame.writer, frame.newest) for frame in buffer.frames() if frame.kind == "joint"}
+    last = START + 90 * MS
+    # "both" would be half a driver from the first sample of "later" on.
+    assert movers == {
+        "arm/l1": ("both", START + 50 * MS),
+        "arm/l2": ("later", last),
+        "arm/l3": ("later", last),
+    }
 
 
 def test_missing_driver_leaves_exactly_its_own_links_without_data(tmp_path: Path):

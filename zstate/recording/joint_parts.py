@@ -6,16 +6,14 @@ first samples of their writers in the file:
 
 1. the set of the writer that appears later moves the joints, as live the driver that started later,
 2. of the sets of one writer, or of the nodes of one topic in a bag of ROS, the larger one,
-3. a set in which such a joint is missing would be half a driver, and is refused; a writer of all joints keeps
-   those that no other set has.
+3. a set that another one replaces keeps its samples of the other joints, and further ones are refused: they
+   would be those of half a driver. A writer of all joints keeps those that no other set has.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-
-from msgspec.structs import replace
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import MessageError
@@ -47,6 +45,8 @@ class RecordedJoints:
         self._drivers: dict[frozenset[str], RecordedPartIngest] = {}
         self._ingests: dict[tuple[int, bytes], StreamIngest] = {}
         self._writers: dict[int, int] = {}
+        self._orders: dict[StreamIngest, int] = {}
+        self._replaced: set[StreamIngest] = set()
         self._counts: Counter[StreamIngest] = Counter()
 
     def describe(self, description: RobotDescription) -> None:
@@ -58,16 +58,20 @@ class RecordedJoints:
 
     def insert(self, writer: RecordedWriter, state: JointState) -> None:
         """Insert the next joint state."""
+        counters = self._ownership.counters.for_robot(self._robot)
         ingest = self._ingests.get((state.session, state.order))
         if ingest is None:
             try:
                 ingest = self._ingests[state.session, state.order] = self._ingest(writer, state)
             except MessageError as error:
-                counters = self._ownership.counters.for_robot(self._robot)
                 counters.count_refusal(error.reason, f"{self._robot!r}: {error}")
                 return
+        if ingest in self._replaced:
+            text = f"{self._robot!r}: {', '.join(map(repr, state.names or ()))} have a later writer"
+            counters.count_refusal("second writer", text)
+            return
         if writer.foreign:  # its number counts the messages of all nodes of the topic
-            state = replace(state, seq=self._counts[ingest])
+            state = _renumbered(state, state.session, self._counts[ingest])
             self._counts[ingest] += 1
         ingest.insert_sample(state, overflowed=False)
 
@@ -95,6 +99,12 @@ class RecordedJoints:
         if name is not None:
             self._ownership.live[self._robot, driver.number] = name
         self.whole.parts.add_writer(driver.number, order)
+        self._orders[driver] = order
+        self._replaced.discard(driver)
+        for joints, other in self._drivers.items():
+            if joints.intersection(names) and self._orders[other] < order:
+                self._replaced.add(other)
+                self.whole.parts.remove_writer(other.number)
         return driver
 
 
@@ -126,7 +136,7 @@ class RecordedJointStateIngest(JointStateIngest):
 
 
 class RecordedPartIngest(PartialJointStateIngest):
-    """The same for one set of joints; ``number`` identifies it among ``parts``, whoever writes it."""
+    """The same for one set of joints; ``number`` identifies it among ``parts``, for all of its writers."""
 
     def __init__(self, robot: str, ownership: FrameOwnership, parts: RobotParts, number: int) -> None:
         super().__init__(robot, ownership, parts, others=True)
@@ -138,7 +148,8 @@ class RecordedPartIngest(PartialJointStateIngest):
     def _insert(self, sample: Sample) -> bool | None:
         if self._newest is not None and sample.stamp < self._newest - DELAYED_NS:
             return False
-        return super()._insert(replace(sample, session=self.number))
+        assert isinstance(sample, JointState)
+        return super()._insert(_renumbered(sample, self.number, sample.seq))
 
     def _drop_history(self) -> None:
         self._parts.restart(self.number)
@@ -146,6 +157,11 @@ class RecordedPartIngest(PartialJointStateIngest):
     def _replace_session(self, sample: Sample) -> None:
         if self._newest is not None and sample.stamp <= self._newest:
             self._drop_history()
+
+
+def _renumbered(state: JointState, session: int, seq: int) -> JointState:
+    numbers = state.positions, state.velocities, state.efforts
+    return JointState(state.stamp, seq, session, state.order, *numbers, state.names)
 
 
 def has_parts(recording: DecodedRecording, robot: str, model: RobotModel) -> bool:
