@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
 from helpers.recording_builder import MS, START, Bag, RecordingBuilder, S, pose, recorded_buffer
-from helpers.robots import RRBOT, SampleCollector
+from helpers.robots import RRBOT, SampleCollector, wait_for_stream_readers
 
 from zstate.errors import SecondWriter
 from zstate.net.presence import current_tokens
@@ -230,13 +230,14 @@ def drivers(tmp_path: Path) -> Path:
     return path
 
 
-def assert_listener_has_the_recorded_joints(sessions, path: Path, robot: str, **options: object):
+def assert_listener_has_the_recorded_joints(sessions, path: Path, robot: str):
     """Play a recording; a listener's positions and poses equal those of the file, bit for bit."""
     tool, recorded = RRBOT.links[-1], recorded_buffer(path)
     newest = recorded.latest("world", tool)
     stamps = np.random.default_rng(5).integers(START + 3 * MS, newest, 200)
     with TransformListener(sessions[0], robot, history_s=100.0) as listener:
-        samples = replay(sessions[1], path, **options)
+        wait_for_stream_readers(sessions[1], robot, "partial_joint_states/any", "robot_description")
+        samples = replay(sessions[1], path)
         until(lambda: listener.stats.received == samples)
         until(lambda: listener.buffer.can_lookup("world", tool, newest))
         positions, valid = listener.buffer.joint_positions_many(robot, stamps)
@@ -256,6 +257,8 @@ def test_drivers_are_played_on_the_keys_of_their_names(sessions, drivers: Path):
         closing(SampleCollector(sessions[0], "zstate/arm/partial_joint_states/lower-1")) as lower,
         closing(SampleCollector(sessions[0], "zstate/arm/partial_joint_states/upper")) as upper,
     ):
+        names = "partial_joint_states/lower-1", "partial_joint_states/upper"
+        wait_for_stream_readers(sessions[1], "arm", *names)
         replay(sessions[1], drivers)
         # The restarted driver continues as its predecessor.
         samples = [decode(one, ENCODINGS[JointState], JointState) for one in lower.payloads(2 * COUNT)]
@@ -269,6 +272,7 @@ def test_drivers_are_played_on_the_keys_of_their_names(sessions, drivers: Path):
 
 def test_joints_of_an_active_driver_are_played_only_with_takeover(sessions, drivers: Path):
     with PartialStatePublisher(sessions[0], RRBOT, [ELBOW], "arm", writer="wrist", program="wrist.py"):
+        until(lambda: current_tokens(sessions[1], "zstate/arm/@writer/partial_joint_states/*", 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], drivers)
         assert raised.value.first.program == "wrist.py"
