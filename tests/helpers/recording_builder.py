@@ -98,6 +98,25 @@ class RecordingBuilder:
         self.encoder.write_message(robot, state, stamp + LATENCY if log_time is None else log_time)
         return state
 
+    def part(
+        self,
+        robot: str,
+        stamp: int,
+        named: dict[str, float],
+        writer: str | None,
+        *,
+        session: int,
+        velocities: Sequence[float] | None = None,
+        log_time: int | None = None,
+    ) -> JointState:
+        """A joint state of some joints; without a ``writer`` as ROS nodes publish it."""
+        head = (stamp, self._seq(robot, session), session, order_digest(tuple(named)))
+        rates = None if velocities is None else to_block(velocities)
+        state = JointState(*head, to_block(list(named.values())), rates, None, tuple(named))
+        at = stamp + LATENCY if log_time is None else log_time
+        self.encoder.write_message(robot, state, at, writer)
+        return state
+
     def edges(
         self,
         robot: str,

@@ -49,17 +49,27 @@ def test_description_without_joint_states_gives_no_model(tmp_path: Path):
     assert models(tmp_path / "r.mcap") == ({"arm": None}, [])
 
 
+@pytest.mark.parametrize("last", [{"shoulder": 0.5, "elbow": 0.5}, {"elbow": 0.5}])
 @pytest.mark.parametrize(("after", "is_found"), [(99, True), (100, False)])
-def test_one_of_the_first_hundred_joint_states_must_have_all_joints(
-    tmp_path: Path, after: int, is_found: bool
+def test_first_joint_states_together_must_have_all_joints(
+    tmp_path: Path, after: int, is_found: bool, last: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr("zstate.recording.decode._MAX_TRIED", 100)
     with Bag(tmp_path / "bag") as bag:
         bag.describe()
         for n in range(after):
             bag.joints(START + n * MS, {"shoulder": 0.5})
-        bag.joints(START + after * MS, {"shoulder": 0.5, "elbow": 0.5})
+        bag.joints(START + after * MS, last)
     found, _ = models(tmp_path / "bag")
     assert (found["ros"] is not None) == is_found
+
+
+def test_drivers_of_a_recording_need_not_have_all_joints(tmp_path: Path):
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        builder.describe("arm")
+        builder.part("arm", START, {"elbow": 0.5}, "wrist", session=4)
+    found, _ = models(tmp_path / "r.mcap")
+    assert found["arm"] is not None
 
 
 def test_invalid_urdf_is_reported(tmp_path: Path):

@@ -279,3 +279,22 @@ def test_parquet_without_pyarrow_names_the_extra(run: Path, monkeypatch: pytest.
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with Recording(run) as recording, pytest.raises(LibraryMissing, match=r"pip install 'zstate\[export\]'"):
         Exporter(recording).write(run.with_suffix(".parquet"), "parquet")
+
+
+def test_rows_of_several_drivers_are_the_samples_that_all_of_them_cover(tmp_path: Path):
+    path = tmp_path / "drivers.mcap"
+    shoulder, elbow = RRBOT.joint_names
+    with RecordingBuilder(path) as builder:
+        builder.describe("arm")
+        for n in range(4):
+            builder.part("arm", START + n * 20 * MS, {shoulder: float(n)}, "lower", session=4)
+            builder.part("arm", START + n * 20 * MS + 10 * MS, {elbow: -float(n)}, "upper", session=5)
+    columns, report = export(path)
+    # From the elbow's first sample, 10 ms after the shoulder's, to the shoulder's last.
+    assert columns["stamp"] == [START + n * 10 * MS for n in range(1, 7)]
+    assert columns[POSITIONS[0]] == pytest.approx([0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
+    assert columns[POSITIONS[1]] == pytest.approx([0.0, -0.5, -1.0, -1.5, -2.0, -2.5])
+    assert (report.rows, report.kinds) == (6, ("position",))
+    path.with_suffix(".csv").unlink()
+    grid, _ = export(path, rate_hz=100.0, poses=[("world", RRBOT.links[-1])])
+    assert {name: grid[name] for name in columns} == columns

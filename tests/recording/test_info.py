@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from helpers.recording_builder import MS, RecordingBuilder
 from helpers.recording_files import START, S, joint_states, write_run
 
 from zstate.errors import RecordingError
-from zstate.recording.info import read_info
+from zstate.recording.info import read_info, recorded_robots
 
 
 def test_info_has_the_facts_of_the_writer(tmp_path: Path):
@@ -56,3 +57,20 @@ def test_recording_of_one_instant_has_no_growth(tmp_path: Path):
 def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):
     with pytest.raises(RecordingError):
         read_info(tmp_path / "nothing.mcap")
+
+
+def test_drivers_of_a_robot_are_listed_by_their_names(tmp_path: Path):
+    with RecordingBuilder(tmp_path / "r.mcap", "arm", {5: "wrist.py@host pid 7"}) as builder:
+        builder.describe("arm")
+        for n in range(11):
+            builder.part(
+                "arm", START + n * 10 * MS, {"shoulder": 0.0}, "lower", session=4, log_time=START + n * S
+            )
+        builder.part("arm", START, {"elbow": 0.0}, "upper", session=5)
+    (robot,) = recorded_robots(read_info(tmp_path / "r.mcap"))
+    streams = {one.writer: one for one in robot.streams if one.stream == "partial_joint_states"}
+    assert {writer: one.count for writer, one in streams.items()} == {
+        "lower": 11,
+        "upper, wrist.py@host pid 7": 1,
+    }
+    assert (streams["lower"].topic, streams["lower"].rate_hz) == ("/joint_states", 1.0)

@@ -10,19 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
-from helpers.recording_builder import MS, START, RecordingBuilder, S, pose
-from helpers.robots import RRBOT, SampleCollector
+from helpers.recording_builder import MS, START, Bag, RecordingBuilder, S, pose, recorded_buffer
+from helpers.robots import RRBOT, SampleCollector, wait_for_stream_readers
 
 from zstate.errors import SecondWriter
 from zstate.net.presence import current_tokens
 from zstate.net.session import connect
 from zstate.nodes.listener import TransformListener
+from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.recording.player import Player
 from zstate.transform import Transform
-from zstate.wire.messages import TransformSample, poses_from_block
+from zstate.wire.messages import JointState, TransformSample, poses_from_block
 from zstate.wire.native import ENCODINGS, decode
 
 COUNT = 20
@@ -209,3 +210,79 @@ def test_transforms_of_an_active_writer_are_played_only_with_takeover(sessions, 
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], tracked)
         assert raised.value.edge == ("cart/odom", "cart/base")
+
+
+SHOULDER, ELBOW = RRBOT.joint_names
+
+
+@pytest.fixture
+def drivers(tmp_path: Path) -> Path:
+    """An arm with two drivers at different rates; one is restarted in the middle, under another name."""
+    path = tmp_path / "drivers.mcap"
+    with RecordingBuilder(path, "arm") as builder:
+        builder.describe("arm")
+        for n in range(2 * COUNT):
+            at = START + n * 10 * MS
+            name, session = ("lower-1", 4) if n < COUNT else ("lower-2", 6)
+            builder.part("arm", at, {SHOULDER: math.sin(n)}, name, session=session, velocities=[n])
+            if n % 3 == 0:
+                builder.part("arm", at + 3 * MS, {ELBOW: math.cos(n)}, "upper", session=5)
+    return path
+
+
+def assert_listener_has_the_recorded_joints(sessions, path: Path, robot: str):
+    """Play a recording; a listener's positions and poses equal those of the file, bit for bit."""
+    tool, recorded = RRBOT.links[-1], recorded_buffer(path)
+    newest = recorded.latest("world", tool)
+    stamps = np.random.default_rng(5).integers(START + 3 * MS, newest, 200)
+    with TransformListener(sessions[0], robot, history_s=100.0) as listener:
+        wait_for_stream_readers(sessions[1], robot, "partial_joint_states/any", "robot_description")
+        samples = replay(sessions[1], path)
+        until(lambda: listener.stats.received == samples)
+        until(lambda: listener.buffer.can_lookup("world", tool, newest))
+        positions, valid = listener.buffer.joint_positions_many(robot, stamps)
+        poses, _ = listener.buffer.lookup_many("world", tool, stamps)
+        assert not listener.stats.refused
+    assert valid.all()
+    assert np.array_equal(positions, recorded.joint_positions_many(robot, stamps)[0])
+    assert np.array_equal(poses, recorded.lookup_many("world", tool, stamps)[0])
+
+
+def test_listener_has_the_joints_of_played_drivers_bit_for_bit(sessions, drivers: Path):
+    assert_listener_has_the_recorded_joints(sessions, drivers, "arm")
+
+
+def test_drivers_are_played_on_the_keys_of_their_names(sessions, drivers: Path):
+    with (
+        closing(SampleCollector(sessions[0], "zstate/arm/partial_joint_states/lower-1")) as lower,
+        closing(SampleCollector(sessions[0], "zstate/arm/partial_joint_states/upper")) as upper,
+    ):
+        names = "partial_joint_states/lower-1", "partial_joint_states/upper"
+        wait_for_stream_readers(sessions[1], "arm", *names)
+        replay(sessions[1], drivers)
+        # The restarted driver continues as its predecessor.
+        samples = [decode(one, ENCODINGS[JointState], JointState) for one in lower.payloads(2 * COUNT)]
+        assert {sample.names for sample in samples} == {(SHOULDER,)}
+        assert [sample.seq for sample in samples] == list(range(2 * COUNT))
+        assert [sample.velocities for sample in samples] == [
+            np.float64(n).tobytes() for n in range(2 * COUNT)
+        ]
+        assert len(upper.payloads(-(-2 * COUNT // 3))) == -(-2 * COUNT // 3)
+
+
+def test_joints_of_an_active_driver_are_played_only_with_takeover(sessions, drivers: Path):
+    with PartialStatePublisher(sessions[0], RRBOT, [ELBOW], "arm", writer="wrist", program="wrist.py"):
+        until(lambda: current_tokens(sessions[1], "zstate/arm/@writer/partial_joint_states/*", 1.0))
+        with pytest.raises(SecondWriter) as raised:
+            replay(sessions[1], drivers)
+        assert raised.value.first.program == "wrist.py"
+        assert replay(sessions[1], drivers, takeover=True) > 2 * COUNT
+
+
+def test_nodes_of_a_bag_are_played_as_drivers(sessions, tmp_path: Path):
+    with Bag(tmp_path / "bag") as bag:
+        bag.describe()
+        for n in range(COUNT):
+            bag.joints(START + n * 10 * MS, {SHOULDER: math.sin(n)})
+            bag.joints(START + n * 10 * MS + 3 * MS, {ELBOW: math.cos(n)})
+    assert_listener_has_the_recorded_joints(sessions, tmp_path / "bag", "ros")

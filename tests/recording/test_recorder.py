@@ -23,6 +23,7 @@ from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
+from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
@@ -554,3 +555,34 @@ def test_transforms_of_each_writer_are_recorded_beside_joint_states(sessions, tm
     assert {"odometry", "tracker"} <= named
     assert np.array_equal(placed.covariance, np.diag([2.0] * 6))
     assert len(read(path, "/pose_with_covariance/world")) == 3
+
+
+def test_joint_states_of_each_driver_are_recorded_on_a_channel_of_its_own(sessions, tmp_path: Path):
+    writer, reader = sessions
+    path = tmp_path / "run.mcap"
+    names = RRBOT.joint_names
+    with (
+        StatePublisher(writer, RRBOT, "r1", streams=("robot_description",)),
+        PartialStatePublisher(writer, RRBOT, names[:1], "r1", writer="lower") as lower,
+        PartialStatePublisher(writer, RRBOT, names[1:], "r1", writer="upper") as upper,
+        Recorder(reader, path, "r1") as recorder,
+    ):
+        wait_for_stream_readers(
+            writer, "r1", "partial_joint_states/lower", "partial_joint_states/upper", "robot_description"
+        )
+        for k in range(3):
+            lower.publish([k + 0.25], [1.0], [2.0], STAMP + k * PERIOD)
+            upper.publish([-k], stamp=STAMP + k * PERIOD)
+        until(lambda: count(recorder, "r1", "partial_joint_states") == 6)
+        until(lambda: count(recorder, "r1", "robot_description") == 1)
+    for decoded in OTHERS:
+        states = [message for topic, message in decoded(path) if topic == "/joint_states"]
+        lower_states, upper_states = ([one for one in states if list(one.name) == [name]] for name in names)
+        assert [list(one.position) for one in lower_states] == [[0.25], [1.25], [2.25]]
+        assert [(list(one.velocity), list(one.effort)) for one in lower_states] == [([1.0], [2.0])] * 3
+        assert [list(one.position) for one in upper_states] == [[0.0], [-1.0], [-2.0]]
+    with Recording(path) as recording:
+        channels = [one for one in recording.info.channels if one.topic == "/joint_states"]
+        positions, _ = recording.buffer().joint_positions("r1", STAMP + PERIOD // 2)
+    assert {one.metadata["zstate.writer"] for one in channels} == {"lower", "upper"}
+    assert positions == pytest.approx([0.75, -0.5])

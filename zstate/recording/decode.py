@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import blake2b
 from itertools import islice
 from typing import NamedTuple
 
 from zstate.errors import InvalidInput, MessageError, ModelError
-from zstate.ingest.joint_parts import joint_order
+from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance
-from zstate.recording.encode import StaticAccumulator
+from zstate.recording.encode import TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
 from zstate.wire.keys import Stream
@@ -25,17 +26,19 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import SHARED, robot_from_topic, ros_type
 
 _TOPICS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
-STREAMS: tuple[Stream, ...] = (*_TOPICS, "transforms")
+STREAMS: tuple[Stream, ...] = (*_TOPICS, *TOPICS)
 """The streams that are decoded. ``transforms`` are channels of the topic tf with the name of a writer, and
-those of their covariances."""
+those of their covariances; ``partial_joint_states`` channels of the topic joint_states with such a name."""
+
+_NAMED: dict[Stream, Stream] = {topic: named for named, topic in TOPICS.items()}
 
 LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
 """Streams whose messages are in effect until the next."""
 
 _SESSION, _PREFIX = "zstate.session", "zstate.frame_prefix"
 
-_MAX_TRIED = 100
-"""Joint states that are tried for one that has all joints of the model."""
+_MAX_TRIED = 10_000
+"""Joint states in which the joints of the model are looked up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,8 @@ class RecordedWriter:
     """One writer of one stream, as one channel of a recording describes it.
 
     ``robot`` is empty for the clock. ``edge_writer`` is the name under which edges were written: moving ones,
-    or static ones, each time all of them. None in the bags of ROS, where static edges add up. ``program`` is
+    or static ones, each time all of them; or the name of a driver of some joints. None in the bags of ROS,
+    where static edges add up. ``program`` is
     the writer's program, ``session`` one start of it. ``foreign`` channels do not describe writers: their
     robot is the topic's namespace, and all writers of a topic count as one.
     """
@@ -67,12 +71,14 @@ class RecordedWriter:
             else:
                 return None
         facts = channel.metadata
+        if EDGE_WRITER in facts:
+            stream = _NAMED.get(stream, stream)
         foreign = _SESSION not in facts
         digest = blake2b(channel.topic.encode(), digest_size=4).digest()
         robot = robot_from_topic(channel.topic) if foreign else facts.get(ROBOT, "")
         return cls(
             robot="" if stream == "clock" else robot,
-            stream="transforms" if stream == "tf" and EDGE_WRITER in facts else stream,
+            stream=stream,
             session=int.from_bytes(digest, "little") if foreign else int(facts[_SESSION]),
             edge_writer=facts.get(EDGE_WRITER),
             program=facts.get("zstate.program"),
@@ -219,7 +225,7 @@ class DecodedRecording:
             if writer is not None:
                 options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))
                 names = FrameNames(options, writer.robot or SHARED)
-                topic: Stream = "tf" if writer.stream == "transforms" else writer.stream
+                topic = TOPICS.get(writer.stream, writer.stream)
                 decoder = ChannelDecoder(writer, topic, names, RosDecoder(), child_frame(channel) or "")
             self._known[channel] = decoder
         return self._known[channel]
@@ -295,9 +301,14 @@ def check_has_robot(recording: DecodedRecording, robot: str) -> str:
     return robot
 
 
-def robot_with_joint_states(recording: DecodedRecording, robot: str | None) -> str:
-    """``robot``, or the only one with joint states. Raises InvalidInput, which names those that have some."""
-    robots = sorted({writer.robot for writer in recording.writers if writer.stream == "joint_states"})
+def robot_with_joint_states(
+    recording: DecodedRecording, robot: str | None, streams: Collection[Stream] = ("joint_states",)
+) -> str:
+    """``robot``, or the only one with joint states on ``streams``.
+
+    Raises InvalidInput, which names those that have some.
+    """
+    robots = sorted({writer.robot for writer in recording.writers if writer.stream in streams})
     if robot in robots:
         return robot
     if robot is None and len(robots) == 1:
@@ -326,8 +337,9 @@ def recorded_model(
 ) -> RobotModel | None:
     """The model of a described robot, or None if its joint states cannot be used with it.
 
-    That is the case without joint states, with a URDF that cannot be parsed, and if none of the first joint
-    states has all joints: in a bag of ROS they may come in parts, from several topics.
+    That is the case without joint states, with a URDF that cannot be parsed, and if the first joint states
+    together lack a joint: in a bag of ROS the rest may be on another topic, or in tf alone. Of a robot with
+    ``partial_joint_states`` drivers may be missing, as they may be live.
     """
     robot, message = description.writer.robot, description.message
     assert isinstance(message, RobotDescription)
@@ -337,12 +349,13 @@ def recorded_model(
     except ModelError as error:
         refuse("robot description", f"{robot!r}: {error}")
         return None
-    order = joint_order(model)
+    if any((one.robot, one.stream) == (robot, "partial_joint_states") for one in recording.writers):
+        return model
+    names, missing = JointNames(model), set(model.joint_names)
     for decoded in islice(recording.messages((robot,), ("joint_states",)), _MAX_TRIED):
         assert isinstance(decoded.message, JointState)
-        try:
-            order.read(decoded.message)
-        except MessageError:
-            continue
-        return model
+        with suppress(MessageError):  # of other joints
+            missing.difference_update(names.joints(decoded.message.names or (), others=True))
+        if not missing:
+            return model
     return None

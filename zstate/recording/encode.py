@@ -32,6 +32,7 @@ from zstate.wire.messages import (
     Sample,
     StaticTransforms,
     TransformSample,
+    WriterTransforms,
     order_digest,
 )
 from zstate.wire.ros2.cdr import to_time
@@ -63,6 +64,17 @@ _STREAMS: dict[type[Message], Stream] = {
     RobotDescription: "robot_description",
     ClockMessage: "clock",
 }
+_NAMED_STREAMS: dict[type[Message], Stream] = {
+    **_STREAMS,
+    JointState: "partial_joint_states",
+    TransformSample: "transforms",
+    WriterTransforms: "transforms",
+}
+"""The streams of messages that have the name of a writer."""
+
+TOPICS: dict[Stream, Stream] = {"transforms": "tf", "partial_joint_states": "joint_states"}
+"""The streams after which the topics of others are named: ROS has no topics of single writers."""
+
 _NAMED = SampleLayout()
 
 
@@ -117,9 +129,10 @@ class RecordingEncoder:
         """Write ``message`` of ``robot``, received at ``log_time`` [ns]; the clock belongs to SHARED.
 
         ``edge_writer`` is the name under which edges are written: static ones, or moving ones of a
-        TransformPublisher, which go to the topic tf. Without one, as in ROS, the static edges of a session
-        add up. Returns False if the robot has no channel left for that writer. Raises RecordingError
-        if the file cannot grow.
+        TransformPublisher, which go to the topic tf; or under which a driver publishes some of the joints,
+        which go to the topic joint_states. Without one, as in ROS, the static edges of a session add up.
+        Returns False if the robot has no channel left for that writer. Raises RecordingError if the file
+        cannot grow.
         """
         try:
             if isinstance(message, StaticTransforms):
@@ -163,7 +176,7 @@ class RecordingEncoder:
         if sample_names is None:
             self._pending.append(robot, message, log_time)
             return
-        stream: Stream = "transforms" if edge_writer else _STREAMS[type(message)]
+        stream = (_NAMED_STREAMS if edge_writer else _STREAMS)[type(message)]
         if edge_writer and isinstance(message, TransformSample):
             edges = sample_names.moving_edges if message.edges is None else message.edges
             for one in known_covariances(message, edges):
@@ -254,7 +267,7 @@ class RecordingEncoder:
             metadata[EDGE_WRITER] = edge_writer
         if session in self._programs:
             metadata["zstate.program"] = self._programs[session]
-        carrier: Stream = "tf" if stream == "transforms" else stream
+        carrier = TOPICS.get(stream, stream)
         topic, kind = RmwKeys(options).topic(robot, carrier), ros_type(carrier)
         if covariances_of:
             metadata[CHILD_FRAME] = child = names.to_ros(covariances_of)

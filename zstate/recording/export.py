@@ -90,9 +90,13 @@ class Exporter:
 
     Rows are the samples as recorded; or the instants of a grid at ``rate_hz`` from the first sample to the
     last, or ``stamps`` [ns], with positions interpolated as in lookups, and without velocities and efforts.
+    If drivers published some of the joints each, there is a row for each sample of a driver, from the
+    instant that all drivers have reached until the first of them ends: positions of the other drivers are
+    interpolated between their own samples, their velocities are NaN, and efforts are left out.
     ``poses`` are pairs (target, source) of frames, looked up at the same instants.
 
-    The recording is streamed: memory does not grow with it. ``on_progress(read, recorded)`` is called with
+    The recording is streamed: memory does not grow with it, unless it has several drivers of ``robot``, whose
+    samples are then in memory. ``on_progress(read, recorded)`` is called with
     numbers of samples. Raises InvalidInput for an unknown robot, and for interpolation without a model of
     the robot.
     """
@@ -115,7 +119,7 @@ class Exporter:
         self._refusals = Refusals("recorded joint_states")
         reader = recording.joint_state_reader(robot, self._refusals.count)
         self.robot = reader.robot
-        if not (self._is_as_recorded or reader.has_model):
+        if not (self._is_as_recorded or reader.model is not None):
             raise InvalidInput(
                 f"positions of {self.robot!r} are interpolated by its model, and the recording has no "
                 "robot_description that fits its joint states; export the samples as recorded"
@@ -352,7 +356,7 @@ class StreamedBuffer:
         own = (frame for frame in joints if frame_owner(frame.name) == self._robot)
         paths = (frame for pair in self._poses for _, frame in self._buffer.path_frames(*pair))
         moving = (frame for frame in paths if frame is not None and frame.kind in ("joint", "pose"))
-        return [*islice(own, 1), *moving]  # all joints of a robot have the same samples
+        return [*own, *moving]
 
     def _check(self) -> None:
         """Raise _Changed if frames, edges or the beginnings of histories are others than before."""

@@ -105,9 +105,9 @@ class JointStateReader:
         self._epoch = _Epoch()
 
     @property
-    def has_model(self) -> bool:
-        """Whether the recording has a model that fits the joint states."""
-        return self._model is not None
+    def model(self) -> RobotModel | None:
+        """The model in the recording that fits the joint states, if there is one."""
+        return self._model
 
     @property
     def count(self) -> int:

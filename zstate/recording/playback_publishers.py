@@ -13,7 +13,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, ManualClock
 from zstate.errors import InvalidInput, MessageError, ModelError
-from zstate.ingest.joint_parts import joint_order
+from zstate.ingest.joint_parts import JointNames, joint_order
 from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -37,6 +37,7 @@ from zstate.wire.messages import (
     WriterTransforms,
     select_edges,
 )
+from zstate.wire.protocol import carrier
 from zstate.wire.registry import get_wire
 
 EdgeWriter: TypeAlias = tuple[str, str]
@@ -49,7 +50,8 @@ class PlaybackPublishers(Closeable):
     """Publishes recorded messages as new writers.
 
     Robots with one of ``models`` get a StatePublisher, which recomputes their transforms if their own
-    publisher wrote them; all other messages are published unchanged. ``latched`` is in effect from the start.
+    publisher wrote them; all other messages are published unchanged. The joint states of robots ``in_parts``
+    are those of several drivers, each with some of the joints. ``latched`` is in effect from the start.
     Messages that cannot be published are counted in ``refusals``. Raises SecondWriter if another writer
     publishes the same, unless ``takeover``.
     """
@@ -61,6 +63,7 @@ class PlaybackPublishers(Closeable):
         writers: Collection[RecordedWriter],
         *,
         models: Mapping[str, RobotModel],
+        in_parts: Collection[str] = (),
         latched: LatchedState,
         refusals: Refusals,
         takeover: bool = False,
@@ -70,30 +73,35 @@ class PlaybackPublishers(Closeable):
         self._takeover = takeover
         self._refusals = refusals
         self._latched = latched
+        self._in_parts = in_parts
         self._modelled, self._computed = ModelEdgeFilter(), ModelEdgeFilter()
         self._sessions: set[int] = set()
         self._robots: dict[str, _RobotPublisher] = {}
         self._others: dict[str, PassthroughPublisher] = {}
+        self._parts: dict[str, JointPartPlayback] = {}
+        self._open_passthrough = partial(
+            PassthroughPublisher, session, wires, sessions=self._sessions, takeover=takeover
+        )
         with ExitStack() as opening:
             opening.callback(lambda: [robot.publisher.close() for robot in self._robots.values()])
+            opening.callback(lambda: [parts.close() for parts in self._parts.values()])
             for robot, model in models.items():
-                self._open(robot, model, _is_computed(robot, writers))
+                self._open(robot, model, robot not in in_parts and _is_computed(robot, writers))
             recorded = {(writer.robot, writer.stream) for writer in writers}
             moving = {(one.robot, one.edge_writer) for one in writers if one.stream == "transforms"}
             self._transforms = opening.enter_context(
                 TransformPlayback(
-                    partial(PassthroughPublisher, session, wires, sessions=self._sessions, takeover=takeover),
-                    sorted((robot, name or "") for robot, name in moving),
+                    self._open_passthrough, sorted((robot, name or "") for robot, name in moving)
                 )
             )
             for robot in {robot for robot, _ in recorded if robot}:
-                own = self._robots[robot].streams if robot in self._robots else ()
+                own = set(self._robots[robot].streams) if robot in self._robots else set[Stream]()
+                if robot in in_parts:
+                    own.add("joint_states")
                 streams: list[Stream] = [
                     one for one in _SAMPLES if (robot, one) in recorded and one not in own
                 ]
-                self._others[robot] = PassthroughPublisher(
-                    session, wires, robot, streams, sessions=self._sessions, takeover=takeover
-                )
+                self._others[robot] = self._open_passthrough(robot, streams)
                 opening.enter_context(self._others[robot])
             for decoded in (*latched.descriptions.values(), *latched.statics):
                 self._publish_counted(decoded)
@@ -101,7 +109,8 @@ class PlaybackPublishers(Closeable):
 
     def _open(self, robot: str, model: RobotModel, is_computed: bool) -> None:
         """Open the publisher of a robot with a known model."""
-        streams: tuple[Stream, ...] = ("joint_states", "tf_static", "robot_description")
+        joints: tuple[Stream, ...] = () if robot in self._in_parts else ("joint_states",)
+        streams: tuple[Stream, ...] = (*joints, "tf_static", "robot_description")
         self._modelled.set_model(robot, model)
         if is_computed:
             self._computed.set_model(robot, model)
@@ -118,6 +127,8 @@ class PlaybackPublishers(Closeable):
         )
         self._robots[robot] = _RobotPublisher(publisher, joint_order(model), streams)
         self._sessions.add(publisher.description().session)
+        if robot in self._parts:
+            self._parts.pop(robot).close()
 
     def publish(self, decoded: DecodedMessage) -> bool:
         """Publish it; False for a repetition and for what cannot be published."""
@@ -152,6 +163,10 @@ class PlaybackPublishers(Closeable):
                 model = parse_urdf(message.urdf, f"the URDF of {writer.robot!r}")
                 robot.publisher.close()
                 self._open(writer.robot, model, "tf" in robot.streams)
+        elif isinstance(message, JointState) and (
+            writer.stream == "partial_joint_states" or writer.robot in self._in_parts
+        ):
+            self._parts_of(writer.robot).publish(writer, message)
         elif isinstance(message, JointState) and robot is not None:
             positions, velocities, efforts = robot.order.read(message)
             robot.publisher.publish(positions, velocities, efforts, message.stamp)
@@ -165,6 +180,12 @@ class PlaybackPublishers(Closeable):
         elif isinstance(message, JointState):
             self._others[writer.robot].publish(message)
         return True
+
+    def _parts_of(self, robot: str) -> JointPartPlayback:
+        if robot not in self._parts:
+            model = self._robots[robot].publisher.model if robot in self._robots else None
+            self._parts[robot] = JointPartPlayback(self._open_passthrough, robot, model)
+        return self._parts[robot]
 
     def close(self) -> None:
         """Close all publishers. A second call does nothing."""
@@ -244,14 +265,85 @@ class TransformPlayback(Closeable):
             publisher.close()
 
 
+class JointPartPlayback(Closeable):
+    """Publishes the recorded joint states of drivers of ``robot``, each set of joints by a writer of its own.
+
+    A driver that was restarted under another name, as by default, continues as the writer of its
+    predecessor. Of two sets with joints in common the one that counts is as in ``RecordedJoints``: the writer
+    of the other set is closed. Nodes of ROS, whose joint states have no names, are named "recorded-1" and so
+    on. ``open_publisher(robot, streams, name)`` opens a writer; it may raise SecondWriter. Without a
+    ``model`` the joints are not owned.
+    """
+
+    def __init__(
+        self, open_publisher: Callable[..., PassthroughPublisher], robot: str, model: RobotModel | None
+    ) -> None:
+        self._open_publisher = open_publisher
+        self._robot = robot
+        self._model = model
+        self._names = None if model is None else JointNames(model)
+        self._publishers: dict[frozenset[str], PassthroughPublisher] = {}
+        self._orders: dict[frozenset[str], tuple[int, int]] = {}
+        self._joints: dict[tuple[int, bytes], frozenset[str]] = {}
+        self._writers: dict[int, int] = {}
+
+    def publish(self, writer: RecordedWriter, state: JointState) -> None:
+        """Publish one sample. Raises MessageError if its joints cannot be used, or are those of another."""
+        key = state.session, state.order
+        joints = self._joints.get(key)
+        if joints is None:
+            joints = self._joints[key] = self._joints_of(writer, state)
+            self._open(writer, state.session, joints)
+        publisher = self._publishers.get(joints)
+        if publisher is None:
+            text = f"{', '.join(map(repr, sorted(joints)))}: another writer publishes some of these joints"
+            raise MessageError(text, reason="second writer")
+        publisher.publish(state)
+
+    def _joints_of(self, writer: RecordedWriter, state: JointState) -> frozenset[str]:
+        names = state.names or ()
+        if self._names is None:
+            return frozenset(names)
+        return frozenset(self._names.joints(names, others=writer.edge_writer is None))
+
+    def _open(self, writer: RecordedWriter, session: int, joints: frozenset[str]) -> None:
+        """Open the writer of a set of joints, unless another set counts."""
+        position = self._writers.setdefault(session, len(self._writers))
+        order = self._orders[joints] = position, len(joints)
+        if joints in self._publishers:
+            return
+        name = writer.edge_writer or f"recorded-{len(self._orders)}"
+        rivals = [
+            other
+            for other, publisher in self._publishers.items()
+            if other & joints or publisher.edge_writer == name
+        ]
+        if any(self._orders[rival] > order for rival in rivals):
+            return
+        for rival in rivals:
+            self._publishers.pop(rival).close()
+        publisher = self._open_publisher(self._robot, ("partial_joint_states",), name)
+        self._publishers[joints] = publisher
+        if self._model is not None:
+            moved = self._model.part(tuple(joints)).joints
+            publisher.own_joints(
+                [(f"{self._robot}/{joint.parent}", f"{self._robot}/{joint.child}") for joint in moved]
+            )
+
+    def close(self) -> None:
+        """Close all publishers. A second call does nothing."""
+        for publisher in self._publishers.values():
+            publisher.close()
+
+
 class PassthroughPublisher(Closeable):
     """Publishes messages of ``robot`` unchanged on all ``wires``, with its own session and sequence numbers.
 
-    ``streams`` are announced at once, latched values with the first of their name; ``transforms`` under the
-    name ``edge_writer``. A message that one of the wires cannot encode raises InvalidInput, and is published
-    on none. Raises SecondWriter if another live writer publishes the same on the native wire, unless
-    ``takeover``. Edges of the ``sessions`` of this playback, its own included, may place the same frame, as
-    in the recording.
+    ``streams`` are announced at once, latched values with the first of their name; ``transforms`` and
+    ``partial_joint_states`` under the name ``edge_writer``. A message that one of the wires cannot encode
+    raises InvalidInput, and is published on none. Raises SecondWriter if another live writer publishes the
+    same on the native wire, unless ``takeover``. Edges of the ``sessions`` of this playback, its own
+    included, may place the same frame, as in the recording.
     """
 
     def __init__(
@@ -268,7 +360,7 @@ class PassthroughPublisher(Closeable):
         self._session = session
         self._session_id = secrets.randbits(32)
         self._robot = robot
-        self._edge_writer = edge_writer
+        self.edge_writer = edge_writer
         self._sessions = sessions
         self._is_alone = "native" in wires and not takeover
         self._seqs: Counter[Stream] = Counter()
@@ -286,9 +378,7 @@ class PassthroughPublisher(Closeable):
             ]
             self._streams: dict[Stream, list[SampleWriter]] = {
                 stream: [
-                    one.open_stream(
-                        get_wire(wire).transforms if stream == "transforms" else stream, edge_writer
-                    )
+                    one.open_stream(carrier(get_wire(wire), stream), edge_writer)
                     for wire, one in zip(wires, self._wire_writers, strict=True)
                 ]
                 for stream in streams
@@ -301,6 +391,8 @@ class PassthroughPublisher(Closeable):
             self._claim.check()
             self._edge_monitor.check()
         stream: Stream = "joint_states"
+        if "partial_joint_states" in self._streams:
+            stream = "partial_joint_states"
         if isinstance(message, TransformSample):
             stream = "transforms" if "transforms" in self._streams else "tf"
             if stream == "transforms":
@@ -316,12 +408,19 @@ class PassthroughPublisher(Closeable):
         write_all(self._streams[stream], sample)
         self._seqs[stream] += 1
 
+    def own_joints(self, edges: Sequence[Edge]) -> None:
+        """Own joints, given by their edges, until the end. Raises SecondWriter if one has another writer."""
+        if self._is_alone:
+            announced = self._announced("partial_joint_states", self.edge_writer)
+            claim = claim_edges(self._session, announced, edges, allowed=self._sessions)
+            self._opened.enter_context(claim)
+
     def _own(self, edges: Edges) -> None:
         """Own moving edges until the end of the pass. Raises SecondWriter if another writer places one."""
-        placed = self._placed.setdefault(self._edge_writer, set())
+        placed = self._placed.setdefault(self.edge_writer, set())
         new = [edge for edge in named_edges(self._robot, edges) if edge not in placed]
         if new and self._is_alone:
-            announced = self._announced("transforms", self._edge_writer)
+            announced = self._announced("transforms", self.edge_writer)
             claim = claim_edges(self._session, announced, new, allowed=self._sessions)
             self._opened.enter_context(claim)
             self._edge_monitor.add(new)

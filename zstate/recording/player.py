@@ -23,6 +23,7 @@ from zstate.recording.decode import (
     first_descriptions,
     recorded_model,
 )
+from zstate.recording.joint_parts import has_parts
 from zstate.recording.playback_publishers import PlaybackPublishers
 from zstate.recording.player_clock import Lateness, PlayerClock
 from zstate.recording.reader import RecordingReader
@@ -63,10 +64,11 @@ class Player(Closeable):
     at that point, and lasts ``duration_s`` of the recording. With ``loop`` it restarts at its end; each pass
     has new writers, as stamps step back. The recording's time is published on the clock.
 
-    Robots with a recorded model are published by a StatePublisher, other messages unchanged. Raises
-    RecordingError, and InvalidInput for robots and times that are not in the recording. A context manager;
-    ``run`` plays, other threads may pause and seek. ``run`` raises SecondWriter if another writer publishes
-    one of the robots, unless ``takeover``.
+    Robots with a recorded model are published by a StatePublisher, other messages unchanged, such as the
+    joint states of several drivers of a robot, each by a writer of the recorded name. Raises RecordingError,
+    and InvalidInput for robots and times that are not in the recording. A context manager; ``run`` plays,
+    other threads may pause and seek. ``run`` raises SecondWriter if another writer publishes one of the
+    robots, unless ``takeover``.
     """
 
     def __init__(
@@ -102,10 +104,13 @@ class Player(Closeable):
             self.robots = selected or self._recording.robots
             self._begin, self._end = self._bounds(path, start_s, duration_s)
             self._models: dict[str, RobotModel] = {}
+            self._in_parts: set[str] = set()
             for robot, description in first_descriptions(self._recording, self.robots).items():
                 model = recorded_model(self._recording, description, self._refusals.count)
                 if model is not None:
                     self._models[robot] = model
+                    if has_parts(self._recording, robot, model):
+                        self._in_parts.add(robot)
         except BaseException:
             self._reader.close()
             raise
@@ -204,6 +209,7 @@ class Player(Closeable):
                 self._wires,
                 writers,
                 models=self._models,
+                in_parts=self._in_parts,
                 latched=latched,
                 refusals=self._refusals,
                 takeover=self._takeover,

@@ -164,8 +164,9 @@ class Recorder(Closeable):
         selected = (robots,) if isinstance(robots, str) else tuple(dict.fromkeys(robots))
         self._selected = tuple(map(check_robot, selected))
         self._wire = get_wire(wire)
-        # On a ROS wire all moving edges are on tf.
-        samples: tuple[Stream, ...] = ("joint_states", "tf", self._wire.transforms)
+        # On a ROS wire all moving edges are on tf, and all joints on joint_states.
+        named = self._wire.partial_joint_states, self._wire.transforms
+        samples: tuple[Stream, ...] = ("joint_states", "tf", *named)
         self._streams: tuple[Stream, ...] = tuple(dict.fromkeys((*LATCHED, *samples)))
         self._counters = Counters()
         self._gaps = GapCounter(self._counters)

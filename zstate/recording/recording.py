@@ -9,6 +9,8 @@ the recording holds                         the buffer gets
 a writer ends, a new one continues later    one history, interpolated between the two as elsewhere
 a new writer with an earlier clock          a new history, which begins with this writer
 two samples in a row more than 0.1 s back   a new history: the clock was set back
+drivers of some joints each                 a history for each set of joints, by the same rules; of two with a
+                                            joint in common the one that appears later moves their joints
 another model (URDF) of a robot             a new history of the robot
 a withdrawn static edge                     the edge, until another writer places the frame
 ==========================================  ============================================================
@@ -18,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +34,11 @@ from zstate.errors import InvalidInput
 from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest, TransformIngest
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import (
+    STREAMS,
     DecodedMessage,
     DecodedRecording,
     RecordedWriter,
@@ -45,9 +48,10 @@ from zstate.recording.decode import (
     robot_with_joint_states,
 )
 from zstate.recording.info import RecordingInfo, read_info
+from zstate.recording.joint_parts import MergedJointStateReader, RecordedJoints, has_parts
 from zstate.recording.joint_states import DELAYED_NS, JointStateReader
 from zstate.recording.reader import RecordingReader
-from zstate.wire.keys import MODEL_WRITER, full_name
+from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, full_name
 from zstate.wire.messages import (
     Edges,
     JointState,
@@ -94,14 +98,15 @@ class Recording(Closeable):
         """All joint states of ``robot``, by default of the only one: those of its last history, see above.
 
         Of samples with one stamp the later one counts. Samples without a finite position of every joint
-        are left out; the first of each reason is logged. Raises InvalidInput for another robot, and
-        without ``robot`` if several have joint states.
+        are left out; the first of each reason is logged. If drivers published some of the joints each, the
+        rows are those of ``TransformBuffer.joint_states``, without efforts. Raises InvalidInput for another
+        robot, and without ``robot`` if several have joint states.
         """
         return self.joint_state_reader(robot).all()
 
     def joint_state_reader(
         self, robot: str | None = None, refuse: Callable[[str, str], None] | None = None
-    ) -> JointStateReader:
+    ) -> JointStateReader | MergedJointStateReader:
         """Reader of ``joint_states(robot)`` in parts, for a recording that does not fit into memory.
 
         ``refuse(reason, text)`` is called for each sample left out; by default the first of each reason is
@@ -109,7 +114,24 @@ class Recording(Closeable):
         """
         refuse = refuse or Refusals("recorded joint_states").count
         decoded = DecodedRecording(self._reader, refuse)
-        return JointStateReader(decoded, robot_with_joint_states(decoded, robot or self.robot), refuse)
+        robot = robot_with_joint_states(decoded, robot or self.robot, JOINT_STREAMS)
+        reader = JointStateReader(decoded, robot, refuse)
+        if reader.model is None or not has_parts(decoded, robot, reader.model):
+            return reader
+        return MergedJointStateReader(
+            decoded, robot, reader.model, partial(self._buffer_of_joints, robot, refuse)
+        )
+
+    def _buffer_of_joints(self, robot: str, refuse: Callable[[str, str], None]) -> TransformBuffer:
+        """A buffer with the model and all joint states of ``robot`` alone."""
+        buffer, counters = TransformBuffer(HISTORY_S), Counters()
+        for _ in self._fill(buffer, counters, (robot,), (*JOINT_STREAMS, "robot_description")):
+            pass
+        texts = counters.refusals()
+        for reason, count in counters.stats().refused.items():
+            for _ in range(count):
+                refuse(reason, texts[reason])
+        return buffer
 
     def buffer(self, around: ArrayLike | None = None) -> TransformBuffer:
         """A buffer with all of the recording, or with all of ``robot``.
@@ -127,10 +149,17 @@ class Recording(Closeable):
 
     def fill(self, buffer: TransformBuffer) -> Iterator[DecodedMessage]:
         """Insert all of the recording into an empty ``buffer``; each message is returned when it is in."""
+        return self._fill(buffer, Counters(), None if self.robot is None else (self.robot,), STREAMS)
+
+    def _fill(
+        self,
+        buffer: TransformBuffer,
+        counters: Counters,
+        robots: Collection[str] | None,
+        streams: Collection[Stream],
+    ) -> Iterator[DecodedMessage]:
         buffer.is_recording = True
-        counters = Counters()
         recording = DecodedRecording(self._reader, counters.count_refusal)
-        robots = None if self.robot is None else (self.robot,)
         shares_frames = any(
             writer.foreign or (writer.stream == "tf_static" and writer.edge_writer is None)  # of ROS
             for writer in recording.writers
@@ -140,7 +169,7 @@ class Recording(Closeable):
             model = recorded_model(recording, description, counters.count_refusal)
             if model is not None:
                 loader.add_model(description, model)
-        for decoded in recording.messages(robots):
+        for decoded in recording.messages(robots, streams):
             loader.insert(decoded)
             yield decoded
 
@@ -170,7 +199,7 @@ class RecordingLoader:
         self._ownership = FrameOwnership(buffer, counters, is_shared=not robots)
         for robot in robots:
             self._ownership.add_robot(robot)
-        self._joints: dict[str, RecordedJointStateIngest] = {}
+        self._joints: dict[str, RecordedJoints] = {}
         self._transforms: dict[tuple[str, int], RecordedTransformIngest] = {}
         self._statics: dict[tuple[str, str | int], StaticTransformIngest] = {}
         self._static_messages: dict[tuple[str, str | int], StaticTransforms] = {}
@@ -183,26 +212,26 @@ class RecordingLoader:
         """Insert the joint states of a robot with this ``model``. Call it before the first ``insert``."""
         robot = description.writer.robot
         self._filter.set_model(robot, model)
-        self._joints[robot] = RecordedJointStateIngest(robot, self._ownership, self._filter)
+        self._joints[robot] = RecordedJoints(robot, self._ownership, self._filter)
         self.insert(description)
 
     def insert(self, decoded: DecodedMessage) -> None:
         """Insert the next message."""
         writer, message, _ = decoded
         if isinstance(message, JointState):
-            ingest = self._joints.get(writer.robot)
-            if ingest is None:
+            joints = self._joints.get(writer.robot)
+            if joints is None:
                 text = f"{writer.robot!r}: no robot_description fits its joint states"
                 self._counters.count_refusal("no description", text)
             else:
-                self._set_name(ingest, writer)
-                ingest.insert_sample(message, overflowed=False)
+                self._set_name(joints.whole, writer)
+                joints.insert(writer, message)
         elif isinstance(message, TransformSample):
             self._insert_transforms(writer, message)
         elif isinstance(message, StaticTransforms):
             self._insert_statics(writer, message)
         elif isinstance(message, RobotDescription) and writer.robot in self._joints:
-            self._set_name(self._joints[writer.robot], writer)
+            self._set_name(self._joints[writer.robot].whole, writer)
             self._joints[writer.robot].describe(message)
 
     def _insert_transforms(self, writer: RecordedWriter, sample: TransformSample) -> None:
@@ -254,28 +283,6 @@ def _children(robot: str, edges: Edges) -> set[str]:
         with suppress(InvalidInput):  # refused and counted when it is inserted
             children.add(full_name(robot, child))
     return children
-
-
-class RecordedJointStateIngest(JointStateIngest):
-    """Keeps the samples of earlier writers while stamps increase."""
-
-    def __init__(self, robot: str, ownership: FrameOwnership, model_filter: ModelEdgeFilter) -> None:
-        super().__init__(robot, ownership)
-        self._filter = model_filter
-
-    def _replace_model(self, model: RobotModel) -> None:
-        super()._replace_model(model)
-        self._filter.set_model(self.robot, model)
-
-    def _insert(self, sample: Sample) -> bool | None:
-        is_described = self._track is not None
-        if is_described and self._newest is not None and sample.stamp < self._newest - DELAYED_NS:
-            return False
-        return super()._insert(sample)
-
-    def _replace_session(self, sample: Sample) -> None:
-        if self._newest is not None and sample.stamp <= self._newest:
-            self._drop_history()
 
 
 class RecordedTransformIngest(TransformIngest):

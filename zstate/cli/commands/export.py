@@ -81,7 +81,8 @@ def export_command(
     Columns are stamp [ns], position.JOINT, velocity.JOINT and effort.JOINT as far as recorded, and
     TARGET.SOURCE.x to .qw of each --pose; numbers that are not known are NaN. At --rate or --stamps,
     positions are interpolated as in lookups, and velocities and efforts are left out.
-    Parquet needs pyarrow: pip install 'zstate[export]'.
+    If drivers published some of the joints each, each of their samples is a row, with the positions of
+    the other drivers interpolated, and without efforts. Parquet needs pyarrow: pip install 'zstate[export]'.
 
     \b
     zstate export run.mcap --parquet                         # run.parquet
