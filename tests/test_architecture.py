@@ -389,12 +389,12 @@ class Ratchet:
 
 
 RATCHETS = (
-    Ratchet("dialect words", dialect_words, 6, 150),
+    Ratchet("dialect words", dialect_words, 5, 150),
     Ratchet("banned methods", banned_methods, 1, 0),
-    Ratchet("single importers", single_importers, 28, 25),
+    Ratchet("single importers", single_importers, 29, 25),
     Ratchet("modules in largest folder", modules_in_largest_folder, 18, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
-    Ratchet("modules", lambda: len(modules()), 243, 270),
+    Ratchet("modules", lambda: len(modules()), 244, 270),
     Ratchet("lines", lines, 46_800, 36_000),  # 40,026 before moving frames, joints as data, several drivers
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
