@@ -260,8 +260,13 @@ class BufferCore:
 
         ``place`` is the track of its joints, or its edges. None is expected if the samples need further
         checks: those of floating joints, of edges in several tracks, or any unless the clock is the system's.
+        Nor is one if a subclass overrides the methods that insert samples, for instance to measure them.
         """
-        if type(self.clock) is not SystemClock:
+        methods = type(self).insert_joints, type(self).insert_many
+        if type(self.clock) is not SystemClock or methods != (
+            BufferCore.insert_joints,
+            BufferCore.insert_many,
+        ):
             return
         if not isinstance(place, JointTrack):
             track = self._pose_tracks.whole_track(place)
