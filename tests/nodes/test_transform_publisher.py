@@ -411,7 +411,7 @@ def test_samples_lost_in_a_full_ring_are_counted_and_the_others_inserted(
 ):
     monkeypatch.setattr("zstate.net.streams.WILDCARD_CAPACITY", 64)
     writer, reader = sessions
-    stamp, goes_on = time.time_ns(), threading.Event()
+    stamp, is_inserting, goes_on = time.time_ns(), threading.Event(), threading.Event()
     with (
         TransformPublisher(writer, "r1", "odometry") as odometry,
         TransformListener(reader, "r1", history_on_join=False) as listener,
@@ -419,6 +419,7 @@ def test_samples_lost_in_a_full_ring_are_counted_and_the_others_inserted(
         insert = listener.buffer.insert_many
 
         def slowly(*arguments: object, **options: object) -> bool:
+            is_inserting.set()
             goes_on.wait(SOON_S)
             return insert(*arguments, **options)
 
@@ -429,6 +430,8 @@ def test_samples_lost_in_a_full_ring_are_counted_and_the_others_inserted(
             step = next(steps)
             odometry.publish([pose("odom", "base_link", float(step))], stamp + step * MS)
 
+        move()
+        assert is_inserting.wait(SOON_S)  # samples before the first one received are not counted
         for _ in range(500):
             move()
         goes_on.set()
