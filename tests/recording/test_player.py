@@ -32,7 +32,7 @@ from zstate.errors import InvalidInput
 from zstate.model.urdf import parse_urdf
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
-from zstate.recording.player import Player, PlayerReport
+from zstate.recording.player import CLOCK_HZ, Player, PlayerReport
 from zstate.recording.recorder import Recorder
 from zstate.transform import Transform
 from zstate.wire.messages import ClockMessage, JointState, StaticTransforms, TransformSample, from_block
@@ -268,13 +268,12 @@ def test_player_can_be_paused_and_resumed(sessions, arm: Path):
     replayer = Player(sessions[0], arm)
     replayer.pause()
     with replaying(replayer) as reports:
-        until(lambda: len(clocks.arrivals) > 10)
+        until(lambda: len(clocks.arrivals) > CLOCK_HZ)  # at least a second, as long as the recording
         assert not tap.arrivals
         replayer.resume()
         tap.payloads(COUNT)
         until(lambda: reports)
-    # The pause does not count.
-    assert reports[0].rate > 0.9
+    assert reports[0].rate > 0.5  # the pause does not count
 
 
 def test_player_can_seek(sessions, arm: Path):
