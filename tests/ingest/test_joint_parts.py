@@ -211,7 +211,12 @@ def test_further_joints_are_left_out_where_a_topic_has_them():
 
 
 def test_writer_of_any_number_of_sets_of_joints_is_refused():
-    drivers = Drivers(load_model("panda"))
+    links = "".join(f'<link name="l{n}"/>' for n in range(9))
+    hinges = "".join(
+        f'<joint name="j{n}" type="continuous"><parent link="l{n}"/><child link="l{n + 1}"/></joint>'
+        for n in range(8)
+    )
+    drivers = Drivers(load_model(f'<robot name="chain">{links}{hinges}</robot>'))
     drivers.describe()
     joints = drivers.model.joint_names
     for count in range(1, 7):

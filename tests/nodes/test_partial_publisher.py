@@ -161,6 +161,7 @@ def test_all_joints_and_some_joints_exclude_each_other(sessions):
         StatePublisher(first, RRBOT, "r1", program="robot.py"),
         pytest.raises(SecondWriter, match=r"robot\.py.* already writes joint_states of 'r1'"),
     ):
+        until(lambda: any("joint_states" in dict(info.writers) for info in discover(second)))
         PartialStatePublisher(second, RRBOT, [ELBOW], "r1")
 
 

@@ -4,8 +4,8 @@ A driver of some joints publishes a *part* of the robot's joint states. Each joi
 that contradict each other the first in this list moves the joints they have in common:
 
 1. an announced writer; of two the one that started later, as among writers of all joints,
-2. a writer that is not announced: the first samples of a new one may arrive before its token,
-3. a writer that has left: its samples stay until another one moves the joint.
+2. the one that left last, or appeared last, of the others: the samples of a writer that has left stay until
+   another one moves the joint, and the first samples of a new one may arrive before its token.
 
 A part in which such a joint is missing would be half a robot at an instant, so it is refused as a whole, and
 accepted once the other writer has left. A writer of all joints keeps those that no part moves. The result
@@ -17,6 +17,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
@@ -29,7 +30,7 @@ from zstate.wire.joint_order import JointOrder
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, RobotDescription, Sample
 
-_ANNOUNCED, _UNANNOUNCED, _LEFT, _NO_WRITER = range(4)
+_ANNOUNCED, _LEFT_OR_UNANNOUNCED, _NO_WRITER = range(3)
 
 _MAX_SETS = 16
 """Sets of joints that one writer may publish; a driver publishes one."""
@@ -70,13 +71,14 @@ class JointNames:
 class JointPart:
     """The joints that the writer of a ``session`` publishes together; ``track`` has their samples.
 
-    The session is None if there is no writer yet.
+    The session is None if there is no writer yet. ``appeared`` numbers parts and departures in their order.
     """
 
     session: int | None
     joints: tuple[str, ...]
     track: JointTrack
     order: JointOrder
+    appeared: int = 0
     refusal: InsertRefused | None = None
 
 
@@ -100,6 +102,7 @@ class RobotParts:
         self._by_order: BoundedDict[tuple[int, bytes], JointPart] = BoundedDict()
         self._since: dict[int, int] = {}
         self._departed: BoundedDict[int, int] = BoundedDict()
+        self._moments = count(1)
         self._lock = fork_safe(threading.RLock())
 
     def set_model(self, track: JointTrack) -> None:
@@ -117,7 +120,7 @@ class RobotParts:
             if session != self._whole_session:
                 self._whole_session = session
                 if self._whole is not None:
-                    self._whole.session = session
+                    self._whole.session, self._whole.appeared = session, next(self._moments)
                     self._resolve()
 
     def add_writer(self, session: int, since: int) -> None:
@@ -132,9 +135,8 @@ class RobotParts:
     def remove_writer(self, session: int) -> None:
         """Remove a writer that has left. Its samples stay until another writer moves the joints."""
         with self._lock:
-            since = self._since.pop(session, None)
-            if since is not None:
-                self._departed[session] = since
+            if self._since.pop(session, None) is not None:
+                self._departed[session] = next(self._moments)
                 self._resolve()
 
     def drop(self, session: int) -> None:
@@ -179,7 +181,7 @@ class RobotParts:
                 text = f"a writer of more than {_MAX_SETS} sets of joints; now {', '.join(map(repr, joints))}"
                 raise MessageError(text, reason="too many sets of joints")
             track = self._buffer.add_part(whole, joints, self._names.get((self._robot, session)))
-            part = JointPart(session, joints, track, joint_order(track.model))
+            part = JointPart(session, joints, track, joint_order(track.model), next(self._moments))
             track.check_positions(part.order.read(state).positions)  # unusable ones take no joint
             self._parts[session, frozenset(joints)] = part
             self._resolve()
@@ -197,7 +199,8 @@ class RobotParts:
         movers: dict[str, JointPart] = {}
         for part in sorted((whole, *self._parts.values()), key=self._precedence):
             taken = [joint for joint in part.joints if joint in movers]
-            if taken and self._precedence(part)[0] in (_ANNOUNCED, _UNANNOUNCED):
+            has_left = part.session is None or part.session in self._departed
+            if taken and not has_left:
                 self._refuse(part, taken[0], movers[taken[0]])
             else:
                 part.refusal = None
@@ -208,14 +211,12 @@ class RobotParts:
     def _precedence(self, part: JointPart) -> tuple[int, int, int, int, tuple[str, ...]]:
         """Sort key: the first moves a joint. Of a writer's own parts that is the one with more joints."""
         session = part.session or 0
-        rank, since = _UNANNOUNCED, 0
+        rank, moment = _LEFT_OR_UNANNOUNCED, self._departed.get(session, part.appeared)
         if part.session is None:
             rank = _NO_WRITER
-        elif session in self._departed:
-            rank, since = _LEFT, self._departed[session]
         elif session in self._since:
-            rank, since = _ANNOUNCED, self._since[session]
-        return rank, -since, session, -len(part.joints), part.joints
+            rank, moment = _ANNOUNCED, self._since[session]
+        return rank, -moment, session, -len(part.joints), part.joints
 
     def _refuse(self, part: JointPart, joint: str, first: JointPart) -> None:
         text, reason = f"joint {joint!r} is published by {self._writer(first)}", "second writer"
