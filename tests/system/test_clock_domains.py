@@ -366,7 +366,7 @@ def test_restarted_simulation_is_a_new_epoch_at_its_second_sample(sessions, foll
     clock = simulated(0)
     with (
         StatePublisher(writer, RRBOT, "r1", clock=clock) as publisher,
-        TransformListener(reader, "r1", follow=follow, history_s=10.0) as listener,
+        TransformListener(reader, "r1", follow=follow, history_on_join=False) as listener,
     ):
         wait_for_stream_readers(writer, "r1", follow)
         # Eight seconds, less than the history, then a restart.
