@@ -1,3 +1,5 @@
+import threading
+
 import pytest
 import zenoh
 from helpers.processes import Child, until
@@ -64,6 +66,29 @@ def test_change_reaches_all_subscribers():
             value.set(b"2")
             for values in (early, late):
                 until(lambda values=values: values.values == {key("a"): b"2"})
+
+
+def test_cached_value_does_not_overtake_the_live_ones_before_it():
+    is_busy, may_go_on = threading.Event(), threading.Event()
+    received: list[bytes] = []
+
+    def collect(arrival: SerializedSample) -> None:
+        if arrival.payload == b"slow":
+            is_busy.set()
+            may_go_on.wait(10.0)
+        received.append(arrival.payload)
+
+    with connect() as writer, connect() as reader, LatchedPublisher(writer, key("slow"), ENCODING) as slow:
+        slow.set(b"slow")
+        with LatchedSubscriber(reader, ALL, collect), LatchedPublisher(writer, key("a"), ENCODING) as value:
+            others = Values(reader)
+            assert is_busy.wait(10.0)
+            value.set(b"1")
+            value.set(b"2")
+            until(lambda: others.values.get(key("a")) == b"2")
+            may_go_on.set()
+            until(lambda: b"2" in received)
+            assert received == [b"slow", b"1", b"2"]
 
 
 def test_late_joiner_receives_the_value_of_every_matching_writer():

@@ -23,7 +23,7 @@ from zstate.errors import Closed, InvalidInput
 from zstate.net.queryable import query
 from zstate.net.sample_history import RoundRobinQueue
 from zstate.net.session import Session
-from zstate.net.streams import Receiver, call_for_each, subscribe_to_all, to_serialized
+from zstate.net.streams import Receiver, SharedSubscription, call_for_each, subscribe_to_all, to_serialized
 from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 4096
@@ -34,6 +34,8 @@ _TOKENS = 16_384
 _MAX_IN_FLIGHT = 8
 _MAX_ATTEMPTS = 3
 _ANSWER_WITHIN_S = 2.0
+_HANDLED_WITHIN_S = 0.5
+"""For a cached value that a full ring has dropped; a slow callback then has a few more waiting."""
 
 
 class LatchedPublisher(Closeable):
@@ -79,12 +81,22 @@ class LatchedPublisher(Closeable):
         self._session.release(self._publisher)
 
 
-class LatchedSubscriber(Receiver[zenoh.Sample]):
+@dataclass(frozen=True)
+class _CachedValue:
+    """The reply of a publisher's cache, in the order in which it arrived among the live samples."""
+
+    sample: zenoh.Sample
+    on_handled: Callable[[], None]
+
+
+class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
     """Subscriber to the current value of every matching key, then to each change.
 
-    ``on_value(sample)`` is called for one sample at a time, from one of two threads of this subscriber; the
-    payload is empty if the value was withdrawn. Several key expressions share these threads. ``Receiver``
-    describes slow and failing callbacks.
+    ``on_value(sample)`` is called from one thread of this subscriber, for several key expressions too; the
+    payload is empty if the value was withdrawn. ``Receiver`` describes slow and failing callbacks.
+
+    In ROS each message of a writer of /tf_static adds to the ones before, and its cache has the last one: so
+    a cached value is not handled before the live samples that arrived earlier.
     """
 
     def __init__(
@@ -92,26 +104,43 @@ class LatchedSubscriber(Receiver[zenoh.Sample]):
     ) -> None:
         self._on_value = on_value
         self._numbers: BoundedDict[str, int | zenoh.Timestamp] = BoundedDict()
-        self._lock = threading.Lock()
         keyexprs = (keyexprs,) if isinstance(keyexprs, str) else keyexprs
         recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
         declare = partial(zenoh.ext.declare_advanced_subscriber, session.zenoh, recovery=recovery)
-        super().__init__(session, subscribe_to_all(keyexprs, CAPACITY, declare), CAPACITY)
+        live: SharedSubscription[zenoh.Sample | _CachedValue] = SharedSubscription(
+            keyexprs, CAPACITY, declare
+        )
+        self._arrived = live.handler
+        super().__init__(session, live, CAPACITY)
         try:
             # After subscribing, so that no change falls between a cached value and the live ones.
-            self._cached = _CachedValues(session, keyexprs, self._on_sample)
+            self._cached = _CachedValues(session, keyexprs, self._add_cached)
         except BaseException:
             super().close()
             raise
 
-    def _on_batch(self, batch: list[zenoh.Sample]) -> None:
-        call_for_each(batch, self._on_sample)
+    def _add_cached(self, sample: zenoh.Sample) -> None:
+        """Add the reply of a cache to what has arrived; wait until it is handled, at most half a second."""
+        handled = threading.Event()
+        self._arrived.put(_CachedValue(sample, handled.set))
+        handled.wait(_HANDLED_WITHIN_S)
+
+    def _on_batch(self, batch: list[zenoh.Sample | _CachedValue]) -> None:
+        call_for_each(batch, self._on_arrival)
+
+    def _on_arrival(self, arrival: zenoh.Sample | _CachedValue) -> None:
+        if not isinstance(arrival, _CachedValue):
+            self._on_sample(arrival)
+            return
+        try:
+            self._on_sample(arrival.sample)
+        finally:
+            arrival.on_handled()
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
-        with self._lock:
-            if self._is_newer(sample):
-                # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
-                self._on_value(to_serialized(sample))
+        if self._is_newer(sample):
+            # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
+            self._on_value(to_serialized(sample))
 
     def _is_newer(self, sample: zenoh.Sample) -> bool:
         """Whether ``sample`` is newer than the others of its publisher: a cached one may come after them."""
@@ -129,6 +158,7 @@ class LatchedSubscriber(Receiver[zenoh.Sample]):
         return True
 
     def close(self) -> None:
+        self._closed = True  # what is cached is no longer handled
         self._cached.close()
         super().close()
 

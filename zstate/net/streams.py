@@ -108,12 +108,14 @@ def subscribe_to_all(keyexprs: Sequence[str], capacity: int, declare: Declare) -
     if len(keyexprs) == 1:
         # Zenoh's own ring takes samples while other Python threads run.
         return declare(keyexprs[0], zenoh.handlers.RingChannel(capacity))
-    return _SharedSubscription(keyexprs, capacity, declare)
+    return SharedSubscription(keyexprs, capacity, declare)
 
 
-class _SharedSubscription:
+class SharedSubscription(Generic[T]):
+    """Subscribers that deliver into one ring, which other items may be put into as well."""
+
     def __init__(self, keyexprs: Sequence[str], capacity: int, declare: Declare) -> None:
-        self.handler: SharedRing[zenoh.Sample] = SharedRing(capacity)
+        self.handler: SharedRing[T] = SharedRing(capacity)
         self._subscribers: list[Undeclarable] = []
         try:
             for keyexpr in keyexprs:
