@@ -12,7 +12,7 @@ from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zsta
 from helpers.processes import SOON_S
 
 from zstate import connect, load_model
-from zstate.cli import main, usage_hints
+from zstate.cli import main
 from zstate.model.pinocchio_solver import load_pinocchio
 from zstate.sources import JointStateListener
 
@@ -63,10 +63,10 @@ def test_commands_of_ros_lead_to_their_equivalents(word: str, hint: str):
 
 
 def test_every_synonym_leads_to_commands_that_exist():
-    for commands in usage_hints._SYNONYMS.values():
+    for commands in main._SYNONYMS.values():
         for command in commands.split(" | "):
             assert command.split()[0] in main._COMMANDS, command
-    assert not set(usage_hints._SYNONYMS) & set(main._COMMANDS)
+    assert not set(main._SYNONYMS) & set(main._COMMANDS)
 
 
 def test_help_is_a_command_too():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from itertools import permutations
 
 import pytest
@@ -88,6 +88,15 @@ class Drivers:
         }
 
 
+def in_every_order(steps: Sequence[Callable[[Drivers], None]]) -> Iterator[Drivers]:
+    """Drivers after ``steps``, in each of their orders."""
+    for order in permutations(steps):
+        drivers = Drivers()
+        for step in order:
+            step(drivers)
+        yield drivers
+
+
 def test_newer_of_two_live_drivers_of_a_joint_counts_in_every_order_of_arrival():
     steps: list[Callable[[Drivers], None]] = [
         lambda drivers: drivers.announce(1, since=100),
@@ -98,10 +107,7 @@ def test_newer_of_two_live_drivers_of_a_joint_counts_in_every_order_of_arrival()
         lambda drivers: drivers.part(3, ("shoulder",), [0.3]),
         Drivers.describe,
     ]
-    for order in permutations(steps):
-        drivers = Drivers()
-        for step in order:
-            step(drivers)
+    for drivers in in_every_order(steps):
         # Driver 2 started last. Driver 1, which lacks the elbow then, would be half a driver.
         assert drivers.movers() == {"shoulder": "driver 3", "elbow": "driver 2"}
 
@@ -116,10 +122,7 @@ def test_driver_of_all_joints_counts_by_its_start_too(since: int, elbow: str):
         lambda drivers: drivers.part(2, ("elbow",), [0.2]),
         Drivers.describe,
     ]
-    for order in permutations(steps):
-        drivers = Drivers()
-        for step in order:
-            step(drivers)
+    for drivers in in_every_order(steps):
         assert drivers.movers() == {"shoulder": "driver 1", "elbow": elbow}
         assert drivers.counters.stats().refused.keys() <= {"second writer"}
 

@@ -1,11 +1,13 @@
 """PartialStatePublisher: the joints of one robot come from several programs."""
 
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
 from helpers.robots import RRBOT, assert_pose, kinematic_pose
+from helpers.urdf_text import joint
 
 from zstate.errors import Closed, InFuture, InvalidInput, NoData, SecondWriter
 from zstate.model.load import load_model
@@ -19,37 +21,36 @@ from zstate.transform import Transform
 MS = 1_000_000
 SHOULDER, ELBOW = RRBOT.joint_names
 
-FINGERS = load_model("""
-<robot name="fingers">
-  <link name="palm"/> <link name="left"/> <link name="right"/> <link name="wrist"/>
-  <joint name="turn" type="revolute">
-    <parent link="wrist"/> <child link="palm"/> <axis xyz="0 0 1"/>
-    <limit lower="-3" upper="3" velocity="1" effort="1"/>
-  </joint>
-  <joint name="open" type="prismatic">
-    <parent link="palm"/> <child link="left"/> <axis xyz="0 1 0"/>
-    <limit lower="0" upper="0.1" velocity="1" effort="1"/>
-  </joint>
-  <joint name="follow" type="prismatic">
-    <parent link="palm"/> <child link="right"/> <axis xyz="0 1 0"/>
-    <limit lower="-0.1" upper="0" velocity="1" effort="1"/> <mimic joint="open" multiplier="-1"/>
-  </joint>
-</robot>""")
+LIMIT = '<limit lower="-3" upper="3" velocity="1" effort="1"/>'
+SIDEWAYS = f'<axis xyz="0 1 0"/>{LIMIT}'
+FINGERS = load_model(
+    '<robot name="fingers"><link name="palm"/><link name="left"/><link name="right"/><link name="wrist"/>'
+    + joint("turn", "revolute", "wrist", "palm", f'<axis xyz="0 0 1"/>{LIMIT}')
+    + joint("open", "prismatic", "palm", "left", SIDEWAYS)
+    + joint("follow", "prismatic", "palm", "right", f'{SIDEWAYS}<mimic joint="open" multiplier="-1"/>')
+    + "</robot>"
+)
 
 
 def described(session, model=RRBOT, robot="r1"):
     return StatePublisher(session, model, robot, streams=("robot_description",))
 
 
+@contextmanager
+def shoulder_and_elbow(first, second):
+    """The two drivers of a described robot."""
+    with (
+        described(first),
+        PartialStatePublisher(first, RRBOT, [SHOULDER], "r1", program="arm.py") as lower,
+        PartialStatePublisher(second, RRBOT, [ELBOW], "r1", program="wrist.py") as upper,
+    ):
+        yield lower, upper
+
+
 def test_each_joint_is_interpolated_between_the_samples_of_its_own_driver(sessions):
     first, second = sessions
     stamp = time.time_ns()
-    with (
-        described(first),
-        PartialStatePublisher(first, RRBOT, [SHOULDER], "r1") as lower,
-        PartialStatePublisher(second, RRBOT, [ELBOW], "r1") as upper,
-        TransformListener(second, "r1") as listener,
-    ):
+    with shoulder_and_elbow(first, second) as (lower, upper), TransformListener(second, "r1") as listener:
         lower.publish([0.0], stamp=stamp)
         lower.publish([1.0], stamp=stamp + 100 * MS)
         upper.publish({ELBOW: 2.0}, stamp=stamp + 20 * MS)
@@ -69,12 +70,7 @@ def test_a_driver_that_stops_leaves_exactly_its_own_links_behind(sessions):
     stamp = time.time_ns()
     hand = RRBOT.links[-1]
     upper_arm = next(joint.child for joint in RRBOT.joints if joint.name == SHOULDER)
-    with (
-        described(first),
-        PartialStatePublisher(first, RRBOT, [SHOULDER], "r1", program="arm.py") as lower,
-        PartialStatePublisher(second, RRBOT, [ELBOW], "r1", program="wrist.py") as upper,
-        TransformListener(second, "r1") as listener,
-    ):
+    with shoulder_and_elbow(first, second) as (lower, upper), TransformListener(second, "r1") as listener:
         for publisher in (lower, upper):
             publisher.publish([0.5], stamp=stamp)
         listener.buffer.wait("world", hand, stamp, timeout_s=SOON_S)
@@ -126,11 +122,7 @@ def test_mimic_joints_follow_the_driver_of_their_master(sessions):
 def test_late_listener_gets_the_parts_of_the_last_seconds(sessions):
     first, second = sessions
     stamp = time.time_ns()
-    with (
-        described(first),
-        PartialStatePublisher(first, RRBOT, [SHOULDER], "r1") as lower,
-        PartialStatePublisher(first, RRBOT, [ELBOW], "r1") as upper,
-    ):
+    with shoulder_and_elbow(first, first) as (lower, upper):
         for step in range(300):  # more than a page
             lower.publish([0.001 * step], stamp=stamp + step * MS)
             upper.publish([-0.001 * step], stamp=stamp + step * MS)

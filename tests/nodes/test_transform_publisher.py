@@ -394,7 +394,7 @@ def test_unannounced_writers_are_bounded_and_leave_no_edges(sessions):
 
 
 def test_edges_of_writers_that_have_left_stay(sessions, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("zstate.nodes.listener._MAX_UNANNOUNCED", 1)
+    monkeypatch.setattr("zstate.ingest.base._MAX_UNANNOUNCED", 1)
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener:
         for number in range(3):

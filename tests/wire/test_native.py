@@ -55,6 +55,11 @@ def fixstr(text: str) -> bytes:
     return bytes([0xA0 | len(text)]) + text.encode()
 
 
+def pairs(*edges: tuple[str, str]) -> bytes:
+    """Each edge an array of two strings."""
+    return b"".join(b"\x92" + fixstr(parent) + fixstr(child) for parent, child in edges)
+
+
 def header(fields: int) -> bytes:
     stamp = UINT64 + struct.pack(">Q", STAMP)
     seq = UINT16 + struct.pack(">H", 300)
@@ -92,12 +97,8 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         header(7)[:-8]
         + order_digest(EDGES)
         + bin8(struct.pack("<14d", *[1, 2, 3, 0, 0, 0, 1] * 2))
-        + b"\x92\x92"
-        + fixstr("b")
-        + fixstr("a")
         + b"\x92"
-        + fixstr("a")
-        + fixstr("h")
+        + pairs(*EDGES)
         + b"\xc5\x01\x50"
         + struct.pack("<42d", *[0.5] * 42),
     ),
@@ -107,7 +108,7 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     ),
     "statics": (
         StaticTransforms(7, (("b", "c"),), to_block([0, 0, 1, 0, 0, 0, 1])),
-        b"\x93\x07\x91\x92" + fixstr("b") + fixstr("c") + bin8(struct.pack("<7d", 0, 0, 1, 0, 0, 0, 1)),
+        b"\x93\x07\x91" + pairs(("b", "c")) + bin8(struct.pack("<7d", 0, 0, 1, 0, 0, 0, 1)),
     ),
     "description": (
         RobotDescription(7, "<robot/>", "00ff", NAMES, EDGES),
@@ -117,12 +118,8 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + b"\x92"
         + fixstr("j1")
         + fixstr("j2")
-        + b"\x92\x92"
-        + fixstr("b")
-        + fixstr("a")
         + b"\x92"
-        + fixstr("a")
-        + fixstr("h")
+        + pairs(*EDGES)
         + fixstr("system"),
     ),
     "clock": (ClockMessage(0, 1, 2), b"\x93\x00\x01\x02"),

@@ -1,10 +1,14 @@
-"""Base of the ingest of one robot's samples: writers, sequence numbers, early samples, epochs."""
+"""Base of the ingest of one robot's samples: writers, sequence numbers, early samples, epochs.
+
+``StreamIngests`` has the ingests of all writers on one stream.
+"""
 
 from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from zstate._util.bounded import BoundedDict, BoundedQueue
@@ -14,6 +18,7 @@ from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput, MessageError, format_duration
 from zstate.ingest.counters import MissingSamples
 from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.wire.keys import Stream
 from zstate.wire.messages import Edges, RobotDescription, Sample, message_size
 
 # Bounds on the samples that wait for the robot's description, which takes milliseconds.
@@ -21,6 +26,9 @@ _EARLY = 1024
 EARLY_BYTES = 4 * 2**20
 _EARLY_HISTORY = 20_000
 _EARLY_HISTORY_BYTES = 16 * 2**20
+
+# Of one stream; a hostile writer can make up any number of sessions.
+_MAX_UNANNOUNCED = 256
 
 ClockSetBack: TypeAlias = Callable[[str, int, str], None]
 """Called with a robot, the session of its writer, and a description of what happened."""
@@ -373,3 +381,37 @@ class StreamIngest(ABC):
     @abstractmethod
     def _on_writer_changed(self) -> None:
         """Called when the current writer, or its name, has changed."""
+
+
+@dataclass(eq=False)
+class StreamIngests:
+    """The ingests of the writers of one stream, by robot and session; the session is 0 unless ``is_shared``.
+
+    ``is_shared`` means that each writer publishes its own part of a robot, and has its own ingest. The first
+    samples of a writer may arrive before its announcement, and the last after it has left: then its ingest is
+    among the ``unannounced``. Of more than 256 the oldest is dropped, with its edges if it was never
+    announced.
+    """
+
+    stream: Stream
+    is_shared: bool
+    has_parts: bool = False
+    """Whether its samples are joint states of some of the joints, or may be."""
+    capacity: int = 0
+    """Of the ring that the samples arrive in."""
+    ingests: dict[tuple[str, int], StreamIngest] = field(default_factory=dict[tuple[str, int], StreamIngest])
+    unannounced: dict[tuple[str, int], StreamIngest] = field(
+        default_factory=dict[tuple[str, int], StreamIngest]
+    )
+    overflowed: set[StreamIngest] = field(default_factory=set[StreamIngest])
+    newest_by_key: BoundedDict[str, StreamIngest] = field(default_factory=BoundedDict[str, StreamIngest])
+    """The ingest of the last sample on each key, which may expect the next one."""
+
+    def add_unannounced(self, key: tuple[str, int], ingest: StreamIngest) -> StreamIngest:
+        """The ingest of a writer that is not announced: the one there is, else this one."""
+        ingest = self.unannounced.setdefault(key, ingest)
+        if len(self.unannounced) > _MAX_UNANNOUNCED:
+            oldest = self.unannounced.pop(next(iter(self.unannounced)))
+            if oldest.writer is None:
+                oldest.drop()
+        return ingest

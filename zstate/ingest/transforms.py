@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 
 from zstate._util.bounded import BoundedDict
@@ -11,7 +12,7 @@ from zstate.ingest.base import ClockSetBack, StreamIngest
 from zstate.ingest.frame_ownership import CONTESTED, Admitted, EdgeSource, FrameOwnership
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
-from zstate.wire.keys import EdgeNames, full_name
+from zstate.wire.keys import MODEL_WRITER, EdgeNames, full_name
 from zstate.wire.messages import (
     POSE_BYTES,
     Edges,
@@ -263,6 +264,49 @@ class StaticTransformIngest:
                 text = f"static edge of {self._source.name!r}: {error}"
                 self._ownership.counters.for_robot(robot).count_refusal(reason, text)
         return edges
+
+
+class StaticTransformIngests:
+    """The static edges of all writers, each of which replaces or withdraws its own.
+
+    ``on_children(robot, writer, children)`` is called with the child frames of a named writer when it
+    publishes.
+    """
+
+    def __init__(
+        self, ownership: FrameOwnership, on_children: Callable[[str, str, frozenset[str]], None]
+    ) -> None:
+        self._ownership = ownership
+        self._on_children = on_children
+        self._ingests: dict[tuple[str, int], StaticTransformIngest] = {}
+
+    def insert(self, key: str, robot: str, writer: str | None, statics: StaticTransforms) -> None:
+        """Insert edges received on ``key``; ``writer`` is the name in it, None in ROS."""
+        if writer is not None:
+            ingest = self._ingest(key, robot, writer)
+            ingest.replace(statics)
+            self._on_children(robot, writer, ingest.children)
+        else:
+            # A ROS node that is not announced yet is identified by its number.
+            session = statics.session
+            name = self._ownership.live.get((robot, session), f"a ROS node {session:016x}")
+            self._ingest(key, robot, name, session).add(statics)
+
+    def withdraw(self, key: str, robot: str, writer: str) -> None:
+        """Withdraw all edges received on ``key``."""
+        self._ingest(key, robot, writer).withdraw()
+        self._ingests.pop((key, 0), None)
+        self._on_children(robot, writer, frozenset())
+
+    def name_writer(self, session: int, name: str) -> None:
+        """Set the printed name of a ROS node, whose edges may arrive before its token."""
+        for (_, other), ingest in list(self._ingests.items()):
+            if other == session:
+                ingest.name_writer(name)
+
+    def _ingest(self, key: str, robot: str, writer: str, session: int = 0) -> StaticTransformIngest:
+        ingest = StaticTransformIngest(robot, writer, self._ownership, is_model=writer == MODEL_WRITER)
+        return self._ingests.setdefault((key, session), ingest)
 
 
 class ModelEdgeFilter:

@@ -140,13 +140,21 @@ def _offset_in(reply: zenoh.Reply, sent: int, round_trip_ns: int) -> MeasuredOff
 class ClockOffsetMonitor(Closeable):
     """Measures the clock offsets of writers when they are read, in its own thread.
 
-    The thread lives only while there is something to measure. Robots take turns: silent writers of one robot
-    do not delay those of another for long.
+    ``offsets`` has a function for the printed name of each watched writer, which returns its offset. The
+    thread lives only while there is something to measure. Robots take turns: silent writers of one robot do
+    not delay those of another for long.
     """
 
-    def __init__(self, session: Session, clock: Clock) -> None:
+    def __init__(
+        self,
+        session: Session,
+        clock: Clock,
+        offsets: dict[str, Callable[[], ClockOffset | None]] | None = None,
+    ) -> None:
         self._session = session
         self._clock = clock
+        self._offsets = {} if offsets is None else offsets
+        self._watched: dict[WriterId, _WriterOffset] = {}
         self._requests: RoundRobinQueue[_WriterOffset] = RoundRobinQueue()
         self._lock = fork_safe_lock()
         self._is_running = False
@@ -154,9 +162,18 @@ class ClockOffsetMonitor(Closeable):
 
     def watch(self, robot: str, writer: WriterId) -> Callable[[], ClockOffset | None]:
         """A function that returns the clock offset of ``writer``; measured now, and again after 30 s."""
-        offset = _WriterOffset(self, robot, clock_key(robot, writer.identity))
-        offset()
+        offset = self._watched.get(writer)
+        if offset is None:
+            offset = self._watched[writer] = _WriterOffset(self, robot, clock_key(robot, writer.identity))
+            offset()
+            self._offsets[str(writer)] = offset
         return offset
+
+    def unwatch(self, writer: WriterId) -> None:
+        """Stop measuring the clock of ``writer``; another one of the same name keeps its offset."""
+        offset = self._watched.pop(writer, None)
+        if offset is not None and self._offsets.get(str(writer)) is offset:
+            del self._offsets[str(writer)]
 
     def request(self, offset: _WriterOffset) -> None:
         """Measure ``offset`` after the ones that were requested before."""
@@ -173,6 +190,7 @@ class ClockOffsetMonitor(Closeable):
                     self._is_open = False
 
     def close(self) -> None:
+        """Stop measuring; the last offsets stay. A second call does nothing."""
         with self._lock:
             self._is_open = False
             self._requests.clear()

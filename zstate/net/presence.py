@@ -11,8 +11,8 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -299,6 +299,48 @@ class WriterWatch(Receiver[zenoh.Sample]):
         super().close()  # first: its thread uses the detector
         if self._routers is not None:
             self._routers.close()
+
+
+class OtherTfSubscription(Closeable):
+    """The subscription to /tf of a listener of joint states, while a node writes it beside state publishers.
+
+    A state publisher writes there what its model and the joint states contain; zstate's own does not even
+    compute it without a subscriber.
+    """
+
+    def __init__(self, subscribe: Callable[[], ExitStack]) -> None:
+        self._subscribe = subscribe
+        self._writers: set[Announcement] = set()
+        self._subscription: ExitStack | None = None
+
+    def on_writer(self, announced: Announcement, *, alive: bool) -> None:
+        """Subscribe or unsubscribe, if this writer makes a difference."""
+        (self._writers.add if alive else self._writers.discard)(announced)
+        streams: dict[str, set[Stream]] = {}
+        for one in self._writers:
+            streams.setdefault(one.node, set()).add(one.stream)
+        if not any(one.stream == "tf" and not _is_state_publisher(one, streams) for one in self._writers):
+            self.close()
+        elif self._subscription is None:
+            self._subscription = self._subscribe()
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        subscription, self._subscription = self._subscription, None
+        if subscription is not None:
+            subscription.close()
+
+
+def _is_state_publisher(announced: Announcement, streams: Mapping[str, Collection[Stream]]) -> bool:
+    """Whether it is of a node with the model that writes joint states, or is named robot_state_publisher.
+
+    ``streams`` are those of each node; the nodes behind a zenoh-plugin-ros2dds bridge are not known.
+    """
+    written = streams[announced.node]
+    is_named_so = announced.writer.program.endswith("/robot_state_publisher")
+    return (
+        bool(announced.node) and "robot_description" in written and ("joint_states" in written or is_named_so)
+    )
 
 
 class Connections(NamedTuple):

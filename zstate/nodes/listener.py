@@ -5,81 +5,41 @@ from __future__ import annotations
 import os
 import time
 import weakref
-from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal, ParamSpec, TypeVar
 
-from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
-from zstate.clock import SYSTEM, Clock, ClockOffset, SystemClock
+from zstate.clock import SYSTEM, Clock, SystemClock
 from zstate.errors import InvalidInput, MessageError
 from zstate.extension import kernel
-from zstate.ingest.base import StreamIngest
+from zstate.ingest.base import StreamIngest, StreamIngests
 from zstate.ingest.counters import Counters, ListenerStats
 from zstate.ingest.events import EventLog, WriterEvent
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_parts import PartialJointStateIngest, RobotParts
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.stamp_checks import FAR_NS, LATE_NS, StampCheck
-from zstate.ingest.transforms import StaticTransformIngest, TransformIngest
+from zstate.ingest.transforms import StaticTransformIngests, TransformIngest
 from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import WriterWatch, announce_reader
+from zstate.net.presence import OtherTfSubscription, WriterWatch, announce_reader
 from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.wire import native
-from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot, shortened, stream_from_key, stream_key
+from zstate.wire.identity import Announcement
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened, stream_from_key, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
-from zstate.wire.protocol import SerializedSample, Wire
+from zstate.wire.protocol import SerializedSample, selected_robots
 from zstate.wire.registry import get_wire
 
 Follow = Literal["joint_states", "tf"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-
-# Of one stream; a hostile writer can make up any number of sessions.
-_MAX_UNANNOUNCED = 256
-
-
-@dataclass(eq=False)
-class _SampleStream:
-    """One of the streams of samples that a listener receives, with the ingests of their writers.
-
-    ``is_shared`` means that each writer publishes its own part of a robot, and has its own ingest. The first
-    samples of a writer may arrive before its announcement, and the last after it has left: then its ingest is
-    among the ``unannounced``. Of more than 256 the oldest is dropped, with its edges if it was never
-    announced.
-    """
-
-    stream: Stream
-    is_shared: bool
-    has_parts: bool = False
-    """Whether its samples are joint states of some of the joints, or may be."""
-    capacity: int = 0
-    ingests: dict[tuple[str, int], StreamIngest] = field(default_factory=dict[tuple[str, int], StreamIngest])
-    unannounced: dict[tuple[str, int], StreamIngest] = field(
-        default_factory=dict[tuple[str, int], StreamIngest]
-    )
-    overflowed: set[StreamIngest] = field(default_factory=set[StreamIngest])
-    newest_by_key: BoundedDict[str, StreamIngest] = field(default_factory=BoundedDict[str, StreamIngest])
-    """The ingest of the last sample on each key, which may expect the next one."""
-
-    def add_unannounced(self, key: tuple[str, int], ingest: StreamIngest) -> StreamIngest:
-        """The ingest of a writer that is not announced: the one there is, else this one."""
-        ingest = self.unannounced.setdefault(key, ingest)
-        if len(self.unannounced) > _MAX_UNANNOUNCED:
-            oldest = self.unannounced.pop(next(iter(self.unannounced)))
-            if oldest.writer is None:
-                oldest.drop()
-        return ingest
 
 
 class TransformListener(Closeable):
@@ -135,7 +95,7 @@ class TransformListener(Closeable):
         if follow not in ("joint_states", "tf"):
             raise InvalidInput(f"follow is 'joint_states' or 'tf', not {follow!r}")
         self._wire = get_wire(wire)
-        self._robots = _robot_names(robot, self._wire)
+        self._robots = selected_robots(robot, self._wire)
         self.robot = self._robots[0] if len(self._robots) == 1 else ANY
         self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
         if clock is not None:
@@ -149,8 +109,8 @@ class TransformListener(Closeable):
         self._on_event = on_event
         self._counters = Counters()
         self._stamp_check = StampCheck(self.buffer, self._counters, is_described=not self._wire.shared)
-        self._samples = _SampleStream(follow, is_shared=follow in self._wire.shared)
-        self._parts = _SampleStream(self._wire.partial_joint_states, is_shared=True, has_parts=True)
+        self._samples = StreamIngests(follow, is_shared=follow in self._wire.shared)
+        self._parts = StreamIngests(self._wire.partial_joint_states, is_shared=True, has_parts=True)
         self._sample_streams = self._received_streams()
         streams: tuple[Stream, ...] = ("robot_description", "tf_static", *self._sample_streams)
         self._events = EventLog(streams, follow, self._wire.shared, on_event)
@@ -162,10 +122,10 @@ class TransformListener(Closeable):
             on_conflict=self._events.add_second_edge,
         )
         self._names = self._ownership.live
-        self._statics: dict[tuple[str, int], StaticTransformIngest] = {}
+        self._statics = StaticTransformIngests(self._ownership, self._events.set_static_children)
         self._history: HistoryReader | None = None
-        self._clock_offsets: _WriterClockOffsets | None = None
-        self._tf_of_others: _TfOfOtherNodes | None = None
+        self._clock_offsets: ClockOffsetMonitor | None = None
+        self._other_tf: OtherTfSubscription | None = None
         self._observers: tuple[Callable[[], object], ...] = ()
         with ExitStack() as opening:
             opening.enter_context(self._events)
@@ -177,7 +137,7 @@ class TransformListener(Closeable):
                 opening.enter_context(LatchedSubscriber(session, self._keys(stream), self._observed(handle)))
             if len(self._sample_streams) > 1 and self._wire.shared:
                 subscribe = partial(self._subscribe, session, [self._wire.transforms])
-                self._tf_of_others = opening.enter_context(_TfOfOtherNodes(subscribe))
+                self._other_tf = opening.enter_context(OtherTfSubscription(subscribe))
                 opening.enter_context(self._subscribe(session, [follow]))
             else:
                 opening.enter_context(self._subscribe(session, tuple(self._sample_streams)))
@@ -186,8 +146,10 @@ class TransformListener(Closeable):
                 self._history = opening.enter_context(
                     HistoryReader(session, on_history, self._count_undecodable)
                 )
-            if not self._wire.shared:
-                self._clock_offsets = opening.enter_context(_WriterClockOffsets(session, self.buffer))
+            if not self._wire.shared and self.buffer.clock.domain == SYSTEM:
+                self._clock_offsets = opening.enter_context(
+                    ClockOffsetMonitor(session, self.buffer.clock, self.buffer.clock_offsets)
+                )
             # History is requested from each writer found: after subscribing, so that no sample falls between.
             on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
             opening.enter_context(WriterWatch(session, self._robots, on_writer, wire, on_cut_off))
@@ -198,13 +160,13 @@ class TransformListener(Closeable):
         self._pid = os.getpid()
         _LISTENERS.add(self)
 
-    def _received_streams(self) -> dict[Stream, _SampleStream]:
-        received: dict[Stream, _SampleStream] = {self._follow: self._samples}
+    def _received_streams(self) -> dict[Stream, StreamIngests]:
+        received: dict[Stream, StreamIngests] = {self._follow: self._samples}
         if self._follow == "joint_states":
             received[self._parts.stream] = self._parts  # in ROS any joint state may be a part
         others = self._wire.transforms
         if others != self._follow:
-            received[others] = _SampleStream(others, is_shared=True)
+            received[others] = StreamIngests(others, is_shared=True)
         return received
 
     def _subscribe(self, session: Session, streams: Sequence[Stream]) -> ExitStack:
@@ -285,7 +247,7 @@ class TransformListener(Closeable):
             "or 'forkserver' method"
         )
 
-    def _subscriber(self, session: Session, keys: Sequence[str], samples: _SampleStream) -> StreamSubscriber:
+    def _subscriber(self, session: Session, keys: Sequence[str], samples: StreamIngests) -> StreamSubscriber:
         on_samples = partial(self._on_samples, samples)
         if not self._has_fast_path:
             return StreamSubscriber(session, keys, on_samples)
@@ -293,7 +255,7 @@ class TransformListener(Closeable):
         encoding = native.stream_encoding(samples.stream)
         return StreamSubscriber(session, keys, on_samples, insert_next=insert_next, encoding=encoding)
 
-    def _ingest_for(self, samples: _SampleStream, robot: str, session: int) -> StreamIngest:
+    def _ingest_for(self, samples: StreamIngests, robot: str, session: int) -> StreamIngest:
         key = (robot, session if samples.is_shared else 0)
         ingest = samples.ingests.get(key) or samples.unannounced.get(key)
         if ingest is None:
@@ -308,7 +270,7 @@ class TransformListener(Closeable):
                 ingest = samples.add_unannounced(key, ingest)
         return ingest
 
-    def _new_ingest(self, samples: _SampleStream, robot: str) -> StreamIngest:
+    def _new_ingest(self, samples: StreamIngests, robot: str) -> StreamIngest:
         on_set_back = self._events.add_set_back
         if samples.has_parts:
             others = bool(self._wire.shared)
@@ -323,7 +285,7 @@ class TransformListener(Closeable):
         assert isinstance(ingest, JointStateIngest)
         return ingest.parts
 
-    def _insert_next(self, samples: _SampleStream, key: str, payload: bytes | None) -> bool:
+    def _insert_next(self, samples: StreamIngests, key: str, payload: bytes | None) -> bool:
         """Insert a sample in one call of the extension if it is the usual next one on its key."""
         ingest = samples.newest_by_key.get(key)
         now = time.time_ns()
@@ -337,7 +299,7 @@ class TransformListener(Closeable):
             notify()
         return True
 
-    def _on_samples(self, samples: _SampleStream, arrivals: list[SerializedSample]) -> None:
+    def _on_samples(self, samples: StreamIngests, arrivals: list[SerializedSample]) -> None:
         is_full = len(arrivals) >= samples.capacity
         if is_full:
             # A full ring has lost samples of any of the writers, and loses more while it is drained.
@@ -410,30 +372,14 @@ class TransformListener(Closeable):
         if not self._is_withdrawn(arrival):
             for message in self._decode("tf_static", arrival, robot):
                 if isinstance(message, StaticTransforms):
-                    self._insert_statics(arrival.key, robot, writer, message)
+                    self._ingest_for(self._samples, robot, message.session).has_data = True
+                    self._statics.insert(arrival.key, robot, writer, message)
         elif writer is not None:
-            self._static_ingest(arrival.key, robot, writer).withdraw()
-            self._statics.pop((arrival.key, 0), None)
-            self._events.set_static_children(robot, writer, frozenset())
+            self._statics.withdraw(arrival.key, robot, writer)
 
     def _is_withdrawn(self, arrival: SerializedSample) -> bool:
         # In ROS nothing can be withdrawn: an empty payload there is a broken message.
         return not arrival.payload and not self._wire.shared
-
-    def _insert_statics(self, key: str, robot: str, writer: str | None, message: StaticTransforms) -> None:
-        self._ingest_for(self._samples, robot, message.session).has_data = True
-        if writer is not None:
-            ingest = self._static_ingest(key, robot, writer)
-            ingest.replace(message)
-            self._events.set_static_children(robot, writer, ingest.children)
-        else:
-            # A ROS node that is not announced yet is identified by its number.
-            name = self._names.get((robot, message.session), f"a ROS node {message.session:016x}")
-            self._static_ingest(key, robot, name, message.session).add(message)
-
-    def _static_ingest(self, key: str, robot: str, writer: str, session: int = 0) -> StaticTransformIngest:
-        ingest = StaticTransformIngest(robot, writer, self._ownership, is_model=writer == MODEL_WRITER)
-        return self._statics.setdefault((key, session), ingest)
 
     def _decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         try:
@@ -456,8 +402,8 @@ class TransformListener(Closeable):
         self._events.on_writer(announced, alive)
         robot, session, stream = announced.robot, announced.writer.session, announced.stream
         name = str(announced.writer)
-        if self._tf_of_others is not None:
-            self._tf_of_others.on_writer(announced, alive=alive)
+        if self._other_tf is not None:
+            self._other_tf.on_writer(announced, alive=alive)
         if alive:
             self._names[robot, session] = name
             self._ownership.add_robot(robot)
@@ -465,9 +411,7 @@ class TransformListener(Closeable):
             self._names.pop((robot, session), None)
         if stream == "tf_static" and alive:
             self._ownership.add_writer(robot, session)
-            for (_, other), static_ingest in list(self._statics.items()):
-                if other == session:  # of a ROS node, whose edges may arrive before its name
-                    static_ingest.name_writer(name)
+            self._statics.name_writer(session, name)
         elif stream == "tf_static":
             self._ownership.remove_writer(robot, session)
         elif stream == "robot_description" and self._follow == "joint_states" and alive:
@@ -475,7 +419,7 @@ class TransformListener(Closeable):
         elif stream in self._sample_streams:
             self._set_followed_writer(self._sample_streams[stream], announced, alive=alive)
 
-    def _set_followed_writer(self, samples: _SampleStream, announced: Announcement, *, alive: bool) -> None:
+    def _set_followed_writer(self, samples: StreamIngests, announced: Announcement, *, alive: bool) -> None:
         robot, session = announced.robot, announced.writer.session
         if samples.stream == "transforms":
             (self._ownership.add_writer if alive else self._ownership.remove_writer)(robot, session)
@@ -485,8 +429,10 @@ class TransformListener(Closeable):
                 parts.add_writer(session, announced.writer.since)
             else:
                 parts.remove_writer(session)
-        if self._clock_offsets is not None:
-            self._clock_offsets.on_writer(announced, alive=alive)
+        if self._clock_offsets is not None and alive:
+            self._clock_offsets.watch(robot, announced.writer)
+        elif self._clock_offsets is not None:
+            self._clock_offsets.unwatch(announced.writer)
         if alive and self._history is not None:
             self._history.request(stream_key(robot, samples.stream, announced.name), session)
         key = robot, session
@@ -501,96 +447,6 @@ class TransformListener(Closeable):
         ingest.writer_left(session)
         if samples.is_shared:
             samples.add_unannounced(key, samples.ingests.pop(key))
-
-
-def _robot_names(robot: str | Sequence[str], wire: Wire) -> tuple[str, ...]:
-    """``robot`` as a tuple of names. Raises InvalidInput unless a sequence has different valid names."""
-    if isinstance(robot, str):
-        return (robot,)
-    names = tuple(robot)
-    if not names:
-        raise InvalidInput("robot is an empty sequence; name the robots, or give '*' for all")
-    if ANY in names:
-        raise InvalidInput("'*' is in a sequence of robots; give robot='*' for all, or the names alone")
-    for name in names:
-        check_robot(name)
-    repeated = [name for name, count in Counter(names).items() if count > 1]
-    if repeated:
-        text = ", ".join(map(repr, repeated))
-        raise InvalidInput(f"the sequence of robots has {text} more than once; name each robot once")
-    if wire.shared and len(names) > 1:
-        raise InvalidInput(
-            f"the sequence of robots has {len(names)} names; on the wire {wire.name!r} robots share topics "
-            "whose keys do not name one of them; open a listener for each robot, on one buffer"
-        )
-    return names
-
-
-class _TfOfOtherNodes(Closeable):
-    """The subscription to /tf of a listener of joint states, while a node writes it beside state publishers.
-
-    A state publisher writes there what its model and the joint states contain; zstate's own does not even
-    compute it without a subscriber.
-    """
-
-    def __init__(self, subscribe: Callable[[], ExitStack]) -> None:
-        self._subscribe = subscribe
-        self._writers: set[Announcement] = set()
-        self._subscription: ExitStack | None = None
-
-    def on_writer(self, announced: Announcement, *, alive: bool) -> None:
-        """Subscribe or unsubscribe, if this writer makes a difference."""
-        (self._writers.add if alive else self._writers.discard)(announced)
-        streams: dict[str, set[Stream]] = {}
-        for one in self._writers:
-            streams.setdefault(one.node, set()).add(one.stream)
-        if not any(one.stream == "tf" and not _is_state_publisher(one, streams) for one in self._writers):
-            self.close()
-        elif self._subscription is None:
-            self._subscription = self._subscribe()
-
-    def close(self) -> None:
-        """Unsubscribe."""
-        subscription, self._subscription = self._subscription, None
-        if subscription is not None:
-            subscription.close()
-
-
-def _is_state_publisher(announced: Announcement, streams: Mapping[str, Collection[Stream]]) -> bool:
-    """Whether it is of a node with the model that writes joint states, or is named robot_state_publisher.
-
-    ``streams`` are those of each node; the nodes behind a zenoh-plugin-ros2dds bridge are not known.
-    """
-    written = streams[announced.node]
-    is_named_so = announced.writer.program.endswith("/robot_state_publisher")
-    return (
-        bool(announced.node) and "robot_description" in written and ("joint_states" in written or is_named_so)
-    )
-
-
-class _WriterClockOffsets(Closeable):
-    """Measures the clock offset of each writer of the native wire, for the error texts of ``buffer``."""
-
-    def __init__(self, session: Session, buffer: TransformBuffer) -> None:
-        self._offsets = buffer.clock_offsets
-        self._is_enabled = buffer.clock.domain == SYSTEM
-        self._meter = ClockOffsetMonitor(session, buffer.clock)
-        self._measured: dict[WriterId, Callable[[], ClockOffset | None]] = {}
-
-    def on_writer(self, announced: Announcement, *, alive: bool) -> None:
-        """Start or stop measuring the clock of a writer."""
-        writer = announced.writer
-        if not alive:
-            offset = self._measured.pop(writer, None)
-            if offset is not None and self._offsets.get(str(writer)) is offset:
-                del self._offsets[str(writer)]
-        elif self._is_enabled and writer not in self._measured:
-            offset = self._measured[writer] = self._meter.watch(announced.robot, writer)
-            self._offsets[str(writer)] = offset
-
-    def close(self) -> None:
-        """Stop measuring; the last offsets stay. A second call does nothing."""
-        self._meter.close()
 
 
 _LISTENERS: weakref.WeakSet[TransformListener] = weakref.WeakSet()

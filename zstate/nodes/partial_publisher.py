@@ -9,11 +9,10 @@ from contextlib import ExitStack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.clock import SYSTEM, Clock, check_stamp
+from zstate.clock import Clock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.model.joint_limits import JointLimits
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
-from zstate.net.clock_offset import ClockService
 from zstate.net.ownership import WriterClaim, claim_edges
 from zstate.net.presence import local_writer
 from zstate.net.sample_history import SampleCache, serve_history
@@ -22,7 +21,7 @@ from zstate.net.status import StatusPublisher
 from zstate.net.writer import WireWriter
 from zstate.nodes.publisher import Positions, positions_block
 from zstate.nodes.publisher_status import LimitWatch, StatusReporter
-from zstate.nodes.sample_publisher import NEWEST_ONLY_S, SamplePublisher
+from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.nodes.static_publisher import edge_writer_name
 from zstate.rate import RateReport
 from zstate.sources.joint_source import JointReading, JointSource
@@ -98,12 +97,10 @@ class PartialStatePublisher(SamplePublisher):
         """Become the one writer of the joints on the native wire, until ``opening`` is closed."""
         announced = Announcement(self.robot, "partial_joint_states", identity, self.writer)
         self._claim = opening.enter_context(WriterClaim(session, [announced]))
-        if self._clock.domain == SYSTEM:
-            # Before this writer is announced: readers that see its token measure its clock at once.
-            opening.enter_context(ClockService(session, self.robot, identity, self._clock))
+        self._serve_clock(session, identity, opening)
         # Its queryable is also how writers that claim joints at the same time find each other.
         numbers = 3 * self.model.position_count
-        self._cache = SampleCache(cache_s or NEWEST_ONLY_S, numbers, self._session_id)
+        self._cache = self._new_cache(cache_s, numbers)
         history = serve_history(session, self.robot, "partial_joint_states", self._cache, writer=self.writer)
         opening.enter_context(history)
         movers = {f"{self.robot}/{joint.child}": joint for joint in self.model.joints}

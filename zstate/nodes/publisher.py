@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from numpy.typing import ArrayLike
 
-from zstate.clock import SYSTEM, Clock, check_stamp
+from zstate.clock import Clock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.extension import kernel
 from zstate.model.joint_limits import JointLimits
 from zstate.model.joint_transforms import edge_forms
 from zstate.model.kinematics import MovingEdges
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
-from zstate.net.clock_offset import ClockService
 from zstate.net.ownership import WriterClaim
 from zstate.net.presence import local_writer
 from zstate.net.sample_history import SampleCache, serve_history
@@ -30,7 +29,7 @@ from zstate.net.status import StatusPublisher
 from zstate.net.writer import SampleWriter, WireWriter, write_all
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter
-from zstate.nodes.sample_publisher import NEWEST_ONLY_S, SamplePublisher
+from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.rate import RateReport
 from zstate.sources.joint_source import JointReading, JointSource
 from zstate.wire.identity import Announcement
@@ -177,9 +176,8 @@ class StatePublisher(SamplePublisher):
                     for stream in streams
                 ]
                 self._claim = opening.enter_context(WriterClaim(session, announced))
-            if "native" in wires and self._clock.domain == SYSTEM:
-                # Before this writer is announced: readers that see its token measure its clock at once.
-                opening.enter_context(ClockService(session, self.robot, writer, self._clock))
+            if "native" in wires:
+                self._serve_clock(session, writer, opening)
             wire_writers = [
                 opening.enter_context(WireWriter(session, get_wire(wire), self.robot, writer, sample_names))
                 for wire in wires
@@ -215,7 +213,7 @@ class StatePublisher(SamplePublisher):
         if "native" not in self._wires:
             return None
         numbers = self.model.position_count + 2 * self.model.velocity_count
-        cache = SampleCache(cache_s or NEWEST_ONLY_S, numbers, self._session_id)
+        cache = self._new_cache(cache_s, numbers)
         if cache_s:
             if self._native is not None:
                 opening.enter_context(serve_history(session, self.robot, "joint_states", cache))

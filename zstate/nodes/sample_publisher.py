@@ -9,17 +9,21 @@ from typing import TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
-from zstate.clock import Clock, SystemClock
+from zstate.clock import SYSTEM, Clock, SystemClock
 from zstate.errors import Closed
+from zstate.net.clock_offset import ClockService
+from zstate.net.sample_history import SampleCache
+from zstate.net.session import Session
 from zstate.net.writer import SampleWriter
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StreamStats
 from zstate.rate import Rate, RateReport
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import Stream, check_robot
 from zstate.wire.registry import as_wire_names
 
 T = TypeVar("T")
 
-NEWEST_ONLY_S = 1e-9
+_NEWEST_ONLY_S = 1e-9
 """Span of a cache that has no room for a second sample."""
 
 
@@ -40,6 +44,18 @@ class SamplePublisher(Closeable):
         self._opened = ExitStack()
         self._lock = fork_safe_lock()
         self._stop = fork_safe(threading.Event())
+
+    def _serve_clock(self, session: Session, writer: WriterId, opening: ExitStack) -> None:
+        """Reply to readers that measure this clock, unless it is simulated.
+
+        Called before ``writer`` is announced: readers that see its token measure its clock at once.
+        """
+        if self._clock.domain == SYSTEM:
+            opening.enter_context(ClockService(session, self.robot, writer, self._clock))
+
+    def _new_cache(self, cache_s: float, numbers: int) -> SampleCache:
+        """For the samples of the last ``cache_s`` seconds; 0: for the newest one."""
+        return SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
 
     @property
     def stats(self) -> PublisherStats:

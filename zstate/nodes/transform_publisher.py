@@ -11,9 +11,8 @@ import numpy as np
 
 from zstate._util.bounded import BoundedDict
 from zstate.buffer.buffer import TransformBuffer
-from zstate.clock import SYSTEM, Clock, check_stamp
+from zstate.clock import Clock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
-from zstate.net.clock_offset import ClockService
 from zstate.net.edge_monitor import EdgeMonitor
 from zstate.net.ownership import Edge, WriterClaim, check_readers, claim_edges
 from zstate.net.presence import local_writer
@@ -22,7 +21,7 @@ from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
 from zstate.net.writer import WireWriter
 from zstate.nodes.publisher_status import StatusReporter
-from zstate.nodes.sample_publisher import NEWEST_ONLY_S, SamplePublisher
+from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.nodes.static_publisher import edge_writer_name
 from zstate.rate import RateReport
 from zstate.transform import UPPER_TRIANGLE, Transform
@@ -94,9 +93,7 @@ class TransformPublisher(SamplePublisher):
             if "native" in self._wires:
                 self._claim = opening.enter_context(WriterClaim(session, [self._announced]))
                 self._edge_monitor = opening.enter_context(EdgeMonitor(session, self._announced))
-            if "native" in self._wires and self._clock.domain == SYSTEM:
-                # Before this writer is announced: readers that see its token measure its clock at once.
-                opening.enter_context(ClockService(session, self.robot, identity, self._clock))
+                self._serve_clock(session, identity, opening)
             for name in self._wires:
                 wire = get_wire(name)
                 wire_writer = opening.enter_context(WireWriter(session, wire, self.robot, identity))
@@ -106,7 +103,7 @@ class TransformPublisher(SamplePublisher):
                 status = StatusReporter(identity, lambda: self.stats).status
                 opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
                 # Its queryable is also how writers that claim edges at the same time find each other.
-                self._cache = SampleCache(cache_s or NEWEST_ONLY_S, _TYPICAL_EDGES * 28, self._session_id)
+                self._cache = self._new_cache(cache_s, _TYPICAL_EDGES * 28)
                 opening.enter_context(
                     serve_history(session, self.robot, "transforms", self._cache, writer=self.writer)
                 )

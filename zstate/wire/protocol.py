@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from msgspec import Struct
 
+from zstate.errors import InvalidInput
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import Stream
+from zstate.wire.keys import ANY, Stream, check_robot
 from zstate.wire.messages import Message
 
 
@@ -139,3 +141,26 @@ class Wire(Protocol):
     def parse_token(self, token: str, robot: str) -> Announcement | None:
         """The writer and stream of a token under that expression; None for any other token."""
         ...
+
+
+def selected_robots(robot: str | Sequence[str], wire: Wire) -> tuple[str, ...]:
+    """``robot`` as a tuple of names. Raises InvalidInput unless a sequence has different valid names."""
+    if isinstance(robot, str):
+        return (robot,)
+    names = tuple(robot)
+    if not names:
+        raise InvalidInput("robot is an empty sequence; name the robots, or give '*' for all")
+    if ANY in names:
+        raise InvalidInput("'*' is in a sequence of robots; give robot='*' for all, or the names alone")
+    for name in names:
+        check_robot(name)
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        text = ", ".join(map(repr, repeated))
+        raise InvalidInput(f"the sequence of robots has {text} more than once; name each robot once")
+    if wire.shared and len(names) > 1:
+        raise InvalidInput(
+            f"the sequence of robots has {len(names)} names; on the wire {wire.name!r} robots share topics "
+            "whose keys do not name one of them; open a listener for each robot, on one buffer"
+        )
+    return names

@@ -141,7 +141,7 @@ def publish_command(
         elif source == "sine":
             run_publisher(whole, SineSource(model), rate_hz, seconds)
         else:
-            from zstate.recording.source import RecordedSource
+            from zstate.recording.player import RecordedSource
 
             with RecordedSource(source, None, model) as recorded:
                 # One tick more than the recording is long, for its last sample.

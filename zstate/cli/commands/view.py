@@ -271,7 +271,7 @@ def _write_snapshot(
     fixed_frame: str,
 ) -> None:
     """Write a picture once ``robots`` have arrived, and print which robots and meshes are not in it."""
-    from zstate.view.screenshot import save_screenshot
+    from zstate.view.server import save_screenshot
 
     def has_models() -> bool:
         models = source.models

@@ -16,7 +16,7 @@ from zstate.buffer.snapshot import FrameTable, Mask, Poses, Rows
 from zstate.model.geometry import Color, Shape
 from zstate.view.mesh_paths import MissingFile
 from zstate.view.meshes import MeshAsset, MeshLoader, MeshRequest
-from zstate.view.scene.frame_nodes import FrameNodes, in_frame, set_instances, wxyzs
+from zstate.view.scene.frames import FrameNodes, in_frame, set_instances, wxyzs
 
 RenderStyle = Literal["visual", "collision", "stale"]
 

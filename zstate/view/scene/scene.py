@@ -18,8 +18,15 @@ from zstate.model.findings import Finding
 from zstate.model.geometry import Shape, read_shapes
 from zstate.model.robot import RobotModel
 from zstate.view.meshes import Meshes, MeshLoader
-from zstate.view.scene.frame_markers import Axes, FrameLabels, NodeLabels, ParentLines, Trails
-from zstate.view.scene.frame_nodes import FrameNodes, in_frame
+from zstate.view.scene.frames import (
+    Axes,
+    FrameLabels,
+    FrameNodes,
+    NodeLabels,
+    ParentLines,
+    Trails,
+    in_frame,
+)
 from zstate.view.scene.robot_meshes import InstancedMeshes, RenderStyle, RobotKind, RobotMeshes
 
 _MIN_INSTANCES = 4  # identical robots that are drawn by instances

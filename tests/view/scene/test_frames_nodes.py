@@ -12,7 +12,7 @@ viser = pytest.importorskip("viser")
 from helpers.scene_drawing import at, is_visible, pose_in_fixed, sent_messages, snapshot, tree  # noqa: E402
 
 from zstate import se3  # noqa: E402
-from zstate.view.scene.frame_nodes import FrameNodes  # noqa: E402
+from zstate.view.scene.frames import FrameNodes  # noqa: E402
 
 ARM = tree({"map": None, "arm/base": "map", "arm/upper": "arm/base", "arm/tool": "arm/upper"})
 ALL = frozenset({*ARM.names, "cup"})

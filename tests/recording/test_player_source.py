@@ -14,7 +14,7 @@ from zstate.errors import InvalidInput
 from zstate.model.load import load_model
 from zstate.net.session import connect
 from zstate.nodes.publisher import StatePublisher
-from zstate.recording.source import RecordedSource
+from zstate.recording.player import RecordedSource
 
 NOW = 1_900_000_000 * S
 
