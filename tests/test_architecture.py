@@ -35,6 +35,7 @@ FLOORS = (
     {"net"},
     {"sources"},
     {"nodes"},
+    {"scans"},
     {"bridges", "recording"},
     {"zstate"},
     {"metrics"},
