@@ -88,6 +88,8 @@ GUESTS = {
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
     ("cli/snapshot_file.py", "msgspec"),
     ("cli/up/cell.py", "msgspec"),
+    ("scans/map_files.py", "PIL"),
+    ("scans/map_metadata.py", "yaml"),
 }
 
 PURE = {"model", "buffer", "wire"}

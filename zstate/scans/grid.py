@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,15 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.checks import check_names, real_numbers
 from zstate.clock import check_stamp
 from zstate.errors import InvalidInput
+from zstate.scans.map_files import read_cells, scale_image, write_map
+from zstate.scans.map_metadata import Mode, read_metadata
 from zstate.transform import Transform
 
 UNKNOWN = -1
-FREE = 0
 OCCUPIED = 100
+
+_LEVEL = 1e-9
+"""z [m], roll and pitch [rad] up to this are rounding."""
 
 CORNER = "corner"
 """The source frame of ``origin``, if it is given as numbers."""
@@ -98,24 +103,42 @@ class Grid:
 
         From white (0) to black (100); cells that are unknown are transparent grey.
         """
-        colors = np.take(_COLORS, self.cells[::-1].view(np.uint8))
-        return colors.view(np.uint8).reshape(*self.cells.shape, 4)
+        return scale_image(self.cells)
+
+    def save(self, path: str | Path, mode: Mode = "trinary") -> None:
+        """Write the map files ``path`` (.yaml) and, with the same name, its image.
+
+        "trinary", as map_saver's default, is a .pgm in which cells from 65 are occupied, those up to 25
+        free, and all others unknown. "scale" (a .png) and "raw" (a .pgm) keep every cell. map_server's files
+        have no frame. Raises InvalidInput if the origin is tilted or has a z, or if a file cannot be written.
+        """
+        write_map(Path(path), self.cells, self.resolution, self.planar_origin(), mode)
+
+    def planar_origin(self) -> tuple[float, float, float]:
+        """x, y [m] and yaw [rad] of ``origin``. Raises InvalidInput if it is tilted or has a z."""
+        x, y, z = self.origin.translation.tolist()
+        roll, pitch, yaw = self.origin.rpy.tolist()
+        if max(abs(z), abs(roll), abs(pitch)) > _LEVEL:
+            raise InvalidInput(
+                f"the origin of {self!r} is not in the x-y plane: z {z:g} m, roll {roll:g} rad, "
+                f"pitch {pitch:g} rad; make a Grid with an origin x, y, yaw"
+            )
+        return x, y, yaw
 
     def __repr__(self) -> str:
         height, width = self.cells.shape
         return f"<Grid of {width} x {height} cells of {self.resolution:g} m in {self.frame!r}>"
 
 
-def _colors() -> NDArray[np.uint32]:
-    """RGBA in the four bytes of an integer, by the cell as uint8, so that -1 is 255: (256,)."""
-    colors = np.zeros((256, 4), dtype=np.uint8)
-    colors[: OCCUPIED + 1, :3] = np.rint(np.linspace(255.0, 0.0, OCCUPIED + 1))[:, None]
-    colors[: OCCUPIED + 1, 3] = 255
-    colors[UNKNOWN] = (128, 128, 128, 0)
-    return colors.view(np.uint32)[:, 0]
+def load_map(path: str | Path, frame: str = "map") -> Grid:
+    """The map of map_server whose YAML file is ``path``, placed in ``frame``.
 
-
-_COLORS = _colors()
+    All modes, as in ``zstate.scans.map_files``; ~ is the home folder. Raises InvalidInput with every finding
+    in the YAML file, or the reason why its image cannot be read, and LibraryMissing without PyYAML and Pillow
+    (``pip install 'zstate[maps]'``).
+    """
+    metadata = read_metadata(Path(path).expanduser())
+    return Grid(read_cells(metadata), metadata.resolution, metadata.origin, frame)
 
 
 def _checked_cells(cells: ArrayLike) -> NDArray[np.int8]:
