@@ -35,6 +35,7 @@ FLOORS = (
     {"net"},
     {"sources"},
     {"nodes"},
+    {"scans"},
     {"bridges", "recording"},
     {"zstate"},
     {"metrics"},
@@ -87,6 +88,8 @@ GUESTS = {
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
     ("cli/snapshot_file.py", "msgspec"),
     ("cli/up/cell.py", "msgspec"),
+    ("scans/map_files.py", "PIL"),
+    ("scans/map_metadata.py", "yaml"),
 }
 
 PURE = {"model", "buffer", "wire"}
