@@ -103,6 +103,8 @@ def test_every_key_of_a_robot_lies_under_its_own_prefix():
     assert keys.stream_key("panda", "tf_static", "mount") == "zstate/panda/tf_static/mount"
     assert keys.stream_key("panda", "robot_description") == "zstate/panda/robot_description"
     assert keys.stream_key("panda", "joint_commands") == "zstate/panda/joint_commands"
+    assert keys.stream_key("panda", "scan", "front") == "zstate/panda/scan/front"
+    assert keys.stream_key("hall", "map", "map") == "zstate/hall/map/map"
     assert keys.lookup_key("panda") == "zstate/panda/lookup"
     assert keys.writer_key("panda", "tf", "x") == "zstate/panda/@writer/tf/x"
     assert keys.CLOCK_KEY == "zstate/clock"
@@ -112,6 +114,8 @@ def test_expression_matches_one_robot_or_all_and_every_static_writer():
     assert keys.stream_expression("panda", "joint_states") == "zstate/panda/joint_states"
     assert keys.stream_expression("*", "joint_states") == "zstate/*/joint_states"
     assert keys.stream_expression("*", "tf_static") == "zstate/*/tf_static/*"
+    assert keys.stream_expression("panda", "scan") == "zstate/panda/scan/*"
+    assert keys.stream_expression("*", "map") == "zstate/*/map/*"
     assert keys.writer_expression("panda") == "zstate/panda/@writer/*/*"
     assert keys.writer_expression("*") == "zstate/*/@writer/*/*"
 

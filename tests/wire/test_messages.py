@@ -1,17 +1,24 @@
 from hashlib import blake2b
+from typing import Any
 
 import numpy as np
 import pytest
 
 from zstate.errors import InvalidInput
 from zstate.wire.messages import (
+    GRID_CELLS,
     JointState,
+    LaserScan,
+    OccupancyGrid,
     StaticTransforms,
     TransformSample,
+    cells_of,
     from_block,
+    from_float32_block,
     order_digest,
     poses_from_block,
     to_block,
+    to_float32_block,
 )
 
 EDGES = (("base", "arm"), ("arm", "hand"))
@@ -73,6 +80,80 @@ def test_names_and_edges_sent_along_must_fit_their_digest_and_their_numbers():
         TransformSample(0, 0, 1, order_digest(["b"]), to_block(np.zeros((2, 7))), EDGES)
     with pytest.raises(InvalidInput, match="1 names need as many numbers, not 2"):
         JointState(0, 0, 1, order_digest(["a"]), to_block([1.0, 2.0]), names=("a",))
+
+
+def scan(**changed: Any) -> LaserScan:
+    fields: dict[str, Any] = {
+        **{"stamp": 5, "seq": 0, "session": 1, "frame": "laser", "angle_min": -1.0, "angle_increment": 0.5},
+        **{"ray_ns": 10, "scan_ns": 100, "range_min": 0.1, "range_max": 10.0},
+        "ranges": to_float32_block([1.0, 2.0]),
+    }
+    return LaserScan(**{**fields, **changed})
+
+
+def grid(**changed: Any) -> OccupancyGrid:
+    fields: dict[str, Any] = {
+        **{"session": 1, "stamp": 5, "frame": "map", "resolution": 0.1, "width": 3, "height": 2},
+        **{"origin": to_block([0, 0, 0, 0, 0, 0, 1]), "cells": np.arange(-1, 5, dtype=np.int8).tobytes()},
+    }
+    return OccupancyGrid(**{**fields, **changed})
+
+
+def test_a_block_of_ranges_is_little_endian_float32():
+    # 1.0 is sign 0, exponent 127, fraction 0: 3f 80 00 00 read from the high end
+    assert to_float32_block([1, -2]) == bytes.fromhex("0000803f 000000c0")
+    np.testing.assert_array_equal(from_float32_block(to_float32_block([0.5, np.inf])), [0.5, np.inf])
+
+
+def test_ranges_that_are_no_measurements_are_part_of_a_scan():
+    ranges = to_float32_block([-np.inf, np.inf, np.nan, 99.0])
+    assert scan(ranges=ranges, intensities=ranges, range_max=np.inf).ranges == ranges
+    assert scan(ranges=b"", ray_ns=0, scan_ns=0).ranges == b""
+
+
+@pytest.mark.parametrize(
+    ("changed", "text"),
+    [
+        ({"angle_min": np.nan}, "angles of finite numbers .* not nan, 0.5"),
+        ({"angle_increment": np.inf}, "not -1.0, inf"),
+        ({"range_min": -0.1}, "not -0.1 and 10.0"),
+        ({"range_min": 11.0}, "not 11.0 and 10.0"),
+        ({"range_min": np.inf, "range_max": np.inf}, "not inf and inf"),
+        ({"range_max": np.nan}, "not 0.1 and nan"),
+        ({"ranges": b"12345"}, "multiple of 4 bytes, not 5"),
+        ({"intensities": b"1234"}, "2 ranges take as many intensities; got 4 bytes, not 8"),
+        ({"ray_ns": -1}, "one each -1 ns"),
+        ({"scan_ns": -1}, "a scan each -1 ns"),
+        ({"stamp": 2**63 - 20}, "last ray has 64 bits"),
+    ],
+)
+def test_a_scan_with_impossible_geometry_or_times_cannot_be_made(changed: dict[str, Any], text: str):
+    with pytest.raises(InvalidInput, match=text):
+        scan(**changed)
+
+
+def test_row_0_of_the_cells_is_the_first_width_cells():
+    np.testing.assert_array_equal(cells_of(grid()), [[-1, 0, 1], [2, 3, 4]])
+    assert cells_of(grid(width=0, cells=b"")).shape == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "text"),
+    [
+        ({"resolution": 0.0}, "positive and finite .* not 0.0"),
+        ({"resolution": np.nan}, "not nan"),
+        ({"origin": bytes(48)}, "a pose of 56 bytes, not 48"),
+        ({"origin": to_block([np.inf, 0, 0, 0, 0, 0, 1])}, "origin of finite numbers .* not inf, 0.0"),
+        ({"width": 4}, "4 x 2 needs as many cells, not 6"),
+        ({"width": -3, "height": -2}, "-3 x -2 needs"),
+        ({"cells": bytes([0, 0, 0, 0, 0, 101])}, "not 0 to 101"),
+        ({"cells": bytes([0, 0, 0, 0, 0, 254])}, "not -2 to 0"),
+        ({"width": GRID_CELLS + 1, "height": 1, "cells": bytes(GRID_CELLS + 1)}, "16000000 are allowed"),
+    ],
+)
+def test_a_grid_with_impossible_geometry_or_cells_cannot_be_made(changed: dict[str, Any], text: str):
+    with pytest.raises(InvalidInput, match=text):
+        grid(**changed)
 
 
 def test_messages_are_frozen():

@@ -1,4 +1,6 @@
 import struct
+import tracemalloc
+import zlib
 
 import msgspec
 import numpy as np
@@ -10,11 +12,14 @@ from zstate.errors import MessageError
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
+    LATCHED_BYTES,
     ClockMessage,
     HistoryPage,
     JointCommand,
     JointState,
+    LaserScan,
     Message,
+    OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     Status,
@@ -22,6 +27,7 @@ from zstate.wire.messages import (
     WriterTransforms,
     order_digest,
     to_block,
+    to_float32_block,
 )
 from zstate.wire.native import (
     ENCODINGS,
@@ -121,6 +127,30 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + b"\x92"
         + pairs(*EDGES)
         + fixstr("system"),
+    ),
+    "scan": (
+        LaserScan(
+            *(STAMP, 300, 2**63 + 5, "laser", -0.5, 0.25, 5, 7, 0.125, 8.0),
+            to_float32_block([0.5, np.inf]),
+            to_float32_block([1, 2]),
+        ),
+        header(12)[:-10]
+        + fixstr("laser")
+        + b"".join(b"\xcb" + struct.pack(">d", number) for number in (-0.5, 0.25))
+        + b"\x05\x07"
+        + b"".join(b"\xcb" + struct.pack(">d", number) for number in (0.125, 8.0))
+        + bin8(struct.pack("<2f", 0.5, np.inf))
+        + bin8(struct.pack("<2f", 1, 2)),
+    ),
+    "grid": (
+        OccupancyGrid(7, 6, "map", 0.5, 2, 1, to_block([1, 2, 0, 0, 0, 0, 1]), b"\xff\x64"),
+        b"\x98\x07\x06"
+        + fixstr("map")
+        + b"\xcb"
+        + struct.pack(">d", 0.5)
+        + b"\x02\x01"
+        + bin8(struct.pack("<7d", 1, 2, 0, 0, 0, 0, 1))
+        + bin8(b"\xff\x64"),
     ),
     "clock": (ClockMessage(0, 1, 2), b"\x93\x00\x01\x02"),
     "status": (
@@ -240,6 +270,47 @@ def test_text_that_is_not_utf8_is_malformed():
 def test_arrays_nested_without_end_are_malformed():
     bomb = b"\x99" + encode(MESSAGES[0])[1:] + b"\x91" * 1_000_000 + b"\xc0"
     assert reason(bomb, ENCODINGS[JointState]) == "malformed"
+
+
+def large_grid(side: int) -> OccupancyGrid:
+    cells = np.random.default_rng(1).integers(-1, 101, side * side, np.int8).tobytes()
+    return OccupancyGrid(1, 2, "map", 0.05, side, side, to_block([0, 0, 0, 0, 0, 0, 1]), cells)
+
+
+@pytest.mark.parametrize("side", [250, 300, 4000])
+def test_a_grid_is_deflated_above_64_kb_and_read_again(side: int):
+    grid = large_grid(side)
+    payload = encode(grid)
+    plain = msgspec.msgpack.encode(grid)
+    assert payload == plain if side == 250 else zlib.decompress(payload) == plain
+    arrival = SerializedSample("zstate/hall/map/map", payload, ENCODINGS[OccupancyGrid])
+    assert NativeWire().decode("map", arrival, "hall") == (grid,)
+
+
+def test_a_deflated_grid_cut_off_anywhere_is_truncated():
+    payload = encode(
+        OccupancyGrid(1, 2, "m", 0.05, 70_000, 1, to_block([0, 0, 0, 0, 0, 0, 1]), bytes(70_000))
+    )
+    assert len(payload) < 1000
+    lengths = range(1, len(payload))
+    assert {reason(payload[:n], ENCODINGS[OccupancyGrid], OccupancyGrid) for n in lengths} == {"truncated"}
+
+
+def test_a_grid_that_inflates_beyond_the_limit_is_refused_without_inflating_it():
+    bomb = zlib.compress(bytes(2**28), 9)
+    assert len(bomb) < 300_000
+    tracemalloc.start()
+    try:
+        assert reason(bomb, ENCODINGS[OccupancyGrid], OccupancyGrid) == "too large"
+        assert tracemalloc.get_traced_memory()[1] < 3 * LATCHED_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+def test_bytes_after_a_deflated_grid_and_wrong_checksums_are_malformed():
+    payload = encode(large_grid(300))
+    for wrong in (payload + b"\0", payload[:-1] + bytes([payload[-1] ^ 1]), b"\x78" + bytes(9)):
+        assert reason(wrong, ENCODINGS[OccupancyGrid], OccupancyGrid) == "malformed"
 
 
 def test_the_wire_does_not_check_for_infinite_numbers():

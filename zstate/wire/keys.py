@@ -7,6 +7,8 @@
 ``zstate/<robot>/tf_static/<writer>``             StaticTransforms, latched
 ``zstate/<robot>/transforms/<writer>``            WriterTransforms, each sample; likewise
 ``zstate/<robot>/robot_description``              RobotDescription, latched
+``zstate/<robot>/scan/<sensor>``                  LaserScan, each scan; the sensor is the writer's name
+``zstate/<robot>/map/<writer>``                   OccupancyGrid, latched
 ``zstate/<robot>/joint_commands``                 JointCommand, to a driver
 ``zstate/<robot>/lookup``                         a queryable
 ``zstate/<robot>/status/<id>``                    Status of one writer, once a second while read
@@ -40,13 +42,17 @@ Stream = Literal[
     "tf_static",
     "robot_description",
     "joint_commands",
+    "scan",
+    "map",
     "clock",
 ]
 
 CLOCK_KEY = "zstate/clock"
 ANY = "*"
 
-NAMED_STREAMS: frozenset[Stream] = frozenset({"tf_static", "transforms", "partial_joint_states"})
+NAMED_STREAMS: frozenset[Stream] = frozenset(
+    {"tf_static", "transforms", "partial_joint_states", "scan", "map"}
+)
 """The streams with one key for each of the writer names of a robot."""
 
 JOINT_STREAMS: frozenset[Stream] = frozenset({"joint_states", "partial_joint_states"})

@@ -1,9 +1,9 @@
 """Message types of the native wire format (frozen msgspec structs), and their size limits.
 
 A block is the bytes of consecutive little-endian float64: ``to_block`` makes one of an array, ``from_block``
-reads it without a copy. Fields are encoded by position, so a later version may append fields, which
-today's readers skip; any other change needs a new version. The limits bound the memory that a writer
-can make a reader use.
+reads it without a copy. The rays of a scan are a block of float32. Fields are encoded by position, so a later
+version may append fields, which today's readers skip; any other change needs a new version. The limits bound
+the memory that a writer can make a reader use.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from hashlib import blake2b
+from math import inf, isfinite
 from typing import Annotated, Literal
 
 import msgspec
@@ -24,6 +25,7 @@ from zstate.wire.keys import Stream
 Edges = tuple[tuple[str, str], ...]
 Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0)]
+Interval = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
 Level = Literal["ok", "warn", "error", "stale"]
 
@@ -31,6 +33,7 @@ POSE_BYTES = 7 * 8
 COVARIANCE_NUMBERS = 21
 """The upper triangle of a covariance of a pose."""
 _FLOAT64 = np.dtype("<f8")
+_FLOAT32 = np.dtype("<f4")
 
 
 def to_block(values: ArrayLike) -> bytes:
@@ -41,6 +44,16 @@ def to_block(values: ArrayLike) -> bytes:
 def from_block(block: bytes) -> NDArray[np.float64]:
     """The numbers of a block: (n,), read-only, sharing the block's memory."""
     return np.frombuffer(block, dtype=_FLOAT64)
+
+
+def to_float32_block(values: ArrayLike) -> bytes:
+    """``to_block`` in float32."""
+    return np.asarray(values, dtype=_FLOAT32).tobytes()
+
+
+def from_float32_block(block: bytes) -> NDArray[np.float32]:
+    """``from_block`` in float32."""
+    return np.frombuffer(block, dtype=_FLOAT32)
 
 
 def poses_from_block(block: bytes) -> NDArray[np.float64]:
@@ -65,16 +78,20 @@ class Message(Struct, frozen=True, array_like=True, gc=False):
     """Base of the messages of the native wire format."""
 
 
-class Sample(Message, frozen=True, array_like=True, gc=False):
-    """One instant ``stamp`` [ns] of a robot.
+class StampedMessage(Message, frozen=True, array_like=True, gc=False):
+    """A message of a stream at the instant ``stamp`` [ns].
 
-    ``seq`` grows by one with each sample of a ``session``, a random number drawn when a writer starts;
-    ``order`` is the digest of the order of the numbers.
+    ``seq`` grows by one with each message of a ``session``, a random number drawn when a writer starts.
     """
 
     stamp: Stamp
     seq: Count
     session: Count
+
+
+class Sample(StampedMessage, frozen=True, array_like=True, gc=False):
+    """One instant of a robot's state; ``order`` is the digest of the order of the numbers."""
+
     order: Digest
 
 
@@ -193,12 +210,95 @@ class RobotDescription(Message, frozen=True, array_like=True, gc=False):
     clock: str = "system"
 
 
-class ClockMessage(Message, frozen=True, array_like=True, gc=False):
-    """The simulated time, or the reply of one writer's clock."""
+class LaserScan(StampedMessage, frozen=True, array_like=True, gc=False):
+    """One scan of a planar laser, which measures its rays one after the other.
 
-    stamp: Stamp
-    seq: Count
+    Ray i has the angle ``angle_min + i * angle_increment`` [rad], from the x axis of ``frame`` about its z
+    axis, and the stamp ``stamp + i * ray_ns``. ``ray_ns`` is zero if it is not known, and so is ``scan_ns``,
+    the time between two scans. ``ranges`` [m] is a block of float32. A range outside of ``range_min`` to
+    ``range_max`` is no measurement: -inf if too near, inf without an echo, NaN if invalid (REP 117).
+    ``intensities`` is None or such a block, in units of the device. ``frame`` is named as in edges.
+    """
+
+    frame: str
+    angle_min: float
+    angle_increment: float
+    ray_ns: Interval
+    scan_ns: Interval
+    range_min: float
+    range_max: float
+    ranges: bytes
+    intensities: bytes | None = None
+
+    def __post_init__(self) -> None:
+        _check_finite("angles", self.angle_min, self.angle_increment)
+        if not 0.0 <= self.range_min <= self.range_max or self.range_min == inf:
+            limits = f"{self.range_min} and {self.range_max}"
+            raise InvalidInput(f"a scan has 0 <= range_min <= range_max, range_min finite, not {limits}")
+        count, rest = divmod(len(self.ranges), _FLOAT32.itemsize)
+        if rest:
+            raise InvalidInput(f"a block of float32 has a multiple of 4 bytes, not {len(self.ranges)}")
+        if self.intensities is not None and len(self.intensities) != len(self.ranges):
+            raise InvalidInput(
+                f"{count} ranges take as many intensities; got {len(self.intensities)} bytes, not {4 * count}"
+            )
+        if min(self.ray_ns, self.scan_ns) < 0 or self.stamp + count * self.ray_ns >= 2**63:
+            raise InvalidInput(
+                f"{count} rays, one each {self.ray_ns} ns, and a scan each {self.scan_ns} ns: times are not "
+                "negative, and the stamp of the last ray has 64 bits"
+            )
+
+
+GRID_CELLS = 16_000_000
+"""The most cells of an occupancy grid: 4000 x 4000."""
+
+
+class OccupancyGrid(Message, frozen=True, array_like=True, gc=False):
+    """A map of square cells: the probability that a cell is occupied [%], or -1 if not known.
+
+    ``cells`` are int8, row by row: each of the ``height`` rows has ``width`` cells along the grid's x axis,
+    and rows follow its y axis. A cell has edges of ``resolution`` [m]. ``origin`` is a block of one pose,
+    ``frame_from_grid``, at the corner of the first cell. ``frame`` is named as in edges; ``stamp`` [ns] is
+    the time of the map.
+    """
+
     session: Count
+    stamp: Stamp
+    frame: str
+    resolution: float
+    width: Count
+    height: Count
+    origin: bytes
+    cells: bytes
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.resolution < inf:
+            raise InvalidInput(f"the resolution of a grid is positive and finite [m], not {self.resolution}")
+        if len(self.origin) != POSE_BYTES:
+            raise InvalidInput(f"the origin is a pose of {POSE_BYTES} bytes, not {len(self.origin)}")
+        _check_finite("an origin", *from_block(self.origin).tolist())
+        if min(self.width, self.height) < 0 or len(self.cells) != self.width * self.height:
+            raise InvalidInput(
+                f"a grid of {self.width} x {self.height} needs as many cells, not {len(self.cells)}"
+            )
+        if len(self.cells) > GRID_CELLS:
+            raise InvalidInput(
+                f"a grid of {len(self.cells)} cells, where {GRID_CELLS} are allowed (4000 x 4000)"
+            )
+        values = np.frombuffer(self.cells, dtype=np.int8)
+        if values.size and not -1 <= values.min() <= values.max() <= 100:
+            raise InvalidInput(
+                f"cells are from -1 (not known) to 100 (occupied), not {values.min()} to {values.max()}"
+            )
+
+
+def cells_of(grid: OccupancyGrid) -> NDArray[np.int8]:
+    """The cells of ``grid``: (height, width), read-only, sharing its memory; row 0 is at the origin."""
+    return np.frombuffer(grid.cells, dtype=np.int8).reshape(grid.height, grid.width)
+
+
+class ClockMessage(StampedMessage, frozen=True, array_like=True, gc=False):
+    """The simulated time, or the reply of one writer's clock."""
 
 
 class Status(Message, frozen=True, array_like=True, gc=False):
@@ -241,6 +341,11 @@ def _check_numbers(*blocks: bytes | None) -> None:
             raise InvalidInput(f"a block of float64 has a multiple of 8 bytes, not {len(block)}")
 
 
+def _check_finite(what: str, *numbers: float) -> None:
+    if not all(map(isfinite, numbers)):
+        raise InvalidInput(f"{what} of finite numbers are needed, not {', '.join(map(str, numbers))}")
+
+
 def _check_poses(block: bytes, edges: Edges | None) -> None:
     count, rest = divmod(len(block), POSE_BYTES)
     if rest:
@@ -258,6 +363,7 @@ SAMPLE_BYTES = 256_000
 """The transforms of 2000 links, names included, take less; in CDR they take up to four times as many."""
 
 LATCHED_BYTES = 16 * 2**20
+"""A grid of ``GRID_CELLS`` takes less on each wire, with a frame name of up to 1024 characters."""
 ATTACHMENT_BYTES = 1_024
 STATIC_EDGES = 10_000
 
@@ -267,8 +373,10 @@ MAX_BYTES: Mapping[Stream, int] = {
     "tf": SAMPLE_BYTES,
     "transforms": SAMPLE_BYTES,
     "joint_commands": SAMPLE_BYTES,
+    "scan": SAMPLE_BYTES,
     "tf_static": 1_000_000,
     "robot_description": LATCHED_BYTES,
+    "map": LATCHED_BYTES,
     "clock": 1_000,
 }
 

@@ -1,8 +1,13 @@
-"""Native wire format: plain keys, MessagePack arrays, type and version in the Zenoh encoding."""
+"""Native wire format: plain keys, MessagePack arrays, type and version in the Zenoh encoding.
+
+The payload of an OccupancyGrid above 64 kB is deflated (zlib, RFC 1950). Its first byte is then 0x78, with
+which no array of MessagePack begins.
+"""
 
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
@@ -20,7 +25,9 @@ from zstate.wire.messages import (
     HistoryPage,
     JointCommand,
     JointState,
+    LaserScan,
     Message,
+    OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     Status,
@@ -43,6 +50,8 @@ ENCODINGS: dict[type[Message], str] = {
     JointCommand: "zstate/JointCommand;v=1",
     StaticTransforms: "zstate/StaticTransforms;v=1",
     RobotDescription: "zstate/RobotDescription;v=1",
+    LaserScan: "zstate/LaserScan;v=1",
+    OccupancyGrid: "zstate/OccupancyGrid;v=1",
     ClockMessage: "zstate/Clock;v=1",
     Status: "zstate/Status;v=1",
     HistoryPage: "zstate/Past;v=1",
@@ -55,6 +64,8 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "tf_static": StaticTransforms,
     "robot_description": RobotDescription,
     "joint_commands": JointCommand,
+    "scan": LaserScan,
+    "map": OccupancyGrid,
     "clock": ClockMessage,
 }
 
@@ -63,6 +74,10 @@ _MIN_LIMIT_BYTES = 1_000
 
 # Of messages without a stream.
 _MAX_BYTES: dict[type[Message], int] = {Status: 64_000, HistoryPage: 4 * SAMPLE_BYTES}
+
+_DEFLATED_BYTES = 64_000
+_DEFLATED = b"\x78"
+_FASTEST = 1
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in ENCODINGS}
@@ -76,7 +91,10 @@ def stream_encoding(stream: Stream) -> str:
 
 def encode(message: Message) -> bytes:
     """The payload of ``message``; its Zenoh encoding is ``ENCODINGS[type(message)]``."""
-    return _ENCODER.encode(message)
+    payload = _ENCODER.encode(message)
+    if isinstance(message, OccupancyGrid) and len(payload) > _DEFLATED_BYTES:
+        return zlib.compress(payload, _FASTEST)
+    return payload
 
 
 def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
@@ -89,6 +107,8 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
         raise _foreign_error(encoding, kind)
     if len(payload) > _MIN_LIMIT_BYTES and len(payload) > _MAX_BYTES.get(kind, LATCHED_BYTES):
         raise MessageError(f"a {_type_name(kind)} of {len(payload)} bytes", reason="too large")
+    if kind is OccupancyGrid and payload.startswith(_DEFLATED):
+        payload = _inflated(payload)
     try:
         return _DECODERS[kind].decode(payload)  # type: ignore[return-value]  # one decoder per type
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -97,6 +117,25 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
             text = f"a {_type_name(kind)} cut off after {len(payload)} bytes"
             raise MessageError(text, reason="truncated") from None
         raise MessageError(f"a malformed {_type_name(kind)}: {error}", reason="malformed") from None
+
+
+def _inflated(payload: bytes) -> bytes:
+    """The deflated grid in ``payload``; at most one byte more than is allowed is inflated."""
+    inflater = zlib.decompressobj()
+    try:
+        data = inflater.decompress(payload, LATCHED_BYTES + 1)
+    except zlib.error as error:
+        raise MessageError(f"a malformed OccupancyGrid: {error}", reason="malformed") from None
+    if len(data) > LATCHED_BYTES:
+        text = f"an OccupancyGrid of more than {LATCHED_BYTES} bytes, deflated to {len(payload)}"
+        raise MessageError(text, reason="too large")
+    if not inflater.eof:
+        text = f"a deflated OccupancyGrid cut off after {len(payload)} bytes"
+        raise MessageError(text, reason="truncated")
+    if inflater.unused_data:
+        text = f"a malformed OccupancyGrid: {len(inflater.unused_data)} bytes after its deflated ones"
+        raise MessageError(text, reason="malformed")
+    return data
 
 
 def decode_joint_state(payload: bytes) -> JointState:
@@ -135,7 +174,7 @@ class NativeStreamEncoder:
         self.token = None if stream == "clock" else keys.writer_key(robot, stream, identity)
 
     def encode(self, message: Message) -> bytes:
-        return _ENCODER.encode(message)
+        return encode(message)
 
 
 class NativeWire:
