@@ -7,11 +7,11 @@ import math
 import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 
 from zstate._util.closeable import Closeable
+from zstate._util.inbox import Inbox
 from zstate._util.refusals import Refusals
-from zstate.clock import LONGEST_WAIT_S
 from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -74,10 +74,8 @@ class JointStateListener(Closeable):
         self._merger: JointStateMerger | None = None
         self._explained: set[tuple[str, ...]] = set()
         self._undescribed: deque[Received] = deque(maxlen=_CAPACITY)
-        self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
-        self._changed = threading.Condition()
-        self._waiting_tasks: list[Callable[[], object]] = []
-        self._closed = False
+        self._unread: Inbox[JointReading] = Inbox(_CAPACITY)
+        self._lock = threading.Lock()
         self._on_reading = on_reading
         streams: tuple[Stream, ...] = tuple(dict.fromkeys(("joint_states", self._wire.partial_joint_states)))
         with ExitStack() as opening:
@@ -95,7 +93,7 @@ class JointStateListener(Closeable):
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:
-        return f"<JointStateListener of {self.robot!r}: {len(self._readings)} unread samples>"
+        return f"<JointStateListener of {self.robot!r}: {len(self._unread)} unread samples>"
 
     @property
     def model(self) -> RobotModel | None:
@@ -112,23 +110,27 @@ class JointStateListener(Closeable):
         self._merger = JointStateMerger(model, self._max_age_s, others=bool(self._wire.shared))
 
     def _on_description(self, _: str, model: RobotModel) -> None:
-        with self._changed:
+        with self._lock:
             self._set_model(model)
             undescribed = list(self._undescribed)
             self._undescribed.clear()
-            self._add(undescribed)  # before samples that arrive now
+            readings = self._add(undescribed)  # before samples that arrive now
+        self._call_back(readings)
 
     def _on_messages(self, received: list[Received]) -> None:
-        self._add(received)
-
-    def _add(self, received: list[Received]) -> None:
-        with self._changed:
+        with self._lock:
             if self._validator is None:
                 self._undescribed.extend(received)
                 return
-            readings = [reading for one in received if (reading := self._reading(one))]
-            self._readings.extend(readings)
-            self._wake()
+            readings = self._add(received)
+        self._call_back(readings)
+
+    def _add(self, received: list[Received]) -> list[JointReading]:
+        readings = [reading for one in received if (reading := self._reading(one))]
+        self._unread.add(readings)
+        return readings
+
+    def _call_back(self, readings: list[JointReading]) -> None:
         if self._on_reading is not None:
             for reading in readings:
                 self._on_reading(reading)
@@ -157,58 +159,20 @@ class JointStateListener(Closeable):
             _LOG.warning("%s: no whole joint states: %s", self.robot, merger.explanation())
         return reading
 
-    def _wake(self) -> None:
-        self._changed.notify_all()
-        for wake in self._waiting_tasks:
-            wake()
-        self._waiting_tasks.clear()
-
     def read(self, stamp: int) -> JointReading | None:
         """The newest reading, independent of ``stamp``; None if none arrived since the last call."""
-        with self._changed:
-            newest = self._readings[-1] if self._readings else None
-            self._readings.clear()
-        return newest
+        return self._unread.take_newest()
 
     def __iter__(self) -> Iterator[JointReading]:
-        while True:
-            with self._changed:
-                if not self._changed.wait_for(lambda: self._readings or self._closed, LONGEST_WAIT_S):
-                    continue
-                if not self._readings:
-                    return
-                reading = self._readings.popleft()
-            yield reading
+        return iter(self._unread)
 
-    async def __aiter__(self) -> AsyncIterator[JointReading]:
-        import asyncio  # noqa: PLC0415  # a caller has it already, and others do not need it
-
-        loop = asyncio.get_running_loop()
-        while True:
-            arrived = asyncio.Event()
-
-            def wake(arrived: asyncio.Event = arrived) -> None:
-                # The loop may be closed by the time a sample arrives.
-                with suppress(RuntimeError):
-                    loop.call_soon_threadsafe(arrived.set)
-
-            with self._changed:
-                reading = self._readings.popleft() if self._readings else None
-                if reading is None:
-                    if self._closed:
-                        return
-                    self._waiting_tasks.append(wake)
-            if reading is not None:
-                yield reading
-            else:
-                await arrived.wait()
+    def __aiter__(self) -> AsyncIterator[JointReading]:
+        return aiter(self._unread)
 
     def close(self) -> None:
         """Unsubscribe; iterations end. A second call does nothing."""
         self._opened.close()
-        with self._changed:
-            self._closed = True
-            self._wake()
+        self._unread.close()
 
 
 class DescriptionSubscriber(Closeable):

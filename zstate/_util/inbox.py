@@ -1,0 +1,88 @@
+"""Received items that wait for a reader, which takes them with ``for``, ``async for`` or the newest alone."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from contextlib import suppress
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+# Ctrl-C that arrives as a thread starts to wait is handled only after that wait.
+_LONGEST_WAIT_S = 0.5
+
+
+class Inbox(Generic[T]):
+    """The last ``capacity`` items that were added and not taken. Any thread may add.
+
+    Iterations return each item once, in the order of arrival, and end with ``close()``, after the last item.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._items: deque[T] = deque(maxlen=capacity)
+        self._changed = threading.Condition()
+        self._waiting_tasks: list[Callable[[], object]] = []
+        self._closed = False
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def add(self, items: Iterable[T]) -> None:
+        """Add items, oldest first. Of more than ``capacity`` the oldest are lost."""
+        with self._changed:
+            self._items.extend(items)
+            self._wake()
+
+    def take_newest(self) -> T | None:
+        """The newest item, None if there is none; the others are lost."""
+        with self._changed:
+            newest = self._items[-1] if self._items else None
+            self._items.clear()
+        return newest
+
+    def __iter__(self) -> Iterator[T]:
+        while True:
+            with self._changed:
+                if not self._changed.wait_for(lambda: self._items or self._closed, _LONGEST_WAIT_S):
+                    continue
+                if not self._items:
+                    return
+                item = self._items.popleft()
+            yield item
+
+    async def __aiter__(self) -> AsyncIterator[T]:
+        import asyncio  # noqa: PLC0415  # a caller has it already, and others do not need it
+
+        loop = asyncio.get_running_loop()
+        while True:
+            arrived = asyncio.Event()
+
+            def wake(arrived: asyncio.Event = arrived) -> None:
+                # The loop may be closed by the time an item arrives.
+                with suppress(RuntimeError):
+                    loop.call_soon_threadsafe(arrived.set)
+
+            with self._changed:
+                items = [self._items.popleft()] if self._items else []
+                if not items:
+                    if self._closed:
+                        return
+                    self._waiting_tasks.append(wake)
+            if items:
+                yield items[0]
+            else:
+                await arrived.wait()
+
+    def close(self) -> None:
+        """End the iterations. A second call does nothing."""
+        with self._changed:
+            self._closed = True
+            self._wake()
+
+    def _wake(self) -> None:
+        self._changed.notify_all()
+        for wake in self._waiting_tasks:
+            wake()
+        self._waiting_tasks.clear()
