@@ -114,6 +114,7 @@ def test_ranges_that_are_no_measurements_are_part_of_a_scan():
 @pytest.mark.parametrize(
     ("changed", "text"),
     [
+        ({"frame": ""}, "1 to 1024 characters, not 0"),
         ({"angle_min": np.nan}, "angles of finite numbers .* not nan, 0.5"),
         ({"angle_increment": np.inf}, "not -1.0, inf"),
         ({"range_min": -0.1}, "not -0.1 and 10.0"),
@@ -122,8 +123,9 @@ def test_ranges_that_are_no_measurements_are_part_of_a_scan():
         ({"range_max": np.nan}, "not 0.1 and nan"),
         ({"ranges": b"12345"}, "multiple of 4 bytes, not 5"),
         ({"intensities": b"1234"}, "2 ranges take as many intensities; got 4 bytes, not 8"),
-        ({"ray_ns": -1}, "one each -1 ns"),
-        ({"scan_ns": -1}, "a scan each -1 ns"),
+        ({"ray_ns": -1}, "2 rays of -1 ns"),
+        ({"scan_ns": -1}, "a scan of -1 ns"),
+        ({"scan_ns": 2**63}, "a scan of 9223372036854775808 ns"),
         ({"stamp": 2**63 - 20}, "last ray has 64 bits"),
     ],
 )
@@ -140,6 +142,7 @@ def test_row_0_of_the_cells_is_the_first_width_cells():
 @pytest.mark.parametrize(
     ("changed", "text"),
     [
+        ({"frame": "a" * 1025}, "1 to 1024 characters, not 1025"),
         ({"resolution": 0.0}, "positive and finite .* not 0.0"),
         ({"resolution": np.nan}, "not nan"),
         ({"origin": bytes(48)}, "a pose of 56 bytes, not 48"),

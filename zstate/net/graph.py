@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     RosEndpoint = EndpointToken | DdsToken
 
-ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description", "clock")
-
 _PERIOD_S = 2.0
 _FIRST_PERIOD_S = 0.5
 _DISCOVERY_TIMEOUT_S = 0.3
@@ -240,10 +238,11 @@ class RosGraph:
 def discover_ros_graph(session: Session, wire: Ros2Wire) -> RosGraph:
     """The ROS graph of all namespaces of the domain. Takes up to a second if nothing is announced.
 
-    A topic belongs to the stream that has its last name and its type; other topics are left out.
+    A topic belongs to the stream of its type, and of its last name unless it is a scan or a map; other topics
+    are left out.
     """
     from zstate.wire.ros2.graph import NodeToken, parse_dds_token, parse_token  # noqa: PLC0415 - ROS only
-    from zstate.wire.ros2.topics import ros_type  # noqa: PLC0415 - ROS only
+    from zstate.wire.ros2.topics import topic_stream  # noqa: PLC0415 - ROS only
 
     parse = parse_dds_token if wire.name == "ros2dds" else parse_token
     nodes: list[NodeToken] = []
@@ -252,9 +251,9 @@ def discover_ros_graph(session: Session, wire: Ros2Wire) -> RosGraph:
         if isinstance(token, NodeToken):
             nodes.append(token)
         elif token is not None:
-            for stream in ROS_STREAMS:
-                if token.topic.rpartition("/")[2] == stream and token.dds_type == ros_type(stream).dds:
-                    ends.setdefault((f"/{token.topic.strip('/')}", stream), []).append(token)
+            stream = topic_stream(token.topic, token.dds_type)
+            if stream is not None:
+                ends.setdefault((f"/{token.topic.strip('/')}", stream), []).append(token)
     topics: list[Topic] = []
     for (name, stream), tokens in sorted(ends.items()):
         tokens.sort(key=lambda token: (token.full_name, token.zid, token.hash, token.key))

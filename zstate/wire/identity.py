@@ -62,9 +62,9 @@ class WriterId:
 class Announcement:
     """The content of a liveliness token: ``writer`` writes ``stream`` of ``robot``.
 
-    ``name`` is the name under which it writes edges or joints, on the ``NAMED_STREAMS``; empty for other
-    streams, and on wires without such names. ``node`` is the same for all streams of one ROS node, whose name
-    other nodes may have, too; empty where nodes are not announced.
+    ``name`` is the name under which it writes, on the ``NAMED_STREAMS``; empty for other streams, and on
+    wires without such names. ``node`` is the same for all streams of one ROS node, whose name other nodes may
+    have, too; empty where nodes are not announced.
     """
 
     robot: str

@@ -20,7 +20,7 @@ from msgspec import Meta, Struct
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.keys import Stream
+from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, Stream
 
 Edges = tuple[tuple[str, str], ...]
 Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -231,6 +231,7 @@ class LaserScan(StampedMessage, frozen=True, array_like=True, gc=False):
     intensities: bytes | None = None
 
     def __post_init__(self) -> None:
+        _check_frame(self.frame)
         _check_finite("angles", self.angle_min, self.angle_increment)
         if not 0.0 <= self.range_min <= self.range_max or self.range_min == inf:
             limits = f"{self.range_min} and {self.range_max}"
@@ -242,9 +243,10 @@ class LaserScan(StampedMessage, frozen=True, array_like=True, gc=False):
             raise InvalidInput(
                 f"{count} ranges take as many intensities; got {len(self.intensities)} bytes, not {4 * count}"
             )
-        if min(self.ray_ns, self.scan_ns) < 0 or self.stamp + count * self.ray_ns >= 2**63:
+        last_stamp = self.stamp + count * self.ray_ns
+        if min(self.ray_ns, self.scan_ns) < 0 or max(last_stamp, self.scan_ns) >= 2**63:
             raise InvalidInput(
-                f"{count} rays, one each {self.ray_ns} ns, and a scan each {self.scan_ns} ns: times are not "
+                f"{count} rays of {self.ray_ns} ns each, in a scan of {self.scan_ns} ns: times are not "
                 "negative, and the stamp of the last ray has 64 bits"
             )
 
@@ -272,6 +274,7 @@ class OccupancyGrid(Message, frozen=True, array_like=True, gc=False):
     cells: bytes
 
     def __post_init__(self) -> None:
+        _check_frame(self.frame)
         if not 0.0 < self.resolution < inf:
             raise InvalidInput(f"the resolution of a grid is positive and finite [m], not {self.resolution}")
         if len(self.origin) != POSE_BYTES:
@@ -341,6 +344,14 @@ def _check_numbers(*blocks: bytes | None) -> None:
             raise InvalidInput(f"a block of float64 has a multiple of 8 bytes, not {len(block)}")
 
 
+def _check_frame(frame: str) -> None:
+    if not 0 < len(frame) <= MAX_FRAME_NAME_LENGTH:
+        raise InvalidInput(
+            f"the name of a frame has 1 to {MAX_FRAME_NAME_LENGTH} characters, not {len(frame)}; name the "
+            "frame of the rays or of the grid"
+        )
+
+
 def _check_finite(what: str, *numbers: float) -> None:
     if not all(map(isfinite, numbers)):
         raise InvalidInput(f"{what} of finite numbers are needed, not {', '.join(map(str, numbers))}")
@@ -363,7 +374,7 @@ SAMPLE_BYTES = 256_000
 """The transforms of 2000 links, names included, take less; in CDR they take up to four times as many."""
 
 LATCHED_BYTES = 16 * 2**20
-"""A grid of ``GRID_CELLS`` takes less on each wire, with a frame name of up to 1024 characters."""
+"""A grid of ``GRID_CELLS`` takes less on each wire."""
 ATTACHMENT_BYTES = 1_024
 STATIC_EDGES = 10_000
 

@@ -78,7 +78,8 @@ class Wire(Protocol):
     """One wire format for the streams of a robot: keys, encodings and bytes.
 
     A stream carries the same messages in each: JointState on ``joint_states``, TransformSample on ``tf``,
-    StaticTransforms on ``tf_static``, RobotDescription on ``robot_description``, Clock on ``clock``.
+    StaticTransforms on ``tf_static``, RobotDescription on ``robot_description``, LaserScan on ``scan``,
+    OccupancyGrid on ``map``, Clock on ``clock``.
     Decoding may keep state, so each reader has an instance of its own.
     """
 
@@ -102,7 +103,7 @@ class Wire(Protocol):
         """The encoder of ``stream`` for the writer ``node``.
 
         ``number`` identifies the stream within the session; ``name`` is the one under which the writer
-        publishes edges or joints. Raises InvalidInput for names that cannot be in a key.
+        publishes edges, joints, scans or a map. Raises InvalidInput for names that cannot be in a key.
         """
         ...
 
@@ -128,7 +129,7 @@ class Wire(Protocol):
         ...
 
     def edge_writer_name(self, key: str) -> str | None:
-        """The name under which the edges on ``key`` are written, if the key has it.
+        """The name under which the edges, joints, scans or maps on ``key`` are published, if the key has it.
 
         Raises InvalidInput if the key belongs to no robot.
         """

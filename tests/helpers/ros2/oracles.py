@@ -43,7 +43,7 @@ class Oracle(NamedTuple):
 
 
 _ZENOH = "eclipse-zenoh>=1.10.2,<1.11"
-_KILTED = ("rclpy[fastrtps]", "sensor-msgs", "geometry-msgs", "std-msgs", "rosgraph-msgs")
+_KILTED = ("rclpy[fastrtps]", "sensor-msgs", "nav-msgs", "geometry-msgs", "std-msgs", "rosgraph-msgs")
 # Generators and build tools for tf2_msgs, which has no wheel.
 _AMENT = (
     "ament-package",

@@ -100,5 +100,10 @@ def test_a_recording_names_the_same_qos_to_rosbags(qos: Qos):
 
 def test_only_latched_streams_are_transient_local():
     latched = {stream for stream, qos in STREAM_QOS.items() if qos.durability == "transient_local"}
-    assert latched == {"tf_static", "robot_description"}
-    assert {qos.reliability for qos in STREAM_QOS.values()} == {"reliable"}
+    assert latched == {"tf_static", "robot_description", "map"}
+
+
+def test_only_scans_are_best_effort_as_sensor_data_is():
+    # rmw_qos_profile_sensor_data
+    assert STREAM_QOS["scan"] == Qos("best_effort", "volatile", "keep_last", 5)
+    assert {qos.reliability for stream, qos in STREAM_QOS.items() if stream != "scan"} == {"reliable"}

@@ -2,7 +2,8 @@ import pytest
 
 from zstate.errors import InvalidInput
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, ros_type
+from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, ros_type, topic_stream
+from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID, TF_MESSAGE
 
 STREAMS = ("joint_states", "robot_description", "tf", "tf_static", "clock")
 # `ros2 topic info -v` of a genuine ROS 2 names these hashes.
@@ -50,6 +51,60 @@ def test_humble_keys_have_no_hash_and_readers_match_both():
     assert humble.key("r1", "tf") == "0/tf/tf2_msgs::msg::dds_::TFMessage_/TypeHashNotSupported"
     assert iron.expression("r1", "tf") == humble.expression("r1", "tf")
     assert humble.expression("r1", "tf") == "0/tf/tf2_msgs::msg::dds_::TFMessage_/*"
+
+
+SCAN = (
+    "sensor_msgs::msg::dds_::LaserScan_/"
+    "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"
+)
+MAP = (
+    "nav_msgs::msg::dds_::OccupancyGrid_/"
+    "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
+)
+
+
+def test_scans_and_maps_are_topics_named_by_their_writers():
+    root, robots = RmwKeys(Ros2Options()), RmwKeys(Ros2Options(namespace="*"))
+    assert root.key("panda", "scan") == root.key("panda", "scan", "scan") == f"0/scan/{SCAN}"
+    assert root.key("panda", "scan", "front") == f"0/front/{SCAN}"
+    assert robots.key("panda", "scan", "front") == f"0/panda/front/{SCAN}"
+    assert robots.key("hall", "map", "map") == f"0/hall/map/{MAP}"
+    assert robots.key("panda", "joint_states", "front") == robots.key("panda", "joint_states")
+
+
+def test_scans_and_maps_are_found_by_their_type():
+    root, robots = RmwKeys(Ros2Options()), RmwKeys(Ros2Options(namespace="*"))
+    assert root.expression("panda", "scan") == "0/*/sensor_msgs::msg::dds_::LaserScan_/*"
+    assert robots.expression("panda", "map") == "0/panda/*/nav_msgs::msg::dds_::OccupancyGrid_/*"
+    assert robots.expression("*", "scan") == "0/*/*/sensor_msgs::msg::dds_::LaserScan_/*"
+    assert topic_stream("/r1/front", LASER_SCAN.dds) == topic_stream("scan", LASER_SCAN.dds) == "scan"
+    assert topic_stream("/r1/floor_2", OCCUPANCY_GRID.dds) == "map"
+    assert topic_stream("/r1/tf", TF_MESSAGE.dds) == "tf"
+    assert topic_stream("/r1/tf", LASER_SCAN.dds) == "scan"
+    assert topic_stream("/r1/other", TF_MESSAGE.dds) is topic_stream("/r1/scan", "std_msgs") is None
+
+
+def test_the_name_of_a_sensor_or_a_map_is_the_last_of_its_topic():
+    keys = RmwKeys(Ros2Options(namespace="*"))
+    for stream in ("scan", "map"):
+        assert keys.writer_name(keys.key("panda", stream, "front")) == "front"
+    assert keys.writer_name(keys.key("panda", "tf")) is None
+    with pytest.raises(InvalidInput, match="'<domain>/<topic>/<type>/<hash>'"):
+        keys.writer_name("0/scan")
+
+
+@pytest.mark.parametrize("layout", [RmwKeys, DdsKeys])
+def test_a_sensor_name_that_is_invalid_in_ros_is_refused(layout):
+    with pytest.raises(InvalidInput, match=r"scan name 'front\.left', which becomes .* 'front_left'"):
+        layout(Ros2Options()).key("panda", "scan", "front.left")
+
+
+def test_keys_of_a_bridge_have_no_type_so_only_scan_and_map_are_read():
+    keys = DdsKeys(Ros2Options(namespace="*"))
+    assert keys.key("panda", "scan", "front") == "panda/front"
+    assert keys.expression("panda", "scan") == "panda/scan"
+    assert keys.expression("*", "map") == "*/map"
+    assert (keys.writer_name("panda/scan"), keys.writer_name("tf")) == ("scan", None)
 
 
 def test_expression_of_all_robots_matches_the_namespace():

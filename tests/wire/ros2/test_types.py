@@ -6,9 +6,18 @@ from helpers.manual_cdr import STORE, rosbags_joint_state, rosbags_tf_message
 from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from zstate.wire.ros2.types import CLOCK, JOINT_STATE, POSE_WITH_COVARIANCE, STRING, TF_MESSAGE, RosType
+from zstate.wire.ros2.types import (
+    CLOCK,
+    JOINT_STATE,
+    LASER_SCAN,
+    OCCUPANCY_GRID,
+    POSE_WITH_COVARIANCE,
+    STRING,
+    TF_MESSAGE,
+    RosType,
+)
 
-TYPES = (JOINT_STATE, TF_MESSAGE, STRING, CLOCK, POSE_WITH_COVARIANCE)
+TYPES = (JOINT_STATE, TF_MESSAGE, STRING, CLOCK, POSE_WITH_COVARIANCE, LASER_SCAN, OCCUPANCY_GRID)
 EACH = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])
 
 
@@ -29,6 +38,9 @@ def test_a_type_has_the_name_people_use_and_the_one_of_the_keys():
         (TF_MESSAGE, "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"),
         (STRING, "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
         (CLOCK, "692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564"),
+        # in LaserScan.json and OccupancyGrid.json of the wheels of ROS 2 Kilted, 5.5.1
+        (LASER_SCAN, "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"),
+        (OCCUPANCY_GRID, "8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"),
     ],
 )
 def test_the_hash_is_the_one_in_the_keys_of_genuine_ros_2(kind: RosType, known: str):

@@ -23,6 +23,7 @@ from zstate.wire.identity import WriterId
 from zstate.wire.keys import Stream
 from zstate.wire.protocol import SerializedSample, StreamEncoder, WriterNode
 from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
 from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
 
 STAMP = 1_700_000_000_123_456_789
@@ -115,6 +116,23 @@ def test_a_publisher_is_that_of_the_robot_whose_topic_it_writes(options, namespa
         assert one.robot_from_key(key_of(topic, namespace)) == expected
 
 
+SCAN_TOPIC = ("front", LASER_SCAN.dds, LASER_SCAN.hash, "2::,5:,:,:,,")
+MAP_TOPIC = ("map", OCCUPANCY_GRID.dds, OCCUPANCY_GRID.hash, ":1:,1:,:,:,,")
+
+
+@pytest.mark.parametrize(("stream", "topic"), [("scan", SCAN_TOPIC), ("map", MAP_TOPIC)])
+def test_a_publisher_of_scans_or_maps_is_announced_under_the_name_of_its_topic(stream, topic):
+    there = wire(namespace="*")
+    encoder = there.stream_encoder(NODE, stream, 9, topic[0])
+    assert encoder.token == endpoint(topic, "arm_driver", namespace="r1")
+    announced = there.parse_token(encoder.token, "*")
+    assert announced is not None
+    assert (announced.robot, announced.stream, announced.name) == ("r1", stream, topic[0])
+    assert announced.writer.session == int.from_bytes(gid_of(encoder.token)[:8], "little")
+    assert there.edge_writer_name(encoder.key) == topic[0]
+    assert there.parse_token(endpoint(topic, "arm_driver", namespace="r1"), "r2") is None
+
+
 @pytest.mark.parametrize(
     "token",
     [
@@ -176,7 +194,7 @@ def test_key_in_a_namespace_that_ros_does_not_allow_is_foreign():
     assert caught.value.reason == "foreign"
 
 
-STREAMS = st.sampled_from(["joint_states", "tf", "tf_static", "robot_description", "clock"])
+STREAMS = st.sampled_from(["joint_states", "tf", "tf_static", "robot_description", "scan", "map", "clock"])
 BESIDE = st.one_of(
     st.none(),
     st.binary(max_size=40),

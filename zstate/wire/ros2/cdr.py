@@ -109,16 +109,16 @@ class CdrWriter:
         self.count(len(data) + 1)
         self._data += data + b"\x00"
 
-    def numbers(self, block: bytes) -> None:
-        """A block of float64 of a fixed count."""
-        self._align(_DOUBLE_BYTES)
+    def numbers(self, block: bytes, size: int = _DOUBLE_BYTES) -> None:
+        """A block of numbers of ``size`` bytes, by default float64, of a fixed count."""
+        self._align(size)
         self._data += block
 
-    def sequence(self, block: bytes) -> None:
-        """A block of float64 with its count; an empty one has no padding after the count."""
-        self.count(len(block) // _DOUBLE_BYTES)
+    def sequence(self, block: bytes, size: int = _DOUBLE_BYTES) -> None:
+        """A block of such numbers with its count; an empty one has no padding after the count."""
+        self.count(len(block) // size)
         if block:
-            self.numbers(block)
+            self.numbers(block, size)
 
     def payload(self) -> bytes:
         """The payload written so far."""
@@ -172,18 +172,18 @@ class CdrReader:
         except UnicodeDecodeError as error:
             raise self.malformed(f"a string that is not UTF-8 ({error.reason}): {data[:40]!r}") from None
 
-    def numbers(self, count: int) -> bytes:
-        """A block of ``count`` float64."""
-        start, end = span = self._next(count * _DOUBLE_BYTES, _DOUBLE_BYTES)
+    def numbers(self, count: int, size: int = _DOUBLE_BYTES) -> bytes:
+        """A block of ``count`` numbers of ``size`` bytes, by default float64."""
+        start, end = span = self._next(count * size, size)
         self.blocks.append(span)
         block = self.payload[start:end]
-        return block if self.order == LITTLE_ENDIAN else np.frombuffer(block, "u8").byteswap().tobytes()
+        return block if self.order == LITTLE_ENDIAN else np.frombuffer(block, f"u{size}").byteswap().tobytes()
 
-    def sequence(self) -> bytes:
-        """A block of float64 after its count."""
+    def sequence(self, size: int = _DOUBLE_BYTES) -> bytes:
+        """A block of such numbers after its count."""
         count = self.count()
         if count:
-            return self.numbers(count)
+            return self.numbers(count, size)
         self.blocks.append((self.position, self.position))
         return b""
 

@@ -1,4 +1,4 @@
-"""Decoder of ROS 2 topics into zstate's messages: JointState, TFMessage, String, Clock."""
+"""Decoder of ROS 2 topics into zstate's messages, and of JointState and TFMessage among them."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from zstate.wire.ros2.cdr import (
     unpack_stamps,
 )
 from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.scans import decode_grid, decode_scan
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
 _POSE_NUMBERS = 7
@@ -64,11 +65,19 @@ class RosDecoder:
         if stream == "tf_static":
             transforms = self._edges.decode(payload)
             return (StaticTransforms(session, names.edges_to_zstate(transforms.edges), transforms.poses),)
+        message: Message
         if stream == "robot_description":
             urdf = decode_string(payload)
             digest = blake2b(urdf.encode(), digest_size=8).hexdigest()
-            return (RobotDescription(session, urdf, digest, joint_names=(), moving_edges=(), clock=""),)
-        return (ClockMessage(decode_clock(payload), seq, session),)
+            message = RobotDescription(session, urdf, digest, joint_names=(), moving_edges=(), clock="")
+        elif stream == "scan":
+            message = decode_scan(payload, session, seq, names)
+            _checked_stamp(message.stamp)
+        elif stream == "map":
+            message = decode_grid(payload, session, names)
+        else:
+            message = ClockMessage(decode_clock(payload), seq, session)
+        return (message,)
 
     def joint_states(self, payloads: Sequence[bytes]) -> RosJointStates | None:
         """The joint states in ``payloads``, of one length and channel, decoded together.

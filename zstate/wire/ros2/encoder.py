@@ -14,7 +14,9 @@ from zstate.wire.messages import (
     ClockMessage,
     Edges,
     JointState,
+    LaserScan,
     Message,
+    OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     TransformSample,
@@ -25,6 +27,7 @@ from zstate.wire.ros2.attachment import pack
 from zstate.wire.ros2.cdr import CdrReader, CdrTemplate, CdrWriter, encode_clock, encode_string, pack_stamp
 from zstate.wire.ros2.decoder import duplicate_text, read_joint_state, read_tf_message
 from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.scans import encode_grid, encode_scan
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
 
@@ -67,24 +70,33 @@ class RosStreamEncoder:
         Raises InvalidInput for a stamp that ROS cannot represent, and for numbers without names.
         """
         if isinstance(message, JointState):
-            names = self._sample_names.coordinates if message.names is None else message.names
-            if self._joints is None or self._joints[0] is not names:
-                self._joints = names, JointStateEncoder(names)
-            velocities, efforts = message.velocities, message.efforts
-            if len(self._sample_names.velocity_slots) != len(names):
-                velocities, efforts = self._spread(velocities, len(names)), self._spread(efforts, len(names))
-            stamp = _checked_stamp(message.stamp)
-            return self._joints[1].encode(stamp, message.positions, velocities, efforts)
+            return self._encode_joints(message)
         if isinstance(message, TransformSample):
             edges = self._sample_names.moving_edges if message.edges is None else message.edges
             return self._encode_edges(edges, _checked_stamp(message.stamp), message.poses)
         if isinstance(message, StaticTransforms):
             return self._encode_edges(message.edges, 0, message.poses)
-        if isinstance(message, RobotDescription):
-            return encode_string(message.urdf)
-        if isinstance(message, ClockMessage):
-            return encode_clock(message.stamp)
-        raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
+        if isinstance(message, LaserScan):
+            _checked_stamp(message.stamp)
+            payload = encode_scan(message, self._names)
+        elif isinstance(message, OccupancyGrid):
+            payload = encode_grid(message, self._names)
+        elif isinstance(message, RobotDescription):
+            payload = encode_string(message.urdf)
+        elif isinstance(message, ClockMessage):
+            payload = encode_clock(message.stamp)
+        else:
+            raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
+        return payload
+
+    def _encode_joints(self, state: JointState) -> bytes:
+        names = self._sample_names.coordinates if state.names is None else state.names
+        if self._joints is None or self._joints[0] is not names:
+            self._joints = names, JointStateEncoder(names)
+        velocities, efforts = state.velocities, state.efforts
+        if len(self._sample_names.velocity_slots) != len(names):
+            velocities, efforts = self._spread(velocities, len(names)), self._spread(efforts, len(names))
+        return self._joints[1].encode(_checked_stamp(state.stamp), state.positions, velocities, efforts)
 
     def _spread(self, block: bytes | None, count: int) -> bytes | None:
         """Each number at the index of its coordinate: in ROS there are as many velocities as positions."""

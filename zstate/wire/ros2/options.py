@@ -48,14 +48,14 @@ class Ros2Options:
                     "which puts every robot into a namespace of its own name"
                 )
             for token in self.namespace.split("/"):
-                _check_token("namespace", token, f" in {self.namespace!r}" if token != self.namespace else "")
+                check_token("namespace", token, f" in {self.namespace!r}" if token != self.namespace else "")
         _check_prefix(self.frame_prefix)
         if self.tf not in ("global", "namespace"):
             raise _value_error("tf", self.tf, "'global' and 'namespace'")
         if self.hash not in ("iron", "humble"):
             raise _value_error("hash", self.hash, "'iron' and 'humble'")
         if self.node:
-            _check_token("node", self.node)
+            check_token("node", self.node)
 
     @classmethod
     def parse(cls, text: str) -> Ros2Options:
@@ -87,7 +87,7 @@ class Ros2Options:
         """
         check_robot(robot)
         if self.namespace == ANY:
-            _check_token("robot", robot, " with namespace=*, where it becomes a ROS namespace")
+            check_token("robot", robot, " with namespace=*, where it becomes a ROS namespace")
             return robot
         return self.namespace
 
@@ -101,7 +101,8 @@ class Ros2Options:
         return prefix.replace(ANY, check_robot(robot))
 
 
-def _check_token(what: str, token: str, where: str = "") -> None:
+def check_token(what: str, token: str, where: str = "") -> None:
+    """Raise InvalidInput if ``token`` is no part of a ROS name; ``what`` and ``where`` describe it."""
     if _TOKEN.fullmatch(token):
         return
     foreign = dict.fromkeys(_FOREIGN.findall(token))

@@ -122,11 +122,13 @@ STREAM_QOS: dict[Stream, Qos] = {
     "tf": Qos(depth=100),
     "tf_static": Qos(durability="transient_local", depth=1),
     "robot_description": Qos(durability="transient_local", depth=1),
+    "scan": Qos("best_effort", depth=5),
+    "map": Qos(durability="transient_local", depth=1),
     # Readers request best effort (rclcpp's ClockQoS) or reliable (a plain subscription). DDS matches a
     # reliable writer with both, a best-effort writer with the former only. An old time is useless.
     "clock": Qos(depth=1),
 }
-"""The QoS that the writer of each stream offers, like robot_state_publisher and tf2."""
+"""The QoS that the writer of each stream offers, as robot_state_publisher, tf2 and map_server do."""
 
 
 def _parse_policy(numbers: dict[Policy, int], text: str, default: Policy) -> Policy:

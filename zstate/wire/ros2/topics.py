@@ -6,16 +6,28 @@ stream               type                    topic of robot r1 with ``namespace=
 joint_states         sensor_msgs/JointState  ``/r1/joint_states``
 robot_description    std_msgs/String         ``/r1/robot_description``
 tf, tf_static        tf2_msgs/TFMessage      ``/tf``; ``/r1/tf`` with ``tf=namespace``
+scan                 sensor_msgs/LaserScan   ``/r1/<sensor>``, such as ``/r1/scan``
+map                  nav_msgs/OccupancyGrid  ``/r1/<name>``, such as ``/r1/map``
 clock                rosgraph_msgs/Clock     ``/clock``
 ===================  ======================  ===========================================
+
+Scans and maps are found by their type, whatever the last name of their topic is.
 """
 
 from __future__ import annotations
 
 from zstate.errors import InvalidInput
 from zstate.wire.keys import ANY, Stream
-from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosType
+from zstate.wire.ros2.options import Ros2Options, check_token
+from zstate.wire.ros2.types import (
+    CLOCK,
+    JOINT_STATE,
+    LASER_SCAN,
+    OCCUPANCY_GRID,
+    STRING,
+    TF_MESSAGE,
+    RosType,
+)
 
 SHARED = "ros"
 """The robot of topics in the root namespace, and of frames that belong to no robot."""
@@ -28,8 +40,13 @@ _TYPES: dict[Stream, RosType] = {
     "robot_description": STRING,
     "tf": TF_MESSAGE,
     "tf_static": TF_MESSAGE,
+    "scan": LASER_SCAN,
+    "map": OCCUPANCY_GRID,
     "clock": CLOCK,
 }
+
+NAMED_TOPICS: frozenset[Stream] = frozenset({"scan", "map"})
+"""The streams whose topics are named by their writers."""
 
 
 def ros_type(stream: Stream) -> RosType:
@@ -41,67 +58,101 @@ def ros_type(stream: Stream) -> RosType:
     return _TYPES[stream]
 
 
+def topic_stream(topic: str, dds_type: str) -> Stream | None:
+    """The stream that ``topic`` carries by its type and its last name; None if it is none."""
+    last_name = topic.rpartition("/")[2]
+    for stream, kind in _TYPES.items():
+        if dds_type == kind.dds and (stream in NAMED_TOPICS or last_name == stream):
+            return stream
+    return None
+
+
 class RmwKeys:
     """The topics of robots, and their keys in rmw_zenoh_cpp: ``<domain>/<topic>/<type>/<hash>``."""
 
     def __init__(self, options: Ros2Options) -> None:
         self._options = options
 
-    def topic(self, robot: str, stream: Stream) -> str:
-        """The full ROS name of the topic, with its leading slash."""
-        return self._topic(self._options.robot_namespace(robot), stream)
+    def topic(self, robot: str, stream: Stream, name: str = "") -> str:
+        """The full ROS name of the topic, with its leading slash.
 
-    def key(self, robot: str, stream: Stream) -> str:
+        ``name`` is that of a sensor or a map, by default "scan" and "map". Raises InvalidInput if it is no
+        ROS name.
+        """
+        last_name = stream
+        if stream in NAMED_TOPICS and name:
+            check_token(f"{stream} name", name, ", which becomes the name of a ROS topic")
+            last_name = name
+        return self._topic(self._options.robot_namespace(robot), stream, last_name)
+
+    def key(self, robot: str, stream: Stream, name: str = "") -> str:
         """The Zenoh key of ``stream``. Raises InvalidInput for a name that ROS does not allow."""
         kind = ros_type(stream)
         type_hash = kind.hash if self._options.hash == "iron" else HUMBLE_HASH
-        return f"{self._options.domain}{self.topic(robot, stream)}/{kind.dds}/{type_hash}"
+        return f"{self._options.domain}{self.topic(robot, stream, name)}/{kind.dds}/{type_hash}"
 
     def expression(self, robot: str, stream: Stream) -> str:
         """The key expression of ``stream``; robot ``"*"`` means all robots in the namespace.
 
         With ``namespace=*`` these are all robots in a namespace of one token.
         """
-        return f"{self._options.domain}{self._topic_pattern(robot, stream)}/{ros_type(stream).dds}/*"
+        last_name = ANY if stream in NAMED_TOPICS else stream
+        return (
+            f"{self._options.domain}{self._topic_pattern(robot, stream, last_name)}/{ros_type(stream).dds}/*"
+        )
 
     def robot_from_key(self, key: str) -> str:
         """The robot of ``key``: the last token of its namespace, SHARED in the root.
 
         Raises InvalidInput for a key that is not of this layout.
         """
+        return robot_from_topic("/".join(self._path(key)[:-2]))
+
+    def writer_name(self, key: str) -> str | None:
+        """The name of the sensor or map of ``key``; None for other topics. Raises InvalidInput as above."""
+        *_, name, dds_type, _hash = self._path(key)
+        return name if any(dds_type == ros_type(stream).dds for stream in NAMED_TOPICS) else None
+
+    @staticmethod
+    def _path(key: str) -> list[str]:
         _domain, *path = key.split("/")
         if len(path) < 3:
             raise InvalidInput(f"the key {key!r} is not of the form '<domain>/<topic>/<type>/<hash>'")
-        return robot_from_topic("/".join(path[:-2]))
+        return path
 
-    def _topic_pattern(self, robot: str, stream: Stream) -> str:
-        return self._topic(self._options.namespace, stream) if robot == ANY else self.topic(robot, stream)
+    def _topic_pattern(self, robot: str, stream: Stream, last_name: str) -> str:
+        namespace = self._options.namespace if robot == ANY else self._options.robot_namespace(robot)
+        return self._topic(namespace, stream, last_name)
 
-    def _topic(self, namespace: str, stream: Stream) -> str:
+    def _topic(self, namespace: str, stream: Stream, last_name: str) -> str:
         ros_type(stream)
         is_global = stream == "clock" or (stream.startswith("tf") and self._options.tf == "global")
-        return f"/{namespace}/{stream}" if namespace and not is_global else f"/{stream}"
+        return f"/{namespace}/{last_name}" if namespace and not is_global else f"/{last_name}"
 
 
 class DdsKeys(RmwKeys):
     """The same in zenoh-plugin-ros2dds: a key is the name of the topic, without its leading slash.
 
     A bridge puts its namespace before every topic, before /tf and /clock too. Its keys have no
-    domain and no type hash.
+    domain, no type and no type hash, so only the topics ``scan`` and ``map`` can be read as such.
     """
 
-    def key(self, robot: str, stream: Stream) -> str:
-        return self.topic(robot, stream)[1:]
+    def key(self, robot: str, stream: Stream, name: str = "") -> str:
+        return self.topic(robot, stream, name)[1:]
 
     def expression(self, robot: str, stream: Stream) -> str:
-        return self._topic_pattern(robot, stream)[1:]
+        return self._topic_pattern(robot, stream, stream)[1:]
 
     def robot_from_key(self, key: str) -> str:
         return robot_from_topic(key)
 
-    def _topic(self, namespace: str, stream: Stream) -> str:
+    def writer_name(self, key: str) -> str | None:
+        name = key.rpartition("/")[2]
+        return name if name in NAMED_TOPICS else None
+
+    def _topic(self, namespace: str, stream: Stream, last_name: str) -> str:
         ros_type(stream)
-        return f"/{namespace}/{stream}" if namespace else f"/{stream}"
+        return f"/{namespace}/{last_name}" if namespace else f"/{last_name}"
 
 
 def robot_from_topic(topic: str) -> str:

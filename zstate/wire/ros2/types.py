@@ -20,6 +20,25 @@ _FIELDS: dict[str, tuple[tuple[str, str], ...]] = {
         ("float64[]", "velocity"),
         ("float64[]", "effort"),
     ),
+    "sensor_msgs/LaserScan": (
+        ("std_msgs/Header", "header"),
+        *(("float32", name) for name in ("angle_min", "angle_max", "angle_increment")),
+        *(("float32", name) for name in ("time_increment", "scan_time", "range_min", "range_max")),
+        ("float32[]", "ranges"),
+        ("float32[]", "intensities"),
+    ),
+    "nav_msgs/MapMetaData": (
+        ("builtin_interfaces/Time", "map_load_time"),
+        ("float32", "resolution"),
+        ("uint32", "width"),
+        ("uint32", "height"),
+        ("geometry_msgs/Pose", "origin"),
+    ),
+    "nav_msgs/OccupancyGrid": (
+        ("std_msgs/Header", "header"),
+        ("nav_msgs/MapMetaData", "info"),
+        ("int8[]", "data"),
+    ),
     "geometry_msgs/Vector3": (("float64", "x"), ("float64", "y"), ("float64", "z")),
     "geometry_msgs/Quaternion": (("float64", "x"), ("float64", "y"), ("float64", "z"), ("float64", "w")),
     "geometry_msgs/Transform": (
@@ -42,7 +61,7 @@ _FIELDS: dict[str, tuple[tuple[str, str], ...]] = {
 }
 # The numbers of type_description_interfaces/FieldType.
 _NESTED, _ARRAY, _UNBOUNDED_SEQUENCE = 1, 48, 144
-_PRIMITIVES = {"int32": 6, "uint32": 7, "float64": 11, "string": 17}
+_PRIMITIVES = {"int8": 2, "int32": 6, "uint32": 7, "float32": 10, "float64": 11, "string": 17}
 
 _SEPARATOR = "=" * 80
 
@@ -106,5 +125,7 @@ def _description(short: str) -> dict[str, Any]:
 JOINT_STATE = RosType.from_fields("sensor_msgs/JointState")
 TF_MESSAGE = RosType.from_fields("tf2_msgs/TFMessage")
 STRING = RosType.from_fields("std_msgs/String")
+LASER_SCAN = RosType.from_fields("sensor_msgs/LaserScan")
+OCCUPANCY_GRID = RosType.from_fields("nav_msgs/OccupancyGrid")
 CLOCK = RosType.from_fields("rosgraph_msgs/Clock")
 POSE_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/PoseWithCovarianceStamped")

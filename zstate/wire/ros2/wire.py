@@ -30,9 +30,15 @@ from zstate.wire.ros2.graph import (
 )
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
-from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, robot_from_topic, ros_type
-
-STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
+from zstate.wire.ros2.topics import (
+    NAMED_TOPICS,
+    SHARED,
+    DdsKeys,
+    RmwKeys,
+    robot_from_topic,
+    ros_type,
+    topic_stream,
+)
 
 
 class Ros2Wire:
@@ -62,8 +68,8 @@ class Ros2Wire:
     def stream_encoder(
         self, node: WriterNode, stream: Stream, number: int, name: str = ""
     ) -> RosStreamEncoder:
-        token = self._endpoint_token(node, stream, "MP", number)
-        names, key = self._frame_names(node.robot), self._keys.key(node.robot, stream)
+        token = self._endpoint_token(node, stream, "MP", number, name)
+        names, key = self._frame_names(node.robot), self._keys.key(node.robot, stream, name)
         return RosStreamEncoder(names, node.sample_names, key, token, gid(token) if self._has_gids else None)
 
     def _node(self, node: WriterNode) -> NodeToken:
@@ -83,10 +89,10 @@ class Ros2Wire:
         return tuple(token for token in (self.node_token(node), *endpoints) if token is not None)
 
     def _endpoint_token(
-        self, node: WriterNode, stream: Stream, kind: Literal["MP", "MS"], number: int
+        self, node: WriterNode, stream: Stream, kind: Literal["MP", "MS"], number: int, name: str = ""
     ) -> str:
         """The token of ``node`` as publisher ("MP") or subscriber ("MS") of ``stream``."""
-        topic, dds_type = self._keys.topic(node.robot, stream), ros_type(stream).dds
+        topic, dds_type = self._keys.topic(node.robot, stream, name), ros_type(stream).dds
         type_hash = self._keys.key(node.robot, stream).rpartition("/")[2]
         token = EndpointToken(self._node(node), number, kind, topic, dds_type, type_hash, STREAM_QOS[stream])
         return token.key
@@ -97,8 +103,9 @@ class Ros2Wire:
     def robot_from_key(self, key: str) -> str:
         return self._keys.robot_from_key(key)
 
-    def edge_writer_name(self, key: str) -> None:
-        """None: in ROS all writers of edges share the topics."""
+    def edge_writer_name(self, key: str) -> str | None:
+        """The name of a scan's sensor, or of a map; None for edges, whose writers share the topics."""
+        return self._keys.writer_name(key)
 
     def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         # CDR repeats all frame names in each sample.
@@ -133,12 +140,15 @@ class Ros2Wire:
     def _announcement(
         self, topic: str, dds_type: str, robot: str, writer: WriterId, node: str = ""
     ) -> Announcement | None:
+        stream = topic_stream(topic, dds_type)
+        if stream is None or stream == "clock":
+            return None
         named = robot_from_topic(topic) if robot == ANY else robot
-        for stream in STREAMS:
-            # a namespace that ROS does not allow matches no topic
-            with suppress(InvalidInput):
-                if dds_type == ros_type(stream).dds and topic == self._keys.topic(named, stream):
-                    return Announcement(named, stream, writer, node=node)
+        name = topic.rpartition("/")[2] if stream in NAMED_TOPICS else ""
+        # a namespace or a name that ROS does not allow matches no topic
+        with suppress(InvalidInput):
+            if topic == self._keys.topic(named, stream, name):
+                return Announcement(named, stream, writer, name, node)
         return None
 
 
@@ -161,9 +171,9 @@ class Ros2DdsWire(Ros2Wire):
         super().node_token(node)
 
     def _endpoint_token(
-        self, node: WriterNode, stream: Stream, kind: Literal["MP", "MS"], number: int
+        self, node: WriterNode, stream: Stream, kind: Literal["MP", "MS"], number: int, name: str = ""
     ) -> str:
-        ros, topic = ros_type(stream), self._keys.key(node.robot, stream)
+        ros, topic = ros_type(stream), self._keys.key(node.robot, stream, name)
         return DdsToken(node.zid, kind, topic, ros.name, STREAM_QOS[stream], ros.hash).key
 
     def _origin(self, arrival: SerializedSample) -> tuple[int, int]:

@@ -97,7 +97,8 @@ def joint_states(draw: st.DrawFn) -> tuple[list[str], list[float], list[float] |
 
 
 def test_type_hashes_are_those_that_ros_generates(kilted: Program):
-    for kind in (types.JOINT_STATE, types.TF_MESSAGE, types.STRING, types.CLOCK):
+    known = (types.JOINT_STATE, types.TF_MESSAGE, types.STRING, types.CLOCK)
+    for kind in (*known, types.LASER_SCAN, types.OCCUPANCY_GRID):
         assert kind.hash == kilted.ask("hash", type_name=kind.name)
 
 
