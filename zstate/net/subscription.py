@@ -9,7 +9,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.wire.keys import ANY, Stream, shortened
+from zstate.wire.keys import ANY, LATCHED_STREAMS, Stream, shortened
 from zstate.wire.messages import Message
 from zstate.wire.protocol import SerializedSample, Wire
 
@@ -73,6 +73,6 @@ def subscribe(
             on_withdrawn(sample.key)
 
     key = wire.expression(robot, stream)
-    if stream in ("robot_description", "tf_static"):
+    if stream in LATCHED_STREAMS:
         return LatchedSubscriber(session, key, on_value)
     return StreamSubscriber(session, key, on_samples)

@@ -1,6 +1,17 @@
 """Laser scans and occupancy grids."""
 
 from zstate.scans.grid import Grid, load_map
+from zstate.scans.listener import PlacedScan, ScanListener
+from zstate.scans.publishers import MapPublisher, RangeSource, ScanPublisher
 from zstate.scans.scan import Scan
 
-__all__ = ["Grid", "Scan", "load_map"]
+__all__ = [
+    "Grid",
+    "MapPublisher",
+    "PlacedScan",
+    "RangeSource",
+    "Scan",
+    "ScanListener",
+    "ScanPublisher",
+    "load_map",
+]

@@ -20,6 +20,8 @@ from zstate.errors import InvalidInput
 from zstate.scans.map_files import read_cells, scale_image, write_map
 from zstate.scans.map_metadata import Mode, read_metadata
 from zstate.transform import Transform
+from zstate.wire.keys import full_name
+from zstate.wire.messages import OccupancyGrid, cells_of, from_block, to_block
 
 UNKNOWN = -1
 OCCUPIED = 100
@@ -139,6 +141,23 @@ def load_map(path: str | Path, frame: str = "map") -> Grid:
     """
     metadata = read_metadata(Path(path).expanduser())
     return Grid(read_cells(metadata), metadata.resolution, metadata.origin, frame)
+
+
+def grid_to_message(grid: Grid, session: int) -> OccupancyGrid:
+    """``grid`` on the wire."""
+    height, width = grid.cells.shape
+    origin = to_block(grid.origin.pose7)
+    where = grid.frame, grid.resolution, width, height
+    return OccupancyGrid(session, grid.stamp, *where, origin, grid.cells.tobytes())
+
+
+def grid_from_message(message: OccupancyGrid, robot: str) -> Grid:
+    """The grid of ``robot`` in ``message``; its frame has the full name.
+
+    Raises InvalidInput if it has no cells, or an origin that is no pose.
+    """
+    frame = full_name(robot, message.frame)
+    return Grid(cells_of(message), message.resolution, from_block(message.origin), frame, message.stamp)
 
 
 def _checked_cells(cells: ArrayLike) -> NDArray[np.int8]:

@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.checks import check_names, real_numbers
 from zstate.clock import check_stamp, format_stamp
 from zstate.errors import InvalidInput
+from zstate.wire.keys import full_name
+from zstate.wire.messages import LaserScan, from_float32_block, to_float32_block
 
 Floats = NDArray[np.float32]
 
@@ -143,6 +145,43 @@ class Scan:
             f"<Scan of {self.frame!r} at {format_stamp(self.stamp)}: {count} rays, "
             f"{np.count_nonzero(self.valid)} valid>"
         )
+
+
+def scan_to_message(scan: Scan, seq: int, session: int, scan_ns: int = 0) -> LaserScan:
+    """``scan`` on the wire; ``scan_ns`` [ns] is the time between two scans, 0 if it is not known."""
+    intensities = None if scan.intensities is None else to_float32_block(scan.intensities)
+    return LaserScan(
+        scan.stamp,
+        seq,
+        session,
+        scan.frame,
+        scan.angle_min,
+        scan.angle_increment,
+        scan.ray_ns,
+        scan_ns,
+        scan.range_min,
+        scan.range_max,
+        to_float32_block(scan.ranges),
+        intensities,
+    )
+
+
+def scan_from_message(message: LaserScan, robot: str) -> Scan:
+    """The scan of ``robot`` in ``message``; its frame has the full name.
+
+    Raises InvalidInput if it is none: it has no rays, or all in one direction.
+    """
+    return Scan(
+        message.stamp,
+        message.angle_min,
+        message.angle_increment,
+        message.ray_ns,
+        from_float32_block(message.ranges),
+        message.range_min,
+        message.range_max,
+        full_name(robot, message.frame),
+        None if message.intensities is None else from_float32_block(message.intensities),
+    )
 
 
 @lru_cache(maxsize=64)  # a sensor keeps its geometry

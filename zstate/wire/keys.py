@@ -55,6 +55,9 @@ NAMED_STREAMS: frozenset[Stream] = frozenset(
 )
 """The streams with one key for each of the writer names of a robot."""
 
+LATCHED_STREAMS: frozenset[Stream] = frozenset({"robot_description", "tf_static", "map"})
+"""The streams of one current value, which late joiners receive as well."""
+
 JOINT_STREAMS: frozenset[Stream] = frozenset({"joint_states", "partial_joint_states"})
 """The streams of joint positions."""
 

@@ -1,0 +1,185 @@
+"""Publishers of scans and maps, read back from the network by plain subscriptions."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from helpers.processes import until
+
+from zstate.clock import ManualClock
+from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.net.subscription import Received, subscribe
+from zstate.scans import Grid, MapPublisher, Scan, ScanPublisher
+from zstate.scans.grid import grid_from_message
+from zstate.scans.scan import scan_from_message
+from zstate.wire.messages import LaserScan, OccupancyGrid
+from zstate.wire.registry import get_wire
+
+GEOMETRY = {"angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.1, "range_max": 10.0}
+ROOM = Grid([[0, 100], [-1, 50]], 0.5, (1.0, 2.0, 0.3))
+
+
+class Scans(list[Scan]):
+    """The scans of r1, as they arrive."""
+
+    def __init__(self, session, wire: str = "native") -> None:
+        self._subscriber = subscribe(session, get_wire(wire), "r1", "scan", self._on_messages)
+
+    def _on_messages(self, received: list[Received]) -> None:
+        for robot, _, message in received:
+            assert isinstance(message, LaserScan)
+            self.append(scan_from_message(message, robot))
+
+
+class Maps(dict[str, Grid]):
+    """The maps by key."""
+
+    def __init__(self, session, wire: str = "native") -> None:
+        self._subscriber = subscribe(
+            session, get_wire(wire), "hall", "map", self._on_messages, on_withdrawn=self.pop
+        )
+
+    def _on_messages(self, received: list[Received]) -> None:
+        for robot, key, message in received:
+            assert isinstance(message, OccupancyGrid)
+            self[key] = grid_from_message(message, robot)
+
+
+def publish_until_received(publisher: ScanPublisher, scans: Scans, ranges, **options) -> Scan:
+    """Scans are not kept for late readers: publishes until the first has arrived."""
+    until(lambda: publisher.publish(ranges, **options) or scans)
+    return scans[0]
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_scan_arrives_as_it_was_published(sessions, wire: str):
+    writer, reader = sessions
+    scans = Scans(reader, wire)
+    with ScanPublisher(writer, "r1", "front", wire, ray_ns=1000, frame="laser", **GEOMETRY) as publisher:
+        scan = publish_until_received(publisher, scans, [1.0, np.inf, np.nan], stamp=5, intensities=[1, 2, 3])
+    assert (scan.stamp, scan.ray_ns, scan.frame) == (5, 1000, "r1/laser")
+    assert np.allclose((scan.angle_min, scan.angle_increment), (-1.0, 0.5))
+    assert np.array_equal(scan.ranges, np.float32([1.0, np.inf, np.nan]), equal_nan=True)
+    assert scan.intensities is not None
+    assert scan.intensities.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_frame_of_a_sensor_has_its_name_by_default(sessions):
+    writer, reader = sessions
+    scans = Scans(reader)
+    with ScanPublisher(writer, "r1", "front", **GEOMETRY) as publisher:
+        assert publish_until_received(publisher, scans, [1.0], stamp=5).frame == "r1/front"
+
+
+def test_scan_without_a_stamp_ends_now(sessions):
+    writer, reader = sessions
+    clock = ManualClock(1_000_000)
+    scans = Scans(reader)
+    with ScanPublisher(writer, "r1", "front", ray_ns=100, clock=clock, **GEOMETRY) as publisher:
+        scan = publish_until_received(publisher, scans, [1.0, 1.0, 1.0])
+    assert scan.end_stamp == 1_000_000
+    assert scan.stamp == 999_800
+
+
+def test_run_publishes_sweeps_that_end_at_their_ticks_and_leaves_out_none(sessions):
+    writer, reader = sessions
+    ticks: list[int] = []
+
+    class Lidar:
+        def read(self, stamp: int) -> list[float] | None:
+            ticks.append(stamp)
+            return None if len(ticks) % 2 else [1.0, 2.0]
+
+    scans = Scans(reader)
+    with ScanPublisher(writer, "r1", "front", ray_ns=100, **GEOMETRY) as publisher:
+        publish_until_received(publisher, scans, [1.0, 2.0], stamp=0)
+        scans.clear()
+        thread = threading.Thread(target=publisher.run, args=(Lidar(), 100.0))
+        thread.start()
+        until(lambda: len(scans) >= 3)
+    thread.join(10.0)
+    ends = [scan.end_stamp for scan in scans if scan.stamp]
+    assert ends == [tick for tick in ticks[1::2] if tick in set(ends)]
+
+
+def test_scan_that_is_none_is_refused_and_counted_and_nothing_is_sent(sessions):
+    writer, _ = sessions
+    with ScanPublisher(writer, "r1", "front", **GEOMETRY) as publisher:
+        with pytest.raises(InvalidInput, match="flat array"):
+            publisher.publish([[1.0]])
+        with pytest.raises(InvalidInput, match="empty"):
+            publisher.publish([])
+        with pytest.raises(InvalidInput, match="one intensity for each ray"):
+            publisher.publish([1.0, 2.0], intensities=[1.0])
+        assert publisher.stats.sent == 0
+        assert publisher.stats.refused == 3
+
+
+def test_wrong_geometry_is_refused_when_the_publisher_opens(sessions):
+    with pytest.raises(InvalidInput, match="angle_increment is 0"):
+        ScanPublisher(sessions[0], "r1", "front", **{**GEOMETRY, "angle_increment": 0.0})
+    with pytest.raises(InvalidInput, match="range_min <= range_max"):
+        ScanPublisher(sessions[0], "r1", "front", **{**GEOMETRY, "range_min": 11.0})
+
+
+def test_second_writer_of_a_sensor_is_refused_with_the_name_of_the_first(sessions):
+    writer, other = sessions
+    with ScanPublisher(writer, "r1", "front", program="first", **GEOMETRY):
+        with pytest.raises(SecondWriter, match="first"):
+            ScanPublisher(other, "r1", "front", **GEOMETRY)
+        with ScanPublisher(other, "r1", "rear", **GEOMETRY):
+            pass
+
+
+def test_publish_after_close_raises_closed(sessions):
+    with ScanPublisher(sessions[0], "r1", "front", **GEOMETRY) as publisher:
+        pass
+    with pytest.raises(Closed, match="front"):
+        publisher.publish([1.0])
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_late_reader_receives_the_map(sessions, wire: str):
+    writer, reader = sessions
+    with MapPublisher(writer, "hall", ROOM, wire):
+        maps = Maps(reader, wire)
+        until(lambda: maps)
+        (grid,) = maps.values()
+    assert grid.frame == "hall/map"
+    assert np.array_equal(grid.cells, ROOM.cells)
+    assert np.isclose(grid.resolution, ROOM.resolution)
+    assert np.allclose(grid.origin.pose7, ROOM.origin.pose7)
+
+
+def test_map_is_replaced_and_then_withdrawn(sessions):
+    writer, reader = sessions
+    maps = Maps(reader)
+    with MapPublisher(writer, "hall", ROOM, frame="floor") as publisher:
+        until(lambda: maps)
+        assert maps["zstate/hall/map/map"].frame == "hall/floor"
+        publisher.set(Grid([[100]], 1.0, (0.0, 0.0, 0.0)))
+        until(lambda: maps["zstate/hall/map/map"].cells.shape == (1, 1))
+    until(lambda: not maps)
+    with pytest.raises(Closed):
+        publisher.set(ROOM)
+
+
+def test_map_of_4000_x_4000_cells_arrives(sessions):
+    writer, reader = sessions
+    cells = np.zeros((4000, 4000), dtype=np.int8)
+    cells[::7, ::3] = 100
+    with MapPublisher(writer, "hall", Grid(cells, 0.05, (0, 0, 0))):
+        maps = Maps(reader)
+        until(lambda: maps)
+        assert np.array_equal(maps["zstate/hall/map/map"].cells, cells)
+
+
+def test_second_writer_of_a_map_is_refused(sessions):
+    writer, other = sessions
+    with MapPublisher(writer, "hall", ROOM, program="first"):
+        with pytest.raises(SecondWriter, match="first"):
+            MapPublisher(other, "hall", ROOM)
+        with MapPublisher(other, "hall", ROOM, writer="cellar"):
+            pass

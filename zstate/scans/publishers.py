@@ -1,0 +1,219 @@
+"""Publishers of laser scans and of maps."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
+from zstate.clock import Clock, check_stamp
+from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.net.ownership import WriterClaim
+from zstate.net.presence import local_writer
+from zstate.net.session import Session
+from zstate.net.status import StatusPublisher
+from zstate.net.writer import WireWriter, write_all
+from zstate.nodes.publisher_status import StatusReporter
+from zstate.nodes.sample_publisher import SamplePublisher
+from zstate.rate import RateReport
+from zstate.scans.grid import Grid, grid_to_message
+from zstate.scans.scan import Scan, scan_to_message
+from zstate.wire.identity import Announcement
+from zstate.wire.keys import check_robot, check_writer
+from zstate.wire.registry import as_wire_names, get_wire
+
+
+class RangeSource(Protocol):
+    """Interface of programs that measure ranges: lidar drivers, simulators."""
+
+    def read(self, stamp: int) -> ArrayLike | None:
+        """The ranges [m] of the sweep whose last ray is at ``stamp`` [ns]; None when there is nothing new."""
+        ...
+
+
+class ScanPublisher(SamplePublisher):
+    """Publishes the scans of one laser scanner of a robot, whose geometry is given once.
+
+    ``sensor`` is the scanner's name, in ROS its topic. Its frame is ``frame``, by default a frame of the
+    sensor's name; a bare name is the robot's own. The other numbers are those of a ``Scan``. Leave
+    ``ray_ns`` out only if the sensor measures all rays at once, or does not tell their times: listeners then
+    place each scan rigidly.
+
+    Under congestion scans are dropped, and joining listeners receive none from the past. On the native wire
+    each sensor has one writer: SecondWriter, which names the first one, is raised if another writer publishes
+    it, or by ``publish`` if both opened at once, which closes the later one. ``program`` is the script's name
+    by default. A context manager; safe from any thread.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        sensor: str,
+        wires: str | Sequence[str] = ("native",),
+        *,
+        angle_min: float,
+        angle_increment: float,
+        range_min: float,
+        range_max: float,
+        ray_ns: int = 0,
+        frame: str | None = None,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        identity = local_writer(secrets.randbits(32), program)
+        super().__init__(robot, wires, clock, identity.session)
+        self.sensor = check_writer(sensor)
+        self.frame = sensor if frame is None else frame
+        self._angles = angle_min, angle_increment, ray_ns
+        self._limits_m = range_min, range_max
+        self._scan(0, [range_max, range_max], None)  # raises here, where the mistake is made
+        self._claim: WriterClaim | None = None
+        self._second_writer: SecondWriter | None = None
+        announced = Announcement(self.robot, "scan", identity, self.sensor)
+        with ExitStack() as opening:
+            if "native" in self._wires:
+                self._claim = opening.enter_context(WriterClaim(session, [announced]))
+                self._serve_clock(session, identity, opening)
+            for name in self._wires:
+                wire_writer = WireWriter(session, get_wire(name), self.robot, identity)
+                opening.enter_context(wire_writer)
+                self._writers[name, "scan"] = wire_writer.open_stream("scan", self.sensor)
+            if self._claim is not None:
+                status = StatusReporter(identity, lambda: self.stats).status
+                opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
+            self._opened = opening.pop_all()
+
+    def __repr__(self) -> str:
+        closed = ", closed" if self._stop.is_set() else ""
+        return f"<ScanPublisher {self.sensor!r} of {self.robot!r}: {self._seq} scans{closed}>"
+
+    def _scan(self, stamp: int, ranges: ArrayLike, intensities: ArrayLike | None) -> Scan:
+        return Scan(stamp, *self._angles, ranges, *self._limits_m, self.frame, intensities)
+
+    def publish(
+        self, ranges: ArrayLike, stamp: int | None = None, intensities: ArrayLike | None = None
+    ) -> None:
+        """Publish one scan: ``ranges`` [m] and ``intensities`` of its rays, both (N,).
+
+        ``stamp`` [ns] is the instant of the first ray; by default the scan ends now. A range that is no
+        measurement is inf without an echo, -inf if it is too near, and NaN if it is invalid (REP 117). Raises
+        InvalidInput for other shapes, SecondWriter and Closed. If it raises, nothing was sent.
+        """
+        try:
+            stamp = self._first_stamp(self._clock.now(), ranges) if stamp is None else check_stamp(stamp)
+            scan = self._scan(stamp, ranges, intensities)
+            with self._lock:
+                if self._stop.is_set():
+                    raise Closed(f"the scan publisher {self.sensor!r} is closed")
+                self._check_ownership()
+                message = scan_to_message(scan, self._seq, self._session_id, self._scan_ns())
+                write_all(self._writers.values(), message)
+                self._seq += 1
+        except InvalidInput as error:
+            self._count_refusal(error)
+            raise
+
+    def _first_stamp(self, last: int, ranges: ArrayLike) -> int:
+        """The instant of the first ray of a sweep whose last ray is at ``last``."""
+        *_, ray_ns = self._angles
+        return last - ray_ns * max(np.size(ranges) - 1, 0)
+
+    def _scan_ns(self) -> int:
+        return 0 if self._rate is None else round(1e9 / self._rate.report().commanded_hz)
+
+    def _check_ownership(self) -> None:
+        """Raise SecondWriter if an older writer publishes this sensor (sticky)."""
+        if self._second_writer is None and self._claim is not None:
+            try:
+                self._claim.check()
+            except SecondWriter as error:
+                self._second_writer = error
+                self._opened.close()
+        if self._second_writer is not None:
+            raise self._second_writer.with_traceback(None)
+
+    def run(self, source: RangeSource, rate_hz: float = 30.0, *, seconds: float | None = None) -> RateReport:
+        """Publish the sweeps of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
+
+        Each sweep ends at its tick. Raises as ``publish``; ``Rate`` describes late ticks.
+        """
+
+        def publish(ranges: ArrayLike, now: int) -> None:
+            self.publish(ranges, self._first_stamp(now, ranges))
+
+        return self._publish_at(rate_hz, seconds, source.read, publish)
+
+
+class MapPublisher(Closeable):
+    """Publishes the map of a place, latched: listeners that join later receive it as well.
+
+    A place is a robot, whose name is that of the place ("hall"), or a map that a robot has made. The frame of
+    the map is ``frame`` if it is given, else that of the grid. ``writer`` distinguishes maps of one robot.
+    ``close()`` withdraws the map; the ROS wires cannot express that. On the native wire SecondWriter, which
+    names the first writer, is raised if another active writer publishes this map. A context manager.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        grid: Grid,
+        wires: str | Sequence[str] = ("native",),
+        *,
+        frame: str | None = None,
+        writer: str = "map",
+        program: str = "",
+    ) -> None:
+        identity = local_writer(secrets.randbits(32), program)
+        self.robot = check_robot(robot)
+        self.writer = check_writer(writer)
+        self._session_id = identity.session
+        self._frame = frame
+        self._closed = False
+        self._lock = fork_safe_lock()
+        self._claim: WriterClaim | None = None
+        with ExitStack() as opening:
+            if "native" in as_wire_names(wires):
+                announced = Announcement(self.robot, "map", identity, self.writer)
+                self._claim = opening.enter_context(WriterClaim(session, [announced]))
+            self._latched = [
+                opening.enter_context(WireWriter(session, get_wire(wire), robot, identity)).open_latched(
+                    "map", self.writer
+                )
+                for wire in as_wire_names(wires)
+            ]
+            if self._claim is not None:
+                self._claim.confirm()
+            self.set(grid)
+            self._opened = opening.pop_all()
+
+    def __repr__(self) -> str:
+        closed = ", closed" if self._closed else ""
+        return f"<MapPublisher {self.writer!r} of {self.robot!r}: {self.grid!r}{closed}>"
+
+    def set(self, grid: Grid) -> None:
+        """Replace the map. Raises InvalidInput if it is larger than a message may be, and Closed."""
+        with self._lock:
+            if self._closed:
+                raise Closed(f"the map publisher {self.writer!r} is closed")
+            if self._frame not in (None, grid.frame):
+                grid = Grid(grid.cells, grid.resolution, grid.origin.pose7, self._frame, grid.stamp)
+            write_all(self._latched, grid_to_message(grid, self._session_id))
+            self.grid = grid
+
+    def close(self) -> None:
+        """Withdraw the map. A second call does nothing."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            for latched in self._latched:
+                latched.withdraw()
+            self._opened.close()
