@@ -139,7 +139,11 @@ class ScanListener(Closeable):
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:
-        return f"<ScanListener of {self.robot!r} in {self.target!r}: {len(self._unread)} unread scans>"
+        return f"<ScanListener of {self.robot!r} in {self.target!r}: {len(self)} unread scans>"
+
+    def __len__(self) -> int:
+        """How many placed scans are unread."""
+        return len(self._unread)
 
     def _on_messages(self, received: list[Received]) -> None:
         deadline = time.monotonic() + self._timeout_s
