@@ -407,11 +407,6 @@ class StreamIngests:
     newest_by_key: BoundedDict[str, StreamIngest] = field(default_factory=BoundedDict[str, StreamIngest])
     """The ingest of the last sample on each key, which may expect the next one."""
 
-    def get(self, robot: str, session: int) -> StreamIngest | None:
-        """The ingest of the samples of a session, if there is one."""
-        key = (robot, session if self.is_shared else 0)
-        return self.ingests.get(key) or self.unannounced.get(key)
-
     def all(self, robot: str | None = None) -> list[StreamIngest]:
         """All ingests, or those of one robot; any thread may add others at the same time."""
         ingests = (*list(self.ingests.values()), *list(self.unannounced.values()))

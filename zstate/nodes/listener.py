@@ -254,7 +254,8 @@ class TransformListener(Closeable):
         return StreamSubscriber(session, keys, on_samples, insert_next=insert_next, encoding=encoding)
 
     def _ingest_for(self, samples: StreamIngests, robot: str, session: int) -> StreamIngest:
-        ingest = samples.get(robot, session)
+        key = (robot, session if samples.is_shared else 0)
+        ingest = samples.ingests.get(key) or samples.unannounced.get(key)
         if ingest is None:
             ingest = self._new_ingest(samples, robot)
             self._ownership.add_robot(robot)
