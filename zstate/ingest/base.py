@@ -407,8 +407,43 @@ class StreamIngests:
     newest_by_key: BoundedDict[str, StreamIngest] = field(default_factory=BoundedDict[str, StreamIngest])
     """The ingest of the last sample on each key, which may expect the next one."""
 
-    def add_unannounced(self, key: tuple[str, int], ingest: StreamIngest) -> StreamIngest:
-        """The ingest of a writer that is not announced: the one there is, else this one."""
+    def all(self, robot: str | None = None) -> list[StreamIngest]:
+        """All ingests, or those of one robot; any thread may add others at the same time."""
+        ingests = (*list(self.ingests.values()), *list(self.unannounced.values()))
+        return [one for one in ingests if robot in (None, one.robot)]
+
+    def add(self, ingest: StreamIngest, session: int, writer: str | None) -> StreamIngest:
+        """Add the ingest of a session; ``writer`` is the name of its writer if that is announced.
+
+        Returns the ingest that another thread has added at the same time, if any.
+        """
+        if not self.is_shared:
+            return self.ingests.setdefault((ingest.robot, 0), ingest)
+        if writer is None:
+            return self._add_unannounced((ingest.robot, session), ingest)
+        ingest = self.ingests.setdefault((ingest.robot, session), ingest)
+        ingest.name_writer(session, writer)
+        return ingest
+
+    def announce(self, robot: str, session: int) -> bool:
+        """Keep the ingest of a writer that is announced now; False if it has not published yet."""
+        key = (robot, session)
+        ingest = self.unannounced.get(key)
+        if ingest is not None:
+            self.ingests[key] = ingest
+            self.unannounced.pop(key, None)
+        return key in self.ingests
+
+    def writer_left(self, robot: str, session: int) -> None:
+        """Handle the end of a writer, whose last samples may arrive later."""
+        key = (robot, session if self.is_shared else 0)
+        ingest = self.ingests.get(key)
+        if ingest is not None:
+            ingest.writer_left(session)
+            if self.is_shared:
+                self._add_unannounced(key, self.ingests.pop(key))
+
+    def _add_unannounced(self, key: tuple[str, int], ingest: StreamIngest) -> StreamIngest:
         ingest = self.unannounced.setdefault(key, ingest)
         if len(self.unannounced) > _MAX_UNANNOUNCED:
             oldest = self.unannounced.pop(next(iter(self.unannounced)))

@@ -203,11 +203,9 @@ class TransformListener(Closeable):
 
     def robots(self) -> tuple[str, ...]:
         """The robots that sent any message so far, sorted by name."""
-        ingests = [
-            ingest
-            for samples in {self._samples, *self._sample_streams.values()}
-            for ingest in (*list(samples.ingests.values()), *list(samples.unannounced.values()))
-        ]
+        ingests = (
+            one for samples in {self._samples, *self._sample_streams.values()} for one in samples.all()
+        )
         return tuple(sorted({ingest.robot for ingest in ingests if ingest.has_data}))
 
     def events(self) -> tuple[WriterEvent, ...]:
@@ -261,13 +259,7 @@ class TransformListener(Closeable):
         if ingest is None:
             ingest = self._new_ingest(samples, robot)
             self._ownership.add_robot(robot)
-            if not samples.is_shared:
-                ingest = samples.ingests.setdefault(key, ingest)
-            elif key in self._names:
-                ingest = samples.ingests.setdefault(key, ingest)
-                ingest.name_writer(session, self._names[key])
-            else:
-                ingest = samples.add_unannounced(key, ingest)
+            ingest = samples.add(ingest, session, self._names.get((robot, session)))
         return ingest
 
     def _new_ingest(self, samples: StreamIngests, robot: str) -> StreamIngest:
@@ -357,9 +349,8 @@ class TransformListener(Closeable):
         for description in self._decode("robot_description", arrival, robot):
             if isinstance(description, RobotDescription):
                 self._ingest_for(self._samples, robot, description.session).describe(description)
-                for part in (*self._parts.ingests.values(), *self._parts.unannounced.values()):
-                    if part.robot == robot:
-                        part.describe(description)
+                for part in self._parts.all(robot):
+                    part.describe(description)
 
     def _on_statics(self, arrival: SerializedSample) -> None:
         try:
@@ -435,18 +426,10 @@ class TransformListener(Closeable):
             self._clock_offsets.unwatch(announced.writer)
         if alive and self._history is not None:
             self._history.request(stream_key(robot, samples.stream, announced.name), session)
-        key = robot, session
-        if samples.is_shared and alive and key in samples.unannounced:
-            samples.ingests[key] = samples.unannounced.pop(key)
-        if samples.is_shared and key not in samples.ingests:
-            return  # it has not published yet
-        ingest = self._ingest_for(samples, robot, session)
-        if alive:
-            ingest.name_writer(session, str(announced.writer))
-            return
-        ingest.writer_left(session)
-        if samples.is_shared:
-            samples.add_unannounced(key, samples.ingests.pop(key))
+        if not alive:
+            samples.writer_left(robot, session)
+        elif not samples.is_shared or samples.announce(robot, session):
+            self._ingest_for(samples, robot, session).name_writer(session, str(announced.writer))
 
 
 _LISTENERS: weakref.WeakSet[TransformListener] = weakref.WeakSet()
