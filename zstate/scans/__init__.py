@@ -2,5 +2,6 @@
 
 from zstate.scans.grid import Grid, load_map
 from zstate.scans.scan import Scan
+from zstate.scans.simulated_laser import SimulatedLaser, dummy_scan
 
-__all__ = ["Grid", "Scan", "load_map"]
+__all__ = ["Grid", "Scan", "SimulatedLaser", "dummy_scan", "load_map"]
