@@ -250,6 +250,10 @@ def test_a_buffer_loads_no_library():
     assert loaded_by("from zstate import Transform, TransformBuffer\nTransformBuffer()") == set()
 
 
+def test_scans_and_maps_load_no_library():
+    assert loaded_by("import zstate.scans") == set()
+
+
 def test_following_transforms_loads_no_kinematics():
     code = "from zstate import TransformListener, connect\nTransformListener, connect"
     assert loaded_by(code) == {"msgspec", "zenoh"}

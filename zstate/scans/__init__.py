@@ -4,6 +4,7 @@ from zstate.scans.grid import Grid, load_map
 from zstate.scans.listener import PlacedScan, ScanListener
 from zstate.scans.publishers import MapPublisher, RangeSource, ScanPublisher
 from zstate.scans.scan import Scan
+from zstate.scans.simulated_laser import SimulatedLaser, dummy_scan
 
 __all__ = [
     "Grid",
@@ -13,5 +14,7 @@ __all__ = [
     "Scan",
     "ScanListener",
     "ScanPublisher",
+    "SimulatedLaser",
+    "dummy_scan",
     "load_map",
 ]

@@ -19,7 +19,7 @@ _Value = str | list[str] | None
 
 MODES: tuple[Mode, ...] = ("trinary", "scale", "raw")
 
-_MAX_BYTES = 65536
+_MAX_BYTES = 8192  # libyaml's time grows with the square of nested brackets: 40 s for 60,000
 _TRUE = {"true", "yes", "on", "y"}
 _FALSE = {"false", "no", "off", "n"}
 
@@ -81,7 +81,7 @@ class _Entry:
 def _parse(path: Path) -> Iterator[tuple[str, _Entry]]:
     """The keys and values of the mapping in a YAML file. Raises InvalidInput for any other file."""
     yaml = _pyyaml()
-    # Events need no recursion. Composed to nodes, a file of nothing but dashes crashes libyaml.
+    # Events, because libyaml composes nodes recursively: nested lists can overflow the stack of the process.
     try:
         events: list[Any] = list(yaml.parse(_yaml_text(path), getattr(yaml, "CSafeLoader", yaml.SafeLoader)))
     except yaml.MarkedYAMLError as error:
