@@ -16,25 +16,34 @@ from helpers.recording_builder import (
     RecordingBuilder,
     S,
     pose,
+    recorded_buffer,
     swing_positions,
 )
 from rosbags.rosbag2 import StoragePlugin
 
-from zstate.recording.decode import DecodedMessage, DecodedRecording
+from zstate.recording.decode import SCAN_STREAMS, STREAMS, DecodedMessage, DecodedRecording
 from zstate.recording.mcap.recover import recover
 from zstate.recording.reader import RecordingReader
 from zstate.transform import Transform
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
     JointState,
+    LaserScan,
+    OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     TransformSample,
     from_block,
     poses_from_block,
+    to_block,
+    to_float32_block,
 )
+from zstate.wire.ros2.encoder import RosStreamEncoder
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
-from zstate.wire.ros2.types import JOINT_STATE
+from zstate.wire.ros2.types import JOINT_STATE, LASER_SCAN, OCCUPANCY_GRID
 
 STORAGES = (StoragePlugin.SQLITE3, StoragePlugin.MCAP)
 
@@ -102,6 +111,51 @@ def test_static_writers_keep_their_names(tmp_path: Path):
         (MODEL_WRITER, (("world", "base"),)),
         ("camera", ()),
     ]
+
+
+def scan(stamp: int = START, seq: int = 3, session: int = 9, frame: str = "laser") -> LaserScan:
+    geometry = (-2.0, 0.5, 1000, 4000, 0.125, 8.0)
+    return LaserScan(stamp, seq, session, frame, *geometry, to_float32_block([1.0, 2.0]))
+
+
+def grid(session: int = 9, frame: str = "map") -> OccupancyGrid:
+    return OccupancyGrid(session, START, frame, 0.5, 2, 1, to_block([1, 2, 0, 0, 0, 0, 1]), b"\xff\x64")
+
+
+def test_scans_and_maps_are_decoded_as_written(tmp_path: Path):
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        builder.encoder.write_message("arm", scan(), START + 1, "front-laser")
+        builder.encoder.write_message("hall", grid(), START + 2, "map")
+    read = DecodedFile(tmp_path / "r.mcap", streams=(*STREAMS, *SCAN_STREAMS))
+    assert [(one.writer.robot, one.writer.stream, one.writer.edge_writer) for one in read.decoded] == [
+        ("arm", "scan", "front-laser"),
+        ("hall", "map", "map"),
+    ]
+    assert [one.message for one in read.decoded] == [scan(), grid()]
+    assert not DecodedFile(tmp_path / "r.mcap").decoded
+
+
+def test_scans_and_maps_of_a_bag_are_named_by_their_topics(tmp_path: Path):
+    with Bag(tmp_path / "bag") as bag:
+        for message, topic, kind in (
+            (scan(session=0), "/front", LASER_SCAN),
+            (grid(session=0), "/hall/map", OCCUPANCY_GRID),
+        ):
+            payload = RosStreamEncoder(FrameNames(Ros2Options(), "r1"), SampleLayout()).encode(message)
+            bag.write(topic, START, STORE.deserialize_cdr(payload, kind.name), kind.name)
+    read = DecodedFile(tmp_path / "bag", streams=SCAN_STREAMS)
+    found = {one.writer.stream: (one.writer.robot, one.writer.edge_writer) for one in read.decoded}
+    assert found == {"scan": ("ros", "front"), "map": ("hall", "map")}
+    (one,) = read.of(LaserScan)
+    assert one.message == scan(seq=1, session=one.writer.session)
+
+
+def test_a_recording_with_scans_and_maps_fills_a_buffer(tmp_path: Path):
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        builder.encoder.write_message("hall", grid(), START, "map")
+        builder.encoder.write_message("arm", scan(), START, "front")
+        builder.edges("arm", START, {("odom", "base"): pose(1.0)})
+    assert recorded_buffer(tmp_path / "r.mcap").lookup("arm/odom", "arm/base", START).translation[0] == 1.0
 
 
 def test_restarted_writer_is_another_writer(tmp_path: Path):

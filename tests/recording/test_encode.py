@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.recording_files import STORE, S
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
 
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -28,11 +32,14 @@ from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
     ClockMessage,
     JointState,
+    LaserScan,
+    OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     TransformSample,
     order_digest,
     to_block,
+    to_float32_block,
 )
 
 NOW = 1_790_000_000 * S
@@ -356,6 +363,61 @@ def test_channels_of_departed_writers_are_released_unless_latched(
         assert len(reader.channels()) <= 11
     sessions = [r.metadata["zstate.session"] for r in case.records() if r.topic == "/joint_states"]
     assert sessions == [*map(str, range(2, 40)), "2"]
+
+
+def scan(seq: int = 0) -> LaserScan:
+    geometry = (-2.0, 0.5, 1000, 4000, 0.125, 8.0)
+    return LaserScan(NOW - 5, seq, 1, "laser", *geometry, to_float32_block([1.0, math.inf, 0.5, math.nan]))
+
+
+def grid(session: int = 1, cells: bytes = b"\xff\x00\x64") -> OccupancyGrid:
+    return OccupancyGrid(session, NOW - 7, "map", 0.5, 3, 1, to_block([1, 2, 3, 0, 0, 0, 1]), cells)
+
+
+def by_rosbags(path: Path) -> dict[str, Any]:
+    with AnyReader([path]) as reader:
+        return {one.topic: reader.deserialize(data, one.msgtype) for one, _, data in reader.messages()}
+
+
+def by_mcap_ros2(path: Path) -> dict[str, Any]:
+    with path.open("rb") as stream:
+        decoded = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        return {channel.topic: message for _, channel, _, message in decoded}
+
+
+@pytest.mark.parametrize("read", [by_rosbags, by_mcap_ros2])
+def test_other_readers_read_scans_and_maps(case: EncoderCase, read: Callable[[Path], dict[str, Any]]):
+    case.encoder.write_message("cart", scan(), NOW, "front-laser")
+    case.encoder.write_message("hall", grid(), NOW, "map")
+    case.writer.close()
+    messages = read(case.path)
+    assert messages.keys() == {"/front_laser", "/hall/map"}
+    ours, theirs = messages["/front_laser"], messages["/hall/map"]
+    assert (ours.header.frame_id, ours.angle_min, ours.angle_max, ours.range_max) == (
+        "laser",
+        -2.0,
+        -0.5,
+        8.0,
+    )
+    assert np.array_equal(ours.ranges, [1.0, math.inf, 0.5, math.nan], equal_nan=True)
+    assert ours.header.stamp.sec * S + ours.header.stamp.nanosec == NOW - 5
+    assert (theirs.header.frame_id, theirs.info.width, theirs.info.resolution) == ("hall/map", 3, 0.5)
+    assert (theirs.info.origin.position.y, list(theirs.data)) == (2.0, [-1, 0, 100])
+
+
+def test_a_map_is_latched_and_scans_are_not(case: EncoderCase):
+    case.encoder.write_message("cart", grid(), NOW, "floor")
+    case.encoder.write_message("cart", grid(cells=b"\0\0\0"), NOW, "floor")
+    case.encoder.write_message("cart", scan(), NOW, "front")
+    assert [(topic, session) for topic, session, _ in repeated(case)] == [("/floor", "1")]
+    assert case.encoder.messages == {("cart", "map"): 2, ("cart", "scan"): 1, ("cart", "clock"): 1}
+
+
+def test_a_scan_without_a_stamp_is_refused(case: EncoderCase):
+    case.encoder.write_message(
+        "cart", LaserScan(0, 0, 1, "laser", 0.0, 0.1, 0, 0, 0.0, 1.0, b""), NOW, "front"
+    )
+    assert case.refused == {"no stamp": 1}
 
 
 def test_endless_static_writers_are_refused_and_counted(case: EncoderCase):

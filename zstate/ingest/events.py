@@ -17,7 +17,7 @@ from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import NAMED_STREAMS, Stream
+from zstate.wire.keys import Stream
 
 Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]
 
@@ -140,7 +140,7 @@ class CallbackThread(Closeable, Generic[T]):
                         threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
 
-_NAMED_SAMPLES = NAMED_STREAMS - {"tf_static"}
+_NAMED_SAMPLES: frozenset[Stream] = frozenset({"transforms", "partial_joint_states"})
 _Place = tuple[str, Stream, str]
 
 

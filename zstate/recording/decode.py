@@ -27,8 +27,12 @@ from zstate.wire.ros2.topics import SHARED, robot_from_topic, ros_type
 
 _TOPICS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
 STREAMS: tuple[Stream, ...] = (*_TOPICS, *TOPICS)
-"""The streams that are decoded. ``transforms`` are channels of the topic tf with the name of a writer, and
-those of their covariances; ``partial_joint_states`` channels of the topic joint_states with such a name."""
+"""The streams of a robot's state, which are decoded by default. ``transforms`` are channels of the topic tf
+with the name of a writer, and those of their covariances; ``partial_joint_states`` channels of the topic
+joint_states with such a name."""
+
+SCAN_STREAMS: tuple[Stream, ...] = ("scan", "map")
+"""Further streams that can be decoded: the channels of these types, whatever their topic is."""
 
 _NAMED: dict[Stream, Stream] = {topic: named for named, topic in TOPICS.items()}
 
@@ -46,10 +50,11 @@ class RecordedWriter:
     """One writer of one stream, as one channel of a recording describes it.
 
     ``robot`` is empty for the clock. ``edge_writer`` is the name under which edges were written: moving ones,
-    or static ones, each time all of them; or the name of a driver of some joints. None in the bags of ROS,
-    where static edges add up. ``program`` is
-    the writer's program, ``session`` one start of it. ``foreign`` channels do not describe writers: their
-    robot is the topic's namespace, and all writers of a topic count as one.
+    or static ones, each time all of them; or the name of a driver of some joints, of a sensor or of a map.
+    In the bags of ROS it is the last name of the topic of scans or of a map, and None for edges, of which
+    static ones add up there. ``program`` is the writer's program, ``session`` one start of it. ``foreign``
+    channels do not describe writers: their robot is the topic's namespace, and all writers of a topic count
+    as one.
     """
 
     robot: str
@@ -63,10 +68,11 @@ class RecordedWriter:
     def from_channel(cls, channel: Channel) -> RecordedWriter | None:
         """The writer of ``channel``; None if it is no stream of a robot."""
         stream: Stream = "transforms"
+        name = channel.topic.rpartition("/")[2]
         if child_frame(channel) is None:
-            name = channel.topic.rpartition("/")[2]
-            for stream in _TOPICS:
-                if name == stream and channel.type_name == ros_type(stream).name:
+            for stream in (*_TOPICS, *SCAN_STREAMS):
+                is_named = name == stream or stream in SCAN_STREAMS
+                if is_named and channel.type_name == ros_type(stream).name:
                     break
             else:
                 return None
@@ -80,7 +86,7 @@ class RecordedWriter:
             robot="" if stream == "clock" else robot,
             stream=stream,
             session=int.from_bytes(digest, "little") if foreign else int(facts[_SESSION]),
-            edge_writer=facts.get(EDGE_WRITER),
+            edge_writer=facts.get(EDGE_WRITER, name if stream in SCAN_STREAMS else None),
             program=facts.get("zstate.program"),
             foreign=foreign,
         )

@@ -27,9 +27,12 @@ from zstate.wire.messages import (
     POSE_BYTES,
     ClockMessage,
     JointState,
+    LaserScan,
     Message,
+    OccupancyGrid,
     RobotDescription,
     Sample,
+    StampedMessage,
     StaticTransforms,
     TransformSample,
     WriterTransforms,
@@ -44,7 +47,7 @@ from zstate.wire.ros2.topics import SHARED, RmwKeys, ros_type
 from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 
 MAX_LATCHED = 256
-"""Descriptions and sets of static edges of one robot that are latched, one of each static writer."""
+"""Latched messages of one robot: its description, the edges of each static writer, and its maps."""
 
 MAX_PENDING = 1024
 """Samples of one robot that wait for the description that names their numbers."""
@@ -62,6 +65,8 @@ _STREAMS: dict[type[Message], Stream] = {
     TransformSample: "tf",
     StaticTransforms: "tf_static",
     RobotDescription: "robot_description",
+    LaserScan: "scan",
+    OccupancyGrid: "map",
     ClockMessage: "clock",
 }
 _NAMED_STREAMS: dict[type[Message], Stream] = {
@@ -130,7 +135,8 @@ class RecordingEncoder:
 
         ``edge_writer`` is the name under which edges are written: static ones, or moving ones of a
         TransformPublisher, which go to the topic tf; or under which a driver publishes some of the joints,
-        which go to the topic joint_states. Without one, as in ROS, the static edges of a session add up.
+        which go to the topic joint_states; or it is the name of a sensor or a map, and of its topic. Without
+        one, as in ROS, the static edges of a session add up.
         Returns False if the robot has no channel left for that writer. Raises RecordingError if the file
         cannot grow.
         """
@@ -143,14 +149,16 @@ class RecordingEncoder:
                 self._latch(robot, message, log_time, f"{robot}/{edge_writer}", edge_writer)
             elif isinstance(message, RobotDescription):
                 self._write_description(robot, message, log_time)
-            elif isinstance(message, Sample | ClockMessage):
+            elif isinstance(message, OccupancyGrid):
+                self._latch(robot, message, log_time, f"{robot}/map/{edge_writer}", edge_writer or "")
+            elif isinstance(message, StampedMessage):
                 with self._lock:
                     self._write_sample(robot, message, log_time, edge_writer or "")
         except _TooManyWriters as error:
             self._refuse("too many writers", f"{robot!r}: {error}")
             return False
         except InvalidInput as error:
-            reason, stamp = "not sayable", message.stamp if isinstance(message, Sample | ClockMessage) else 1
+            reason, stamp = "not sayable", message.stamp if isinstance(message, StampedMessage) else 1
             try:
                 to_time(stamp)
             except InvalidInput:
@@ -169,9 +177,7 @@ class RecordingEncoder:
                 self._writer.unlatch(channel.number, key)
                 self._counts[robot, "tf_static"] += 1
 
-    def _write_sample(
-        self, robot: str, message: Sample | ClockMessage, log_time: int, edge_writer: str
-    ) -> None:
+    def _write_sample(self, robot: str, message: StampedMessage, log_time: int, edge_writer: str) -> None:
         sample_names = self._orders_of(robot).sample_names(message)
         if sample_names is None:
             self._pending.append(robot, message, log_time)
@@ -216,7 +222,7 @@ class RecordingEncoder:
     def _latch(
         self,
         robot: str,
-        message: StaticTransforms | RobotDescription,
+        message: StaticTransforms | RobotDescription | OccupancyGrid,
         log_time: int,
         key: str,
         edge_writer: str = "",
@@ -225,7 +231,9 @@ class RecordingEncoder:
         with self._lock:
             latched = self._latched.setdefault(robot, {})
             if key not in latched and len(latched) >= MAX_LATCHED:
-                raise _TooManyWriters(f"it has {MAX_LATCHED} static writers, and {edge_writer!r} is one more")
+                raise _TooManyWriters(
+                    f"it has {MAX_LATCHED} latched messages; that of {edge_writer!r} is one more"
+                )
             channel = self._channel(robot, stream, message.session, log_time, edge_writer)
         payload = channel.encode(message)
         with self._lock:
@@ -268,7 +276,7 @@ class RecordingEncoder:
         if session in self._programs:
             metadata["zstate.program"] = self._programs[session]
         carrier = TOPICS.get(stream, stream)
-        topic, kind = RmwKeys(options).topic(robot, carrier), ros_type(carrier)
+        topic, kind = RmwKeys(options).topic(robot, carrier, ros_name(edge_writer)), ros_type(carrier)
         if covariances_of:
             metadata[CHILD_FRAME] = child = names.to_ros(covariances_of)
             topic, kind = covariance_topic(options.namespace, names.to_zstate(child)), POSE_WITH_COVARIANCE
@@ -371,7 +379,7 @@ class OrderRegistry:
             model = parse_urdf(description.urdf, f"the description of {robot!r}")
             self._joints[order] = SampleLayout(coordinate_names(model), velocity_columns_by_position(model))
 
-    def sample_names(self, sample: Sample | ClockMessage) -> SampleLayout | None:
+    def sample_names(self, sample: StampedMessage) -> SampleLayout | None:
         """The names of the numbers in ``sample``, or None before a description with its order."""
         if isinstance(sample, JointState):
             return self._joints.get(sample.order) if sample.names is None else _NAMED
@@ -388,14 +396,14 @@ class PendingSamples:
 
     def __init__(self) -> None:
         self.dropped = 0
-        self._robots: dict[str, BoundedQueue[tuple[Sample | ClockMessage, int]]] = {}
+        self._robots: dict[str, BoundedQueue[tuple[StampedMessage, int]]] = {}
 
     @property
     def waiting(self) -> int:
         """Number of samples held."""
         return sum(len(pending) for pending in list(self._robots.values()))
 
-    def append(self, robot: str, sample: Sample | ClockMessage, log_time: int) -> None:
+    def append(self, robot: str, sample: StampedMessage, log_time: int) -> None:
         """Hold a sample received at ``log_time``, unless it alone exceeds the limit."""
         pending = self._robots.setdefault(robot, BoundedQueue(MAX_PENDING, MAX_PENDING_BYTES))
         blocks: tuple[bytes | None, ...] = ()
@@ -405,7 +413,7 @@ class PendingSamples:
             blocks = (sample.poses,)
         self.dropped += pending.append((sample, log_time), sum(len(block or b"") for block in blocks))
 
-    def pop(self, robot: str) -> Iterable[tuple[Sample | ClockMessage, int]]:
+    def pop(self, robot: str) -> Iterable[tuple[StampedMessage, int]]:
         """Remove the samples of ``robot``, and return them with their log times."""
         return self._robots.pop(robot, ())
 

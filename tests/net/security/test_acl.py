@@ -17,21 +17,22 @@ from helpers.access_routers import (
     replies,
     router_with_users,
 )
-from helpers.processes import find_free_port, until
+from helpers.processes import find_free_port, repeated, until
 from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import AccessDenied, InvalidInput, SecondWriter
+from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.presence import announce, discover_readers
 from zstate.net.security.acl import AclRoles, access_control
 from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import StreamPublisher, StreamSubscriber
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.wire import keys
-from zstate.wire.messages import TransformSample, order_digest, to_block
+from zstate.wire.messages import LaserScan, OccupancyGrid, TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
 FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",))
@@ -76,6 +77,12 @@ WRITES = [
     ("r1", "zstate/r2/transforms/odometry", False),
     ("r1", "zstate/r1/partial_joint_states/gripper", True),
     ("r1", "zstate/r2/partial_joint_states/gripper", False),
+    ("r1", "zstate/r1/scan/front", True),
+    ("r1", "zstate/r2/scan/front", False),
+    ("r1", "zstate/r1/map/room", True),
+    ("r1", "zstate/r2/map/room", False),
+    ("desk", "zstate/r1/map/room", False),
+    ("site", "zstate/site/map/room", False),
     ("r1", "zstate/r2/joint_states", False),
     ("r1", "zstate/*/joint_states", False),
     ("r1", "zstate/$*1/joint_states", False),
@@ -119,6 +126,35 @@ def test_late_viewer_receives_all_streams(site: Site):
             for listener in (model, poses):
                 assert listener.buffer.wait("base", "camera", timeout_s=5.0).kind == "static"
                 until(lambda reader=listener: publish_and_check(publisher, reader))
+
+
+def test_robots_read_the_map_of_a_place_but_not_the_scans_of_another_robot(site: Site):
+    hall = OccupancyGrid(1, 1, "map", 0.5, 1, 1, to_block([0, 0, 0, 0, 0, 0, 1]), b"\x64")
+    front = LaserScan(1, 0, 1, "laser", 0.0, 0.1, 0, 0, 0.0, 1.0, b"")
+    received: list[bytes] = []
+    keys_of = {"map": "zstate/r2/map/hall", "scan": "zstate/r2/scan/front", "own": "zstate/r1/scan/front"}
+    with ExitStack() as opened:
+        place, robot = site.join("r2"), site.join("r1")
+        published = opened.enter_context(LatchedPublisher(place, keys_of["map"], ENCODINGS[OccupancyGrid]))
+        published.set(encode(hall))
+        opened.enter_context(
+            LatchedSubscriber(robot, "zstate/*/map/*", lambda one: received.append(one.payload))
+        )
+        until(lambda: received == [encode(hall)])
+        scans: list[str] = []
+        opened.enter_context(
+            StreamSubscriber(robot, "zstate/*/scan/*", lambda batch: scans.extend(one.key for one in batch))
+        )
+        foreign = opened.enter_context(StreamPublisher(place, keys_of["scan"], ENCODINGS[LaserScan]))
+        own = opened.enter_context(StreamPublisher(robot, keys_of["own"], ENCODINGS[LaserScan]))
+
+        def publish() -> None:
+            foreign.put(encode(front))
+            own.put(encode(front))
+
+        with repeated(publish):
+            until(lambda: scans.count(keys_of["own"]) > 10)
+        assert set(scans) == {keys_of["own"]}
 
 
 def test_late_viewer_receives_the_transforms_of_a_robot_and_one_writer_owns_an_edge(site: Site):

@@ -27,6 +27,7 @@ from zstate.net.security.credentials import check_identity
 from zstate.wire.keys import CLOCK_KEY, VERBATIM_CHUNKS, check_robot
 from zstate.wire.registry import ros_options
 from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.types import OCCUPANCY_GRID
 
 Rule = dict[str, object]
 
@@ -44,12 +45,12 @@ class AclRoles:
     """Roles of identities behind a router, by name: the common name of a certificate, or a user.
 
     A robot writes and reads its own keys; of other robots it reads their names, their static edges,
-    which it must not contradict, and the simulated time. A viewer reads everything and writes nothing; an
-    operator also commands joints; a timekeeper also writes the simulated time. A placer writes only static
-    edges under its own name, and reads those of the robots: it places their roots, as in
-    ``fleet/map -> r1/odom``; readers with ``placers=`` accept such edges from these only. A name may have
-    several roles. ``namespace`` is that of the sessions behind the router, if they have one. ``wires``:
-    "native", and "ros2" with its options, see ``_Ros2Rules``.
+    which it must not contradict, and their maps, as those of places; and it reads the simulated time. A
+    viewer reads everything and writes nothing; an operator also commands joints; a timekeeper also writes the
+    simulated time. A placer writes only static edges under its own name, and reads those of the robots: it
+    places their roots, as in ``fleet/map -> r1/odom``; readers with ``placers=`` accept such edges from these
+    only. A name may have several roles. ``namespace`` is that of the sessions behind the router, if they have
+    one. ``wires``: "native", and "ros2" with its options, see ``_Ros2Rules``.
     Raises InvalidInput for names that cannot be names of identities.
     """
 
@@ -112,8 +113,10 @@ Grants = Iterator[tuple[Sequence[str], Rule]]
 def _native_rules(roles: AclRoles) -> Grants:
     root = f"{roles.namespace}/zstate" if roles.namespace else "zstate"
     everything, clock = _below(root), root.removesuffix("zstate") + CLOCK_KEY
-    statics = f"{root}/*/tf_static/*"
-    shared = (statics, f"{statics}/@adv/**", f"{root}/*/{_EDGE}/**", f"{root}/*/{_WRITER}/**", clock)
+    latched = tuple(
+        f"{root}/*/{stream}/*{end}" for stream in ("tf_static", "map") for end in ("", "/@adv/**")
+    )
+    shared = (*latched, f"{root}/*/{_EDGE}/**", f"{root}/*/{_WRITER}/**", clock)
     for robot in dict.fromkeys(roles.robots):
         keys = _below(f"{root}/{check_robot(robot)}")
         yield (robot,), _ingress(f"{robot} writes", PUBLISH, keys)
@@ -145,8 +148,9 @@ class _Ros2Rules:
     """The rules in one ROS domain, where each robot has a namespace.
 
     A robot writes the topics of its namespace, serves its services, and announces only these in the graph;
-    global /tf and /tf_static belong to all robots. A viewer subscribes to all topics and calls no service;
-    an operator does. Raises InvalidInput for robots in one namespace.
+    global /tf and /tf_static belong to all robots, and all robots read the maps in other namespaces. A viewer
+    subscribes to all topics and calls no service; an operator does. Raises InvalidInput for robots in one
+    namespace.
     """
 
     def __init__(self, roles: AclRoles, options: Ros2Options) -> None:
@@ -169,6 +173,8 @@ class _Ros2Rules:
         everything = (topics, history, graph)
         clock = self._topic("clock")
         shared = tuple(key for name in self._global for key in self._topic(name))
+        maps = f"{self._domain}/**/{OCCUPANCY_GRID.dds}/*"
+        read = (*shared, *clock, maps, f"{maps}/@adv/**", graph)
         for robot in dict.fromkeys(roles.robots):
             namespace = self._options.robot_namespace(robot)
             keys = self._topic(namespace) if namespace else (topics, history)
@@ -177,8 +183,8 @@ class _Ros2Rules:
             yield (robot,), _ingress(self._id(f"{robot} reads"), SUBSCRIBE, keys)
             yield (robot,), _egress(self._id(f"{robot} is given"), PUBLISH, keys)
         yield roles.robots, _ingress(self._id("robots write"), PUBLISH, shared)
-        yield roles.robots, _ingress(self._id("robots read"), SUBSCRIBE, (*shared, *clock, graph))
-        yield roles.robots, _egress(self._id("robots are given"), PUBLISH, (*shared, *clock, graph))
+        yield roles.robots, _ingress(self._id("robots read"), SUBSCRIBE, read)
+        yield roles.robots, _egress(self._id("robots are given"), PUBLISH, read)
         # A query for all robots goes to each of them; a reply has the robot's own data only.
         yield roles.robots, _egress(self._id("robots are asked"), SUBSCRIBE, everything)
         viewers = (*(f"{self._graph}/*/*/*/{kind}/**" for kind in _READING), f"{self._domain}/**/@adv/sub/**")

@@ -23,16 +23,21 @@ from ros_messages import (
     time,
     transform_stamped,
 )
+from ros_messages import header as message_header
 
-from zstate.wire.messages import to_block
+from zstate.wire.joint_order import SampleLayout
+from zstate.wire.keys import Stream
+from zstate.wire.messages import LaserScan, Message, OccupancyGrid, to_block, to_float32_block
 from zstate.wire.ros2 import types
 from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string
-from zstate.wire.ros2.decoder import JointStateDecoder, TfMessageDecoder
-from zstate.wire.ros2.encoder import JointStateEncoder, TfMessageEncoder
+from zstate.wire.ros2.decoder import JointStateDecoder, RosDecoder, TfMessageDecoder
+from zstate.wire.ros2.encoder import JointStateEncoder, RosStreamEncoder, TfMessageEncoder
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.options import Ros2Options
 
 pytestmark = [pytest.mark.heavy, pytest.mark.processes]
 
-Piece = tuple[Literal["u32", "text", "f64"], Any]
+Piece = tuple[Literal["u32", "text", "f64", "f32", "i8"], Any]
 
 texts = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
 stamps = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
@@ -59,7 +64,7 @@ def mask(pieces: Sequence[Piece]) -> bytes:
     """1 for each defined byte of a payload, 0 for padding, which ROS leaves uninitialised."""
     out = bytearray(b"\1\1\1\1")
     for kind, value in pieces:
-        size = 8 if kind == "f64" else 4
+        size = {"f64": 8, "i8": 1}.get(kind, 4)
         out += bytes(-(len(out) - 4) % size)
         out += bytes([1]) * (4 + len(value.encode()) + 1 if kind == "text" else size)
     return bytes(out)
@@ -133,6 +138,59 @@ def test_transforms_are_the_same_bytes(kilted: Program, stamp: int, transforms: 
     assert genuine_message(kilted, TF_MESSAGE, ours) == message
     decoded = TfMessageDecoder().decode(genuine)
     assert (decoded.stamps, decoded.edges, decoded.poses) == ((stamp,) * len(edges), edges, poses)
+
+
+_TIMES = ("time_increment", "scan_time")
+SCAN_FIELDS = ("angle_min", "angle_max", "angle_increment", *_TIMES, "range_min", "range_max")
+PLAIN = FrameNames(Ros2Options(), "r1")
+
+frames = texts.filter(lambda text: text.strip("/") == text != "")
+floats = st.floats(width=32, allow_nan=False)
+
+
+def encoded(message: Message) -> bytes:
+    return RosStreamEncoder(PLAIN, SampleLayout()).encode(message)
+
+
+def decoded(stream: Stream, payload: bytes) -> Message:
+    (message,) = RosDecoder().messages(stream, payload, 77, 5, PLAIN)
+    return message
+
+
+@many
+@given(stamps.filter(bool), frames, st.lists(floats, max_size=6))
+def test_scans_are_the_same_bytes(kilted: Program, stamp: int, frame: str, ranges: list[float]):
+    # exact in float32: 1953125 ns and 31250000 ns are 2^-9 s and 2^-5 s
+    angle_max = -0.5 + 0.25 * max(0, len(ranges) - 1)
+    numbers = (-0.5, angle_max, 0.25, 2.0**-9, 2.0**-5, 0.125, 8.0)
+    geometry = dict(zip(SCAN_FIELDS, numbers, strict=True))
+    message = {"header": message_header(stamp, frame), **geometry, "ranges": ranges, "intensities": ranges}
+    genuine = genuine_bytes(kilted, types.LASER_SCAN.name, message)
+    block = to_float32_block(ranges)
+    times = (1_953_125, 31_250_000)
+    scan = LaserScan(stamp, 5, 77, frame, -0.5, 0.25, *times, 0.125, 8.0, block, block or None)
+    rays: list[Piece] = [("u32", 0), *[("f32", 0.0)] * len(ranges)]
+    assert_same(encoded(scan), genuine, mask([*header(frame), *[("f32", 0.0)] * 7, *rays, *rays]))
+    assert decoded("scan", genuine) == scan
+
+
+@many
+@given(stamps, frames, st.lists(st.integers(-1, 100), max_size=6))
+def test_grids_are_the_same_bytes(kilted: Program, stamp: int, frame: str, cells: list[int]):
+    pose = {
+        "position": dict(zip(XYZ, (1.0, 2.0, 3.0), strict=True)),
+        "orientation": dict(zip(XYZW, (0.0, 0.0, 0.0, 1.0), strict=True)),
+    }
+    size = {"width": len(cells), "height": 1}
+    info = {"map_load_time": time(stamp), "resolution": 0.25, **size, "origin": pose}
+    message = {"header": message_header(stamp, frame), "info": info, "data": cells}
+    genuine = genuine_bytes(kilted, types.OCCUPANCY_GRID.name, message)
+    origin, block = to_block([1, 2, 3, 0, 0, 0, 1]), np.array(cells, np.int8).tobytes()
+    grid = OccupancyGrid(77, stamp, frame, 0.25, len(cells), 1, origin, block)
+    pieces = [*header(frame), *[("u32", 0)] * 5, *[("f64", 0.0)] * 7, ("u32", 0), *[("i8", 0)] * len(cells)]
+    assert_same(encoded(grid), genuine, mask(pieces))
+    assert genuine_message(kilted, types.OCCUPANCY_GRID.name, encoded(grid)) == message
+    assert decoded("map", genuine) == grid
 
 
 @many
