@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
@@ -88,6 +89,19 @@ class Announcement:
         if found.identity != identity:
             raise InvalidInput(f"{shortened(identity)!r} is not the identity of a writer and a name")
         return found
+
+    @classmethod
+    def parse_all(cls, robot: str, streams: Sequence[Stream], identity: str) -> tuple[Announcement, ...]:
+        """The contents of one token for several ``streams``, of which the named ones have one name.
+
+        Raises InvalidInput as ``parse`` does.
+        """
+        named = next((stream for stream in streams if stream in NAMED_STREAMS), streams[0])
+        first = cls.parse(robot, named, identity)
+        names = (first.name if stream in NAMED_STREAMS else "" for stream in streams)
+        return tuple(
+            cls(robot, stream, first.writer, name) for stream, name in zip(streams, names, strict=True)
+        )
 
     def conflicts_with(self, other: Announcement) -> bool:
         """Whether the two are different writers of the same stream, of which only one may be active.
