@@ -96,11 +96,10 @@ class Announcement:
 
         Raises InvalidInput as ``parse`` does.
         """
-        named = next((stream for stream in streams if stream in NAMED_STREAMS), streams[0])
-        first = cls.parse(robot, named, identity)
-        names = (first.name if stream in NAMED_STREAMS else "" for stream in streams)
+        first = cls.parse(robot, max(streams, key=lambda stream: stream in NAMED_STREAMS), identity)
         return tuple(
-            cls(robot, stream, first.writer, name) for stream, name in zip(streams, names, strict=True)
+            cls(robot, stream, first.writer, first.name if stream in NAMED_STREAMS else "")
+            for stream in streams
         )
 
     def conflicts_with(self, other: Announcement) -> bool:
