@@ -261,7 +261,8 @@ class WriterWatch(Receiver[zenoh.Sample]):
         robots = (robot,) if isinstance(robot, str) else robot
         self._robot = robots[0] if len(robots) == 1 else ANY
         self._wire = get_wire(wire)
-        self._expressions = [self._wire.writers_expression(one) for one in robots]
+        # In ROS robots share one expression.
+        self._expressions = list(dict.fromkeys(self._wire.writers_expression(one) for one in robots))
         declare = partial(session.zenoh.liveliness().declare_subscriber, history=True)
         super().__init__(session, subscribe_to_all(self._expressions, CAPACITY, declare), CAPACITY)
 
