@@ -22,7 +22,7 @@ from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import edge_key
+from zstate.wire.keys import edge_key, writer_expression
 
 ROUTER = """
     import sys
@@ -80,7 +80,7 @@ def test_one_of_two_simultaneous_static_writers_of_a_frame_gets_second_writer(pa
             StaticPublisher(pair[1], "r2", "room", program="room") as room,
         ):
             for session in pair:
-                until(lambda s=session: len(current_tokens(s, "zstate/*/@writer/tf_static/*", 1.0)) == 2)
+                until(lambda s=session: len(current_tokens(s, writer_expression("*", "tf_static"), 1.0)) == 2)
             errors = run_together(
                 lambda mount=mount: mount.set(edge("fleet/base", 1.0)),
                 lambda room=room: room.set(edge("fleet/base", 2.0)),

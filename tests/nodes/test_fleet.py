@@ -9,7 +9,7 @@ from typing import Literal
 
 import pytest
 from helpers.link_meter import LinkMeter
-from helpers.processes import until
+from helpers.processes import repeated, until
 from helpers.robots import RRBOT
 
 from zstate import StatePublisher, TransformBuffer, TransformListener, connect
@@ -100,3 +100,15 @@ def test_listener_of_several_robots_has_no_more_threads_than_of_two(sessions: tu
             return threading.active_count() - before
 
     assert threads(20) == threads(2)
+
+
+def test_no_sample_is_lost_while_a_listener_joins_a_fleet(free_port: int):
+    with (
+        fleet(free_port, 150) as robots,
+        repeated(lambda: [robot.publish([0.1, 0.2]) for robot in robots]),
+        connect(mode="client", endpoints=f"tcp/127.0.0.1:{free_port}") as session,
+        TransformListener(session, history_on_join=False) as listener,
+    ):
+        pairs = [(f"{robot.robot}/world", f"{robot.robot}/base") for robot in robots]
+        until(lambda: all(listener.buffer.can_lookup(*pair) for pair in pairs))
+        assert (listener.stats.dropped, listener.stats.missed) == (0, 0)

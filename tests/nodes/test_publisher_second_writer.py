@@ -21,7 +21,7 @@ from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
 from zstate.transform import Transform
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import Stream, stream_key, writer_key
+from zstate.wire.keys import Stream, stream_key, writer_expression, writer_key
 from zstate.wire.messages import JointState, RobotDescription, order_digest
 from zstate.wire.native import ENCODINGS, encode
 
@@ -56,7 +56,7 @@ RIVAL = """
 
 
 def writers_seen(session: Session) -> int:
-    return len(current_tokens(session, "zstate/r1/@writer/joint_states/*", 1.0))
+    return len(current_tokens(session, writer_expression("r1", "joint_states"), 1.0))
 
 
 def edge(child: str) -> Transform:
@@ -146,7 +146,7 @@ def test_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_pu
         for _ in range(2):
             publisher.publish([0.0, 0.0])
         with announce(theirs, writer_key("r1", stream, stranger.identity)):
-            until(lambda: len(current_tokens(ours, f"zstate/r1/@writer/{stream}/*", 1.0)) == 2)
+            until(lambda: len(current_tokens(ours, writer_expression("r1", stream), 1.0)) == 2)
             looked_until = time.monotonic() + 0.3
             while time.monotonic() < looked_until:
                 publisher.publish([0.0, 0.0])
@@ -170,7 +170,7 @@ def test_streams_of_a_robot_may_have_separate_writers(sessions):
         StatePublisher(sessions[1], RRBOT, "r2"),
     ):
         for session in sessions:
-            until(lambda s=session: len(current_tokens(s, "zstate/*/@writer/*/*", 1.0)) == 9)
+            until(lambda s=session: len(current_tokens(s, "zstate/*/@writer/*/*", 1.0)) == 4)
         for publisher in (joints, rest):
             publisher.publish([0.0, 0.0])
         with pytest.raises(SecondWriter) as raised:
@@ -255,7 +255,7 @@ def test_takeover_of_an_edge_is_reported_to_listeners(sessions):
 
 def test_second_static_writer_of_one_name_is_refused(sessions):
     with StaticPublisher(sessions[0], "r1", "mount"):
-        until(lambda: current_tokens(sessions[1], "zstate/r1/@writer/tf_static/*", 1.0))
+        until(lambda: current_tokens(sessions[1], writer_expression("r1", "tf_static"), 1.0))
         with pytest.raises(SecondWriter, match="under the name 'mount'"):
             StaticPublisher(sessions[1], "r1", "mount")
         StaticPublisher(sessions[1], "r2", "mount").close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -212,6 +213,15 @@ def test_only_selected_robots_are_recorded_and_a_single_one_in_the_root(sessions
     assert {robot for robot, _ in two.stats.messages} == {"left", "right"}
     assert len(read(tmp_path / "one.mcap", "/joint_states")) == 1
     assert len(read(tmp_path / "two.mcap", "/left/joint_states")) == 1
+
+
+def test_recorder_of_several_robots_has_no_more_threads_than_of_two(sessions, tmp_path: Path):
+    def threads(count: int) -> int:
+        before = threading.active_count()
+        with Recorder(sessions[1], tmp_path / f"{count}.mcap", [f"r{number}" for number in range(count)]):
+            return threading.active_count() - before
+
+    assert threads(20) == threads(2)
 
 
 def test_samples_before_the_description_are_recorded_after_it(sessions, tmp_path: Path):

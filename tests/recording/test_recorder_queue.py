@@ -24,8 +24,8 @@ def test_several_subscriptions_share_one_queue_with_reception_times(sessions):
         LatchedPublisher(writer, "a/value", "") as value,
     ):
         value.set(b"holds")
-        inbox.subscribe("joint_states", "a/samples", "r1")
-        inbox.subscribe("robot_description", "a/*", None)
+        inbox.subscribe("joint_states", ["a/samples"], "r1")
+        inbox.subscribe("robot_description", ["a/*"], None)
         until(lambda: samples.has_readers)
         wait_for_reader(writer, "a/value")
         before = time.time_ns()
@@ -48,7 +48,7 @@ def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):
         StreamPublisher(writer, "a/samples", "") as samples,
         closing(SampleCollector(reader, "a/samples")) as tap,
     ):
-        inbox.subscribe("joint_states", "a/samples", "r1")
+        inbox.subscribe("joint_states", ["a/samples"], "r1")
         until(lambda: samples.has_readers)
         for number in range(sent):
             samples.put(b"%d" % number)
@@ -66,7 +66,7 @@ def test_close_is_fast_without_a_reader_and_keeps_waiting_batches(sessions):
     writer, reader = sessions
     inbox = MessageQueue(reader)
     with StreamPublisher(writer, "a/samples", "") as samples:
-        inbox.subscribe("joint_states", "a/samples", "r1")
+        inbox.subscribe("joint_states", ["a/samples"], "r1")
         until(lambda: samples.has_readers)
         for number in range(QUEUE_LENGTH + 2 * CAPACITY):
             samples.put(b"%d" % number)

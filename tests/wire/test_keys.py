@@ -23,7 +23,9 @@ CHUNK = st.one_of(
     NAME,
     NUMBER,
     IDENTITY,
-    st.sampled_from(["zstate", "@writer", "@reader", "@clock", "@edge", "tf", "tf_static", "joint_states"]),
+    st.sampled_from(
+        ["zstate", "@writer", "@reader", "@clock", "@edge", "tf", "tf_static", "joint_states", "tf,tf_static"]
+    ),
     st.sampled_from(["@ros2_lv", "MP", "MS", "NN", "::,10:,:,:,,", f"::,{'1' * 5000}:,:,:,,", ":1:0:0,10"]),
 )
 FORMS = st.sampled_from(
@@ -58,8 +60,7 @@ def test_foreign_keys_raise_only_invalid_input(key: str):
         with suppress(InvalidInput):
             parse(key)
     for wire in (NativeWire(), Ros2Wire(), Ros2DdsWire()):
-        announced = wire.parse_token(key, "*")
-        if announced is not None:
+        for announced in wire.parse_token(key, "*"):
             assert keys.check_robot(announced.robot) == announced.robot
             assert 0 <= announced.writer.since < 2**63
             assert 0 <= announced.writer.session < 2**64
@@ -67,11 +68,13 @@ def test_foreign_keys_raise_only_invalid_input(key: str):
 
 @given(TOKEN)
 def test_announced_writer_has_valid_keys_of_its_own(key: str):
-    announced = NativeWire().parse_token(key, "*")
-    if announced is not None:
-        again = keys.writer_key(announced.robot, announced.stream, announced.identity)
+    found = NativeWire().parse_token(key, "*")
+    if found:
+        identity = max((one.identity for one in found), key=len)
+        again = keys.writer_key(found[0].robot, [one.stream for one in found], identity)
         assert again == key
-        assert Announcement.parse(*keys.parse_writer_key(again)) == announced
+        assert Announcement.parse_all(*keys.parse_writer_key(again)) == found
+    for announced in found:
         clock = keys.clock_key(announced.robot, announced.writer.identity)
         assert keys.parse_clock_key(clock) == (announced.robot, announced.writer.identity)
 
@@ -107,6 +110,7 @@ def test_every_key_of_a_robot_lies_under_its_own_prefix():
     assert keys.stream_key("hall", "map", "map") == "zstate/hall/map/map"
     assert keys.lookup_key("panda") == "zstate/panda/lookup"
     assert keys.writer_key("panda", "tf", "x") == "zstate/panda/@writer/tf/x"
+    assert keys.writer_key("panda", ["tf", "joint_states"], "x") == "zstate/panda/@writer/joint_states,tf/x"
     assert keys.CLOCK_KEY == "zstate/clock"
 
 
@@ -125,11 +129,26 @@ def test_reader_key_is_outside_of_robots_and_names_robot_and_stream(robot: str):
     key = keys.reader_key(robot, "joint_states", "x")
     assert key.startswith("zstate/@reader/")
     assert "*" not in key
-    assert keys.parse_reader_key(key) == (robot, "joint_states", "x")
+    assert keys.parse_reader_key(key) == (robot, ("joint_states",), "x")
+
+
+@pytest.mark.parametrize("streams", ["tf,joint_states", "tf,tf", "tf,", ",", "tf, tf_static", "tf,songs"])
+def test_the_streams_of_a_token_have_one_canonical_form(streams: str):
+    for key in (f"zstate/r1/@writer/{streams}/x", f"zstate/@reader/r1/{streams}/x"):
+        parse = keys.parse_writer_key if "@writer" in key else keys.parse_reader_key
+        with pytest.raises(InvalidInput, match="in the order joint_states"):
+            parse(key)
+
+
+def test_tokens_are_found_by_each_of_their_streams():
+    both = zenoh.KeyExpr(keys.writer_key("r1", ["joint_states", "transforms"], "x"))
+    for streams in ("joint_states", "transforms"):
+        assert zenoh.KeyExpr(keys.writer_expression("r1", streams)).includes(both)
+    assert not zenoh.KeyExpr(keys.writer_expression("r1", "tf")).intersects(both)
 
 
 @pytest.mark.parametrize(
-    "key", ["zstate/panda/@writer/tf/x", "zstate/@reader/panda/songs/x", "zstate/@reader/panda/tf/x/y"]
+    "key", ["zstate/panda/@writer/tf/x", "zstate/@reader/panda/x", "zstate/@reader/panda/tf/x/y"]
 )
 def test_other_keys_are_not_parsed_as_readers(key: str):
     with pytest.raises(InvalidInput, match="@reader"):

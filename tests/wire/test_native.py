@@ -355,8 +355,24 @@ def test_native_token_announces_writer_and_stream():
     wire = NativeWire()
     encoder = encoder_of("tf")
     assert encoder.token is not None
-    assert wire.parse_token(encoder.token, "r1") == Announcement("r1", "tf", WRITER)
-    assert wire.parse_token("zstate/r1/@writer/tf/nonsense", "r1") is None
+    assert wire.parse_token(encoder.token, "r1") == (Announcement("r1", "tf", WRITER),)
+    assert wire.parse_token("zstate/r1/@writer/tf/nonsense", "r1") == ()
+
+
+def test_one_token_announces_all_streams_of_a_writer_and_the_name_of_its_static_edges():
+    streams: tuple[Stream, ...] = ("robot_description", "tf_static", "tf", "joint_states")
+    tokens = [token for stream in streams if (token := encoder_of(stream, "mount").token)]
+    (joined,) = NativeWire().joined_tokens(tokens)
+    assert joined == f"zstate/r1/@writer/joint_states,tf,tf_static,robot_description/{WRITER.identity},mount"
+    announced = {NativeWire().parse_token(token, "r1")[0] for token in tokens}
+    assert set(NativeWire().parse_token(joined, "r1")) == announced
+    assert {one.name for one in announced if one.stream == "tf_static"} == {"mount"}
+    assert NativeWire().joined_tokens([]) == []
+
+
+def test_streams_of_different_names_keep_tokens_of_their_own():
+    tokens = [token for name in ("mount", "camera") if (token := encoder_of("tf_static", name).token)]
+    assert NativeWire().joined_tokens(tokens) == tokens
 
 
 @pytest.mark.parametrize("rates", [None, b"", bytes(8)])

@@ -121,9 +121,11 @@ class BufferCore:
             if prefix and self._tree.robots.get(prefix) is not None:
                 text = f"there is a robot {prefix!r} in this buffer; remove_robot first"
                 raise InsertRefused(text, reason="second writer", edge=(prefix, model.root))
-            self._tree.add_frame(track.frame(model.root))
+            # One string for each frame, as the child of its edge and as the parent of others.
+            frames = {link: track.frame(link) for link in model.links}
+            self._tree.add_frame(frames[model.root])
             for index, form in enumerate(track.forms):
-                parent, child = track.edge(form)
+                parent, child = frames[form.parent], frames[form.child]
                 existing = self._tree.frames.get(child)
                 if existing is not None and existing.parent == parent:
                     raise second_writer(parent, child, existing, f"the model of {model.name!r}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass
 
@@ -102,7 +102,7 @@ class MissingSamples:
     """The missing sequence numbers of the current session; of more than 64 gaps the newest are kept."""
 
     def __init__(self) -> None:
-        self._ranges: deque[range] = deque([range(sys.maxsize)], maxlen=_MAX_GAPS)
+        self._ranges = [range(sys.maxsize)]
 
     def __bool__(self) -> bool:
         return bool(self._ranges)
@@ -115,11 +115,12 @@ class MissingSamples:
         if self._ranges and self._ranges[-1].stop == first:
             first = self._ranges.pop().start
         self._ranges.append(range(first, end))
+        del self._ranges[:-_MAX_GAPS]
 
     def stop_at(self, seq: int) -> None:
         """Remove the samples from ``seq`` on: they were received, or will be."""
         kept = [range(one.start, min(one.stop, seq)) for one in self._ranges]
-        self._ranges = deque([one for one in kept if one], maxlen=_MAX_GAPS)
+        self._ranges = [one for one in kept if one]
 
 
 class GapCounter:

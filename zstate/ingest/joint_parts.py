@@ -17,6 +17,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import count
 
 from zstate._util.bounded import BoundedDict
@@ -36,8 +37,9 @@ _MAX_SETS = 16
 """Sets of joints that one writer may publish; a driver publishes one."""
 
 
+@lru_cache(maxsize=16)
 def joint_order(model: RobotModel) -> JointOrder:
-    """Reader of the joint states of a robot with this model, or of the drivers of this part of one."""
+    """Reader of the joint states of robots with this model, or of the drivers of this part of one."""
     return JointOrder(model.joint_names, coordinate_names(model), velocity_columns_by_position(model))
 
 
@@ -65,6 +67,12 @@ class JointNames:
             text = ", ".join(map(repr, missing)) or f"any joint of {self._robot!r}"
             raise MessageError(f"a partial joint state without {text}", reason="missing joints")
         return found
+
+
+@lru_cache(maxsize=16)
+def shared_joint_names(model: RobotModel) -> JointNames:
+    """The names of ``model``; the robots of a fleet that have one model share them."""
+    return JointNames(model)
 
 
 @dataclass(eq=False, slots=True)
@@ -110,7 +118,7 @@ class RobotParts:
         with self._lock:
             order = joint_order(track.model)
             self._whole = JointPart(self._whole_session, track.model.joint_names, track, order)
-            self._joint_names = JointNames(track.model)
+            self._joint_names = shared_joint_names(track.model)
             self._parts.clear()
             self._by_order.clear()
 

@@ -15,12 +15,12 @@ from typing import NamedTuple, TypeAlias
 import zenoh
 
 from zstate._util.closeable import Closeable
-from zstate.errors import InvalidInput, MessageError
+from zstate.errors import MessageError
 from zstate.net.ownership import CHECK_PERIOD_S, Edge, frame_conflict, named_edges, seniority
 from zstate.net.session import Session
 from zstate.net.streams import CAPACITY, Ring, to_serialized
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import parse_writer_key, stream_key, writer_key
+from zstate.wire.keys import stream_key, writer_expression
 from zstate.wire.messages import SAMPLE_BYTES, TransformSample
 from zstate.wire.native import NativeWire
 
@@ -62,7 +62,7 @@ class EdgeMonitor(Closeable):
         """Watch these edges, which ``claim_edges`` owns now."""
         if self._tokens is None:
             self._tokens = self._session.zenoh.liveliness().declare_subscriber(
-                writer_key(self._writer.robot, "transforms", "*"),
+                writer_expression(self._writer.robot, "transforms"),
                 zenoh.handlers.RingChannel(CAPACITY),
                 history=True,
             )
@@ -86,8 +86,9 @@ class EdgeMonitor(Closeable):
                 self._stop_watching(rival)
 
     def _on_token(self, token: zenoh.Sample, now: float) -> None:
-        with suppress(InvalidInput):  # not a token of zstate
-            rival = Announcement.parse(*parse_writer_key(str(token.key_expr)))
+        for rival in _WIRE.parse_token(str(token.key_expr), self._writer.robot):
+            if rival.stream != "transforms":
+                continue
             is_older = seniority(rival) < seniority(self._writer) and bool(rival.name)
             if token.kind == zenoh.SampleKind.DELETE:
                 self._stop_watching(rival)

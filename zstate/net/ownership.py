@@ -212,8 +212,7 @@ class WriterClaim(Closeable):
         return self._rivals_in(confirmed_tokens(self._session, self._expression))
 
     def _rivals_in(self, tokens: Iterable[str]) -> list[Announcement]:
-        announced = (_WIRE.parse_token(token, ANY) for token in tokens)
-        return self._conflicting(one for one in announced if one is not None)
+        return self._conflicting(one for token in tokens for one in _WIRE.parse_token(token, ANY))
 
     def _conflicting(self, others: Iterable[Announcement]) -> list[Announcement]:
         return [one for one in others if any(one.conflicts_with(claimed) for claimed in self._claimed)]
@@ -342,9 +341,9 @@ def check_edges(
 def _announced(session: Session, writer: Announcement) -> Announcement:
     """The announcement of a writer of edges, of which only robot, name and session are known for certain."""
     for token in confirmed_tokens(session, _WIRE.writers_expression(writer.robot)):
-        known = _WIRE.parse_token(token, writer.robot)
-        if known and known.name == writer.name and known.writer.session == writer.writer.session:
-            return known
+        for known in _WIRE.parse_token(token, writer.robot):
+            if known.name == writer.name and known.writer.session == writer.writer.session:
+                return known
     return writer
 
 

@@ -119,8 +119,7 @@ def discover(session: Session, timeout_s: float = 1.0, *, wire: str = "native") 
     """
     format_ = get_wire(wire)
     tokens = discover_tokens(session, format_.writers_expression(ANY), timeout_s)
-    announced = (format_.parse_token(token, ANY) for token in tokens)
-    return by_robot({one for one in announced if one is not None})
+    return by_robot({one for token in tokens for one in format_.parse_token(token, ANY)})
 
 
 def discover_readers(session: Session, timeout_s: float = 1.0) -> tuple[Announcement, ...]:
@@ -131,7 +130,7 @@ def discover_readers(session: Session, timeout_s: float = 1.0) -> tuple[Announce
     found: set[Announcement] = set()
     for token in discover_tokens(session, READERS, timeout_s):
         with suppress(InvalidInput):
-            found.add(Announcement.parse(*parse_reader_key(token)))
+            found.update(Announcement.parse_all(*parse_reader_key(token)))
     return tuple(sorted(found, key=lambda one: (one.robot, one.stream, one.writer)))
 
 
@@ -253,14 +252,17 @@ class WriterWatch(Receiver[zenoh.Sample]):
     ) -> None:
         self.foreign = 0
         self.ignored = 0
-        self._known: dict[str, Announcement | None] = {}
+        self._known: dict[str, tuple[Announcement, ...]] = {}
+        self._tokens_of: Counter[Announcement] = Counter()
+        """A writer may announce a stream by more than one token."""
         self._callback = callback
         self._on_cut_off = on_cut_off
         self._routers = None if on_cut_off is None else RouterLossDetector(session)
         robots = (robot,) if isinstance(robot, str) else robot
         self._robot = robots[0] if len(robots) == 1 else ANY
         self._wire = get_wire(wire)
-        self._expressions = [self._wire.writers_expression(one) for one in robots]
+        # In ROS robots share one expression.
+        self._expressions = list(dict.fromkeys(self._wire.writers_expression(one) for one in robots))
         declare = partial(session.zenoh.liveliness().declare_subscriber, history=True)
         super().__init__(session, subscribe_to_all(self._expressions, CAPACITY, declare), CAPACITY)
 
@@ -287,13 +289,18 @@ class WriterWatch(Receiver[zenoh.Sample]):
         announced = self._wire.parse_token(token, self._robot) if alive else self._known.pop(token)
         if alive:
             self._known[token] = announced
-            self.foreign += announced is None
-        if announced is None:
-            return
-        if cut_off and not alive and self._on_cut_off is not None:
-            self._on_cut_off(announced)
+            self.foreign += not announced
+            changed = [one for one in announced if one not in self._tokens_of]
+            self._tokens_of.update(announced)
         else:
-            self._callback(announced, alive)
+            self._tokens_of.subtract(announced)
+            changed = [one for one in announced if not self._tokens_of[one]]
+            for one in changed:
+                del self._tokens_of[one]
+        if cut_off and not alive and self._on_cut_off is not None:
+            call_for_each(changed, self._on_cut_off)
+        else:
+            call_for_each(changed, lambda one: self._callback(one, alive))
 
     def close(self) -> None:
         super().close()  # first: its thread uses the detector

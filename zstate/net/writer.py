@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
-from contextlib import ExitStack, suppress
+from collections.abc import Generator, Iterable
+from contextlib import ExitStack, contextmanager, suppress
 from typing import TypeVar
 
 import zenoh
@@ -80,7 +80,12 @@ def write_all(writers: Iterable[SampleWriter | LatchedWriter], message: Message)
 
 
 class WireWriter(Closeable):
-    """One writer of ``robot`` on ``wire``: opens and announces its streams, and closes them together."""
+    """One writer of ``robot`` on ``wire``: opens and announces its streams, and closes them together.
+
+    Streams that open inside ``with writer.announced_together():`` are announced at its end, on the native
+    wire by one token; others are announced when they open. Both raise AccessDenied if the router drops the
+    token.
+    """
 
     def __init__(
         self,
@@ -96,16 +101,18 @@ class WireWriter(Closeable):
         self._node = WriterNode(robot, writer, session.zid, session.next_number(), names)
         self._is_permitted = wire.name == "ros2dds"  # the permissions of these are the bridges' own
         self._opened = ExitStack()
+        self._waiting: list[str] | None = None
+        """The tokens of streams that will be announced together."""
         token = wire.node_token(self._node)
         if token is not None:
             self._opened.enter_context(announce(session, token))
 
     def open_stream(self, stream: Stream, name: str = "") -> SampleWriter:
-        """Open and announce ``stream``; edges under ``name``. Raises AccessDenied if the router drops it."""
+        """Open and announce ``stream``; edges under ``name``."""
         return self._announced(SampleWriter(self._session, self._encoder(stream, name)))
 
     def open_latched(self, stream: Stream, name: str = "") -> LatchedWriter:
-        """Open and announce ``stream`` for a latched value; static edges under ``name``. Raises as above."""
+        """Open and announce ``stream`` for a latched value; static edges under ``name``."""
         return self._announced(LatchedWriter(self._session, self._encoder(stream, name)))
 
     def _encoder(self, stream: Stream, name: str = "") -> StreamEncoder:
@@ -114,13 +121,27 @@ class WireWriter(Closeable):
     def _announced(self, writer: W) -> W:
         self._opened.enter_context(writer)
         token = writer.encoder.token
-        if token is not None:
-            self._opened.enter_context(announce(self._session, token))
-            if not self._is_permitted:
-                # One check is enough: all streams of a robot have the same permissions.
-                check_may_write(self._session, self._node.robot, token)
-                self._is_permitted = True
+        if token is not None and self._waiting is not None:
+            self._waiting.append(token)
+        elif token is not None:
+            self._announce(token)
         return writer
+
+    @contextmanager
+    def announced_together(self) -> Generator[None]:
+        """Announce the streams that open in this block at its end."""
+        self._waiting = tokens = []
+        yield
+        self._waiting = None
+        for token in self._wire.joined_tokens(tokens):
+            self._announce(token)
+
+    def _announce(self, token: str) -> None:
+        self._opened.enter_context(announce(self._session, token))
+        if not self._is_permitted:
+            # One check is enough: all streams of a robot have the same permissions.
+            check_may_write(self._session, self._node.robot, token)
+            self._is_permitted = True
 
     def close(self) -> None:
         """Close all streams and withdraw their tokens. A second call does nothing."""

@@ -183,14 +183,15 @@ class StatePublisher(SamplePublisher):
                 for wire in wires
             ]
             for wire, wire_writer in zip(wires, wire_writers, strict=True):
-                if "robot_description" in streams:
-                    description = wire_writer.open_latched("robot_description", MODEL_WRITER)
-                    write_all([description], self.description())
-                if "tf_static" in streams:
-                    write_all([wire_writer.open_latched("tf_static", MODEL_WRITER)], self.statics())
-                for stream in _SAMPLED:
-                    if stream in streams:
-                        self._writers[wire, stream] = wire_writer.open_stream(stream)
+                with wire_writer.announced_together():
+                    if "robot_description" in streams:
+                        description = wire_writer.open_latched("robot_description", MODEL_WRITER)
+                        write_all([description], self.description())
+                    if "tf_static" in streams:
+                        write_all([wire_writer.open_latched("tf_static", MODEL_WRITER)], self.statics())
+                    for stream in _SAMPLED:
+                        if stream in streams:
+                            self._writers[wire, stream] = wire_writer.open_stream(stream)
             self._native = self._writers.get(("native", "joint_states"))
             joints = [one for (_, stream), one in self._writers.items() if stream == "joint_states"]
             self._ros_joints = [one for one in joints if one is not self._native]

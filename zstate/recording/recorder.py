@@ -80,9 +80,9 @@ class MessageQueue(Closeable):
         self._is_open = True
         self._opened = ExitStack()
 
-    def subscribe(self, stream: Stream, expression: str, robot: str | None) -> None:
+    def subscribe(self, stream: Stream, expressions: Sequence[str], robot: str | None) -> None:
         """Subscribe to a stream; an empty payload of a latched one is a withdrawn value."""
-        capacity = capacity_for((expression,))
+        capacity = capacity_for(expressions)
 
         def put(arrivals: list[SerializedSample]) -> None:
             batch = Batch(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity)
@@ -97,9 +97,9 @@ class MessageQueue(Closeable):
                     self._bytes += sum(len(arrival.payload) for arrival in arrivals)
 
         if stream in LATCHED:
-            subscriber = LatchedSubscriber(self._session, expression, lambda arrival: put([arrival]))
+            subscriber = LatchedSubscriber(self._session, expressions, lambda arrival: put([arrival]))
         else:
-            subscriber = StreamSubscriber(self._session, expression, put)
+            subscriber = StreamSubscriber(self._session, expressions, put)
         self._opened.enter_context(subscriber)
 
     def pop_all(self) -> list[Batch]:
@@ -182,8 +182,7 @@ class Recorder(Closeable):
         self._large = _LargeValues(self._write_arrival, self._counters)
         with ExitStack() as opening:
             self._queue = opening.enter_context(MessageQueue(session))
-            robot = self._selected[0] if len(self._selected) == 1 else ANY
-            opening.enter_context(WriterWatch(session, robot, self._on_writer, wire))
+            opening.enter_context(WriterWatch(session, self._selected or ANY, self._on_writer, wire))
             self._subscribe()
             for robot in self._selected or (ANY,):
                 for announcement in announce_reader(session, self._wire, robot, self._streams):
@@ -199,16 +198,15 @@ class Recorder(Closeable):
         self._thread.start()
 
     def _subscribe(self) -> None:
-        """Subscribe to every stream; if two robots share an expression, keys distinguish them."""
+        """Subscribe to every stream; keys distinguish several robots."""
+        robot = self._selected[0] if len(self._selected) == 1 else None
         for stream in self._streams:
-            robots: dict[str, set[str]] = {}
-            for robot in self._selected or (ANY,):
-                robots.setdefault(self._wire.expression(robot, stream), set()).add(robot)
-            for expression, named in robots.items():
-                robot = named.pop() if self._selected and len(named) == 1 else None
-                self._queue.subscribe(stream, expression, robot)
+            expressions = dict.fromkeys(
+                self._wire.expression(name, stream) for name in self._selected or (ANY,)
+            )
+            self._queue.subscribe(stream, tuple(expressions), robot)
         clock = self._wire.expression(self._selected[0] if self._selected else ANY, "clock")
-        self._queue.subscribe("clock", clock, SHARED)
+        self._queue.subscribe("clock", (clock,), SHARED)
 
     @property
     def stats(self) -> RecorderStats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
@@ -88,6 +89,18 @@ class Announcement:
         if found.identity != identity:
             raise InvalidInput(f"{shortened(identity)!r} is not the identity of a writer and a name")
         return found
+
+    @classmethod
+    def parse_all(cls, robot: str, streams: Sequence[Stream], identity: str) -> tuple[Announcement, ...]:
+        """The contents of one token for several ``streams``, of which the named ones have one name.
+
+        Raises InvalidInput as ``parse`` does.
+        """
+        first = cls.parse(robot, max(streams, key=lambda stream: stream in NAMED_STREAMS), identity)
+        return tuple(
+            cls(robot, stream, first.writer, first.name if stream in NAMED_STREAMS else "")
+            for stream in streams
+        )
 
     def conflicts_with(self, other: Announcement) -> bool:
         """Whether the two are different writers of the same stream, of which only one may be active.

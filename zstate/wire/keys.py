@@ -12,17 +12,18 @@
 ``zstate/<robot>/joint_commands``                 JointCommand, to a driver
 ``zstate/<robot>/lookup``                         a queryable
 ``zstate/<robot>/status/<id>``                    Status of one writer, once a second while read
-``zstate/<robot>/@writer/<stream>/<id>``          liveliness token of one writer
+``zstate/<robot>/@writer/<streams>/<id>``         liveliness token of one writer, with all its streams
 ``zstate/<robot>/@clock/<id>``                    a queryable: the time by that writer's clock
 ``zstate/<robot>/@edge/<child>/<parent>/<id>``    liveliness token of a writer that places a moving edge, or
                                                   is about to place a static one
-``zstate/@reader/<robot>/<stream>/<id>``          liveliness token of one reader
+``zstate/@reader/<robot>/<streams>/<id>``         liveliness token of one reader, likewise
 ``zstate/clock``                                  ClockMessage
 ================================================  ==========================================
 
-``<id>`` is the identity of a writer or reader, already one chunk. Functions that build a key raise
-InvalidInput for names that are not one chunk of a key, and functions that parse one for any other key.
-An expression for the robot ``"*"`` matches all robots.
+``<id>`` is the identity of a writer or reader, already one chunk; ``<streams>`` are joined by commas. A
+writer has one token for all, because what tokens cost a router grows with the square of their number.
+Functions that build a key raise InvalidInput for names that are not one chunk of a key, and functions that
+parse one for any other key. An expression for the robot ``"*"`` matches all robots.
 """
 
 from __future__ import annotations
@@ -166,31 +167,55 @@ def parse_status_key(key: str) -> tuple[str, str]:
     return check_robot(robot), identity
 
 
-def writer_key(robot: str, stream: Stream, identity: str) -> str:
-    """The liveliness token of one writer."""
-    return f"zstate/{check_robot(robot)}/@writer/{stream}/{identity}"
+def writer_key(robot: str, streams: Stream | Collection[Stream], identity: str) -> str:
+    """The liveliness token of one writer of ``streams``."""
+    return f"zstate/{check_robot(robot)}/@writer/{_joined(streams)}/{identity}"
 
 
-def writer_expression(robot: str) -> str:
-    """The key expression of all writer tokens of ``robot``."""
-    return f"zstate/{_check_robot_or_any(robot)}/@writer/*/*"
+def writer_expression(robot: str, stream: Stream | None = None) -> str:
+    """The key expression of all writer tokens of ``robot``, or of those with ``stream`` in their streams.
+
+    The tokens of streams whose names contain that of ``stream`` match, too.
+    """
+    streams = "*" if stream is None else f"$*{stream}$*"
+    return f"zstate/{_check_robot_or_any(robot)}/@writer/{streams}/*"
 
 
-def parse_writer_key(key: str) -> tuple[str, Stream, str]:
-    """Robot, stream and identity in a ``writer_key``."""
-    robot, stream, identity = _parse(key, "zstate/<robot>/@writer/<stream>/<identity>")
-    return check_robot(robot), _STREAMS[stream], identity
+def parse_writer_key(key: str) -> tuple[str, tuple[Stream, ...], str]:
+    """Robot, streams and identity in a ``writer_key``."""
+    robot, streams, identity = _parse(key, "zstate/<robot>/@writer/<streams>/<identity>")
+    return check_robot(robot), _split(streams), identity
 
 
-def reader_key(robot: str, stream: Stream, identity: str) -> str:
-    """The liveliness token of one reader; robot ``"*"`` means all. Readers write below no robot's prefix."""
-    return f"zstate/@reader/{quote(robot, safe='')}/{stream}/{identity}"
+def reader_key(robot: str, streams: Stream | Collection[Stream], identity: str) -> str:
+    """The liveliness token of one reader of ``streams``; robot ``"*"`` means all.
+
+    Readers write below no robot's prefix.
+    """
+    return f"zstate/@reader/{quote(robot, safe='')}/{_joined(streams)}/{identity}"
 
 
-def parse_reader_key(key: str) -> tuple[str, Stream, str]:
-    """Robot, stream and identity in a ``reader_key``."""
-    robot, stream, identity = _parse(key, "zstate/@reader/<robot>/<stream>/<identity>")
-    return _check_robot_or_any(unquote(robot)), _STREAMS[stream], identity
+def parse_reader_key(key: str) -> tuple[str, tuple[Stream, ...], str]:
+    """Robot, streams and identity in a ``reader_key``."""
+    robot, streams, identity = _parse(key, "zstate/@reader/<robot>/<streams>/<identity>")
+    return _check_robot_or_any(unquote(robot)), _split(streams), identity
+
+
+def _joined(streams: Stream | Collection[Stream]) -> str:
+    """``streams`` in one chunk, each once, in one canonical order."""
+    names = (streams,) if isinstance(streams, str) else streams
+    return ",".join(name for name in _STREAMS if name in names)
+
+
+def _split(chunk: str) -> tuple[Stream, ...]:
+    """The streams in a chunk. Raises InvalidInput unless they are in canonical form."""
+    names = chunk.split(",")
+    streams: tuple[Stream, ...] = tuple(_STREAMS[name] for name in _STREAMS if name in names)
+    # One canonical form: two tokens of one writer would count as two writers.
+    if not streams or ",".join(streams) != chunk:
+        order = ", ".join(_STREAMS)
+        raise InvalidInput(f"{shortened(chunk)!r} is not a list of streams, each once, in the order {order}")
+    return streams
 
 
 def clock_key(robot: str, identity: str) -> str:
@@ -245,7 +270,7 @@ def _parse(key: str, form: str) -> list[str]:
     if len(chunks) != len(names):
         raise _form_error(key, form)
     for name, chunk in zip(names, chunks, strict=True):
-        if chunk not in _STREAMS if name == "<stream>" else name[0] != "<" and name != chunk:
+        if name[0] != "<" and name != chunk:
             raise _form_error(key, form)
     return [chunk for name, chunk in zip(names, chunks, strict=True) if name[0] == "<"]
 

@@ -197,7 +197,7 @@ class NativeWire:
         self, robot: str, streams: Sequence[Stream], reader: WriterId, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         identity = replace(reader, session=number()).identity
-        return tuple(keys.reader_key(robot, stream, identity) for stream in streams)
+        return (keys.reader_key(robot, streams, identity),)
 
     def expression(self, robot: str, stream: Stream) -> str:
         return keys.stream_expression(robot, stream)
@@ -219,11 +219,20 @@ class NativeWire:
     def writers_expression(self, robot: str) -> str:
         return keys.writer_expression(robot)
 
-    def parse_token(self, token: str, robot: str) -> Announcement | None:
+    def joined_tokens(self, tokens: Sequence[str]) -> Sequence[str]:
+        announced = [one for token in tokens for one in self.parse_token(token, keys.ANY)]
+        names = {one.name for one in announced if one.name}
+        if not announced or len(names) > 1:  # a token has one name
+            return tokens
+        # With the name, if one has it.
+        identity = max((one.identity for one in announced), key=len)
+        return (keys.writer_key(announced[0].robot, [one.stream for one in announced], identity),)
+
+    def parse_token(self, token: str, robot: str) -> tuple[Announcement, ...]:
         try:
-            return Announcement.parse(*keys.parse_writer_key(token))
+            return Announcement.parse_all(*keys.parse_writer_key(token))
         except InvalidInput:
-            return None
+            return ()
 
 
 def _type_name(kind: type[Message]) -> str:

@@ -139,8 +139,12 @@ class Wire(Protocol):
         """The key expression of the tokens of all writers of ``robot``, or of all robots for ``"*"``."""
         ...
 
-    def parse_token(self, token: str, robot: str) -> Announcement | None:
-        """The writer and stream of a token under that expression; None for any other token."""
+    def joined_tokens(self, tokens: Sequence[str]) -> Sequence[str]:
+        """As few liveliness tokens as can announce the same streams of one writer as ``tokens``."""
+        ...
+
+    def parse_token(self, token: str, robot: str) -> tuple[Announcement, ...]:
+        """The writer with each of its streams in a token under that expression; empty for any other token."""
         ...
 
 

@@ -129,27 +129,30 @@ class Ros2Wire:
     def writers_expression(self, robot: str) -> str:
         return graph_expression(self.options.domain)
 
-    def parse_token(self, token: str, robot: str) -> Announcement | None:
+    def joined_tokens(self, tokens: Sequence[str]) -> Sequence[str]:
+        return tokens
+
+    def parse_token(self, token: str, robot: str) -> tuple[Announcement, ...]:
         parsed = parse_token(token)
         if not isinstance(parsed, EndpointToken) or parsed.kind != "MP":
-            return None
+            return ()
         writer = WriterId(parsed.full_name, host="", pid=0, since=0, session=session_from_gid(gid(token)))
         node = f"{parsed.zid}/{parsed.node.nid}"
         return self._announcement(parsed.topic, parsed.dds_type, robot, writer, node)
 
     def _announcement(
         self, topic: str, dds_type: str, robot: str, writer: WriterId, node: str = ""
-    ) -> Announcement | None:
+    ) -> tuple[Announcement, ...]:
         stream = topic_stream(topic, dds_type)
         if stream is None or stream == "clock":
-            return None
+            return ()
         named = robot_from_topic(topic) if robot == ANY else robot
         name = topic.rpartition("/")[2] if stream in NAMED_TOPICS else ""
         # a namespace or a name that ROS does not allow matches no topic
         with suppress(InvalidInput):
             if topic == self._keys.topic(named, stream, name):
-                return Announcement(named, stream, writer, name, node)
-        return None
+                return (Announcement(named, stream, writer, name, node),)
+        return ()
 
 
 class Ros2DdsWire(Ros2Wire):
@@ -183,9 +186,9 @@ class Ros2DdsWire(Ros2Wire):
     def writers_expression(self, robot: str) -> str:
         return DDS_GRAPH_EXPRESSION
 
-    def parse_token(self, token: str, robot: str) -> Announcement | None:
+    def parse_token(self, token: str, robot: str) -> tuple[Announcement, ...]:
         parsed = parse_dds_token(token)
         if parsed is None or parsed.kind != "MP":
-            return None
+            return ()
         writer = WriterId(f"ros2dds bridge {parsed.zid[:8]}", host="", pid=0, since=0, session=0)
         return self._announcement(f"/{parsed.topic}", parsed.dds_type, robot, writer)
