@@ -124,12 +124,11 @@ def test_a_publisher_of_scans_or_maps_is_announced_under_the_name_of_its_topic(s
     there = wire(namespace="*")
     encoder = there.stream_encoder(NODE, stream, 9, topic[0])
     assert encoder.token == endpoint(topic, "arm_driver", namespace="r1")
-    announced = there.parse_token(encoder.token, "*")
-    assert announced is not None
+    (announced,) = there.parse_token(encoder.token, "*")
     assert (announced.robot, announced.stream, announced.name) == ("r1", stream, topic[0])
     assert announced.writer.session == int.from_bytes(gid_of(encoder.token)[:8], "little")
     assert there.edge_writer_name(encoder.key) == topic[0]
-    assert there.parse_token(endpoint(topic, "arm_driver", namespace="r1"), "r2") is None
+    assert there.parse_token(endpoint(topic, "arm_driver", namespace="r1"), "r2") == ()
 
 
 @pytest.mark.parametrize(
