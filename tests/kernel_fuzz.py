@@ -111,6 +111,7 @@ class Fuzz:
             self.make_good_path,
             *(self.lookup,) * 6,
             *(self.lookup_many,) * 2,
+            *(self.place,) * 3,
             self.make_facts,
             self.edges,
             self.make_encoder,
@@ -283,6 +284,28 @@ class Fuzz:
                 self.pick(stamps, stamps, stamps[::2], self.array(count)), self.array(7 * count), valid
             )
 
+    def place(self) -> None:
+        for path in self.paths[-3:]:
+            count = self.pick(0, 1, 7, 40, 300)
+            stamps = self.pick(
+                np.sort(self.numbers.integers(-50, 1000, count)),
+                self.numbers.integers(-(2**63), 2**63 - 1, count),
+                np.full(count, 7),
+                np.arange(1),
+                self.array(count),
+            )
+            dtype = self.pick("f4", "f8", "f8")
+            wide = self.numbers.normal(size=(count, 7)).astype(dtype)
+            points = self.pick(wide[:, :3], wide[:, ::-2][:, :3], wide[::-1, 1:4], self.array(3 * count))
+            packed = np.frombuffer(bytes(13 * count + 12), "u1")[1:]
+            if self.random.random() < 0.2:
+                points = np.ndarray((count, 3), "f4", packed.data, 0, (13, 4))
+            out = self.pick(np.empty((count, 3), dtype), np.empty((count, 3), dtype), self.array(3 * count))
+            valid = self.pick(
+                np.empty(count, bool), np.empty(count, bool), bytearray(count + 1), b"x" * count
+            )
+            path.place(*self.pick((points, stamps, out, valid), (points, stamps, out, valid), ODD[:4], ()))
+
     def edges(self) -> None:
         width = self.pick(8, 14, 0, -1, *ODD)
         steps = tuple(self.step(1) for _ in range(self.random.randrange(6)))
@@ -379,11 +402,14 @@ def run_concurrently(kernel: Any, seconds: float) -> None:
     writer.start()
     deadline = time.monotonic() + seconds
     poses, valid = np.empty((5000, 7)), np.empty(5000, bool)
+    points, placed = np.zeros((5000, 3)), np.empty((5000, 3))
     while time.monotonic() < deadline:
         block, _, end = history.window
         newest = int(np.frombuffer(block, np.int64, block.capacity)[end - 1]) if end else 0
         path.poses(newest - np.arange(5000), poses, valid)
         assert (poses[valid, :3] == (1.0, 2.0, 3.0)).all()
+        path.place(points, np.arange(newest - 4999, newest + 1), placed, valid)
+        assert np.abs(placed[valid] - (1.0, 2.0, 3.0)).max(initial=0.0) < 1e-12
     stop.set()
     writer.join()
 

@@ -55,6 +55,11 @@ def doors(numbers: Callable[[Any], Any]) -> dict[str, tuple[Callable[[], object]
         "rpy": (lambda: Transform.from_rpy("a", "b", POSE7[:3], three), "rpy"),
         "matrix": (lambda: Transform.from_matrix("a", "b", numbers(np.eye(4).tolist())), "matrix"),
         "points": (lambda: Transform.from_pose7("a", "b", POSE7).apply(three), "points"),
+        "placed": (lambda: buffer.place(numbers([three]), 0, "tool", "world"), "points"),
+        "stamps of points": (
+            lambda: buffer.place([[1, 0, 0]] * 2, numbers([1.0, 2.0]), "tool", "world"),
+            "stamps",
+        ),
         "stamps": (lambda: buffer.lookup_many("world", "tool", numbers([1.0, 2.0])), "stamps"),
     }
 
@@ -62,7 +67,7 @@ def doors(numbers: Callable[[Any], Any]) -> dict[str, tuple[Callable[[], object]
 @pytest.mark.parametrize("kind", NOT_REAL)
 def test_every_entry_point_refuses_values_that_are_not_real_numbers(kind: str) -> None:
     for door, (call, what) in doors(NOT_REAL[kind]).items():
-        if (kind, door) in (("dates", "stamps"), ("nothing", "velocities")):
+        if (kind, door) in (("dates", "stamps"), ("dates", "stamps of points"), ("nothing", "velocities")):
             continue  # which they may be
         with pytest.raises(InvalidInput) as caught:
             call()

@@ -113,6 +113,7 @@ SIGNATURES = {
     "TransformBuffer.lookup": ("(target, source, at=None, *, timeout_s=0.0, max_age_s=None, predict_s=0.0)"),
     "TransformBuffer.lookup_between": "(target, target_at, source, source_at, fixed)",
     "TransformBuffer.lookup_many": "(target, source, stamps)",
+    "TransformBuffer.place": "(points, stamps, source, target)",
     "TransformBuffer.plan": "(target, source)",
     "TransformBuffer.twist": "(frame, reference, at=None)",
     "TransformBuffer.can_lookup": "(target, source, at=None)",
@@ -130,6 +131,7 @@ SIGNATURES = {
     "Recording.joint_states": "(robot=None)",
     "Recording.joint_state_reader": "(robot=None, refuse=None)",
     "Recording.lookup_many": "(target, source, stamps)",
+    "Recording.place": "(points, stamps, source, target)",
     "Recording.close": "()",
     "TransformListener": (
         "(session, robot='*', buffer=None, wire='native', follow='joint_states', history_s=10.0, "

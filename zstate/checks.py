@@ -6,12 +6,15 @@ the mask of a masked array. A silent conversion of a pose is a wrong pose.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput
+
+Points: TypeAlias = NDArray[np.float32 | np.float64]
+"""Points as rows x y z [m]: (N, 3)."""
 
 _KINDS = {
     "b": "bool",
@@ -48,6 +51,10 @@ def real_numbers(values: ArrayLike, what: str) -> NDArray[np.float64]:
     Raises InvalidInput for ragged lists and for arrays of anything but integers and floats: complex numbers,
     bool, text, objects, and masked arrays.
     """
+    return np.asarray(_real_array(values, what), dtype=np.float64)
+
+
+def _real_array(values: ArrayLike, what: str) -> NDArray[Any]:
     try:
         array: NDArray[Any] = np.asarray(values)
     except (TypeError, ValueError) as error:
@@ -57,7 +64,39 @@ def real_numbers(values: ArrayLike, what: str) -> NDArray[np.float64]:
         raise InvalidInput(f"{what} must be real numbers, not {_KINDS.get(kind, str(array.dtype))}")
     if is_masked(values):
         raise InvalidInput(f"{what} must be a plain array; fill or leave out what this one masks")
-    return np.asarray(array, dtype=np.float64)
+    return array
+
+
+def check_points(points: ArrayLike) -> Points:
+    """Points as an array (N, 3), without a copy of one of float32 or float64; integers become float64.
+
+    Raises InvalidInput for other shapes and types, and masked arrays.
+    """
+    array = _real_array(points, "points")
+    if array.dtype.kind in "iu":
+        array = array.astype(np.float64)
+    if array.dtype.itemsize not in (4, 8):
+        raise InvalidInput(
+            f"points are float32 or float64, as is the result; got {array.dtype}: convert them with "
+            ".astype(np.float32)"
+        )
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InvalidInput(
+            f"points have shape (N, 3), a row x y z [m] for each; got {array.shape}. One point is [point]; "
+            "of more columns pass points[:, :3], of an image of points points.reshape(-1, 3)"
+        )
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def check_finite_points(points: Points) -> None:
+    """Raises InvalidInput if a number of ``points`` (N, 3) is NaN or infinite."""
+    unknown = ~np.isfinite(points).all(axis=1)
+    if unknown.any():
+        first = int(unknown.argmax())
+        raise InvalidInput(
+            f"{unknown.sum()} of {len(points)} points are not finite, first row {first}: "
+            f"{points[first].tolist()}; leave them out, with their stamps, by np.isfinite(points).all(axis=1)"
+        )
 
 
 def is_masked(values: object) -> bool:

@@ -159,6 +159,21 @@ def check_stamps(stamps: ArrayLike) -> NDArray[np.int64]:
     return array.astype(np.int64)
 
 
+def check_stamps_of_points(stamps: ArrayLike, count: int) -> NDArray[np.int64]:
+    """The stamps of ``count`` points: (1,) of one stamp for all of them, else (count,).
+
+    Raises InvalidInput as ``check_stamps``, and for another number of stamps.
+    """
+    if isinstance(stamps, (int, float, np.generic)):
+        return np.array([check_stamp(stamps)])
+    instants = check_stamps(stamps)
+    if len(instants) != count:
+        raise InvalidInput(
+            f"{count} points have {len(instants)} stamps; pass a stamp for each, or one as an int for all"
+        )
+    return instants
+
+
 def format_stamp(stamp: int) -> str:
     """A stamp as seconds with all nine digits."""
     seconds, nanoseconds = divmod(abs(stamp), 1_000_000_000)

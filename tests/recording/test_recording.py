@@ -101,6 +101,25 @@ def test_lookup_many_equals_that_of_a_full_buffer(tmp_path: Path, seed: int, mon
             assert np.array_equal(streamed_poses, poses, equal_nan=True)
 
 
+def test_points_are_placed_as_by_a_full_buffer(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("zstate.recording.recording._BATCH", 37)
+    wild(tmp_path / "r.mcap", 2)
+    dice = np.random.default_rng(2)
+    with Recording(tmp_path / "r.mcap") as recording:
+        buffer = recording.buffer()
+        newest = buffer.latest("world", "tool")
+        stamps = dice.integers(newest - S, newest + S // 10, 50)
+        points = dice.uniform(-5.0, 5.0, (50, 3)).astype(np.float32)
+        expected, known = buffer.place(points, stamps, source="tool", target="world")
+        placed, valid = recording.place(points, stamps, source="tool", target="world")
+        assert 5 < valid.sum() < 50
+        assert np.array_equal(valid, known)
+        assert np.array_equal(placed, expected, equal_nan=True)
+        placed, valid = recording.place(points, newest, source="tool", target="world")
+        assert valid.all()
+        assert np.array_equal(placed, buffer.place(points, newest, source="tool", target="world")[0])
+
+
 def test_lookup_many_of_no_stamps_is_empty(tmp_path: Path):
     wild(tmp_path / "r.mcap", 1)
     with Recording(tmp_path / "r.mcap") as recording:
@@ -120,6 +139,10 @@ def test_unknown_and_disconnected_frames_raise(tmp_path: Path):
             recording.lookup_many("world", "cup", [START])
         with pytest.raises(InvalidInput, match="integer"):
             recording.lookup_many("world", "tool", [0.5])
+        with pytest.raises(UnknownFrame, match="tol"):
+            recording.place([[0, 0, 0]], START, source="tol", target="world")
+        with pytest.raises(InvalidInput, match="1 points have 2 stamps"):
+            recording.place([[0, 0, 0]], [START, START], source="tool", target="world")
 
 
 def test_edges_refused_live_are_refused_from_a_recording(tmp_path: Path):

@@ -100,13 +100,14 @@ def two_clocks() -> TransformBuffer:
         lambda b: b.lookup("r1/tool", "r2/tool"),
         lambda b: b.lookup("r1/tool", "r2/tool", NOW),
         lambda b: b.lookup_many("r1/tool", "r2/tool", [NOW]),
+        lambda b: b.place([[0, 0, 0]], NOW, "r2/tool", "r1/tool"),
         lambda b: b.lookup_between("r1/tool", NOW, "r2/tool", 5 * SECOND, "r1/world"),
         lambda b: b.twist("r1/tool", "r2/tool"),
         lambda b: b.plan("r1/tool", "r2/tool"),
         lambda b: b.latest("r1/tool", "r2/tool"),
         lambda b: b.wait("r1/tool", "r2/tool", timeout_s=0.01),
     ],
-    ids=["newest", "lookup", "lookup_many", "lookup_between", "twist", "plan", "latest", "wait"],
+    ids=["newest", "lookup", "lookup_many", "place", "lookup_between", "twist", "plan", "latest", "wait"],
 )
 def test_every_lookup_across_two_clocks_is_refused(ask):
     buffer = two_clocks()

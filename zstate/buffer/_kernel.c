@@ -34,13 +34,15 @@
 #include "_kernel/transform_fields.h"
 #include "_kernel/step.h"
 #include "_kernel/path.h"
+#include "_kernel/arc.h"
+#include "_kernel/place.h"
 #include "_kernel/edges.h"
 #include "_kernel/placements.h"
 #include "_kernel/joint_state.h"
 
 /* Raised with every change of the interface to Python, so that a library built from older source
  * (an editable install that was not rebuilt) is recognised and not used. */
-#define REVISION 10
+#define REVISION 11
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,

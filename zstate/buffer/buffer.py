@@ -21,8 +21,8 @@ from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader, TimeSpan
 from zstate.buffer.tracks import JointTrack, Track
 from zstate.buffer.waiting import MessageFilter, RequiredStamps, TransformWatch, Waiter, WakeCondition
-from zstate.checks import check_names
-from zstate.clock import Clock, check_stamp, check_stamps, wait_interruptible
+from zstate.checks import Points, check_finite_points, check_names, check_points
+from zstate.clock import Clock, check_stamp, check_stamps, check_stamps_of_points, wait_interruptible
 from zstate.errors import (
     AmbiguousFrame,
     ClockMismatch,
@@ -154,6 +154,27 @@ class TransformBuffer(BufferCore):
         AmbiguousFrame, Disconnected and ClockMismatch.
         """
         return self.path(target, source).poses(check_stamps(stamps))
+
+    def place(
+        self, points: ArrayLike, stamps: ArrayLike, source: str, target: str
+    ) -> tuple[Points, NDArray[np.bool_]]:
+        """Points of ``source``, each in ``target`` at its own stamp: (N, 3), and which are valid: (N,).
+
+        ``points`` are (N, 3) x y z [m], float32 or float64, as is the result. ``stamps`` [ns] are (N,) in any
+        order, or one for all. A scan of a moving lidar is placed without distortion::
+
+            points_in_odom, valid = buffer.place(points, stamps, source="laser", target="odom")
+
+        Rows without a transform are NaN; ``explain(target, source, int(stamps[valid.argmin()]))`` is the
+        reason of the first. Raises UnknownFrame, AmbiguousFrame, Disconnected and ClockMismatch, and
+        InvalidInput for other shapes and types, and points that are not finite.
+        """
+        path = self.path(target, source)
+        array = check_points(points)
+        placed, valid = path.place(array, check_stamps_of_points(stamps, len(array)))
+        if not valid.all():
+            check_finite_points(array)
+        return placed, valid
 
     def plan(self, target: str, source: str) -> Plan:
         """Compiled lookup of one pair of frames. Raises as ``lookup`` for unknown frames."""

@@ -36,6 +36,7 @@ from zstate.buffer.interpolation import (
     newest_bracket,
 )
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage
+from zstate.checks import Points
 from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InFuture, InPast, InvalidInput, LookupFailed, NoData, NotFinite, Stale
 from zstate.extension import kernel
@@ -181,6 +182,22 @@ class TransformPath:
         poses[valid] = found
         valid[valid] = ~np.isnan(found[:, 0])
         return poses, valid
+
+    def place(self, points: Points, stamps: Stamps) -> tuple[Points, NDArray[np.bool_]]:
+        """Points (N, 3) of the source in the target, by the pose at their own stamp, (N,), or (1,) of all.
+
+        Also (N,) which are known; the others are NaN.
+        """
+        instants, rows = np.unique(stamps, return_inverse=True)
+        found = self.poses(instants)[0][np.broadcast_to(rows, len(points))]
+        x, y, z, *rotation = se3.unstack(found)
+        px, py, pz = points.astype(np.float64).T
+        with np.errstate(over="ignore", invalid="ignore"):
+            dx, dy, dz = se3.rotate((*rotation,), (px, py, pz))
+            placed = np.stack((x + dx, y + dy, z + dz), axis=-1).astype(points.dtype)
+        valid = np.logical_and.reduce(np.isfinite(placed), axis=1)
+        placed[~valid] = np.nan
+        return placed, valid
 
     def stale(self, stamp: int | None, age_s: float, max_age_s: float) -> Stale:
         """The error for a transform that is too old, naming the edge that is most behind."""
@@ -337,6 +354,15 @@ class CompiledPath(TransformPath):
             # Its order of operations may overflow where that of the reference, which raises, does not.
             poses[~valid], valid[~valid] = super().poses(stamps[~valid])
         return poses, valid
+
+    def place(self, points: Points, stamps: Stamps) -> tuple[Points, NDArray[np.bool_]]:
+        placed, valid = np.empty_like(points, order="C"), np.empty(len(points), np.bool_)
+        self._compiled.place(points, stamps, placed, valid)
+        if not valid.all():  # as in poses
+            rest = ~valid
+            their_stamps = stamps if len(stamps) == 1 else stamps[rest]
+            placed[rest], valid[rest] = super().place(points[rest], their_stamps)
+        return placed, valid
 
 
 def compile_path(

@@ -29,7 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
-from zstate.clock import check_stamps
+from zstate.checks import Points, check_points
+from zstate.clock import check_stamps, check_stamps_of_points
 from zstate.errors import InvalidInput
 from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
@@ -181,6 +182,16 @@ class Recording(Closeable):
         Raises UnknownFrame, AmbiguousFrame and Disconnected.
         """
         return self.buffer(stamps).lookup_many(target, source, stamps)
+
+    def place(
+        self, points: ArrayLike, stamps: ArrayLike, source: str, target: str
+    ) -> tuple[Points, NDArray[np.bool_]]:
+        """``buffer(around=stamps).place``: each point in ``target``, (N, 3), and which are valid, (N,).
+
+        Raises UnknownFrame, AmbiguousFrame and Disconnected, and InvalidInput as the buffer does.
+        """
+        instants = check_stamps_of_points(stamps, len(check_points(points)))
+        return self.buffer(instants).place(points, stamps, source, target)
 
     def close(self) -> None:
         """Close the file. A second call does nothing."""

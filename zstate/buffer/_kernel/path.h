@@ -18,6 +18,7 @@ typedef struct {
     const Block *block;
     Py_ssize_t first;
     Py_ssize_t end;
+    Py_ssize_t near; /* of a batch: the sample at or after its last instant */
 } Window;
 
 /* A path over more tracks than this needs memory from the heap in its calls. */
@@ -33,15 +34,15 @@ static inline Window
 window_of(const Path *self, Py_ssize_t index)
 {
     const History *history = (History *)PyTuple_GET_ITEM(self->histories, index);
-    return (Window){history->block, history->first, history->end};
+    return (Window){history->block, history->first, history->end, history->first};
 }
 
-/* False if the window does not cover the instant. */
+/* The rows around an instant; `after` is the first sample not before it. False if the window does
+ * not cover the instant. */
 static inline bool
-rows_around(const Window *window, int64_t at, Bracket *now)
+rows_around(const Window *window, Py_ssize_t after, int64_t at, Bracket *now)
 {
     const Block *block = window->block;
-    Py_ssize_t after = index_not_before(block, window->first, window->end, at);
     if (after == window->end)
         return false;
     now->b = block->rows + (size_t)after * (size_t)block->width;
@@ -100,7 +101,8 @@ transform_at(const Path *self, int64_t at, PyObject *stamp, Bracket *nows)
     PyObject *kind = kind_exact;
     for (Py_ssize_t i = 0; i < track_count(self); i++) {
         Window window = window_of(self, i);
-        if (!rows_around(&window, at, &nows[i]))
+        Py_ssize_t after = index_not_before(window.block, window.first, window.end, at);
+        if (!rows_around(&window, after, at, &nows[i]))
             Py_RETURN_NONE;
         if (nows[i].a != nows[i].b)
             kind = kind_interpolated;
@@ -251,14 +253,33 @@ batch_begin(const Path *self, Batch *batch)
     return 0;
 }
 
+/* As index_not_before, for an instant that the window covers. Stamps in order advance from sample
+ * to sample; others search only the side of the last instant that they are on. */
+static inline Py_ssize_t
+index_from_near(const Window *window, int64_t at)
+{
+    const int64_t *stamps = window->block->stamps;
+    Py_ssize_t near = window->near;
+    if (stamps[near] < at) {
+        near++;
+        return stamps[near] >= at ? near : index_not_before(window->block, near, window->end, at);
+    }
+    if (near == window->first || stamps[near - 1] < at)
+        return near;
+    return index_not_before(window->block, window->first, near, at);
+}
+
 static bool
 batch_pose(const Path *self, const Batch *batch, int64_t at, Pose *pose)
 {
     if (at < batch->oldest || at > batch->newest)
         return false;
-    for (Py_ssize_t i = 0; i < batch->tracks; i++)
-        if (!rows_around(&batch->windows[i], at, &batch->nows[i]))
+    for (Py_ssize_t i = 0; i < batch->tracks; i++) {
+        Window *window = &batch->windows[i];
+        window->near = index_from_near(window, at);
+        if (!rows_around(window, window->near, at, &batch->nows[i]))
             return false;
+    }
     Pose found = pose_at(self, batch->nows);
     if (batch->tracks != 0)
         found = normalized(found);
@@ -318,6 +339,9 @@ path_poses(Path *self, PyObject *const *args, Py_ssize_t count)
     PyBuffer_Release(&stamps);
     return done;
 }
+
+/* In place.h. */
+static PyObject *path_place(Path *self, PyObject *const *args, Py_ssize_t count);
 
 static int
 path_read_steps(Path *self, PyObject *to_target, PyObject *to_source, const Py_ssize_t *widths)
@@ -416,6 +440,9 @@ static PyMethodDef path_methods[] = {
      "none."},
     {"poses", (PyCFunction)(void (*)(void))path_poses, METH_FASTCALL,
      "poses(stamps, out, valid): many at once; NaN and False where there is no transform."},
+    {"place", (PyCFunction)(void (*)(void))path_place, METH_FASTCALL,
+     "place(points, stamps, out, valid): points moved by the poses at their stamps; NaN and False "
+     "where there is none."},
     {NULL},
 };
 

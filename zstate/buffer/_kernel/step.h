@@ -44,12 +44,18 @@ interpolate_linear(double a, double b, double ratio)
 /* Angles within [-pi, pi] more than half a turn apart are of a wrapped encoder, and take the short
  * way: the same rule as AngleInterpolator in interpolation.py. */
 static inline double
-interpolate_angle(double a, double b, double ratio)
+angle_difference(double a, double b)
 {
     double difference = b - a;
     if (fabs(difference) > PI && fabs(a) <= PI && fabs(b) <= PI)
-        difference = difference > 0.0 ? difference - TAU : difference + TAU;
-    return a + ratio * difference;
+        return difference > 0.0 ? difference - TAU : difference + TAU;
+    return difference;
+}
+
+static inline double
+interpolate_angle(double a, double b, double ratio)
+{
+    return a + ratio * angle_difference(a, b);
 }
 
 /* scale * joint + shift */
