@@ -59,6 +59,7 @@ def test_every_python_block_is_a_program_tested_here() -> None:
         "gripper.py",
         "odometry.py",
         "buffer.py",
+        "place.py",
         "recording.py",
         "joints.py",
     }
@@ -103,6 +104,12 @@ def test_buffer_works_without_a_network(spawn: Callable[..., Child]) -> None:
     buffer = spawn(PROGRAMS["buffer.py"])
     assert "500.0 ms after the newest sample of 'map' -> 'base'" in buffer.line()
     assert buffer.wait() == 0, buffer.stderr
+
+
+def test_scan_is_placed_and_its_end_explained(spawn: Callable[..., Child]) -> None:
+    place = spawn(PROGRAMS["place.py"])
+    assert "after the newest sample of 'odom' -> 'base'" in place.line()
+    assert place.wait() == 0, place.stderr
 
 
 @pytest.mark.robots

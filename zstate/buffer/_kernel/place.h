@@ -21,7 +21,8 @@ get_points(PyObject *object, Py_buffer *view, Points *points)
     bool is_single = strcmp(format, "f") == 0 && view->itemsize == sizeof(float);
     bool is_double = strcmp(format, "d") == 0 && view->itemsize == sizeof(double);
     if ((is_single || is_double) && view->ndim == 2 && view->shape[1] == 3) {
-        *points = (Points){view->buf, view->strides[0], view->strides[1], view->shape[0], is_single};
+        *points =
+            (Points){view->buf, view->strides[0], view->strides[1], view->shape[0], is_single};
         return 0;
     }
     PyErr_Format(PyExc_ValueError, "points are (N, 3) of format f or d; got %d dimensions of '%s'",
@@ -267,8 +268,11 @@ place_into(const Path *self, const Points *points, const Py_buffer *stamps, cons
                                           "their format in out and a byte in valid");
         return NULL;
     }
-    Placing placing = {
-        .path = self, .points = points, .stamps = stamps->buf, .out = out->buf, .valid = valid->buf};
+    Placing placing = {.path = self,
+                       .points = points,
+                       .stamps = stamps->buf,
+                       .out = out->buf,
+                       .valid = valid->buf};
     if (batch_begin(self, &placing.batch) < 0)
         return NULL;
     bool has_memory = placing_begin(&placing, count_of(stamps) == 1 || placing.batch.tracks == 0);
