@@ -158,7 +158,7 @@ class TransformListener(Closeable):
             self.buffer,
             self._counters,
             is_shared=bool(self._wire.shared),
-            placers=placers,
+            placers=None if placers is None else frozenset(map(check_robot, placers)),
             on_conflict=self._events.add_second_edge,
         )
         self._names = self._ownership.live
@@ -507,7 +507,7 @@ def _robot_names(robot: str | Sequence[str], wire: Wire) -> tuple[str, ...]:
     """``robot`` as a tuple of names. Raises InvalidInput unless a sequence has different valid names."""
     if isinstance(robot, str):
         return (robot,)
-    names = tuple(robot)
+    names = tuple(robot) if isinstance(robot, Sequence) else (check_robot(robot),)
     if not names:
         raise InvalidInput("robot is an empty sequence; name the robots, or give '*' for all")
     if ANY in names:
