@@ -221,7 +221,9 @@ def test_invalid_follow_and_placers_are_refused(sessions):
         TransformListener(sessions[0], "a/b")
     with pytest.raises(InvalidInput, match="history_s"):
         TransformListener(sessions[0], "r1", history_s=0.0)
-    with pytest.raises(InvalidInput, match=r"placers is a collection of robot names, for instance \['site'\]"):
+    with pytest.raises(
+        InvalidInput, match=r"placers is a collection of robot names, for instance \['site'\]"
+    ):
         TransformListener(sessions[0], "r1", placers="site")
     with pytest.raises(InvalidInput, match="robot name is text; got None"):
         TransformListener(sessions[0], "r1", placers=["site", None])

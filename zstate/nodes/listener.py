@@ -507,7 +507,9 @@ def _robot_names(robot: str | Sequence[str], wire: Wire) -> tuple[str, ...]:
     """``robot`` as a tuple of names. Raises InvalidInput unless a sequence has different valid names."""
     if isinstance(robot, str):
         return (robot,)
-    names = tuple(robot) if isinstance(robot, Sequence) else (check_robot(robot),)
+    if robot is None:  # pyright: ignore[reportUnnecessaryComparison]  # e.g. of a missing variable
+        check_robot(robot)
+    names = tuple(robot)
     if not names:
         raise InvalidInput("robot is an empty sequence; name the robots, or give '*' for all")
     if ANY in names:

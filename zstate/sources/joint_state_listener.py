@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, suppress
 
 from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe
 from zstate._util.refusals import Refusals
 from zstate.clock import LONGEST_WAIT_S
 from zstate.errors import InvalidInput, MessageError, ModelError
@@ -49,6 +50,9 @@ class JointStateListener(Closeable):
     Numbers are in the order of ``model.joint_names``. The default model is the one in the robot's
     description; samples that arrive before it are kept. ``refused`` counts unusable samples by reason; the
     first of each reason is also logged. A context manager.
+
+    Nothing is received in a forked process: there iterations and ``read`` return the unread samples, then
+    raise Closed.
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class JointStateListener(Closeable):
         if not (math.isfinite(max_age_s) and max_age_s > 0.0):
             raise InvalidInput(f"max_age_s is a positive number of seconds, not {max_age_s!r}")
         self.robot = robot
+        self._session = session
         self._refusals = Refusals("joint_states")
         self.refused: dict[str, int] = self._refusals.counts
         self._model = model
@@ -75,7 +80,7 @@ class JointStateListener(Closeable):
         self._explained: set[tuple[str, ...]] = set()
         self._undescribed: deque[Received] = deque(maxlen=_CAPACITY)
         self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
-        self._changed = threading.Condition()
+        self._changed = fork_safe(threading.Condition())
         self._waiting_tasks: list[Callable[[], object]] = []
         self._closed = False
         self._on_reading = on_reading
@@ -164,15 +169,25 @@ class JointStateListener(Closeable):
         self._waiting_tasks.clear()
 
     def read(self, stamp: int) -> JointReading | None:
-        """The newest reading, independent of ``stamp``; None if none arrived since the last call."""
+        """The newest reading, independent of ``stamp``; None if none arrived since the last call.
+
+        Raises Closed.
+        """
         with self._changed:
+            self._check_reception()
             newest = self._readings[-1] if self._readings else None
             self._readings.clear()
         return newest
 
+    def _check_reception(self) -> None:
+        """Raise Closed if no sample is unread, and none can arrive, although this listener is open."""
+        if not (self._readings or self._closed):
+            self._session.check()
+
     def __iter__(self) -> Iterator[JointReading]:
         while True:
             with self._changed:
+                self._check_reception()
                 if not self._changed.wait_for(lambda: self._readings or self._closed, LONGEST_WAIT_S):
                     continue
                 if not self._readings:
@@ -193,6 +208,7 @@ class JointStateListener(Closeable):
                     loop.call_soon_threadsafe(arrived.set)
 
             with self._changed:
+                self._check_reception()
                 reading = self._readings.popleft() if self._readings else None
                 if reading is None:
                     if self._closed:
