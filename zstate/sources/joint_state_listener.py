@@ -9,11 +9,13 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, suppress
 
+from zstate._util.bounded import BoundedQueue
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
 from zstate._util.refusals import Refusals
 from zstate.clock import LONGEST_WAIT_S
 from zstate.errors import InvalidInput, MessageError, ModelError
+from zstate.ingest.base import EARLY_BYTES
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import announce_reader
@@ -22,7 +24,7 @@ from zstate.net.subscription import Received, subscribe
 from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.sources.joint_state_merger import JointStateMerger
 from zstate.wire.keys import Stream
-from zstate.wire.messages import JointState, RobotDescription
+from zstate.wire.messages import JointState, RobotDescription, message_size
 from zstate.wire.registry import get_wire
 
 _LOG = logging.getLogger("zstate")
@@ -78,7 +80,7 @@ class JointStateListener(Closeable):
         self._validator: JointStateValidator | None = None
         self._merger: JointStateMerger | None = None
         self._explained: set[tuple[str, ...]] = set()
-        self._undescribed: deque[Received] = deque(maxlen=_CAPACITY)
+        self._undescribed: BoundedQueue[Received] = BoundedQueue(_CAPACITY, EARLY_BYTES)
         self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
         self._changed = fork_safe(threading.Condition())
         self._waiting_tasks: list[Callable[[], object]] = []
@@ -129,7 +131,8 @@ class JointStateListener(Closeable):
     def _add(self, received: list[Received]) -> None:
         with self._changed:
             if self._validator is None:
-                self._undescribed.extend(received)
+                for one in received:
+                    self._undescribed.append(one, message_size(one.message))
                 return
             readings = [reading for one in received if (reading := self._reading(one))]
             self._readings.extend(readings)
