@@ -179,6 +179,8 @@ def test_sequence_of_one_robot_is_that_robot(sessions):
         (["r1", "r2", "r1"], "native", "has 'r1' more than once"),
         (["r1", "a/b"], "native", "'a/b' contains '/'"),
         (["r1", ""], "native", "is empty"),
+        (["r1", None], "native", "robot name is text; got None"),
+        (None, "native", "robot name is text; got None"),
         (["r1", "r2"], "ros2", "share topics"),
     ],
 )
@@ -219,6 +221,14 @@ def test_invalid_follow_and_placers_are_refused(sessions):
         TransformListener(sessions[0], "a/b")
     with pytest.raises(InvalidInput, match="history_s"):
         TransformListener(sessions[0], "r1", history_s=0.0)
+    with pytest.raises(
+        InvalidInput, match=r"placers is a collection of robot names, for instance \['site'\]"
+    ):
+        TransformListener(sessions[0], "r1", placers="site")
+    with pytest.raises(InvalidInput, match="robot name is text; got None"):
+        TransformListener(sessions[0], "r1", placers=["site", None])
+    with pytest.raises(InvalidInput, match="robot name 'a/b'"):
+        TransformListener(sessions[0], "r1", placers=["a/b"])
 
 
 def test_close_is_fast_ends_reception_and_may_be_repeated(sessions):

@@ -93,7 +93,7 @@ def test_joint_without_a_driver_has_no_data(sessions):
         TransformListener(second, "r1") as listener,
     ):
         lower.publish([0.5])
-        until(lambda: listener.stats.received + listener.stats.recalled == 1)
+        listener.buffer.wait("base", "upper", timeout_s=SOON_S)  # received live, or as history
         with pytest.raises(NoData):
             listener.buffer.lookup("world", RRBOT.links[-1])
 

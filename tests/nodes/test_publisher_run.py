@@ -8,7 +8,8 @@ from helpers.processes import SteppingClock
 from helpers.robots import RRBOT, STAMP, SampleCollector, wait_for_reader
 
 from zstate.clock import SystemClock
-from zstate.errors import InvalidInput
+from zstate.errors import Closed, InvalidInput
+from zstate.net.session import connect
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource
 
@@ -69,3 +70,11 @@ def test_close_from_another_thread_ends_run(sessions):
     runner.join(1.0)
     assert not runner.is_alive()
     assert reports[0].ticks <= 1
+
+
+def test_run_raises_closed_when_its_session_is_closed():
+    with connect() as session, StatePublisher(session, RRBOT) as publisher:
+        source = ScriptedSource()
+        source.read = lambda stamp: session.close() or JointReading(np.zeros(2))
+        with pytest.raises(Closed, match="session is closed"):
+            publisher.run(source, 100.0, seconds=1.0)

@@ -430,6 +430,7 @@ def test_samples_lost_in_a_full_ring_are_counted_and_the_others_inserted(
             step = next(steps)
             odometry.publish([pose("odom", "base_link", float(step))], stamp + step * MS)
 
+        wait_for_reader(writer, "zstate/r1/transforms/odometry")
         move()
         assert is_inserting.wait(SOON_S)  # samples before the first one received are not counted
         for _ in range(500):

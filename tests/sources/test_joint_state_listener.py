@@ -3,9 +3,11 @@ import logging
 import threading
 
 import pytest
+import zenoh
 from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, wait_for_reader
 
+from zstate.ingest.base import EARLY_BYTES
 from zstate.model.load import load_model
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
@@ -145,6 +147,30 @@ def test_unusable_samples_are_counted_and_logged_once_and_the_next_is_read(
         assert next(iter(source)).stamp == 7
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert reason in caplog.text
+
+
+def test_samples_that_wait_for_the_model_are_bounded_in_bytes(sessions):
+    writer, reader = sessions
+    size = 200_000
+    large = joint_state([0.0] * (size // 8))
+    with JointStateListener(reader, "r1") as source:
+        wait_for_reader(writer, KEY)
+        for payload in (*[large] * (2 * EARLY_BYTES // size), joint_state([1.0, 2.0])):
+            writer.zenoh.put(
+                KEY,
+                payload,
+                encoding=ENCODINGS[JointState],
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+
+        def last_is_waiting() -> bool:
+            with source._changed:
+                return any(len(one.message.positions) == 16 for one in source._undescribed)
+
+        until(last_is_waiting)
+        with StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]):
+            assert next(iter(source)).positions.tolist() == [1.0, 2.0]
+        assert 0 < source.refused["bad numbers"] <= EARLY_BYTES // size
 
 
 def test_a_floating_joint_without_a_unit_quaternion_is_refused_before_republishing(sessions):

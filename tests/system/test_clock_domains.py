@@ -204,13 +204,14 @@ def test_robot_may_change_its_clock(sessions):
         assert listener.stats.refused == {}
 
 
-def test_age_limit_of_another_clock_is_an_error_naming_both(sessions):
+@FOLLOW
+def test_age_limit_of_another_clock_is_an_error_naming_both(sessions, follow):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1", clock=simulated()) as virtual,
-        TransformListener(reader, "r1") as listener,
+        TransformListener(reader, "r1", follow=follow) as listener,
     ):
-        wait_for_stream_readers(writer, "r1")
+        wait_for_stream_readers(writer, "r1", follow)
         virtual.publish([0.5, 0.5])
         listener.buffer.wait("world", "tool", timeout_s=5.0)
         until(lambda: listener.buffer.domain.domain_of("r1") == "sim")

@@ -204,6 +204,14 @@ def test_a_robot_or_writer_name_that_is_not_one_chunk_is_refused_by_name(name: s
         assert "letters, digits" in str(caught.value)
 
 
+@pytest.mark.parametrize("name", [None, 5, b"panda", ["panda"], 0.0])
+def test_a_robot_or_writer_name_that_is_not_text_is_refused_with_its_type(name):
+    with pytest.raises(InvalidInput, match=f"robot name is text; got .* of type {type(name).__name__}"):
+        keys.stream_key(name, "tf")
+    with pytest.raises(InvalidInput, match=f"writer name is text; got .* of type {type(name).__name__}"):
+        keys.stream_key("panda", "tf_static", name)
+
+
 @pytest.mark.parametrize("name", ["panda", "r1", "arm-2.left", "über", "a@b", "clock"])
 def test_ordinary_names_are_unchanged(name: str):
     assert keys.check_robot(name) == name

@@ -8,6 +8,8 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Generic, TypeVar
 
+from zstate._util.fork_safe import fork_safe
+
 T = TypeVar("T")
 
 # Ctrl-C that arrives as a thread starts to wait is handled only after that wait.
@@ -18,11 +20,13 @@ class Inbox(Generic[T]):
     """The last ``capacity`` items that were added and not taken. Any thread may add.
 
     Iterations return each item once, in the order of arrival, and end with ``close()``, after the last item.
+    ``check_reception()`` is called before a wait; it raises if nothing can arrive, as in a forked process.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, check_reception: Callable[[], object]) -> None:
         self._items: deque[T] = deque(maxlen=capacity)
-        self._changed = threading.Condition()
+        self._check_reception = check_reception
+        self._changed = fork_safe(threading.Condition())
         self._waiting_tasks: list[Callable[[], object]] = []
         self._closed = False
 
@@ -38,6 +42,7 @@ class Inbox(Generic[T]):
     def take_newest(self) -> T | None:
         """The newest item, None if there is none; the others are lost."""
         with self._changed:
+            self._check()
             newest = self._items[-1] if self._items else None
             self._items.clear()
         return newest
@@ -45,6 +50,7 @@ class Inbox(Generic[T]):
     def __iter__(self) -> Iterator[T]:
         while True:
             with self._changed:
+                self._check()
                 if not self._changed.wait_for(lambda: self._items or self._closed, _LONGEST_WAIT_S):
                     continue
                 if not self._items:
@@ -65,6 +71,7 @@ class Inbox(Generic[T]):
                     loop.call_soon_threadsafe(arrived.set)
 
             with self._changed:
+                self._check()
                 items = [self._items.popleft()] if self._items else []
                 if not items:
                     if self._closed:
@@ -80,6 +87,10 @@ class Inbox(Generic[T]):
         with self._changed:
             self._closed = True
             self._wake()
+
+    def _check(self) -> None:
+        if not (self._items or self._closed):
+            self._check_reception()
 
     def _wake(self) -> None:
         self._changed.notify_all()

@@ -297,8 +297,13 @@ class TransformBuffer(BufferCore):
         if query.max_age_s is None:
             return transform
         if path.domain not in ("", self.clock.domain):
-            use, names, domains = path.uses[0], (path.target, path.source), (path.domain, self.clock.domain)
-            raise ClockMismatch(*names, edges=(use.edge,), robots=(use.track.name,), domains=domains)
+            edge, names, domains = (
+                path.uses[0].edge,
+                (path.target, path.source),
+                (path.domain, self.clock.domain),
+            )
+            robot = self.domain.robot_placing(edge[1])
+            raise ClockMismatch(*names, edges=(edge,), robots=(robot,), domains=domains)
         age_s = transform.age(self.clock)
         if path.uses and age_s > query.max_age_s:
             raise path.stale(transform.stamp, age_s, query.max_age_s)

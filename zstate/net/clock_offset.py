@@ -20,7 +20,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.clock import Clock, ClockOffset, SystemClock
 from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.net.at_exit import join_at_exit
-from zstate.net.queryable import Queryable, Reply, query
+from zstate.net.queryable import Queryable, Reply, check_timeout, query
 from zstate.net.sample_history import RoundRobinQueue
 from zstate.net.session import Session
 from zstate.wire.identity import WriterId
@@ -84,8 +84,9 @@ def measure_offsets(
     ``clock`` is this machine's by default. The shortest round trip of ``rounds`` counts. Empty without a
     reply within ``timeout_s``. Raises InvalidInput and Closed.
     """
-    if rounds < 1 or not timeout_s > 0.0:
-        raise InvalidInput(f"rounds is 1 or more and timeout_s is positive; got {rounds} and {timeout_s}")
+    if rounds < 1:
+        raise InvalidInput(f"rounds is 1 or more; got {rounds}")
+    check_timeout(timeout_s)
     return tuple(
         sorted(_measure(session, clock_expression(robot), rounds, clock or SystemClock(), timeout_s))
     )

@@ -23,7 +23,7 @@ import zenoh
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput
-from zstate.net.queryable import MAX_REPLIES, query_tokens
+from zstate.net.queryable import MAX_REPLIES, check_timeout, query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
 from zstate.wire.identity import Announcement, WriterId
@@ -136,9 +136,7 @@ def discover_readers(session: Session, timeout_s: float = 1.0) -> tuple[Announce
 
 def discover_tokens(session: Session, expression: str, timeout_s: float = 1.0) -> frozenset[str]:
     """The liveliness tokens that match ``expression``, queried like ``discover``."""
-    if not timeout_s > 0.0:
-        raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + check_timeout(timeout_s)
     found = last = frozenset[str]()
     while (remaining_s := deadline - time.monotonic()) > 0.0:
         # Thousands of tokens take a moment: no query is cut short.

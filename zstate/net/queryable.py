@@ -36,9 +36,20 @@ CAPACITY = 64
 
 MAX_PAUSE_S = 0.2
 
+_LONGEST_TIMEOUT_S = 1e9
+"""Zenoh takes longer ones, and infinity, for negative."""
+
 _LOG = logging.getLogger("zstate")
 
 _Channel: TypeAlias = "zenoh.handlers.FifoChannel[zenoh.Reply]"
+
+
+def check_timeout(timeout_s: float) -> float:
+    """``timeout_s``. Raises InvalidInput unless it is above 0 and below 1e9 [s]."""
+    if not 0.0 < timeout_s < _LONGEST_TIMEOUT_S:
+        limits = f"give a positive number of seconds below {_LONGEST_TIMEOUT_S:g}"
+        raise InvalidInput(f"timeout_s is {timeout_s}; {limits}")
+    return timeout_s
 
 
 def query(
@@ -198,8 +209,7 @@ def query_lookup(
     Queries a lookup service of ``robot``, for instance `zstate publish`; needs no buffer here. Raises the
     error that ``TransformBuffer.lookup`` raised there, and Unreachable without a reply within ``timeout_s``.
     """
-    if not timeout_s > 0.0:
-        raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
+    check_timeout(timeout_s)
     key = lookup_key(robot)
     selector = f"{key}?{LookupRequest(target, source, at).parameters()}"
     error: ZStateError = Unreachable(

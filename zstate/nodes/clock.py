@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 
 from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe_lock
+from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, check_stamp, wait_interruptible
 from zstate.errors import Closed, MessageError, NoClock, format_duration
@@ -78,7 +78,8 @@ class SimulatedClock(Closeable):
 
     It stands still between messages, and may jump. The first call of ``now`` waits until a time is
     received, for at most ``timeout_s``. Of several publishers the newest is followed; messages of the
-    others are counted in ``refused``. A context manager; safe from any thread.
+    others are counted in ``refused``. A forked process receives nothing: the clock is closed there. A context
+    manager; safe from any thread.
     """
 
     domain = SIMULATED
@@ -92,7 +93,7 @@ class SimulatedClock(Closeable):
         self._session: int | None = None
         self._ended_sessions: set[int] = set()
         self._received_s = 0.0
-        self._has_time = threading.Event()
+        self._has_time = fork_safe(threading.Event())
         self._lock = fork_safe_lock()
         self._waits: list[tuple[int, threading.Event]] = []
         self._is_open = True
@@ -101,6 +102,10 @@ class SimulatedClock(Closeable):
         self._refusals = Refusals(self.key)
         self.refused: Mapping[str, int] = self._refusals.counts
         self._subscriber = StreamSubscriber(session, self.key, self._on_samples)
+        fork_safe(self)
+
+    def _at_fork_reinit(self) -> None:
+        self._is_open = False
 
     def now(self) -> int:
         """The newest stamp [ns]. Raises NoClock if none is received within ``timeout_s``, and Closed."""
@@ -109,7 +114,7 @@ class SimulatedClock(Closeable):
 
     def wait(self, timeout_s: float | None = None) -> int:
         """The newest stamp [ns], waiting for the first; None waits for ever. Raises NoClock and Closed."""
-        if not wait_interruptible(self._has_time, timeout_s):
+        if self._is_open and not wait_interruptible(self._has_time, timeout_s):
             text = f"no time was received on {self.key!r} for {timeout_s:g} s"
             raise NoClock(f"{text}; start the simulation or `zstate replay`", waited_s=timeout_s or 0.0)
         if self._now is None:

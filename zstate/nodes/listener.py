@@ -31,7 +31,7 @@ from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.wire import native
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened, stream_from_key, stream_key
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot, shortened, stream_from_key, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
 from zstate.wire.protocol import SerializedSample, selected_robots
 from zstate.wire.registry import get_wire
@@ -118,7 +118,7 @@ class TransformListener(Closeable):
             self.buffer,
             self._counters,
             is_shared=bool(self._wire.shared),
-            placers=placers,
+            placers=None if placers is None else frozenset(map(check_robot, placers)),
             on_conflict=self._events.add_second_edge,
         )
         self._names = self._ownership.live

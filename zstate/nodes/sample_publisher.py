@@ -81,7 +81,7 @@ class SamplePublisher(Closeable):
     ) -> RateReport:
         """Publish what ``read`` returns at ``rate_hz``, for ``seconds`` or until ``close()``.
 
-        Both get the present instant [ns].
+        Both get the present instant [ns]. Raises Closed if the session is closed, or not of this process.
         """
         self._rate = rate = Rate(rate_hz, self._clock, self._stop, seconds)
         for now in rate:
@@ -90,6 +90,8 @@ class SamplePublisher(Closeable):
                 try:
                     publish(sample, now)
                 except Closed:
+                    if not self._stop.is_set():
+                        raise
                     break
         return rate.report()
 

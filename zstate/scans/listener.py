@@ -67,9 +67,11 @@ class PlacedScan:
 class _SensorScans(Closeable):
     """The scans of one sensor, which wait for their poses in a thread of their own."""
 
-    def __init__(self, place: Callable[[Scan, float], object], sensor: str) -> None:
+    def __init__(
+        self, place: Callable[[Scan, float], object], sensor: str, check_reception: Callable[[], object]
+    ) -> None:
         self._place = place
-        self._waiting: Inbox[tuple[Scan, float]] = Inbox(_CAPACITY)
+        self._waiting: Inbox[tuple[Scan, float]] = Inbox(_CAPACITY, check_reception)
         threading.Thread(target=self._run, name=f"zstate scans of {sensor}", daemon=True).start()
 
     def add(self, scan: Scan, deadline: float) -> None:
@@ -121,9 +123,10 @@ class ScanListener(Closeable):
         self._refusals = Refusals("scan")
         self.refused: dict[str, int] = self._refusals.counts
         self._timeout_s = timeout_s
-        self._unread: Inbox[PlacedScan] = Inbox(_CAPACITY)
+        self._unread: Inbox[PlacedScan] = Inbox(_CAPACITY, session.check)
         self._sensors: dict[str, _SensorScans] = {}
         self._wire = get_wire(wire)
+        self._check = session.check
         self._closed = False
         with ExitStack() as opening:
             if buffer is None:
@@ -161,7 +164,7 @@ class ScanListener(Closeable):
         if sensor not in self._sensors:
             if len(self._sensors) >= _MAX_SENSORS:
                 raise InvalidInput(f"the robot {self.robot!r} has more than {_MAX_SENSORS} sensors")
-            self._sensors[sensor] = _SensorScans(partial(self._place, sensor), sensor)
+            self._sensors[sensor] = _SensorScans(partial(self._place, sensor), sensor, self._check)
         return self._sensors[sensor]
 
     def _place(self, sensor: str, scan: Scan, deadline: float) -> None:

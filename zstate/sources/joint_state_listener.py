@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
 
+from zstate._util.bounded import BoundedQueue
 from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.inbox import Inbox
 from zstate._util.refusals import Refusals
 from zstate.errors import InvalidInput, MessageError, ModelError
+from zstate.ingest.base import EARLY_BYTES
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import announce_reader
@@ -21,7 +22,7 @@ from zstate.net.subscription import Received, subscribe
 from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.sources.joint_state_merger import JointStateMerger
 from zstate.wire.keys import Stream
-from zstate.wire.messages import JointState, RobotDescription
+from zstate.wire.messages import JointState, RobotDescription, message_size
 from zstate.wire.registry import get_wire
 
 _LOG = logging.getLogger("zstate")
@@ -49,6 +50,9 @@ class JointStateListener(Closeable):
     Numbers are in the order of ``model.joint_names``. The default model is the one in the robot's
     description; samples that arrive before it are kept. ``refused`` counts unusable samples by reason; the
     first of each reason is also logged. A context manager.
+
+    Nothing is received in a forked process: there iterations and ``read`` return the unread samples, then
+    raise Closed.
     """
 
     def __init__(
@@ -73,9 +77,9 @@ class JointStateListener(Closeable):
         self._validator: JointStateValidator | None = None
         self._merger: JointStateMerger | None = None
         self._explained: set[tuple[str, ...]] = set()
-        self._undescribed: deque[Received] = deque(maxlen=_CAPACITY)
-        self._unread: Inbox[JointReading] = Inbox(_CAPACITY)
-        self._lock = threading.Lock()
+        self._undescribed: BoundedQueue[Received] = BoundedQueue(_CAPACITY, EARLY_BYTES)
+        self._unread: Inbox[JointReading] = Inbox(_CAPACITY, session.check)
+        self._lock = fork_safe_lock()
         self._on_reading = on_reading
         streams: tuple[Stream, ...] = tuple(dict.fromkeys(("joint_states", self._wire.partial_joint_states)))
         with ExitStack() as opening:
@@ -120,7 +124,8 @@ class JointStateListener(Closeable):
     def _on_messages(self, received: list[Received]) -> None:
         with self._lock:
             if self._validator is None:
-                self._undescribed.extend(received)
+                for one in received:
+                    self._undescribed.append(one, message_size(one.message))
                 return
             readings = self._add(received)
         self._call_back(readings)
@@ -160,7 +165,10 @@ class JointStateListener(Closeable):
         return reading
 
     def read(self, stamp: int) -> JointReading | None:
-        """The newest reading, independent of ``stamp``; None if none arrived since the last call."""
+        """The newest reading, independent of ``stamp``; None if none arrived since the last call.
+
+        Raises Closed.
+        """
         return self._unread.take_newest()
 
     def __iter__(self) -> Iterator[JointReading]:

@@ -89,6 +89,8 @@ def check_writer(name: str) -> str:
 
 def check_robot(name: str, what: str = "robot") -> str:
     """``name`` if it can be one chunk of a key. Raises InvalidInput with the reason otherwise."""
+    if not isinstance(name, str):  # pyright: ignore[reportUnnecessaryIsInstance]  # e.g. of a missing variable
+        raise InvalidInput(f"a {what} name is text; got {name!r} of type {type(name).__name__}")
     problem = _chunk_problem(name)
     if problem:
         raise InvalidInput(

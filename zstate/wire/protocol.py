@@ -152,6 +152,8 @@ def selected_robots(robot: str | Sequence[str], wire: Wire) -> tuple[str, ...]:
     """``robot`` as a tuple of names. Raises InvalidInput unless a sequence has different valid names."""
     if isinstance(robot, str):
         return (robot,)
+    if robot is None:  # pyright: ignore[reportUnnecessaryComparison]  # e.g. of a missing variable
+        check_robot(robot)
     names = tuple(robot)
     if not names:
         raise InvalidInput("robot is an empty sequence; name the robots, or give '*' for all")

@@ -15,8 +15,8 @@ STARTS = 200
 
 FORKING = """
     import json, multiprocessing, os, select, sys, threading, time
-    from zstate import SineSource, StatePublisher, TransformListener, connect, discover, load_model
-    from zstate import Transform, TransformPublisher
+    from zstate import JointStateListener, PartialStatePublisher, SimulatedClock, SineSource, StatePublisher
+    from zstate import Transform, TransformListener, TransformPublisher, connect, discover, load_model
     from zstate.errors import Closed, LookupFailed
     from zstate.recording.recorder import Recorder
 
@@ -25,6 +25,9 @@ FORKING = """
         StatePublisher(session, load_model("rrbot"), "r1") as publisher,
         TransformPublisher(session, "r1", "odometry") as odometry,
         TransformListener(session, "r1") as listener,
+        JointStateListener(session, "r1") as joints,
+        PartialStatePublisher(session, load_model("rrbot"), ["elbow"], "r3") as part,
+        SimulatedClock(session) as clock,
     ):
         odom = [Transform("odom", "world", (0, 0, 0), (0, 0, 0, 1))]
         odometry.publish(odom)
@@ -61,6 +64,11 @@ FORKING = """
                 refused(lambda: session.zenoh),
                 refused(lambda: publisher.publish([0.0, 0.0])),
                 refused(lambda: odometry.publish(odom)),
+                refused(lambda: part.publish([0.0])),
+                refused(lambda: publisher.run(SineSource(model), 100.0)),
+                refused(lambda: list(joints)),
+                refused(lambda: joints.read(0)),
+                not clock.wait_until(1, threading.Event()),
                 refused(lambda: StatePublisher(session, model, "r2")),
                 refused(lambda: TransformPublisher(session, "r2")),
                 refused(lambda: TransformListener(session, "r2")),
@@ -71,7 +79,7 @@ FORKING = """
                 waits_fail(),
                 buffer.lookup("world", "tool").stamp > 0,
             ]
-            for one in (listener, odometry, publisher, session):
+            for one in (clock, joints, part, listener, odometry, publisher, session):
                 one.close()
             os.write(write_fd, (json.dumps(results) + "\\n").encode())
 
@@ -139,7 +147,7 @@ def test_forked_child_gets_an_error_naming_connect_and_affects_no_other_process(
     child = spawn(FORKING, json.dumps(client(endpoint) if mode == "client" else {}))
     for _ in range(10):
         way, refusals, code, receives_samples = json.loads(child.line(30.0))
-        assert (refusals, code, receives_samples) == ([True] * 12, 0, True), way
+        assert (refusals, code, receives_samples) == ([True] * 17, 0, True), way
     assert child.line() == "closed"
     assert child.wait() == 0
     assert not re.search("Traceback|panicked", child.stderr)
