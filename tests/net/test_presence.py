@@ -166,6 +166,21 @@ def test_foreign_tokens_are_ignored_and_counted():
             token.undeclare()
 
 
+def test_writer_of_two_tokens_for_one_stream_leaves_with_the_last_of_them():
+    events: list[tuple[str, bool]] = []
+    with (
+        connect() as writer,
+        connect() as reader,
+        WriterWatch(reader, "r1", lambda one, alive: events.append((one.stream, alive))),
+    ):
+        with announced(writer, "r1", "tf", DRIVER):
+            until(lambda: events == [("tf", True)])
+            with announce(writer, writer_key("r1", ["tf", "joint_states"], DRIVER.identity)):
+                until(lambda: events[1:] == [("joint_states", True)])
+            until(lambda: events[2:] == [("joint_states", False)])
+        until(lambda: events[3:] == [("tf", False)])
+
+
 def test_watch_reports_current_new_and_leaving_writers():
     events: list[tuple[Announcement, bool]] = []
     camera, driver = Announcement("r1", "tf", CAMERA), Announcement("r1", "joint_states", DRIVER)
