@@ -25,6 +25,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 #include <string.h>
+#include <time.h>
 
 #include "_kernel/input.h"
 #include "_kernel/block.h"
@@ -37,10 +38,12 @@
 #include "_kernel/edges.h"
 #include "_kernel/placements.h"
 #include "_kernel/joint_state.h"
+#include "_kernel/sample_ring.h"
+#include "_kernel/publish_path.h"
 
 /* Raised with every change of the interface to Python, so that a library built from older source
  * (an editable install that was not rebuilt) is recognised and not used. */
-#define REVISION 10
+#define REVISION 11
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,
@@ -59,8 +62,8 @@ static int
 fill_module(PyObject *module)
 {
     PyTypeObject *types[] = {
-        &Block_type, &History_type, &FastPath_type,         &TransformFields_type,
-        &Path_type,  &Edges_type,   &JointStateEncoder_type};
+        &Block_type, &History_type,           &FastPath_type,   &TransformFields_type, &Path_type,
+        &Edges_type, &JointStateEncoder_type, &SampleRing_type, &PublishPath_type};
     for (size_t i = 0; i < sizeof(types) / sizeof(types[0]); i++)
         if (PyModule_AddType(module, types[i]) < 0)
             return -1;
