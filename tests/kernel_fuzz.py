@@ -100,6 +100,7 @@ class Fuzz:
         self.widths: list[Any] = [(7, 6)]
         self.rings: list[Any] = [kernel.SampleRing(5, 100, 10)]
         self.publish_paths: list[tuple[Any, int, int]] = []
+        self.ros_encoders: list[tuple[Any, int, int]] = [(self.ros_encoder(7, 6), 7, 6)]
         self.kept: list[Any] = []
         self.transform = type("Transform", (kernel.TransformFields,), {"__slots__": ()})
         self.calls: tuple[Callable[[], object], ...] = (
@@ -122,6 +123,8 @@ class Fuzz:
             *(self.cache,) * 2,
             self.make_publish_path,
             *(self.publish,) * 4,
+            self.make_ros_encoder,
+            self.encode_for_ros,
             self.placements,
             self.keep_memory,
         )
@@ -331,12 +334,31 @@ class Fuzz:
         samples = ring.samples()
         assert all(type(one[2]) is bytes for one in samples)
 
+    def ros_encoder(self, positions: int, velocities: int) -> Any:
+        slots = tuple(self.mostly(number % max(positions, 1), -1, positions) for number in range(velocities))
+        parts = [tuple(bytes(self.random.randrange(9)) for _ in range(4)) for _ in range(4)]
+        parts[0] = self.mostly(parts[0], parts[0][:3], (1, 2, 3, 4))
+        given = self.mostly(tuple(parts), (), parts), self.mostly(positions, -1, 2**62), self.mostly(slots)
+        return self.kernel.RosJointStateEncoder(*given, self.mostly(bytes(16), None, bytes(15)))
+
+    def make_ros_encoder(self) -> None:
+        counts = self.pick(0, 1, 7, 40), self.pick(0, 1, 6, 40)
+        self.ros_encoders.append((self.ros_encoder(*counts), *counts))
+        del self.ros_encoders[:-4]
+
+    def encode_for_ros(self) -> None:
+        encoder, positions, velocities = self.random.choice(self.ros_encoders)
+        rates = [self.pick(None, self.array(velocities)) for _ in range(2)]
+        payload = encoder.encode(self.array(positions), *rates, self.stamp())
+        assert payload is None or type(payload) is bytes
+        encoder.attachment(self.stamp())
+
     def make_publish_path(self) -> None:
         number = self.random.randrange(len(self.encoders))
         positions, velocities = self.widths[number]
         ring = self.mostly(self.random.choice(self.rings), None)
 
-        def put(payload: bytes) -> Any:
+        def put(payload: bytes, attachment: bytes | None = None) -> Any:
             """Whatever a subscriber's callback in the same thread may do."""
             choice = self.random.random()
             if choice < 0.1:
@@ -349,7 +371,16 @@ class Fuzz:
 
         bounds = [self.mostly(np.full(positions, limit)) for limit in (-1.0, 1.0)]
         encoder = self.mostly(self.encoders[number])
-        arguments = (encoder, ring, self.mostly(put), *bounds, self.mostly(len), self.pick(True, False))
+        ros = self.pick(None, self.ros_encoder(positions, velocities))
+        arguments = (
+            encoder,
+            self.mostly(ros),
+            ring,
+            self.mostly(put),
+            *bounds,
+            self.mostly(len),
+            self.pick(True, False),
+        )
         path = self.kernel.PublishPath(*arguments)
         self.publish_paths.append((path, positions, velocities))
         del self.publish_paths[:-4]
@@ -455,7 +486,7 @@ def publish_concurrently(kernel: Any, seconds: float) -> None:
         time.sleep(0)
         sent.append(payload)
 
-    path = kernel.PublishPath(encoder, ring, put, np.full(2, -9.0), np.full(2, 9.0), None, True)
+    path = kernel.PublishPath(encoder, None, ring, put, np.full(2, -9.0), np.full(2, 9.0), None, True)
     stop = threading.Event()
 
     def publish() -> None:

@@ -72,6 +72,19 @@ class JointStateEncoder:
         self, positions: object, velocities: object, efforts: object, stamp: object, seq: int, /
     ) -> bytes | None: ...
 
+class RosJointStateEncoder:
+    def __init__(
+        self,
+        parts: tuple[tuple[bytes, bytes, bytes, bytes], ...],
+        positions: int,
+        slots: tuple[int, ...],
+        gid: bytes | None,
+    ) -> None: ...
+    def encode(
+        self, positions: object, velocities: object, efforts: object, stamp: object, /
+    ) -> bytes | None: ...
+    def attachment(self, now: int, /) -> bytes | None: ...
+
 class SampleRing:
     def __init__(self, capacity: int, span_ns: int, set_back_ns: int) -> None: ...
     def append(self, stamp: int, seq: int, payload: bytes, /) -> None: ...
@@ -81,6 +94,7 @@ class PublishPath:
     def __init__(
         self,
         encoder: JointStateEncoder,
+        ros: RosJointStateEncoder | None,
         ring: SampleRing | None,
         put: Callable[..., object],
         lower: NDArray[Any],

@@ -8,7 +8,7 @@ import pytest
 import zenoh
 from helpers.processes import until
 from helpers.robots import SECOND, STAMP
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
@@ -110,6 +110,7 @@ def test_cache_size_is_bounded_for_any_stamps():
     assert 1 <= len(kept) <= MAX_CACHE_BYTES // 800_000
 
 
+@settings(deadline=None)
 @given(
     st.integers(1, 90),
     st.integers(0, 200),

@@ -21,6 +21,7 @@ from zstate.net.session import connect
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.messages import JointState, order_digest
 from zstate.wire.native import encode
+from zstate.wire.ros2.attachment import unpack
 
 JOINTS, TF = "zstate/r1/joint_states", "zstate/r1/tf"
 POSITIONS, RATES = np.array([0.1 + 0.2, -1.0 / 3.0]), np.array([5e-324, 1.5])
@@ -69,6 +70,52 @@ def test_payloads_numbers_cache_and_counts_are_those_of_the_slow_way(sessions, r
         sizes = len(first) + sum(map(len, expected))
         assert stats.streams["native", "joint_states"] == (4, sizes, 0)
     tap.close()
+
+
+@pytest.mark.parametrize("wire", ["ros2", "ros2dds"])
+@pytest.mark.parametrize("rates", [(None, None), (RATES, -RATES)])
+def test_ros_payloads_and_attachments_are_those_of_the_slow_way(sessions, wire: str, rates: Any):
+    writer, reader = sessions
+    with open_publisher(writer, wires=(wire,)) as publisher:
+        stream = publisher._writers[wire, "joint_states"]
+        encoder: Any = stream.encoder
+        tap = SampleCollector(reader, encoder.key)
+        wait_for_reader(writer, encoder.key)
+        for seq, positions in enumerate((POSITIONS, list(POSITIONS), POSITIONS), start=1):
+            publisher.publish(positions, *rates, stamp=STAMP + seq)
+            assert is_ready(publisher)
+        blocks = [None if one is None else one.tobytes() for one in rates]
+        states = [
+            JointState(STAMP + seq, seq, 1, order_digest(RRBOT.joint_names), POSITIONS.tobytes(), *blocks)
+            for seq in (1, 2, 3)
+        ]
+        assert tap.payloads(3) == [encoder.encode(state) for state in states]
+        attachments = [arrival.attachment for arrival in tap.arrivals]
+        if wire == "ros2":
+            assert [unpack(one).seq for one in attachments] == [2, 3, 4]
+            assert {unpack(one).gid for one in attachments} == {encoder._gid}
+        else:
+            assert attachments == [None] * 3
+        with pytest.raises(InvalidInput, match="the stamp is 0"):
+            publisher.publish(POSITIONS, stamp=0)
+        assert (publisher.stats.sent, publisher.stats.refused) == (4, 1)
+    tap.close()
+
+
+def test_ros_samples_outside_limits_are_counted(sessions):
+    with open_publisher(sessions[0], LIFT, wires=("ros2",)) as publisher:
+        for position in (0.5, 2.5, 3.0, 1.0):
+            publisher.publish(np.array([position]))
+            assert is_ready(publisher)
+        stats = publisher.stats
+        assert (stats.outside_limits, stats.last_excess) == (2, "'lift' at 3.0 rad is outside -2 to 2")
+
+
+def test_two_wires_take_the_slow_way(sessions):
+    with StatePublisher(sessions[0], RRBOT, "r1", wires=("native", "ros2"), takeover=True) as publisher:
+        publisher.publish(POSITIONS)
+        assert publisher._path is None
+        assert [counts.samples for counts in publisher.stats.streams.values()] == [1, 0, 1, 0]
 
 
 def test_the_default_stamp_is_the_present_time(sessions):

@@ -38,6 +38,7 @@
 #include "_kernel/edges.h"
 #include "_kernel/placements.h"
 #include "_kernel/joint_state.h"
+#include "_kernel/ros_joint_state.h"
 #include "_kernel/sample_ring.h"
 #include "_kernel/publish_path.h"
 
@@ -61,9 +62,16 @@ static struct PyModuleDef kernel_module = {
 static int
 fill_module(PyObject *module)
 {
-    PyTypeObject *types[] = {
-        &Block_type, &History_type,           &FastPath_type,   &TransformFields_type, &Path_type,
-        &Edges_type, &JointStateEncoder_type, &SampleRing_type, &PublishPath_type};
+    PyTypeObject *types[] = {&Block_type,
+                             &History_type,
+                             &FastPath_type,
+                             &TransformFields_type,
+                             &Path_type,
+                             &Edges_type,
+                             &JointStateEncoder_type,
+                             &SampleRing_type,
+                             &PublishPath_type,
+                             &RosJointStateEncoder_type};
     for (size_t i = 0; i < sizeof(types) / sizeof(types[0]); i++)
         if (PyModule_AddType(module, types[i]) < 0)
             return -1;
@@ -73,8 +81,10 @@ fill_module(PyObject *module)
     version_name = PyUnicode_InternFromString("version");
     received_name = PyUnicode_InternFromString("received");
     no_waiters = PyTuple_New(0);
+    attachment_names = Py_BuildValue("(s)", "attachment");
     if (kind_static == NULL || kind_exact == NULL || kind_interpolated == NULL ||
-        version_name == NULL || received_name == NULL || no_waiters == NULL)
+        version_name == NULL || received_name == NULL || no_waiters == NULL ||
+        attachment_names == NULL)
         return -1;
     return PyModule_AddIntConstant(module, "REVISION", REVISION);
 }

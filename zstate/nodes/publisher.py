@@ -215,18 +215,23 @@ class StatePublisher(SamplePublisher):
 
     def _open_path(self) -> PublishPath | None:
         """What publishes usual samples in one call; None without the extension, or with several wires."""
-        encoder, native = self._encoder.compiled, self._native
-        if encoder is None or native is None or self._recent is None or self._ros_joints:
+        encoder = self._encoder.compiled
+        writers = [one for (_, stream), one in self._writers.items() if stream == "joint_states"]
+        if encoder is None or len(writers) != 1:
+            return None
+        ros = writers[0].encoder.compile_joint_states()
+        if ros is None and self._native is None:
             return None
         path = PublishPath(
             encoder,
-            self._recent.ring,
-            native.zenoh_put,
+            ros,
+            None if self._recent is None else self._recent.ring,
+            writers[0].zenoh_put,
             *JointLimits(self.model).bounds(self.model.position_count),
             None if self._limits is None else self._limits.add_outside,
             isinstance(self._clock, SystemClock),
         )
-        native.path = path
+        writers[0].path = path
         if self._claim is not None:
             self._claim.notify_changes(path.pause)
         for writer in self._transforms:
@@ -327,7 +332,7 @@ class StatePublisher(SamplePublisher):
         return self._seq if self._path is None else self._path.stop()
 
     def _resume_path(self) -> None:
-        """Publish the next samples in one call each, if they go to the native wire only."""
+        """Publish the next samples in one call each, while joint states are all that is sent."""
         if self._path is None:
             return
         self._path.resume(self._seq)

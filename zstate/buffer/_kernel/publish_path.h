@@ -11,7 +11,8 @@
 typedef struct {
     PyObject_HEAD
     JointStateEncoder *encoder;
-    SampleRing *ring; /* or NULL */
+    RosJointStateEncoder *ros; /* or NULL on the native wire */
+    SampleRing *ring;          /* or NULL */
     PyObject *put;
     PyObject *on_outside;
     double *lower;            /* limits of the positions; the upper ones are behind them */
@@ -26,6 +27,7 @@ typedef struct {
 } PublishPath;
 
 static PyTypeObject PublishPath_type;
+static PyObject *attachment_names;
 
 static int
 publish_path_traverse(PublishPath *self, visitproc visit, void *arg)
@@ -50,6 +52,7 @@ publish_path_dealloc(PublishPath *self)
     PyObject_GC_UnTrack(self);
     publish_path_clear(self);
     Py_CLEAR(self->encoder);
+    Py_CLEAR(self->ros);
     Py_CLEAR(self->ring);
     PyMem_Free(self->lower);
     if (self->ended != NULL)
@@ -85,25 +88,39 @@ publish_path_fill(PublishPath *self, PyObject *lower, PyObject *upper)
     return 0;
 }
 
+static bool
+have_same_counts(const JointStateEncoder *one, const RosJointStateEncoder *other)
+{
+    return one->positions == other->positions && one->velocities == other->velocities;
+}
+
 static PyObject *
 publish_path_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
 {
-    static char *names[] = {"encoder", "ring",       "put",         "lower",
+    static char *names[] = {"encoder", "ros",        "ring",        "put", "lower",
                             "upper",   "on_outside", "reads_clock", NULL};
-    PyObject *encoder, *ring, *put, *lower, *upper, *on_outside;
+    PyObject *encoder, *ros, *ring, *put, *lower, *upper, *on_outside;
     int reads_clock;
-    if (!PyArg_ParseTupleAndKeywords(args, keywords, "O!OOOOOp:PublishPath", names,
-                                     &JointStateEncoder_type, &encoder, &ring, &put, &lower, &upper,
-                                     &on_outside, &reads_clock))
+    if (!PyArg_ParseTupleAndKeywords(args, keywords, "O!OOOOOOp:PublishPath", names,
+                                     &JointStateEncoder_type, &encoder, &ros, &ring, &put, &lower,
+                                     &upper, &on_outside, &reads_clock))
         return NULL;
-    if (ring != Py_None && !Py_IS_TYPE(ring, &SampleRing_type)) {
-        PyErr_SetString(PyExc_TypeError, "a cache is a SampleRing, or None");
+    if ((ring != Py_None && !Py_IS_TYPE(ring, &SampleRing_type)) ||
+        (ros != Py_None && !Py_IS_TYPE(ros, &RosJointStateEncoder_type))) {
+        PyErr_SetString(PyExc_TypeError,
+                        "ros is a RosJointStateEncoder, ring a SampleRing, or None");
+        return NULL;
+    }
+    if (ros != Py_None &&
+        !have_same_counts((JointStateEncoder *)encoder, (RosJointStateEncoder *)ros)) {
+        PyErr_SetString(PyExc_ValueError, "the encoders of one robot have as many numbers");
         return NULL;
     }
     PublishPath *self = (PublishPath *)type->tp_alloc(type, 0);
     if (self == NULL)
         return NULL;
     self->encoder = (JointStateEncoder *)Py_NewRef(encoder);
+    self->ros = ros == Py_None ? NULL : (RosJointStateEncoder *)Py_NewRef(ros);
     self->ring = ring == Py_None ? NULL : (SampleRing *)Py_NewRef(ring);
     self->put = Py_NewRef(put);
     self->on_outside = Py_NewRef(on_outside);
@@ -115,17 +132,23 @@ publish_path_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
     return (PyObject *)self;
 }
 
+static bool
+present_time(int64_t *stamp)
+{
+    struct timespec now;
+    if (timespec_get(&now, TIME_UTC) != TIME_UTC)
+        return false;
+    *stamp = (int64_t)now.tv_sec * SECOND_NS + now.tv_nsec;
+    return true;
+}
+
 /* The stamp of a sample, or the present time for None. False if the publisher determines it. */
 static bool
 sample_stamp(const PublishPath *self, PyObject *given, int64_t *stamp)
 {
-    struct timespec now;
     if (given != Py_None)
         return plain_stamp(given, stamp);
-    if (!self->reads_clock || timespec_get(&now, TIME_UTC) != TIME_UTC)
-        return false;
-    *stamp = (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
-    return true;
+    return self->reads_clock && present_time(stamp);
 }
 
 static bool
@@ -139,6 +162,28 @@ are_outside(const PublishPath *self, const double *positions)
     return outside;
 }
 
+/* Calls Zenoh's put; with an attachment, if the wire has them. */
+static PyObject *
+call_put(PublishPath *self, PyObject *payload)
+{
+    int64_t now;
+    if (self->ros == NULL || !self->ros->has_gid)
+        return PyObject_Vectorcall(self->put, &payload, 1, NULL);
+    if (!present_time(&now)) {
+        PyErr_SetString(PyExc_OSError, "the clock cannot be read");
+        return NULL;
+    }
+    PyObject *attachment = ros_attachment(self->ros, now);
+    if (attachment == NULL)
+        return NULL;
+    PyObject *arguments[] = {payload, attachment};
+    PyObject *sent = PyObject_Vectorcall(self->put, arguments, 1, attachment_names);
+    Py_DECREF(attachment);
+    if (sent == NULL)
+        self->ros->attached--;
+    return sent;
+}
+
 /* Caches and sends a payload. 1 if it was sent; 0, without an error, if Zenoh refused it: then it
  * is not cached either. -1 and an error if neither is the case. */
 static int
@@ -147,7 +192,7 @@ send_payload(PublishPath *self, int64_t stamp, PyObject *payload)
     /* Before sending: a reader that misses this sample can then request it as history. */
     if (self->ring != NULL && ring_add(self->ring, stamp, (int64_t)self->seq, payload) < 0)
         return -1;
-    PyObject *sent = PyObject_Vectorcall(self->put, &payload, 1, NULL);
+    PyObject *sent = call_put(self, payload);
     if (sent != NULL) {
         Py_DECREF(sent);
         self->seq++;
@@ -163,7 +208,7 @@ send_payload(PublishPath *self, int64_t stamp, PyObject *payload)
     return 0;
 }
 
-/* As send_payload; 0 also for a sample that is not a usual one. */
+/* As send_payload, and calls `on_outside` after it; 0 also for a sample that is not a usual one. */
 static int
 publish_sample(PublishPath *self, PyObject *const *args)
 {
@@ -171,19 +216,26 @@ publish_sample(PublishPath *self, PyObject *const *args)
     int64_t stamp;
     if (!sample_stamp(self, args[3], &stamp) || !get_numbers(self->encoder, args, &numbers))
         return 0;
-    PyObject *payload = encoder_payload(self->encoder, &numbers, stamp, self->seq);
+    /* On the native wire, or as for it: what is outside limits is counted in its payloads. */
+    PyObject *native = NULL, *ros = NULL;
     bool outside = are_outside(self, numbers.positions.buf);
+    if (self->ros == NULL || outside)
+        native = encoder_payload(self->encoder, &numbers, stamp, self->seq);
+    if (self->ros != NULL)
+        ros = ros_payload(self->ros, &numbers, stamp);
     release_numbers(&numbers);
-    if (payload == NULL)
-        return -1;
-    int result = send_payload(self, stamp, payload);
+    int result = PyErr_Occurred() ? -1 : 0;
+    PyObject *payload = self->ros == NULL ? native : ros;
+    if (result == 0 && payload != NULL)
+        result = send_payload(self, stamp, payload);
     if (result == 1 && outside) {
-        PyObject *counted = PyObject_CallOneArg(self->on_outside, payload);
+        PyObject *counted = PyObject_CallOneArg(self->on_outside, native);
         if (counted == NULL)
             result = -1;
         Py_XDECREF(counted);
     }
-    Py_DECREF(payload);
+    Py_XDECREF(native);
+    Py_XDECREF(ros);
     return result;
 }
 
