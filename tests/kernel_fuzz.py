@@ -100,7 +100,7 @@ class Fuzz:
         self.widths: list[Any] = [(7, 6)]
         self.rings: list[Any] = [kernel.SampleRing(5, 100, 10)]
         self.publish_paths: list[tuple[Any, int, int]] = []
-        self.ros_encoders: list[tuple[Any, int, int]] = [(self.ros_encoder(7, 6), 7, 6)]
+        self.ros_encoders: list[tuple[Any, int, int]] = []
         self.kept: list[Any] = []
         self.transform = type("Transform", (kernel.TransformFields,), {"__slots__": ()})
         self.calls: tuple[Callable[[], object], ...] = (
@@ -347,6 +347,8 @@ class Fuzz:
         del self.ros_encoders[:-4]
 
     def encode_for_ros(self) -> None:
+        if not self.ros_encoders:
+            self.make_ros_encoder()
         encoder, positions, velocities = self.random.choice(self.ros_encoders)
         rates = [self.pick(None, self.array(velocities)) for _ in range(2)]
         payload = encoder.encode(self.array(positions), *rates, self.stamp())

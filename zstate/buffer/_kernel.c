@@ -4,8 +4,10 @@
  * Each type is specified by its reference in Python, which stays complete:
  * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
  * (TransformFields), zstate/model/joint_transforms.py (Edges), zstate/model/pinocchio_solver.py
- * (placement_poses), zstate/nodes/publisher.py (JointStateEncoder), zstate/ingest/base.py with
- * zstate/wire/native.py (FastPath). Differences to those are bugs, and tests compare both.
+ * (placement_poses), zstate/nodes/publisher.py (JointStateEncoder, PublishPath),
+ * zstate/wire/ros2/encoder.py (RosJointStateEncoder), zstate/net/sample_history.py (SampleRing),
+ * zstate/ingest/base.py with zstate/wire/native.py (FastPath). Differences to those are bugs, and
+ * tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
  * covers are never written again, so a batch that holds references to its blocks reads them without

@@ -96,7 +96,8 @@ class WriterClaim(Closeable):
         self._rivals: set[Announcement] = set()
         self._changes: deque[tuple[str, zenoh.SampleKind]] = deque(maxlen=CAPACITY)
         """Tokens that came and went since the last ``check``."""
-        self._on_change: Callable[[], None] | None = None
+        self.on_change: Callable[[], None] | None = None
+        """Called in a thread of Zenoh when a token has ended ``is_settled``."""
         self._received: dict[tuple[Stream, str], zenoh.ext.AdvancedSubscriber[_Handler]] = {}
         self._publishing: set[int] = set()
         self._first: Announcement | None = None
@@ -165,10 +166,6 @@ class WriterClaim(Closeable):
         """Whether ``check`` has nothing to do until a token changes."""
         return self._next_check_s == math.inf
 
-    def notify_changes(self, on_change: Callable[[], None]) -> None:
-        """Call ``on_change`` in a thread of Zenoh after each change that ends ``is_settled``."""
-        self._on_change = on_change
-
     def close(self) -> None:
         """Release the ownership. A second call does nothing."""
         with _CLAIMS_LOCK:
@@ -208,8 +205,8 @@ class WriterClaim(Closeable):
     def _on_token(self, sample: zenoh.Sample) -> None:
         self._changes.append((str(sample.key_expr), sample.kind))
         self._next_check_s = 0.0
-        if self._on_change is not None:
-            self._on_change()
+        if self.on_change is not None:
+            self.on_change()
 
     def _publishes(self, rival: Announcement) -> bool:
         """Whether a sample or a latched value of ``rival`` has been received since the first call."""

@@ -173,10 +173,7 @@ class SampleCache:
         self.writer = writer
         capacity = MAX_CACHE_BYTES // (8 * numbers + _OVERHEAD)
         self.ring = SampleRing(capacity, round(span_s * 1e9), SET_BACK_NS)
-
-    def append(self, stamp: int, seq: int, payload: bytes) -> None:
-        """Cache a sample, whose ``seq`` is one more than that of the last."""
-        self.ring.append(stamp, seq, payload)
+        self.append = self.ring.append
 
     def since(self, seq: int) -> list[CachedSample]:
         """The cached samples from ``seq`` on."""

@@ -243,8 +243,10 @@ class StreamPublisher(Closeable):
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=False,
         )
+        self.zenoh_put: Callable[..., object] = self._publisher.put  # pyright: ignore  # its result has no type
         self._has_readers = False
-        self._on_readers: Callable[[], None] | None = None
+        self.on_readers: Callable[[], None] | None = None
+        """Called in a thread of Zenoh after each change of ``has_readers``."""
         self._changes: zenoh.MatchingListener[None] | None = None
 
     @property
@@ -256,20 +258,10 @@ class StreamPublisher(Closeable):
             self._changes = self._publisher.declare_matching_listener(handler)
         return self._has_readers
 
-    def notify_readers(self, on_change: Callable[[], None]) -> None:
-        """Call ``on_change`` in a thread of Zenoh after each change of ``has_readers``."""
-        self._on_readers = on_change
-
     def _on_change(self, status: zenoh.MatchingStatus) -> None:
         self._has_readers = status.matching
-        if self._on_readers is not None:
-            self._on_readers()
-
-    @property
-    def zenoh_put(self) -> Callable[..., object]:
-        """Zenoh's own put on this key, which raises ZError."""
-        put: Callable[..., object] = self._publisher.put  # pyright: ignore  # its result has no type
-        return put
+        if self.on_readers is not None:
+            self.on_readers()
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> None:
         """Send one sample with its attachment. Raises Closed."""

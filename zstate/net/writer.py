@@ -50,14 +50,10 @@ class SampleWriter(StreamPublisher):
         self._attachment = encoder.attachment
 
     @property
-    def samples(self) -> int:
-        """How many samples were sent."""
-        return self._samples + (self.path.samples if self.path else 0)
-
-    @property
-    def bytes(self) -> int:
-        """The size of their payloads [bytes]."""
-        return self._bytes + (self.path.bytes if self.path else 0)
+    def sent(self) -> tuple[int, int]:
+        """How many samples were sent, and the size of their payloads [bytes]."""
+        more = (self.path.samples, self.path.bytes) if self.path else (0, 0)
+        return self._samples + more[0], self._bytes + more[1]
 
     def write(self, payload: bytes) -> None:
         """Send a payload of ``encoder``. Raises Closed."""

@@ -233,9 +233,9 @@ class StatePublisher(SamplePublisher):
         )
         writers[0].path = path
         if self._claim is not None:
-            self._claim.notify_changes(path.pause)
+            self._claim.on_change = path.pause
         for writer in self._transforms:
-            writer.notify_readers(path.pause)
+            writer.on_readers = path.pause
         fork_safe(self)
         return path
 

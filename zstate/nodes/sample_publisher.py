@@ -45,7 +45,7 @@ class SamplePublisher(Closeable):
     def stats(self) -> PublisherStats:
         """Counts of published, suppressed and refused samples."""
         streams = {
-            place: StreamStats(writer.samples, writer.bytes, self._sent - writer.samples)
+            place: StreamStats(*(sent := writer.sent), self._sent - sent[0])
             for place, writer in self._writers.items()
         }
         rate = None if self._rate is None else self._rate.report()
