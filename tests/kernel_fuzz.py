@@ -21,6 +21,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.machinery import ExtensionFileLoader
 from pathlib import Path
 from typing import Any, ClassVar
@@ -97,6 +98,9 @@ class Fuzz:
         self.paths: list[Any] = []
         self.encoders: list[Any] = [kernel.JointStateEncoder(7, bytes(8), 7, 6, (3,))]
         self.widths: list[Any] = [(7, 6)]
+        self.rings: list[Any] = [kernel.SampleRing(5, 100, 10)]
+        self.publish_paths: list[tuple[Any, int, int]] = []
+        self.ros_encoders: list[tuple[Any, int, int]] = []
         self.kept: list[Any] = []
         self.transform = type("Transform", (kernel.TransformFields,), {"__slots__": ()})
         self.calls: tuple[Callable[[], object], ...] = (
@@ -116,6 +120,12 @@ class Fuzz:
             self.edges,
             self.make_encoder,
             *(self.encode,) * 4,
+            self.make_ring,
+            *(self.cache,) * 2,
+            self.make_publish_path,
+            *(self.publish,) * 4,
+            self.make_ros_encoder,
+            self.encode_for_ros,
             self.placements,
             self.keep_memory,
         )
@@ -335,6 +345,87 @@ class Fuzz:
         assert payload is None or (type(payload) is bytes and payload[0] == 0x98)
         encoder.encode(*self.pick((), (numbers,), (numbers,) * 6))
 
+    def make_ring(self) -> None:
+        spans = [self.pick(0, 1, 100, 10**9, 2**63 - 1, -1, 2**63, *ODD) for _ in range(2)]
+        self.rings.append(self.kernel.SampleRing(self.pick(1, 2, 63, 200, 2**62, 0, -1, *ODD), *spans))
+        del self.rings[:-4]
+
+    def cache(self) -> None:
+        ring = self.random.choice(self.rings)
+        for _ in range(self.random.randrange(90)):
+            ring.append(self.stamp(), self.mostly(5), self.mostly(b"payload" * self.random.randrange(9)))
+        samples = ring.samples()
+        assert all(type(one[2]) is bytes for one in samples)
+
+    def ros_encoder(self, positions: int, velocities: int) -> Any:
+        slots = tuple(self.mostly(number % max(positions, 1), -1, positions) for number in range(velocities))
+        parts = [tuple(bytes(self.random.randrange(9)) for _ in range(4)) for _ in range(4)]
+        parts[0] = self.mostly(parts[0], parts[0][:3], (1, 2, 3, 4))
+        given = self.mostly(tuple(parts), (), parts), self.mostly(positions, -1, 2**62), self.mostly(slots)
+        return self.kernel.RosJointStateEncoder(*given, self.mostly(bytes(16), None, bytes(15)))
+
+    def make_ros_encoder(self) -> None:
+        counts = self.pick(0, 1, 7, 40), self.pick(0, 1, 6, 40)
+        self.ros_encoders.append((self.ros_encoder(*counts), *counts))
+        del self.ros_encoders[:-4]
+
+    def encode_for_ros(self) -> None:
+        if not self.ros_encoders:
+            self.make_ros_encoder()
+        encoder, positions, velocities = self.random.choice(self.ros_encoders)
+        rates = [self.pick(None, self.array(velocities)) for _ in range(2)]
+        payload = encoder.encode(self.array(positions), *rates, self.stamp())
+        assert payload is None or type(payload) is bytes
+        encoder.attachment(self.stamp())
+
+    def make_publish_path(self) -> None:
+        number = self.random.randrange(len(self.encoders))
+        positions, velocities = self.widths[number]
+        ring = self.mostly(self.random.choice(self.rings), None)
+
+        def put(payload: bytes, attachment: bytes | None = None) -> Any:
+            """Whatever a subscriber's callback in the same thread may do."""
+            choice = self.random.random()
+            if choice < 0.1:
+                self.pick(path.pause, gc.collect, lambda: path.publish(*(None,) * 4))()
+            elif choice < 0.2 and ring is not None:
+                self.pick(ring.samples, lambda: ring.append(self.stamp(), 3, payload))()
+            elif choice < 0.25:
+                raise self.pick(ValueError, KeyboardInterrupt, path.resume)(7)
+            return self.pick(None, object())
+
+        bounds = [self.mostly(np.full(positions, limit)) for limit in (-1.0, 1.0)]
+        encoder = self.mostly(self.encoders[number])
+        ros = self.pick(None, self.ros_encoder(positions, velocities))
+        arguments = (
+            encoder,
+            self.mostly(ros),
+            ring,
+            self.mostly(put),
+            *bounds,
+            self.mostly(len),
+            self.pick(True, False),
+        )
+        path = self.kernel.PublishPath(*arguments)
+        self.publish_paths.append((path, positions, velocities))
+        del self.publish_paths[:-4]
+
+    def publish(self) -> None:
+        if not self.publish_paths:
+            self.make_publish_path()
+        path, positions, velocities = self.random.choice(self.publish_paths)
+        path.resume(self.mostly(self.pick(0, 5, 2**31), -1, 2**63 - 1, 2**64))
+        for _ in range(self.random.randrange(9)):
+            rates = [self.pick(None, self.array(velocities)) for _ in range(2)]
+            numbers = self.array(positions)
+            if isinstance(numbers, np.ndarray) and numbers.size == 7 and numbers.dtype == np.float64:
+                numbers = numbers / 1e5
+                numbers.flat[6] = 1.0
+            with suppress(KeyboardInterrupt):
+                path.publish(numbers, *rates, self.pick(None, self.stamp()))
+        self.pick(path.pause, path.stop, lambda: path.publish(1))()
+        repr((path.ready, path.seq, path.samples, path.bytes))
+
     def placements(self) -> None:
         count, rows = self.random.randrange(1, 6), self.random.randrange(4)
         chosen = self.numbers.integers(-1 if self.random.random() < 0.1 else 0, count, rows)
@@ -414,6 +505,37 @@ def run_concurrently(kernel: Any, seconds: float) -> None:
     writer.join()
 
 
+def publish_concurrently(kernel: Any, seconds: float) -> None:
+    """Samples of two threads, which a third one stops and resumes: each number once, in order."""
+    encoder, ring = kernel.JointStateEncoder(7, bytes(8), 2, 2, ()), kernel.SampleRing(10, 2**62, 0)
+    sent: list[bytes] = []
+
+    def put(payload: bytes) -> None:
+        time.sleep(0)
+        sent.append(payload)
+
+    path = kernel.PublishPath(encoder, None, ring, put, np.full(2, -9.0), np.full(2, 9.0), None, True)
+    stop = threading.Event()
+
+    def publish() -> None:
+        while not stop.is_set():
+            path.publish(np.zeros(2), None, None, None)
+
+    threads = [threading.Thread(target=publish) for _ in range(2)]
+    path.resume(0)
+    for thread in threads:
+        thread.start()
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        seq = path.stop()
+        assert seq == path.samples == len(sent)
+        path.resume(seq)
+    stop.set()
+    for thread in threads:
+        thread.join()
+    assert [msgspec.msgpack.decode(payload)[1] for payload in sent] == list(range(len(sent)))
+
+
 def main() -> int:
     """Fuzzes for the given number of seconds; the exit code is 0 if no check failed."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
@@ -431,7 +553,8 @@ def main() -> int:
     while time.monotonic() < deadline:
         outcomes += Fuzz(kernel, seed).run(2000)
         seed += 1
-    run_concurrently(kernel, 0.2 * seconds)
+    run_concurrently(kernel, 0.1 * seconds)
+    publish_concurrently(kernel, 0.1 * seconds)
     print(f"{outcomes.total()} calls from {seed} seeds, no crash: {dict(outcomes.most_common())}")
     return 0
 

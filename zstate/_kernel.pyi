@@ -1,5 +1,6 @@
 """The C extension, made of buffer/_kernel.c. ``zstate.extension.kernel`` is "c" if it is used."""
 
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 from numpy.typing import NDArray
@@ -70,6 +71,49 @@ class JointStateEncoder:
     def encode(
         self, positions: object, velocities: object, efforts: object, stamp: object, seq: int, /
     ) -> bytes | None: ...
+
+class RosJointStateEncoder:
+    def __init__(
+        self,
+        parts: tuple[tuple[bytes, bytes, bytes, bytes], ...],
+        positions: int,
+        slots: tuple[int, ...],
+        gid: bytes | None,
+    ) -> None: ...
+    def encode(
+        self, positions: object, velocities: object, efforts: object, stamp: object, /
+    ) -> bytes | None: ...
+    def attachment(self, now: int, /) -> bytes | None: ...
+
+class SampleRing:
+    def __init__(self, capacity: int, span_ns: int, set_back_ns: int) -> None: ...
+    def append(self, stamp: int, seq: int, payload: bytes, /) -> None: ...
+    def samples(self) -> list[tuple[int, int, bytes]]: ...
+
+class PublishPath:
+    def __init__(
+        self,
+        encoder: JointStateEncoder,
+        ros: RosJointStateEncoder | None,
+        ring: SampleRing | None,
+        put: Callable[..., object],
+        lower: NDArray[Any],
+        upper: NDArray[Any],
+        on_outside: Callable[[bytes], object] | None,
+        reads_clock: bool,
+    ) -> None: ...
+    @property
+    def ready(self) -> bool: ...
+    @property
+    def seq(self) -> int: ...
+    @property
+    def samples(self) -> int: ...
+    @property
+    def bytes(self) -> int: ...
+    def publish(self, positions: object, velocities: object, efforts: object, stamp: object, /) -> bool: ...
+    def resume(self, seq: int, /) -> None: ...
+    def pause(self) -> None: ...
+    def stop(self) -> int: ...
 
 class Path:
     def __init__(

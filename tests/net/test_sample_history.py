@@ -8,6 +8,8 @@ import pytest
 import zenoh
 from helpers.processes import until
 from helpers.robots import SECOND, STAMP
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.queryable import Queryable, Reply
@@ -18,7 +20,9 @@ from zstate.net.sample_history import (
     PAGE_SAMPLES,
     CachedSample,
     HistoryReader,
+    ReferenceRing,
     SampleCache,
+    SampleRing,
     serve_history,
 )
 from zstate.net.session import Session
@@ -104,6 +108,21 @@ def test_cache_size_is_bounded_for_any_stamps():
     kept = seqs(cache.since(0))
     assert kept == list(range(100 - len(kept), 100))
     assert 1 <= len(kept) <= MAX_CACHE_BYTES // 800_000
+
+
+@settings(deadline=None)
+@given(
+    st.integers(1, 90),
+    st.integers(0, 200),
+    st.integers(0, 50),
+    st.lists(st.integers(-300, 300) | st.integers(-(2**63), 2**63 - 1), max_size=200),
+)
+def test_the_ring_of_the_kernel_holds_what_the_reference_holds(capacity, span_ns, set_back_ns, stamps):
+    ring, reference = (kind(capacity, span_ns, set_back_ns) for kind in (SampleRing, ReferenceRing))
+    for seq, stamp in enumerate(stamps):
+        for one in (ring, reference):
+            one.append(stamp, seq, encode(state(seq)))
+        assert ring.samples() == reference.samples()
 
 
 @pytest.mark.parametrize("span_s", [-1.0, 0.0, float("nan"), float("inf")])

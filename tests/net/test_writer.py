@@ -111,10 +111,10 @@ def test_a_message_that_one_wire_cannot_represent_is_sent_on_none(sessions):
         writers = [native.open_stream("joint_states"), ros.open_stream("joint_states")]
         with pytest.raises(InvalidInput, match="the stamp is 0"):
             write_all(writers, UNSTAMPED)
-        assert [(writer.samples, writer.bytes) for writer in writers] == [(0, 0), (0, 0)]
+        assert [writer.sent for writer in writers] == [(0, 0), (0, 0)]
         write_all(writers, STATE)
     sizes = [len(writer.encoder.encode(STATE)) for writer in writers]
-    assert [(writer.samples, writer.bytes) for writer in writers] == [(1, size) for size in sizes]
+    assert [writer.sent for writer in writers] == [(1, size) for size in sizes]
 
 
 def test_stream_without_a_ros_topic_is_refused(sessions):

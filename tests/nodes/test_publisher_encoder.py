@@ -38,9 +38,9 @@ pytestmark = pytest.mark.skipif(kernel != "c", reason=f"runs on the reference: {
 def both(model: RobotModel, *arguments: Any, session: int = 7) -> tuple[bytes, bytes]:
     """The payload by the extension alone, and by the reference alone."""
     encoder, reference = RobotEncoder(model, "r1", session), RobotEncoder(model, "r1", session)
-    reference._compiled = None
-    assert encoder._compiled is not None
-    return encoder._compiled.encode(*arguments), reference.encode(*arguments)
+    reference.compiled = None
+    assert encoder.compiled is not None
+    return encoder.compiled.encode(*arguments), reference.encode(*arguments)
 
 
 @given(
@@ -118,7 +118,7 @@ def test_other_forms_are_left_to_the_reference(arguments: tuple[Any, ...]):
 )
 def test_refused_arrays_raise_the_error_of_the_reference(arguments: tuple[Any, ...], text: str):
     encoder, reference = RobotEncoder(RRBOT, "r1", 7), RobotEncoder(RRBOT, "r1", 7)
-    reference._compiled = None
+    reference.compiled = None
     for one in (encoder, reference):
         with pytest.raises(InvalidInput, match=text):
             one.encode(*arguments, 1, 2)

@@ -4,8 +4,10 @@
  * Each type is specified by its reference in Python, which stays complete:
  * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
  * (TransformFields), zstate/model/joint_transforms.py (Edges), zstate/model/pinocchio_solver.py
- * (placement_poses), zstate/nodes/publisher.py (JointStateEncoder), zstate/ingest/base.py with
- * zstate/wire/native.py (FastPath). Differences to those are bugs, and tests compare both.
+ * (placement_poses), zstate/nodes/publisher.py (JointStateEncoder, PublishPath),
+ * zstate/wire/ros2/encoder.py (RosJointStateEncoder), zstate/net/sample_history.py (SampleRing),
+ * zstate/ingest/base.py with zstate/wire/native.py (FastPath). Differences to those are bugs, and
+ * tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
  * covers are never written again, so a batch that holds references to its blocks reads them without
@@ -25,6 +27,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 #include <string.h>
+#include <time.h>
 
 #include "_kernel/input.h"
 #include "_kernel/block.h"
@@ -39,6 +42,9 @@
 #include "_kernel/edges.h"
 #include "_kernel/placements.h"
 #include "_kernel/joint_state.h"
+#include "_kernel/ros_joint_state.h"
+#include "_kernel/sample_ring.h"
+#include "_kernel/publish_path.h"
 
 /* Raised with every change of the interface to Python, so that a library built from older source
  * (an editable install that was not rebuilt) is recognised and not used. */
@@ -60,9 +66,16 @@ static struct PyModuleDef kernel_module = {
 static int
 fill_module(PyObject *module)
 {
-    PyTypeObject *types[] = {
-        &Block_type, &History_type, &FastPath_type,         &TransformFields_type,
-        &Path_type,  &Edges_type,   &JointStateEncoder_type};
+    PyTypeObject *types[] = {&Block_type,
+                             &History_type,
+                             &FastPath_type,
+                             &TransformFields_type,
+                             &Path_type,
+                             &Edges_type,
+                             &JointStateEncoder_type,
+                             &SampleRing_type,
+                             &PublishPath_type,
+                             &RosJointStateEncoder_type};
     for (size_t i = 0; i < sizeof(types) / sizeof(types[0]); i++)
         if (PyModule_AddType(module, types[i]) < 0)
             return -1;
@@ -72,8 +85,10 @@ fill_module(PyObject *module)
     version_name = PyUnicode_InternFromString("version");
     received_name = PyUnicode_InternFromString("received");
     no_waiters = PyTuple_New(0);
+    attachment_names = Py_BuildValue("(s)", "attachment");
     if (kind_static == NULL || kind_exact == NULL || kind_interpolated == NULL ||
-        version_name == NULL || received_name == NULL || no_waiters == NULL)
+        version_name == NULL || received_name == NULL || no_waiters == NULL ||
+        attachment_names == NULL)
         return -1;
     return PyModule_AddIntConstant(module, "REVISION", REVISION);
 }

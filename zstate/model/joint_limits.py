@@ -35,6 +35,12 @@ class JointLimits:
         """Whether any joint has limits."""
         return bool(self._joints)
 
+    def bounds(self, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The least and the greatest of ``count`` positions that are within; infinite without limits."""
+        lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
+        lower[self._columns], upper[self._columns] = self._lower, self._upper
+        return lower, upper
+
     def are_exceeded(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """For each row of ``positions``, (n, position_count), whether any joint is outside its limits."""
         values = positions[:, self._columns]

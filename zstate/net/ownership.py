@@ -9,9 +9,11 @@ Conflicting writers are found by their liveliness tokens and raise SecondWriter.
 
 from __future__ import annotations
 
+import math
 import time
 import weakref
-from collections.abc import Container, Generator, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Container, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from itertools import islice
@@ -59,7 +61,7 @@ _PROPAGATION_S = 0.02
 """The longest time until a token has reached all peers; on a loopback that took some milliseconds."""
 
 CHECK_PERIOD_S = 0.05
-"""Asking Zenoh for new tokens is a fifth of what a sample costs its writer."""
+"""Between two checks of a writer that is not the only one."""
 
 _STARTUP_S = 1.0
 """Each sample checks for this long: by then the tokens of writers that opened at the same time are here."""
@@ -92,15 +94,19 @@ class WriterClaim(Closeable):
         self._session = session
         self._claimed = claimed
         self._rivals: set[Announcement] = set()
+        self._changes: deque[tuple[str, zenoh.SampleKind]] = deque(maxlen=CAPACITY)
+        """Tokens that came and went since the last ``check``."""
+        self.on_change: Callable[[], None] | None = None
+        """Called in a thread of Zenoh when a token has ended ``is_settled``."""
         self._received: dict[tuple[Stream, str], zenoh.ext.AdvancedSubscriber[_Handler]] = {}
         self._publishing: set[int] = set()
         self._first: Announcement | None = None
-        self.next_check_s = 0.0
-        """Until then [s, ``time.monotonic``] ``check`` has nothing to do."""
+        self._next_check_s = 0.0
+        """Until then [s, ``time.monotonic``], or until a token changes, ``check`` has nothing to do."""
         self._established_at = 0.0
         self._expression = _WIRE.writers_expression(claimed[0].robot)
         # Not before the first ``check``: a router's replies leave out some of the tokens that are subscribed.
-        self._tokens: zenoh.Subscriber[_Handler] | None = None
+        self._tokens: zenoh.Subscriber[None] | None = None
         # Conflicts within one session are known at once, without a query.
         with _CLAIMS_LOCK:
             claims = _CLAIMS.setdefault(self._session, set())
@@ -127,20 +133,23 @@ class WriterClaim(Closeable):
     def check(self) -> None:
         """Raise SecondWriter if an older writer of the same stream exists (sticky). Raises Closed.
 
-        A second after the first call, checks at most 20 times per second.
+        A second after the first call, checks at most 20 times per second while there is another writer, and
+        otherwise when a token has appeared or disappeared.
         """
         if self._first is None:
             now = time.monotonic()
-            if now < self.next_check_s:
+            if now < self._next_check_s:
                 return
             self._session.check()
             if self._tokens is None:
                 self._established_at = now + _STARTUP_S
             elif now > self._established_at:
-                self.next_check_s = now + CHECK_PERIOD_S
+                self._next_check_s = math.inf  # before the changes are read: a later one sets it again
             self._update_rivals()
             if not self._rivals:
                 return
+            if now > self._established_at:
+                self._next_check_s = now + CHECK_PERIOD_S
             older = {rival for rival in self._rivals if self._is_older(rival)}
             if now > self._established_at:
                 older = {rival for rival in older if self._publishes(rival)}
@@ -151,6 +160,11 @@ class WriterClaim(Closeable):
                 return
             self._first = self._oldest(alive)
         raise self._second_writer(self._first)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether ``check`` has nothing to do until a token changes."""
+        return self._next_check_s == math.inf
 
     def close(self) -> None:
         """Release the ownership. A second call does nothing."""
@@ -173,19 +187,26 @@ class WriterClaim(Closeable):
     def _update_rivals(self) -> None:
         """Apply token changes. Runs in the publishing thread: a claim has no thread of its own."""
         if self._tokens is None:
-            ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
+            # Called on Zenoh's thread, which must not wait.
+            handler = zenoh.handlers.Callback(self._on_token, indirect=False)
             liveliness = self._session.zenoh.liveliness()
-            self._tokens = liveliness.declare_subscriber(self._expression, ring, history=True)
-        count = 0
-        while (sample := self._tokens.handler.try_recv()) is not None:
-            count += 1
-            rivals = self._rivals_in([str(sample.key_expr)])
-            if sample.kind == zenoh.SampleKind.PUT:
+            self._tokens = liveliness.declare_subscriber(self._expression, handler, history=True)
+        are_complete = len(self._changes) < CAPACITY
+        while self._changes:
+            token, kind = self._changes.popleft()
+            rivals = self._rivals_in([token])
+            if kind == zenoh.SampleKind.PUT:
                 self._rivals.update(rivals)
             else:
                 self._rivals.difference_update(rivals)
-        if count >= CAPACITY:  # some may have been lost
+        if not are_complete:
             self._rivals = set(self._current_rivals())
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        self._changes.append((str(sample.key_expr), sample.kind))
+        self._next_check_s = 0.0
+        if self.on_change is not None:
+            self.on_change()
 
     def _publishes(self, rival: Announcement) -> bool:
         """Whether a sample or a latched value of ``rival`` has been received since the first call."""

@@ -27,14 +27,14 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
-from typing import Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import zenoh
 
 from zstate._util.closeable import Closeable
 from zstate.clock import SET_BACK_NS
 from zstate.errors import Closed, InvalidInput, MessageError
+from zstate.extension import kernel
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
 from zstate.net.streams import JOIN_WITHIN_S, to_serialized
@@ -122,6 +122,44 @@ class CachedSample(NamedTuple):
     payload: bytes
 
 
+class ReferenceRing:
+    """The last ``capacity`` samples, and of these the ones of the ``span_ns`` [ns] before the newest.
+
+    A stamp more than ``set_back_ns`` before an earlier one means that the clock was set back: then the
+    earlier samples are dropped. The reference of the kernel's ``SampleRing``.
+    """
+
+    def __init__(self, capacity: int, span_ns: int, set_back_ns: int) -> None:
+        self._span_ns, self._set_back_ns = span_ns, set_back_ns
+        # Plain tuples: a named one takes longer to create than all the rest of ``append``.
+        self._samples: deque[tuple[int, int, bytes]] = deque(maxlen=capacity)
+        self._newest = 0
+
+    def append(self, stamp: int, seq: int, payload: bytes) -> None:
+        """Add a sample, whose ``seq`` is one more than that of the last."""
+        samples = self._samples
+        limit = stamp - self._span_ns
+        if stamp >= self._newest:
+            self._newest = stamp
+        elif samples and stamp < self._newest - self._set_back_ns:
+            samples.clear()  # readers start a new history, too
+        if not samples:
+            self._newest = stamp
+        samples.append((stamp, seq, payload))
+        while samples[0][0] < limit:
+            samples.popleft()
+
+    def samples(self) -> list[tuple[int, int, bytes]]:
+        """The samples (stamp, seq, payload), the oldest first."""
+        return list(self._samples.copy())  # the copy is atomic: the writer appends at the same time
+
+
+if TYPE_CHECKING or kernel == "c":
+    from zstate._kernel import SampleRing
+else:
+    SampleRing = ReferenceRing
+
+
 class SampleCache:
     """The samples of the session ``writer``: the last ``span_s`` seconds before the newest, by their stamps.
 
@@ -133,41 +171,24 @@ class SampleCache:
             raise InvalidInput(f"cache_s is a number of seconds, 0 for no cache; not {span_s!r}")
         self.span_s = span_s
         self.writer = writer
-        self._span_ns = round(span_s * 1e9)
-        # Plain tuples: a named one takes longer to create than all the rest of ``append``.
-        self._samples: deque[tuple[int, int, bytes]] = deque(
-            maxlen=MAX_CACHE_BYTES // (8 * numbers + _OVERHEAD)
-        )
-        self._newest = 0
-
-    def append(self, stamp: int, seq: int, payload: bytes) -> None:
-        """Cache a sample, whose ``seq`` is one more than that of the last."""
-        samples = self._samples
-        limit = stamp - self._span_ns
-        if stamp >= self._newest:
-            self._newest = stamp
-        elif samples and stamp < self._newest - SET_BACK_NS:
-            samples.clear()  # the clock was set back: readers start a new history, too
-        if not samples:
-            self._newest = stamp
-        samples.append((stamp, seq, payload))
-        while samples[0][0] < limit:
-            samples.popleft()
+        capacity = MAX_CACHE_BYTES // (8 * numbers + _OVERHEAD)
+        self.ring = SampleRing(capacity, round(span_s * 1e9), SET_BACK_NS)
+        self.append = self.ring.append
 
     def since(self, seq: int) -> list[CachedSample]:
         """The cached samples from ``seq`` on."""
-        samples = self._samples.copy()  # atomic: the writer appends at the same time
+        samples = self.ring.samples()
         first = seq - samples[0][1] if samples else 0
-        return [CachedSample(*sample) for sample in islice(samples, max(0, first), None)]
+        return [CachedSample(*sample) for sample in samples[max(0, first) :]]
 
     def before(self, seq: int | None, count: int) -> tuple[list[CachedSample], bool]:
         """The last ``count`` samples before ``seq``, or the newest, and whether there are older ones."""
-        samples = self._samples.copy()
+        samples = self.ring.samples()
         if not samples:
             return [], False
         stop = len(samples) if seq is None else min(max(0, seq - samples[0][1]), len(samples))
         first = max(0, stop - count)
-        return [CachedSample(*sample) for sample in islice(samples, first, stop)], first > 0
+        return [CachedSample(*sample) for sample in samples[first:stop]], first > 0
 
 
 def serve_history(

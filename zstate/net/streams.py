@@ -250,7 +250,10 @@ class StreamPublisher(Closeable):
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=False,
         )
+        self.zenoh_put: Callable[..., object] = self._publisher.put  # pyright: ignore  # its result has no type
         self._has_readers = False
+        self.on_readers: Callable[[], None] | None = None
+        """Called in a thread of Zenoh after each change of ``has_readers``."""
         self._changes: zenoh.MatchingListener[None] | None = None
 
     @property
@@ -264,6 +267,8 @@ class StreamPublisher(Closeable):
 
     def _on_change(self, status: zenoh.MatchingStatus) -> None:
         self._has_readers = status.matching
+        if self.on_readers is not None:
+            self.on_readers()
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> None:
         """Send one sample with its attachment. Raises Closed."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Iterable
 from contextlib import ExitStack, contextmanager, suppress
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import zenoh
 
@@ -25,6 +25,9 @@ from zstate.wire.keys import Stream
 from zstate.wire.messages import Message
 from zstate.wire.protocol import StreamEncoder, Wire, WriterNode
 
+if TYPE_CHECKING:
+    from zstate._kernel import PublishPath
+
 _PERMISSION_TIMEOUT_S = 1.0
 _PERMISSION_ROUND_S = 0.02
 
@@ -35,21 +38,28 @@ class SampleWriter(StreamPublisher):
     """Publishes the samples of one stream of one writer.
 
     Encoding and sending are two calls, so that a message which one of several wires cannot represent is
-    sent on none: encode for all of them first. ``samples`` and ``bytes`` count what was sent.
+    sent on none: encode for all of them first.
     """
 
     def __init__(self, session: Session, encoder: StreamEncoder) -> None:
         super().__init__(session, encoder.key, encoder.encoding)
         self.encoder = encoder
-        self.samples = 0
-        self.bytes = 0
+        self.path: PublishPath | None = None
+        """What else publishes samples of this writer, and counts them."""
+        self._samples = self._bytes = 0
         self._attachment = encoder.attachment
+
+    @property
+    def sent(self) -> tuple[int, int]:
+        """How many samples were sent, and the size of their payloads [bytes]."""
+        more = (self.path.samples, self.path.bytes) if self.path else (0, 0)
+        return self._samples + more[0], self._bytes + more[1]
 
     def write(self, payload: bytes) -> None:
         """Send a payload of ``encoder``. Raises Closed."""
         self.put(payload, self._attachment and self._attachment(time.time_ns()))
-        self.samples += 1
-        self.bytes += len(payload)
+        self._samples += 1
+        self._bytes += len(payload)
 
 
 class LatchedWriter(LatchedPublisher):

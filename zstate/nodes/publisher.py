@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
 import secrets
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -14,7 +12,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from numpy.typing import ArrayLike
 
-from zstate.clock import Clock, check_stamp
+from zstate._util.fork_safe import fork_safe
+from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.extension import kernel
 from zstate.model.joint_limits import JointLimits
@@ -48,7 +47,7 @@ from zstate.wire.native import decode_joint_state, encode
 from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING or kernel == "c":
-    from zstate._kernel import JointStateEncoder
+    from zstate._kernel import JointStateEncoder, PublishPath
 
 _LOG = logging.getLogger("zstate")
 
@@ -85,9 +84,10 @@ class RobotEncoder:
         self._joint_order = order_digest(model.joint_names)
         quaternions = tuple(form.column + 3 for form in forms if form.kind == "floating")
         counts = (model.position_count, model.velocity_count)
-        self._compiled = (
+        self.compiled = (
             JointStateEncoder(session, self._joint_order, *counts, quaternions) if kernel == "c" else None
         )
+        """The same for flat arrays of doubles, in the extension."""
 
     def encode(
         self,
@@ -101,8 +101,8 @@ class RobotEncoder:
 
         Raises InvalidInput unless ``positions`` are a configuration of the robot, and the others fit it.
         """
-        if self._compiled is not None:
-            payload = self._compiled.encode(positions, velocities, efforts, stamp, seq)
+        if self.compiled is not None:
+            payload = self.compiled.encode(positions, velocities, efforts, stamp, seq)
             if payload is not None:
                 return payload
         model = self._model
@@ -154,8 +154,9 @@ class StatePublisher(SamplePublisher):
     ) -> None:
         super().__init__(robot or model.name, wires, clock, secrets.randbits(32))
         self.model = model
+        self._session = session
+        self._path: PublishPath | None = None
         self._encoder = RobotEncoder(model, self.robot, self._session_id)
-        self._next_check_s = -math.inf
         wires = self._wires
         for stream in streams:
             if stream not in STREAMS:
@@ -204,11 +205,41 @@ class StatePublisher(SamplePublisher):
             if self._recent is not None and self._writers:
                 recent = RecentBuffer(model, self.robot, self._recent)
                 opening.enter_context(LookupService(session, recent.buffer, self.robot))
+            self._path = self._open_path()
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:
         closed = ", closed" if self._stop.is_set() else ""
-        return f"<StatePublisher of {self.robot!r} on {', '.join(self._wires)}: {self._seq} samples{closed}>"
+        return f"<StatePublisher of {self.robot!r} on {', '.join(self._wires)}: {self._sent} samples{closed}>"
+
+    def _open_path(self) -> PublishPath | None:
+        """What publishes usual samples in one call; None without the extension, or with several wires."""
+        encoder = self._encoder.compiled
+        writers = [one for (_, stream), one in self._writers.items() if stream == "joint_states"]
+        if encoder is None or len(writers) != 1:
+            return None
+        ros = writers[0].encoder.compile_joint_states()
+        if ros is None and self._native is None:
+            return None
+        path = PublishPath(
+            encoder,
+            ros,
+            None if self._recent is None else self._recent.ring,
+            writers[0].zenoh_put,
+            *JointLimits(self.model).bounds(self.model.position_count),
+            None if self._limits is None else self._limits.add_outside,
+            isinstance(self._clock, SystemClock),
+        )
+        writers[0].path = path
+        if self._claim is not None:
+            self._claim.on_change = path.pause
+        for writer in self._transforms:
+            writer.on_readers = path.pause
+        fork_safe(self)
+        return path
+
+    def _at_fork_reinit(self) -> None:
+        self._path = None  # another thread may have been in it, and the session is closed here
 
     def _open_cache(self, session: Session, cache_s: float, opening: ExitStack) -> SampleCache | None:
         if "native" not in self._wires:
@@ -257,11 +288,13 @@ class StatePublisher(SamplePublisher):
         a unit quaternion, and a stamp that a wire cannot represent; SecondWriter; and Closed. If it raises,
         nothing was sent.
         """
+        if self._path is not None and self._path.publish(positions, velocities, efforts, stamp):
+            return
         try:
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
             with self._lock:
-                if time.monotonic() >= self._next_check_s:
-                    self._check_open()
+                self._check_open()
+                self._seq = self._stop_path()
                 # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
                 payload = self._encoder.encode(positions, velocities, efforts, stamp, self._seq)
                 readable = [writer for writer in self._transforms if writer.has_readers]
@@ -276,6 +309,7 @@ class StatePublisher(SamplePublisher):
                     writer.write(other)
                 if self._limits is not None:
                     self._limits.add(stamp, payload)
+                self._resume_path()
         except InvalidInput as error:
             self._count_refusal(error)
             raise
@@ -285,12 +319,30 @@ class StatePublisher(SamplePublisher):
             raise
 
     def _check_open(self) -> None:
-        """Raise Closed or SecondWriter; until ``_next_check_s`` neither can be the case."""
+        """Raise Closed or SecondWriter."""
         if self._stop.is_set():
             raise Closed(f"the publisher of {self.robot!r} is closed")
+        self._session.check()
         if self._claim is not None:
             self._claim.check()
-        self._next_check_s = math.inf if self._claim is None else self._claim.next_check_s
+
+    def _stop_path(self) -> int:
+        """Wait for the end of a call of the path in another thread. Returns the next sequence number."""
+        return self._seq if self._path is None else self._path.stop()
+
+    def _resume_path(self) -> None:
+        """Publish the next samples in one call each, while joint states are all that is sent."""
+        if self._path is None:
+            return
+        self._path.resume(self._seq)
+        # Checked after that: what changes now pauses the path.
+        is_owner = self._claim is None or self._claim.is_settled
+        if not is_owner or any(writer.has_readers for writer in self._transforms):
+            self._path.pause()
+
+    @property
+    def _sent(self) -> int:
+        return self._seq if self._path is None else max(self._seq, self._path.seq)
 
     def _encode_derived(
         self, payload: bytes, readable: Sequence[SampleWriter]
@@ -326,7 +378,7 @@ class StatePublisher(SamplePublisher):
         """Stop publishing; ``run`` returns. A second call does nothing."""
         self._stop.set()
         with self._lock:
-            self._next_check_s = -math.inf
+            self._seq = self._stop_path()
         super().close()
 
 

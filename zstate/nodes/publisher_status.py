@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zstate._util.fork_safe import fork_safe
 from zstate.errors import format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.rate import RateReport
@@ -45,8 +47,8 @@ class PublisherStats:
     ``sent`` samples were published, ``refused`` ones were not; ``last_refusal`` is the newest reason.
     ``streams`` has the counts by (wire, stream). ``rate`` is the report of the last ``run``, None before
     the first. ``outside_limits`` published samples had joints outside their limits, the newest described
-    by ``last_excess``; they are checked in groups of one second or 250 samples. ``kinematics`` is what
-    computes transforms: "Pinocchio 4.1.0", for instance, or "closed forms"; empty without the stream tf.
+    by ``last_excess``. ``kinematics`` is what computes transforms: "Pinocchio 4.1.0", for instance, or
+    "closed forms"; empty without the stream tf.
     """
 
     sent: int
@@ -63,22 +65,41 @@ class LimitWatch:
     """Counts the samples whose positions exceed joint limits, and logs the first.
 
     The first sample is checked at once, later ones in groups, which takes about 0.3 us per sample.
-    Not thread-safe.
     """
 
     def __init__(self, limits: JointLimits, robot: str) -> None:
-        self.count = 0
-        self.last = ""
+        self._count = 0
+        self._last = ""
+        # Entered again if a handler of the warning reads the counts.
+        self._lock = fork_safe(threading.RLock())
         self._limits, self._robot = limits, robot
         self._payloads: list[bytes] = []
         self._began = self._due = 0
 
     def add(self, stamp: int, payload: bytes) -> None:
         """Count the JointState with ``stamp`` [ns] in ``payload``, now or with its group."""
-        self._payloads.append(payload)
-        if self._began <= stamp < self._due and len(self._payloads) < _CHECKED_AT_ONCE:
-            return
-        self._began, self._due = stamp, stamp + _CHECKED_EVERY_NS
+        with self._lock:
+            self._payloads.append(payload)
+            if self._began <= stamp < self._due and len(self._payloads) < _CHECKED_AT_ONCE:
+                return
+            self._began, self._due = stamp, stamp + _CHECKED_EVERY_NS
+            self._check()
+
+    def add_outside(self, payload: bytes) -> None:
+        """Count the JointState in ``payload``, which is known to be outside: the first now."""
+        with self._lock:
+            self._payloads.append(payload)
+            if not self._count or len(self._payloads) >= _CHECKED_AT_ONCE:
+                self._check()
+
+    def counted(self) -> tuple[int, str]:
+        """How many samples were outside until now, and the joints of the newest."""
+        with self._lock:
+            if self._payloads:
+                self._check()
+            return self._count, self._last
+
+    def _check(self) -> None:
         block = b"".join(map(joint_positions, self._payloads))
         positions = from_block(block).reshape(len(self._payloads), -1)
         self._payloads.clear()
@@ -87,10 +108,10 @@ class LimitWatch:
         if not self._limits.are_exceeded(extremes).any():
             return
         are_exceeded = self._limits.are_exceeded(positions)
-        self.last = self._limits.explanation(positions[are_exceeded][-1:])
-        if not self.count:
-            _LOG.warning("%s: %s; further samples outside limits are only counted", self._robot, self.last)
-        self.count += int(are_exceeded.sum())
+        self._last = self._limits.explanation(positions[are_exceeded][-1:])
+        if not self._count:
+            _LOG.warning("%s: %s; further samples outside limits are only counted", self._robot, self._last)
+        self._count += int(are_exceeded.sum())
 
 
 class Health(NamedTuple):

@@ -61,12 +61,17 @@ class SamplePublisher(Closeable):
     def stats(self) -> PublisherStats:
         """Counts of published, suppressed and refused samples."""
         streams = {
-            place: StreamStats(writer.samples, writer.bytes, self._seq - writer.samples)
+            place: StreamStats(*(sent := writer.sent), self._sent - sent[0])
             for place, writer in self._writers.items()
         }
         rate = None if self._rate is None else self._rate.report()
-        outside, excess = (0, "") if self._limits is None else (self._limits.count, self._limits.last)
-        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate, outside, excess)
+        outside, excess = (0, "") if self._limits is None else self._limits.counted()
+        return PublisherStats(self._sent, self._refused, self._last_refusal, streams, rate, outside, excess)
+
+    @property
+    def _sent(self) -> int:
+        """How many samples were published."""
+        return self._seq
 
     def _count_refusal(self, error: Exception) -> None:
         self._last_refusal = str(error)

@@ -176,6 +176,9 @@ class NativeStreamEncoder:
     def encode(self, message: Message) -> bytes:
         return encode(message)
 
+    def compile_joint_states(self) -> None:
+        return None
+
 
 class NativeWire:
     """The native wire format (``zstate.wire.protocol.Wire``)."""

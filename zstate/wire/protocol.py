@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from msgspec import Struct
 
@@ -13,6 +13,9 @@ from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import ANY, Stream, check_robot
 from zstate.wire.messages import Message
+
+if TYPE_CHECKING:
+    from zstate._kernel import RosJointStateEncoder
 
 
 class SerializedSample(Struct, frozen=True, gc=False):
@@ -59,6 +62,13 @@ class StreamEncoder(Protocol):
 
     def encode(self, message: Message) -> bytes:
         """The payload of ``message``. Raises InvalidInput if the wire format cannot represent it."""
+        ...
+
+    def compile_joint_states(self) -> RosJointStateEncoder | None:
+        """The extension's encoder of usual joint states; None if that of the native wire serves.
+
+        Its attachments and those of ``attachment`` are numbered together.
+        """
         ...
 
     @property

@@ -12,8 +12,11 @@ from helpers.manual_cdr import (
     rosbags_tf_message,
     rosbags_time,
 )
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput
+from zstate.extension import kernel
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import (
     ClockMessage,
@@ -130,6 +133,45 @@ def test_attachments_are_numbered_from_one_on_and_a_refused_message_takes_no_num
         one.encode(state([1.0, 2.0], stamp=0))
     assert one.attachment(6) == struct.pack("<qqB", 2, 6, 16) + GID
     assert encoder(gid=None).attachment(5) is None
+
+
+@pytest.mark.skipif(kernel != "c", reason=f"runs on the reference: {kernel.reason}")
+@pytest.mark.parametrize("layout", [ARM, DRONE, SampleLayout()])
+@pytest.mark.parametrize("sent", [(False, False), (True, False), (False, True), (True, True)])
+@settings(deadline=None)
+@given(
+    dice=st.integers(0, 2**32),
+    stamp=st.integers(-(2**63), 2**63 - 1)
+    | st.integers(-(2**31) * 10**9 - 5, -(2**31) * 10**9 + 5)
+    | st.integers(2**31 * 10**9 - 5, 2**31 * 10**9 + 5)
+    | st.integers(-(10**10), 10**10),
+)
+def test_the_extension_encodes_the_bytes_of_the_reference(layout, sent, dice, stamp):
+    reference, compiled = encoder(layout), encoder(layout).compile_joint_states()
+    random = np.random.default_rng(dice)
+    positions = random.integers(0, 2**62, len(layout.coordinates)).view(np.float64)
+    rates = [random.normal(size=len(layout.velocity_slots)) if one else None for one in sent]
+    payload = compiled.encode(positions, *rates, stamp)
+    try:
+        assert payload == reference.encode(state(positions, *rates, stamp=stamp))
+    except InvalidInput:
+        assert payload is None
+
+
+@pytest.mark.skipif(kernel != "c", reason=f"runs on the reference: {kernel.reason}")
+def test_attachments_of_the_extension_and_the_reference_are_numbered_together():
+    one, expected = encoder(), encoder()
+    compiled = one.compile_joint_states()
+    found = [one.attachment(5), compiled.attachment(-6), one.attachment(2**62)]
+    assert found == [expected.attachment(now) for now in (5, -6, 2**62)]
+    assert encoder(gid=None).compile_joint_states().attachment(5) is None
+
+
+def test_duplicate_names_are_left_to_the_reference():
+    one = encoder(SampleLayout(("a", "a"), (0, 1)))
+    assert one.compile_joint_states() is None
+    with pytest.raises(InvalidInput, match="'a'"):
+        one.encode(state([1.0, 2.0]))
 
 
 def test_latched_values_are_not_withdrawn_and_encoding_is_empty():

@@ -170,11 +170,39 @@ quaternions_are_unit(const JointStateEncoder *self, const double *positions)
     return true;
 }
 
-static PyObject *
-encoder_payload(const JointStateEncoder *self, const Py_buffer *positions,
-                const Py_buffer *velocities, const Py_buffer *efforts, int64_t stamp, uint64_t seq)
+/* The numbers of one sample: a buffer without an object for none. */
+typedef struct {
+    Py_buffer positions, velocities, efforts;
+} Numbers;
+
+static void
+release_numbers(Numbers *numbers)
 {
-    Py_ssize_t size = LONGEST_HEAD + positions->len + velocities->len + efforts->len;
+    PyBuffer_Release(&numbers->positions);
+    PyBuffer_Release(&numbers->velocities);
+    PyBuffer_Release(&numbers->efforts);
+}
+
+/* Positions, velocities and efforts. False, without an error, for anything but flat arrays of
+ * finite doubles in the right number. */
+static bool
+get_numbers(const JointStateEncoder *self, PyObject *const *args, Numbers *numbers)
+{
+    memset(numbers, 0, sizeof(*numbers));
+    if (PY_LITTLE_ENDIAN && plain_numbers(args[0], &numbers->positions, self->positions) &&
+        quaternions_are_unit(self, numbers->positions.buf) &&
+        plain_or_none(args[1], &numbers->velocities, self->velocities) &&
+        plain_or_none(args[2], &numbers->efforts, self->velocities))
+        return true;
+    release_numbers(numbers);
+    return false;
+}
+
+static PyObject *
+encoder_payload(const JointStateEncoder *self, const Numbers *numbers, int64_t stamp, uint64_t seq)
+{
+    Py_ssize_t size =
+        LONGEST_HEAD + numbers->positions.len + numbers->velocities.len + numbers->efforts.len;
     PyObject *payload = PyBytes_FromStringAndSize(NULL, size);
     if (payload == NULL)
         return NULL;
@@ -184,9 +212,9 @@ encoder_payload(const JointStateEncoder *self, const Py_buffer *positions,
     at = put_unsigned(at, seq);
     at = put_unsigned(at, self->session);
     at = put_bytes(at, self->order, sizeof(self->order));
-    at = put_block(at, positions);
-    at = put_block(at, velocities);
-    at = put_block(at, efforts);
+    at = put_block(at, &numbers->positions);
+    at = put_block(at, &numbers->velocities);
+    at = put_block(at, &numbers->efforts);
     at = put_typed(at, 0xc0, 0, 0);
     _PyBytes_Resize(&payload, at - begin);
     return payload;
@@ -195,28 +223,17 @@ encoder_payload(const JointStateEncoder *self, const Py_buffer *positions,
 static PyObject *
 encoder_encode(JointStateEncoder *self, PyObject *const *args, Py_ssize_t count)
 {
-    Py_buffer positions, velocities, efforts;
+    Numbers numbers;
     int64_t stamp, seq;
-    PyObject *payload = Py_None;
     if (count != 5) {
         PyErr_SetString(PyExc_TypeError, "encode(positions, velocities, efforts, stamp, seq)");
         return NULL;
     }
-    if (!PY_LITTLE_ENDIAN || !plain_stamp(args[3], &stamp) || !plain_stamp(args[4], &seq) ||
-        seq < 0 || !plain_numbers(args[0], &positions, self->positions))
+    if (!plain_stamp(args[3], &stamp) || !plain_stamp(args[4], &seq) || seq < 0 ||
+        !get_numbers(self, args, &numbers))
         Py_RETURN_NONE;
-    if (quaternions_are_unit(self, positions.buf) &&
-        plain_or_none(args[1], &velocities, self->velocities)) {
-        if (plain_or_none(args[2], &efforts, self->velocities)) {
-            payload =
-                encoder_payload(self, &positions, &velocities, &efforts, stamp, (uint64_t)seq);
-            PyBuffer_Release(&efforts);
-        }
-        PyBuffer_Release(&velocities);
-    }
-    PyBuffer_Release(&positions);
-    if (payload == Py_None)
-        Py_RETURN_NONE;
+    PyObject *payload = encoder_payload(self, &numbers, stamp, (uint64_t)seq);
+    release_numbers(&numbers);
     return payload;
 }
 

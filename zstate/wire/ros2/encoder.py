@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from zstate.errors import InvalidInput
+from zstate.extension import kernel
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import (
     POSE_BYTES,
@@ -29,6 +32,9 @@ from zstate.wire.ros2.decoder import duplicate_text, read_joint_state, read_tf_m
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.scans import encode_grid, encode_scan
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
+
+if TYPE_CHECKING or kernel == "c":
+    from zstate._kernel import RosJointStateEncoder
 
 
 class RosStreamEncoder:
@@ -56,11 +62,25 @@ class RosStreamEncoder:
         self._sample_names = sample_names
         self._joints: tuple[tuple[str, ...], JointStateEncoder] | None = None
         self._edges: tuple[Edges, TfMessageEncoder] | None = None
+        self._compiled: RosJointStateEncoder | None = None
+
+    def compile_joint_states(self) -> RosJointStateEncoder | None:
+        if kernel != "c":
+            return None
+        names, slots = self._sample_names.coordinates, self._sample_names.velocity_slots
+        with suppress(InvalidInput):  # ``encode`` raises it
+            forms = tuple(
+                _prefix_blocks(_unique(names), "", *sent) for sent in product((False, True), repeat=2)
+            )
+            self._compiled = RosJointStateEncoder(forms, len(names), slots, self._gid)
+        return self._compiled
 
     def attachment(self, now: int) -> bytes | None:
         """Sequence number, time of sending ``now`` [ns] and gid, which ROS nodes require."""
         if self._gid is None:
             return None
+        if self._compiled is not None:
+            return self._compiled.attachment(now)
         self._seq += 1
         return pack(self._seq, now, self._gid)
 
@@ -126,9 +146,7 @@ class JointStateEncoder:
     """
 
     def __init__(self, names: Sequence[str], frame_id: str = "") -> None:
-        if len(set(names)) != len(names):
-            raise InvalidInput(duplicate_text(names))
-        self._count = len(names)
+        self._count = len(_unique(names))
         self._size = 8 * len(names)
         self._prefix_blocks = {
             sent: _prefix_blocks(names, frame_id, *sent) for sent in product((False, True), repeat=2)
@@ -157,6 +175,13 @@ class JointStateEncoder:
         head, names, second, third = self._prefix_blocks[velocities is not None, efforts is not None]
         time = pack_stamp(stamp)
         return b"".join((head, time, names, positions, second, velocities or b"", third, efforts or b""))
+
+
+def _unique(names: Sequence[str]) -> Sequence[str]:
+    """``names``. Raises InvalidInput for a duplicate."""
+    if len(set(names)) != len(names):
+        raise InvalidInput(duplicate_text(names))
+    return names
 
 
 def _prefix_blocks(
