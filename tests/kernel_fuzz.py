@@ -110,6 +110,7 @@ class Fuzz:
             self.make_path,
             self.make_good_path,
             *(self.lookup,) * 6,
+            *(self.take_newer,) * 3,
             *(self.lookup_many,) * 2,
             self.make_facts,
             self.edges,
@@ -270,6 +271,16 @@ class Fuzz:
             if answer is not None:
                 repr((answer._pose, answer.stamp, answer.kind, answer.target, answer.predicted_s))
             path.failure_at(self.stamp())
+
+    def take_newer(self) -> None:
+        for path in self.paths[-3:]:
+            newer = self.kernel.NewerTransforms(
+                *self.mostly((path, self.mostly(3, 2**63), self.stamp()), (path,))
+            )
+            self.write()
+            is_met, transform = newer.is_met(), newer.take(self.mostly(3, 2**70))
+            assert is_met or transform is None
+            assert transform is None or not newer.is_met()
 
     def lookup_many(self) -> None:
         for path in self.paths[-3:]:

@@ -2,10 +2,11 @@
  * publisher.
  *
  * Each type is specified by its reference in Python, which stays complete:
- * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
- * (TransformFields), zstate/model/joint_transforms.py (Edges), zstate/model/pinocchio_solver.py
- * (placement_poses), zstate/nodes/publisher.py (JointStateEncoder), zstate/ingest/base.py with
- * zstate/wire/native.py (FastPath). Differences to those are bugs, and tests compare both.
+ * zstate/buffer/history.py (History), path.py and interpolation.py (Path), waiting.py
+ * (NewerTransforms), zstate/transform.py (TransformFields), zstate/model/joint_transforms.py
+ * (Edges), zstate/model/pinocchio_solver.py (placement_poses), zstate/nodes/publisher.py
+ * (JointStateEncoder), zstate/ingest/base.py with zstate/wire/native.py (FastPath). Differences to
+ * those are bugs, and tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
  * covers are never written again, so a batch that holds references to its blocks reads them without
@@ -34,13 +35,14 @@
 #include "_kernel/transform_fields.h"
 #include "_kernel/step.h"
 #include "_kernel/path.h"
+#include "_kernel/newer_transforms.h"
 #include "_kernel/edges.h"
 #include "_kernel/placements.h"
 #include "_kernel/joint_state.h"
 
 /* Raised with every change of the interface to Python, so that a library built from older source
  * (an editable install that was not rebuilt) is recognised and not used. */
-#define REVISION 10
+#define REVISION 11
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,
@@ -59,8 +61,8 @@ static int
 fill_module(PyObject *module)
 {
     PyTypeObject *types[] = {
-        &Block_type, &History_type, &FastPath_type,         &TransformFields_type,
-        &Path_type,  &Edges_type,   &JointStateEncoder_type};
+        &Block_type, &History_type,         &FastPath_type, &TransformFields_type,
+        &Path_type,  &NewerTransforms_type, &Edges_type,    &JointStateEncoder_type};
     for (size_t i = 0; i < sizeof(types) / sizeof(types[0]); i++)
         if (PyModule_AddType(module, types[i]) < 0)
             return -1;
