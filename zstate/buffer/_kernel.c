@@ -5,8 +5,8 @@
  * zstate/buffer/history.py (History), path.py and interpolation.py (Path), waiting.py
  * (NewerTransforms), zstate/transform.py (TransformFields), zstate/model/joint_transforms.py
  * (Edges), zstate/model/pinocchio_solver.py (placement_poses), zstate/nodes/publisher.py
- * (JointStateEncoder), zstate/ingest/base.py with zstate/wire/native.py (FastPath). Differences to
- * those are bugs, and tests compare both.
+ * (JointStateEncoder), zstate/ingest/base.py with zstate/wire/native.py and
+ * zstate/wire/ros2/decoder.py (FastPath). Differences to those are bugs, and tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
  * covers are never written again, so a batch that holds references to its blocks reads them without
@@ -30,6 +30,7 @@
 #include "_kernel/input.h"
 #include "_kernel/block.h"
 #include "_kernel/history.h"
+#include "_kernel/ros_message.h"
 #include "_kernel/fast_path.h"
 #include "_kernel/motion.h"
 #include "_kernel/transform_fields.h"
