@@ -94,7 +94,7 @@ static_transform(const Path *self, PyObject *stamp)
 }
 
 /* The transform at an instant, or None; `stamp` is NULL or the object that the caller passed. */
-static PyObject *
+static inline PyObject *
 transform_at(const Path *self, int64_t at, PyObject *stamp, Bracket *nows)
 {
     PyObject *kind = kind_exact;
@@ -119,7 +119,7 @@ transform_at(const Path *self, int64_t at, PyObject *stamp, Bracket *nows)
 }
 
 /* The same, with memory for the brackets of all tracks, of which there is at least one. */
-static PyObject *
+static inline PyObject *
 transform_when(const Path *self, int64_t at, PyObject *stamp)
 {
     Py_ssize_t tracks = track_count(self);
