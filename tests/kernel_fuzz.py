@@ -13,6 +13,7 @@ import importlib.util
 import math
 import os
 import random
+import struct
 import subprocess
 import sys
 import sysconfig
@@ -114,6 +115,7 @@ class Fuzz:
             self.make_path,
             self.make_good_path,
             *(self.lookup,) * 6,
+            *(self.take_newer,) * 3,
             *(self.lookup_many,) * 2,
             *(self.place,) * 3,
             self.make_facts,
@@ -208,9 +210,20 @@ class Fuzz:
                 block.reshape(-1, 7)[:, 3:] = (1.0, 0.0, 0.0, 0.0)
         head = [self.mostly(stamp, *STAMPS[:6]), seq, 7, b"\0" * 8]
         good = msgspec.msgpack.encode([*head, *(block.tobytes() for block in numbers), None])
+        if self.random.random() < 0.4:
+            good = self.ros_message(stamp, seq, numbers)
         at = self.random.randrange(len(good))
         flipped = good[:at] + bytes([self.random.randrange(256)]) + good[at + 1 :]
         return self.mostly(good, good[:at], flipped, flipped, good + b"\0", bytearray(good), b"")
+
+    def ros_message(self, stamp: int, seq: int, numbers: list[Any]) -> bytes:
+        """A JointState as CDR, with its attachment."""
+        cdr = bytearray(struct.pack("<4siII4sI", b"\0\1\0\0", *divmod(stamp % 2**60, 10**9), 4, b"abc\0", 2))
+        cdr += struct.pack("<I2sxxI1s", 2, b"a\0", 1, b"\0")
+        for block in [*numbers, (), ()][:3]:
+            cdr += bytes(-len(cdr) % 4) + struct.pack("<I", self.mostly(len(block), 2**32 - 1, 2**29))
+            cdr += bytes((4 - len(cdr)) % 8 if len(block) else 0) + np.array(block, "<f8").tobytes()
+        return bytes(cdr) + struct.pack("<qqB16s", seq, self.random.randrange(9), 16, b"gid")
 
     def insert_next(self) -> None:
         """A run of messages, of which each should be the one after the last."""
@@ -281,6 +294,16 @@ class Fuzz:
             if answer is not None:
                 repr((answer._pose, answer.stamp, answer.kind, answer.target, answer.predicted_s))
             path.failure_at(self.stamp())
+
+    def take_newer(self) -> None:
+        for path in self.paths[-3:]:
+            newer = self.kernel.NewerTransforms(
+                *self.mostly((path, self.mostly(3, 2**63), self.stamp()), (path,))
+            )
+            self.write()
+            is_met, transform = newer.is_met(), newer.take(self.mostly(3, 2**70))
+            assert is_met or transform is None
+            assert transform is None or not newer.is_met()
 
     def lookup_many(self) -> None:
         for path in self.paths[-3:]:

@@ -6,6 +6,8 @@ import math
 import threading
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from zstate import Transform, TransformBuffer
 from zstate.errors import InvalidInput
@@ -81,6 +83,27 @@ def test_callback_that_inserts_is_called_again_afterwards_and_not_recursively() 
     with buffer.watch("map", "base", follow):
         buffer.insert(moved(0.0, 1))
     assert seen == [1, 2, 3]
+
+
+@given(st.lists(st.tuples(st.sampled_from("aabbs!"), st.integers(0, 30)), max_size=60))
+def test_watch_reports_each_growth_of_the_common_instant(changes: list[tuple[str, int]]) -> None:
+    """Samples of two edges in any order, late ones and repeated stamps; other frames; restarts ("!")."""
+    buffer, seen, expected = TransformBuffer(), list[int | None](), list[int]()
+    with buffer.watch("map", "tool", lambda transform: seen.append(transform.stamp)):
+        for number, (change, at) in enumerate([("!", 0), *changes]):
+            pose, stamp = ((float(number), 0, 0), (0, 0, 0, 1)), 0 if change == "!" else at
+            if change == "s":
+                buffer.insert_static(Transform("tool", f"camera{number}", *pose))
+            if change == "!":
+                buffer.clear()
+            if change in "a!":
+                buffer.insert(Transform("map", "base", *pose, stamp=stamp))
+            if change in "b!":
+                buffer.insert(Transform("base", "tool", *pose, stamp=stamp))
+            newest = buffer.latest("map", "tool")
+            if change == "!" or newest > expected[-1]:
+                expected.append(newest)
+    assert seen == expected
 
 
 def test_exception_of_a_callback_does_not_reach_the_inserting_thread() -> None:

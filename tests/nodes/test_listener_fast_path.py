@@ -7,16 +7,17 @@ over, first alone and then, if that inserts nothing, in a list; the other gets l
 from __future__ import annotations
 
 import random
+import struct
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import astuple
 
 import numpy as np
 import pytest
 from helpers.processes import until
-from helpers.robots import RRBOT, SECOND, UPRIGHT, wait_for_stream_readers
+from helpers.robots import RRBOT, SECOND, UPRIGHT, wait_for_reader, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SIMULATED, ManualClock
@@ -38,6 +39,9 @@ from zstate.wire.messages import (
 )
 from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
+from zstate.wire.ros2.attachment import pack
+from zstate.wire.ros2.encoder import JointStateEncoder
 
 pytestmark = pytest.mark.skipif(kernel == "reference", reason="only the extension has a fast path")
 
@@ -56,24 +60,27 @@ def description(model=RRBOT, session: int = 1) -> RobotDescription:
 class Receiver:
     """A listener without a network, and how many samples it inserted in one call."""
 
-    def __init__(self, session: Session, robot: str, follow: str, *, is_fast: bool) -> None:
-        buffer = TransformBuffer(history_s=2.0)
+    def __init__(self, session: Session, robot: str, follow: str, wire: str, *, is_fast: bool) -> None:
+        buffer, options = TransformBuffer(history_s=2.0), {"follow": follow, "history_on_join": False}
         self.listener = TransformListener(
-            session, robot, buffer, follow=follow, history_on_join=False, on_event=lambda event: None
+            session, robot, buffer, wire, on_event=lambda event: None, **options
         )
         self.is_fast = is_fast
         self.inserted_at_once = 0
 
-    def receive(self, stream: str, arrivals: list[SerializedSample], kind: type[Sample]) -> None:
+    def receive(self, stream: str, arrivals: list[SerializedSample]) -> None:
         samples = self.listener._sample_streams[stream]
         if self.is_fast:
-            arrivals = [one for one in arrivals if not self._insert_next(samples, one, kind)]
+            arrivals = [one for one in arrivals if not self._insert_next(samples, one)]
         if arrivals:
             self.listener._on_samples(samples, arrivals)
 
-    def _insert_next(self, samples, arrival: SerializedSample, kind: type[Sample]) -> bool:
-        is_usual = arrival.attachment is None and arrival.encoding == ENCODINGS[kind]
-        inserted = self.listener._insert_next(samples, arrival.key, arrival.payload if is_usual else None)
+    def _insert_next(self, samples, arrival: SerializedSample) -> bool:
+        envelope = self.listener._wire.usual_envelope(samples.stream)
+        attached = arrival.attachment or b""
+        is_usual = (arrival.encoding, len(attached)) == envelope
+        message = arrival.payload + attached if is_usual else None
+        inserted = self.listener._insert_next(samples, arrival.key, message)
         self.inserted_at_once += inserted
         return inserted
 
@@ -115,8 +122,10 @@ def rows_of(track) -> list[list[str]]:
 
 
 @contextmanager
-def pair(session: Session, robot: str, follow: str) -> Iterator[tuple[Receiver, Receiver]]:
-    fast, slow = (Receiver(session, robot, follow, is_fast=is_fast) for is_fast in (True, False))
+def pair(
+    session: Session, robot: str, follow: str, wire: str = "native"
+) -> Iterator[tuple[Receiver, Receiver]]:
+    fast, slow = (Receiver(session, robot, follow, wire, is_fast=is_fast) for is_fast in (True, False))
     with fast.listener, slow.listener:
         yield fast, slow
 
@@ -177,6 +186,10 @@ class Writer:
     def serialized(self, sample: Sample) -> SerializedSample:
         return SerializedSample(self.key, encode(sample), ENCODINGS[self.kind])
 
+    def not_finite(self, payload: bytes) -> bytes:
+        numbers = to_block([self.random.choice((np.nan, np.inf)), 1.0])
+        return payload.replace(payload[-19:-3], numbers)
+
     def sample(self) -> Sample:
         numbers = np.random.default_rng(self.seq % 1000)
         head = self.stamp, self.seq, self.session
@@ -207,11 +220,10 @@ class Writer:
         key, payload, encoding, choose = arrival.key, arrival.payload, arrival.encoding, self.random
         at = choose.randrange(len(payload))
         flipped = bytes([payload[at] ^ 1 << choose.randrange(8)])
-        not_finite = to_block([choose.choice((np.nan, np.inf)), 1.0])
         damaged = (
             payload[:at],
             payload + b"\xc0",
-            payload.replace(payload[-19:-3], not_finite),
+            self.not_finite(payload),
             payload[:at] + flipped + payload[at + 1 :],
             payload[:at] + flipped + payload[at + 1 :],
         )
@@ -219,6 +231,33 @@ class Writer:
         attached = SerializedSample(key, payload, encoding, b"attached")
         others = [SerializedSample(key, one, encoding) for one in damaged]
         return [choose.choice((foreign, attached, *others))]
+
+
+class RosWriter(Writer):
+    """A ROS node that writes /joint_states: CDR, and an attachment that may be damaged, too."""
+
+    def __init__(self, seed: int, key: str, session: int) -> None:
+        super().__init__(seed, key, JointState, session)
+        self.seq %= 2**62  # it has 64 bits with sign
+
+    def serialized(self, sample: Sample) -> SerializedSample:
+        assert isinstance(sample, JointState)
+        encoder = JointStateEncoder(sample.names or RRBOT.joint_names, frame_id="base")
+        payload = encoder.encode(sample.stamp, sample.positions, sample.velocities, sample.efforts)
+        gid = sample.session.to_bytes(8, "little") + bytes(8)
+        return SerializedSample(self.key, payload, "", pack(sample.seq, self.random.randrange(2**60), gid))
+
+    def not_finite(self, payload: bytes) -> bytes:
+        return payload[:-8] + struct.pack("<d", self.random.choice((np.nan, np.inf)))
+
+    def hostile(self) -> list[SerializedSample]:
+        (arrival,) = super().hostile()
+        attached, at = self.good().attachment or b"", self.random.randrange(33)
+        flipped = attached[:at] + bytes([attached[at] ^ 1 << self.random.randrange(8)]) + attached[at + 1 :]
+        moved = SerializedSample(self.key, arrival.payload[:-1], "", arrival.payload[-1:] + attached)
+        others = (b"", attached[:-1], attached + b"\0", flipped, flipped)
+        damaged = [SerializedSample(self.key, arrival.payload, "", one) for one in others]
+        return [self.random.choice((arrival, moved, *damaged))]
 
 
 def interrupt(receiver: Receiver, action: int, writer: Writer, stream: str) -> None:
@@ -260,18 +299,37 @@ def interrupt(receiver: Receiver, action: int, writer: Writer, stream: str) -> N
 def test_any_messages_give_the_same_buffer_counts_and_events(sessions, robot, follow, stream, kind):
     """Writers reorder, repeat, lose and forge messages; clocks jump; other threads change the buffer."""
     key = "zstate/r1/transforms/odometry" if stream == "transforms" else f"zstate/r1/{stream}"
+    assert_same_result(
+        lambda: pair(sessions[1], robot, follow), lambda seed: Writer(seed, key, kind, session=7), stream
+    )
+
+
+def test_any_joint_states_of_ros_give_the_same_buffer_counts_and_events(sessions, monkeypatch):
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    key = get_wire("ros2").expression("r1", "joint_states")
+    assert_same_result(
+        lambda: pair(sessions[1], "r1", "joint_states", "ros2"),
+        lambda seed: RosWriter(seed, key, session=7),
+        "joint_states",
+    )
+
+
+def assert_same_result(
+    make_pair: Callable[[], AbstractContextManager[tuple[Receiver, Receiver]]],
+    make_writer: Callable[[int], Writer],
+    stream: str,
+) -> None:
     at_once = 0
     for seed in SEEDS:
         choose = random.Random(seed)
-        writer = Writer(seed, key, kind, session=7)
-        with pair(sessions[1], robot, follow) as receivers:
+        writer = make_writer(seed)
+        with make_pair() as receivers:
             for receiver in receivers:
-                samples = receiver.listener._sample_streams[follow]
-                receiver.listener._ingest_for(samples, "r1", 1).describe(description())
+                receiver.listener._ingest_for(receiver.listener._samples, "r1", 1).describe(description())
             for _ in range(MESSAGES):
                 batch = [arrival for _ in range(choose.choice((1, 1, 1, 3))) for arrival in writer.arrivals()]
                 for receiver in receivers:
-                    receiver.receive(stream, batch, kind)
+                    receiver.receive(stream, batch)
                 if choose.random() < 0.08:
                     action = choose.randrange(9)
                     for receiver in receivers:
@@ -329,6 +387,24 @@ def test_samples_with_velocities_take_one_call(sessions):
     assert velocities.tolist() == [[0.5 * number, -1.0] for number in range(20)]
 
 
+def test_joint_states_of_ros_take_one_call(sessions, monkeypatch):
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "r1", "ros2") as publisher,
+        TransformListener(reader, "r1", wire="ros2") as listener,
+    ):
+        wait_for_reader(writer, get_wire("ros2").expression("r1", "joint_states"))
+        for number in range(20):
+            publisher.publish([0.01 * number, 0.0], [0.5, -1.0 * number])
+            until(lambda number=number: listener.stats.received == number + 1)
+        assert at_once(listener) >= 15
+        states = listener.buffer.joint_states("r1")
+    assert states.positions.tolist() == [[0.01 * number, 0.0] for number in range(20)]
+    assert states.velocities is not None
+    assert states.velocities.tolist() == [[0.5, -1.0 * number] for number in range(20)]
+
+
 def test_listener_with_another_clock_takes_the_long_way(sessions):
     writer, reader = sessions
     clock = ManualClock(time.time_ns(), SIMULATED)
@@ -353,7 +429,7 @@ def test_removed_robot_is_refused_as_by_the_long_way(sessions):
         for number in range(6):
             message = writer.after(MILLISECOND)
             for receiver in receivers:
-                receiver.receive("joint_states", [message], JointState)
+                receiver.receive("joint_states", [message])
                 if number == 3:
                     (ingest,) = receiver.ingests()
                     receiver.listener.buffer.remove_robot(ingest._track)
@@ -370,9 +446,9 @@ def test_no_sample_is_lost_to_other_threads(sessions, round_number):
     writer.layout, writer.seq = 1, 100
     messages = [writer.after(MILLISECOND // 10) for _ in range(2000)]
     past, live = messages[:5], messages[5:]
-    receiver = Receiver(sessions[1], "r1", "joint_states", is_fast=True)
+    receiver = Receiver(sessions[1], "r1", "joint_states", "native", is_fast=True)
     with receiver.listener as listener:
-        receiver.receive("transforms", live[:1], WriterTransforms)
+        receiver.receive("transforms", live[:1])
         (ingest,) = receiver.ingests()
         samples = [message for one in past for message in listener._decode("transforms", one, "r1")]
         is_done = threading.Event()
@@ -388,7 +464,7 @@ def test_no_sample_is_lost_to_other_threads(sessions, round_number):
         thread = threading.Thread(target=disturb)
         thread.start()
         for message in live[1:]:
-            receiver.receive("transforms", [message], WriterTransforms)
+            receiver.receive("transforms", [message])
         until(lambda: listener.stats.recalled == len(past))
         is_done.set()
         thread.join()

@@ -2,12 +2,12 @@
  * publisher.
  *
  * Each type is specified by its reference in Python, which stays complete:
- * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
- * (TransformFields), zstate/model/joint_transforms.py (Edges), zstate/model/pinocchio_solver.py
- * (placement_poses), zstate/nodes/publisher.py (JointStateEncoder, PublishPath),
- * zstate/wire/ros2/encoder.py (RosJointStateEncoder), zstate/net/sample_history.py (SampleRing),
- * zstate/ingest/base.py with zstate/wire/native.py (FastPath). Differences to those are bugs, and
- * tests compare both.
+ * zstate/buffer/history.py (History), path.py and interpolation.py (Path), waiting.py
+ * (NewerTransforms), zstate/transform.py (TransformFields), zstate/model/joint_transforms.py
+ * (Edges), zstate/model/pinocchio_solver.py (placement_poses), zstate/nodes/publisher.py
+ * (JointStateEncoder, PublishPath), zstate/wire/ros2/encoder.py (RosJointStateEncoder),
+ * zstate/net/sample_history.py (SampleRing), zstate/ingest/base.py with zstate/wire/native.py and
+ * zstate/wire/ros2/decoder.py (FastPath). Differences to those are bugs, and tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
  * covers are never written again, so a batch that holds references to its blocks reads them without
@@ -32,6 +32,7 @@
 #include "_kernel/input.h"
 #include "_kernel/block.h"
 #include "_kernel/history.h"
+#include "_kernel/ros_message.h"
 #include "_kernel/fast_path.h"
 #include "_kernel/motion.h"
 #include "_kernel/transform_fields.h"
@@ -39,6 +40,7 @@
 #include "_kernel/path.h"
 #include "_kernel/arc.h"
 #include "_kernel/place.h"
+#include "_kernel/newer_transforms.h"
 #include "_kernel/edges.h"
 #include "_kernel/placements.h"
 #include "_kernel/joint_state.h"
@@ -71,6 +73,7 @@ fill_module(PyObject *module)
                              &FastPath_type,
                              &TransformFields_type,
                              &Path_type,
+                             &NewerTransforms_type,
                              &Edges_type,
                              &JointStateEncoder_type,
                              &SampleRing_type,

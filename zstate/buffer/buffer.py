@@ -325,11 +325,10 @@ class TransformBuffer(BufferCore):
             transform = path.at(None) or path.transform(None)
         except LookupFailed as reason:
             return self._expect_change(query, reason, waiter, version)
-        newer = None if transform.stamp is None else transform.stamp + 1
-        uses = path.uses
-        if len(uses) == 1 and waiter.expect_newer(dependencies, uses[0].track, newer, version):
-            return transform
-        waiter.expect(WakeCondition(dependencies, {use.track: newer for use in path.uses}), version)
+        stamp = transform.stamp
+        after = None if stamp is None else stamp + 1
+        condition = WakeCondition(dependencies, {use.track: after for use in path.uses})
+        waiter.expect(condition, version, None if stamp is None else path.newer_than(stamp, version))
         return transform
 
     def _expect_change(

@@ -143,7 +143,8 @@ class ReferenceFastPath(Generic[W]):
 
     The usual next message is the last one, byte for byte, but for a newer stamp, the next sequence number and
     other numbers of the same count: what was checked of the last message holds for it. Each other message
-    ends this, until ``expect`` is called again. The reference inserts none.
+    ends this, until ``expect`` is called again. The reference inserts none. A message is a payload of the
+    native wire, or a JointState of the ros2 wire with its attachment behind it.
 
     ``waiters`` are the waiting threads and tasks by track. ``counts["received"]`` grows with each message.
     ``sources`` are objects whose ``version`` is compared with that of the last message.

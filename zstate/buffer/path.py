@@ -46,6 +46,9 @@ from zstate.transform import Kind, PoseWithCovariance, Transform
 if TYPE_CHECKING or kernel == "c":
     from zstate import _kernel
 
+if TYPE_CHECKING:
+    from zstate._kernel import NewerTransforms
+
 F = TypeVar("F", bound=LookupFailed)
 
 Stamps: TypeAlias = NDArray[np.int64]
@@ -86,6 +89,9 @@ class TransformPath:
 
     def raise_if_outside(self, stamp: object, /) -> None:
         """Raises the reason why there is no transform now, if it is found at once."""
+
+    def newer_than(self, stamp: int, version: int) -> NewerTransforms | None:
+        """Each newest transform after ``stamp``, while the tree has this ``version``, if found at once."""
 
     def transform(self, stamp: int | None, predict_ns: int = 0) -> Transform:
         """The transform at ``stamp``, or the latest. Raises NoData, InPast, InFuture, Stale or NotFinite."""
@@ -346,6 +352,9 @@ class CompiledPath(TransformPath):
         if failure is not None:
             kind, number, at, *samples = failure
             raise self._failure(_FAILURES[kind], number, at, samples)
+
+    def newer_than(self, stamp: int, version: int) -> NewerTransforms:
+        return _kernel.NewerTransforms(self._compiled, version, stamp)
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         poses, valid = np.empty((len(stamps), 7)), np.empty(len(stamps), np.bool_)

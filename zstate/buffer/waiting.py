@@ -22,7 +22,7 @@ from collections.abc import (
 from contextlib import ExitStack, contextmanager
 from numbers import Real
 from types import MappingProxyType
-from typing import Generic, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeAlias, TypeVar
 
 from zstate import se3
 from zstate._util.closeable import Closeable
@@ -32,6 +32,9 @@ from zstate.buffer.history import FastPath
 from zstate.buffer.tracks import JointTrack, Track
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.transform import Transform
+
+if TYPE_CHECKING:
+    from zstate._kernel import NewerTransforms
 
 S = TypeVar("S")
 
@@ -75,36 +78,27 @@ class Waiter:
     def __init__(self, registry: WaiterRegistry, wake: Callable[[], None]) -> None:
         self.wake = wake
         self.condition = WakeCondition()
+        self.is_met = self.condition.is_met
+        """Whether the condition is met."""
+        self.newer: NewerTransforms | None = None
+        """The transforms for which the condition waits, if the extension finds them at once."""
         self.tracks = self.condition.required.keys()
         """The tracks that the registry lists it under; changed only by the registry."""
         self._registry = registry
 
-    def expect(self, condition: WakeCondition, version: int) -> None:
+    def expect(self, condition: WakeCondition, version: int, newer: NewerTransforms | None = None) -> None:
         """Set the condition; wakes at once if it is met by now.
 
         ``version`` is that of the tree before the lookup: a change since then may be one that the
-        condition does not cover, and no later notification would report it.
+        condition does not cover, and no later notification would report it. ``newer`` is met when the
+        condition is, and with each transform that is taken from it, it waits for the one after that.
         """
-        self.condition = condition
+        self.condition, self.newer = condition, newer
+        self.is_met = condition.is_met if newer is None else newer.is_met
         if condition.required.keys() != self.tracks:
             self._registry.update(self)
-        if self._registry.tree.version != version or condition.is_met():
+        if self._registry.tree.version != version or self.is_met():
             self.wake()
-
-    def expect_newer(
-        self, dependencies: PathDependencies, track: Track, stamp: int | None, version: int
-    ) -> bool:
-        """Raise the required stamp of ``track`` if nothing else of the condition changes; else False.
-
-        Only for a waiter that looks again when it is woken during the call: a sample that arrives then meets
-        the condition as it is before or after.
-        """
-        required = self.condition.required
-        is_same = self.condition.dependencies is dependencies and self._registry.tree.version == version
-        if not is_same or not isinstance(required, dict) or required.keys() != {track}:
-            return False
-        required[track] = stamp
-        return True
 
 
 class WaiterRegistry:
@@ -161,12 +155,11 @@ class WaiterRegistry:
         if self._notified_version != self.tree.version:
             self._notified_version = self.tree.version
             for waiter in self._waiters:
-                condition = waiter.condition
-                if not self.tree.is_current(condition.dependencies) or condition.is_met():
+                if not self.tree.is_current(waiter.condition.dependencies) or waiter.is_met():
                     waiter.wake()
         elif self._by_track:
             for waiter in self._waiting_for(tracks):
-                if waiter.condition.is_met():
+                if waiter.is_met():
                     waiter.wake()
 
     def fast_path(self, counts: dict[str, int], *sources: object) -> FastPath[Waiter]:
@@ -225,9 +218,11 @@ class TransformWatch(Closeable):
         self.target, self.source = names
         self.failures = 0
         self.last_failure: Exception | None = None
+        self._tree = waiters.tree
         self._lookup_newest = lookup_newest
         self._callback = callback
         self._thresholds = (translation_m, rotation_rad)
+        self._has_thresholds = self._thresholds != (None, None)
         self._last: Transform | None = None
         self._is_pending = False
         self._lock = fork_safe_lock()
@@ -246,38 +241,37 @@ class TransformWatch(Closeable):
     def _on_insert(self) -> None:
         """Runs with each insert that may bring a newer transform, on any thread; calls never overlap."""
         self._is_pending = True
-        while self._is_pending and self._lock.acquire(blocking=False):
+        while self._is_pending and self._lock.acquire(False):
             # A thread that finds the lock taken leaves its transform to the thread that holds it.
             try:
                 self._is_pending = False
-                self._call_back()
+                newer = self._waiter.newer
+                transform = newer and newer.take(self._tree.version)
+                if transform is None:
+                    transform = self._lookup_changed()
+                if transform is not None and (not self._has_thresholds or self._has_moved(transform)):
+                    self._last = transform
+                    self._callback(transform)
+            except Exception as error:  # noqa: PERF203 - the loop runs once, unless threads meet
+                # It belongs to the author of the callback, not to the caller of the insert.
+                self.failures += 1
+                self.last_failure = error
             finally:
                 self._lock.release()
 
-    def _call_back(self) -> None:
+    def _lookup_changed(self) -> Transform | None:
+        """The newest transform, unless it is the last one; None if there is none."""
         try:
             transform = self._lookup_newest(self._waiter)
         except LookupFailed:
-            return  # an ambiguous name; a change of the tree may resolve it
-        if not isinstance(transform, Transform) or not self._has_moved(transform):
-            return
-        self._last = transform
-        try:
-            self._callback(transform)
-        except Exception as error:
-            # It belongs to the author of the callback, not to the caller of the insert.
-            self.failures += 1
-            self.last_failure = error
+            return None  # an ambiguous name; a change of the tree may resolve it
+        return transform if isinstance(transform, Transform) and transform != self._last else None
 
     def _has_moved(self, transform: Transform) -> bool:
         last = self._last
         if last is None:
             return True
-        if last.stamp == transform.stamp and last == transform:
-            return False
         translation_m, rotation_rad = self._thresholds
-        if translation_m is None and rotation_rad is None:
-            return True
         (x, y, z, *qa), (*at, bx, by, bz, bw) = last.pose7.tolist(), transform.pose7.tolist()
         turned = se3.multiply(se3.conjugate((qa[0], qa[1], qa[2], qa[3])), (bx, by, bz, bw))
         return (translation_m is not None and math.dist((x, y, z), at) >= translation_m) or (

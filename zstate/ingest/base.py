@@ -133,7 +133,7 @@ class StreamIngest(ABC):
         if waiters is None:
             return False
         for waiter in waiters:
-            if waiter.condition.is_met():
+            if waiter.is_met():
                 waiter.wake()
         return True
 

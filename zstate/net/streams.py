@@ -23,7 +23,7 @@ from zstate.errors import Closed
 from zstate.net.at_exit import join_at_exit
 from zstate.net.session import Session, Undeclarable
 from zstate.wire.messages import ATTACHMENT_BYTES, LATCHED_BYTES, SAMPLE_BYTES
-from zstate.wire.protocol import SerializedSample
+from zstate.wire.protocol import NO_ENVELOPE, Envelope, SerializedSample
 
 CAPACITY = 1024
 """Samples of one key that wait for a delayed reader: a second at 1 kHz."""
@@ -291,9 +291,9 @@ class StreamSubscriber(Receiver[zenoh.Sample]):
     It is called from one thread of this subscriber, for all of its expressions. ``Receiver`` describes slow
     and failing callbacks.
 
-    ``insert_next(key, payload)`` is called before it with each sample by itself, and returns True if it
-    handled the sample: then ``on_samples`` does not get it. ``payload`` is None if the sample has an
-    attachment, or another encoding than ``encoding``. Samples of a full batch go to ``on_samples`` only.
+    ``insert_next(key, message)`` is called before it with each sample by itself, and returns True if it
+    handled the sample: then ``on_samples`` does not get it. ``message`` is the payload with the attachment
+    behind it, None in another envelope than ``envelope``. Samples of a full batch go to ``on_samples`` only.
 
     The keys of received samples, up to 4096, are declared to Zenoh, which keeps the route of samples on
     declared keys. On others it searches all declarations under them for each sample: with the tokens of 100
@@ -309,7 +309,7 @@ class StreamSubscriber(Receiver[zenoh.Sample]):
         capacity: int | None = None,
         *,
         insert_next: Callable[[str, bytes | None], bool] | None = None,
-        encoding: str = "",
+        envelope: Envelope = NO_ENVELOPE,
     ) -> None:
         keyexprs = (keyexprs,) if isinstance(keyexprs, str) else keyexprs
         self._key = "" if len(keyexprs) > 1 or "*" in keyexprs[0] else keyexprs[0]
@@ -319,9 +319,10 @@ class StreamSubscriber(Receiver[zenoh.Sample]):
         self._on_samples = on_samples
         self._insert_next = insert_next
         # A sample after a gap is not handled at once. What a full ring has lost leaves a gap before the next
-        # sample of a single key; of many keys, the next sample may be of another one.
-        self._needs_batches = not self._key
-        self._encoding = zenoh.Encoding(encoding)
+        # sample of a single key of the native wire; elsewhere, the next sample may be of another writer.
+        self._needs_batches = not self._key or envelope.attachment_bytes > 0
+        self._encoding = zenoh.Encoding(envelope.encoding)
+        self._attachment_bytes = envelope.attachment_bytes
         capacity = capacity or capacity_for(keyexprs)
         subscribed = subscribe_to_all(keyexprs, capacity, session.zenoh.declare_subscriber)
         super().__init__(session, subscribed, capacity)
@@ -329,13 +330,18 @@ class StreamSubscriber(Receiver[zenoh.Sample]):
     def _is_handled(self, item: zenoh.Sample) -> bool:
         if self._insert_next is None:
             return False
-        payload = item.payload
+        payload, attachment = item.payload, item.attachment
         is_usual = (
-            len(payload) <= SAMPLE_BYTES and item.attachment is None and item.encoding == self._encoding
+            len(payload) <= SAMPLE_BYTES
+            and (0 if attachment is None else len(attachment)) == self._attachment_bytes
+            and item.encoding == self._encoding
         )
         try:
             key = self._key or str(item.key_expr)
-            return self._insert_next(key, payload.to_bytes() if is_usual else None)
+            message = payload.to_bytes() if is_usual else None
+            if message is not None and attachment is not None:
+                message += attachment.to_bytes()
+            return self._insert_next(key, message)
         except Exception:
             self._count_failure()
             return True

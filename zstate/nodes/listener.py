@@ -29,7 +29,6 @@ from zstate.net.presence import OtherTfSubscription, WriterWatch, announce_reade
 from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.wire import native
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot, shortened, stream_from_key, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
@@ -104,7 +103,7 @@ class TransformListener(Closeable):
             self._wire.robot_from_key if self.robot == ANY else lambda _: self.robot
         )
         is_on_system_clock = type(self.buffer.clock) is SystemClock
-        self._has_fast_path = kernel == "c" and self._wire.name == "native" and is_on_system_clock
+        self._has_fast_path = kernel == "c" and is_on_system_clock
         self._follow: Follow = follow
         self._on_event = on_event
         self._counters = Counters()
@@ -247,11 +246,11 @@ class TransformListener(Closeable):
 
     def _subscriber(self, session: Session, keys: Sequence[str], samples: StreamIngests) -> StreamSubscriber:
         on_samples = partial(self._on_samples, samples)
-        if not self._has_fast_path:
+        envelope = self._wire.usual_envelope(samples.stream)
+        if not self._has_fast_path or envelope is None:
             return StreamSubscriber(session, keys, on_samples)
         insert_next = partial(self._insert_next, samples)
-        encoding = native.stream_encoding(samples.stream)
-        return StreamSubscriber(session, keys, on_samples, insert_next=insert_next, encoding=encoding)
+        return StreamSubscriber(session, keys, on_samples, insert_next=insert_next, envelope=envelope)
 
     def _ingest_for(self, samples: StreamIngests, robot: str, session: int) -> StreamIngest:
         key = (robot, session if samples.is_shared else 0)
@@ -277,11 +276,11 @@ class TransformListener(Closeable):
         assert isinstance(ingest, JointStateIngest)
         return ingest.parts
 
-    def _insert_next(self, samples: StreamIngests, key: str, payload: bytes | None) -> bool:
+    def _insert_next(self, samples: StreamIngests, key: str, message: bytes | None) -> bool:
         """Insert a sample in one call of the extension if it is the usual next one on its key."""
         ingest = samples.newest_by_key.get(key)
         now = time.time_ns()
-        if ingest is None or not ingest.insert_next(payload, now - LATE_NS, now + FAR_NS):
+        if ingest is None or not ingest.insert_next(message, now - LATE_NS, now + FAR_NS):
             return False
         if samples.overflowed:
             samples.overflowed.discard(ingest)
@@ -296,7 +295,10 @@ class TransformListener(Closeable):
         if is_full:
             # A full ring has lost samples of any of the writers, and loses more while it is drained.
             samples.overflowed = set(samples.ingests.values())
-        is_fast = self._has_fast_path and not is_full  # the samples of full batches take the long way
+        # The samples of full batches take the long way.
+        is_fast = (
+            self._has_fast_path and not is_full and self._wire.usual_envelope(samples.stream) is not None
+        )
         earliest, latest = self._stamp_check.accepted_range()
         failure: Exception | None = None
         for arrival in arrivals:
@@ -306,9 +308,8 @@ class TransformListener(Closeable):
                     if isinstance(sample, Sample):
                         ingest = self._ingest_for(samples, robot, sample.session)
                         overflowed = is_full or ingest in samples.overflowed
-                        ingest.insert_sample(
-                            sample, overflowed=overflowed, message=arrival.payload if is_fast else None
-                        )
+                        message = arrival.payload + (arrival.attachment or b"") if is_fast else None
+                        ingest.insert_sample(sample, overflowed=overflowed, message=message)
                         samples.overflowed.discard(ingest)
                         if is_fast and samples.newest_by_key.get(arrival.key) is not ingest:
                             samples.newest_by_key[arrival.key] = ingest

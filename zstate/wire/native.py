@@ -36,7 +36,7 @@ from zstate.wire.messages import (
     check_edges,
     check_size,
 )
-from zstate.wire.protocol import SerializedSample, WriterNode
+from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
 
 VERSION = 1
 
@@ -214,6 +214,9 @@ class NativeWire:
         if stream == "tf_static":
             check_edges(message)
         return (message,)
+
+    def usual_envelope(self, stream: Stream) -> Envelope:
+        return Envelope(stream_encoding(stream))
 
     def edge_writer_name(self, key: str) -> str:
         keys.robot_from_key(key)

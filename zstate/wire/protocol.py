@@ -32,6 +32,16 @@ class SerializedSample(Struct, frozen=True, gc=False):
     size: int = 0
 
 
+class Envelope(NamedTuple):
+    """What surrounds the payloads of a stream: Zenoh encoding, and the size of the attachment, 0 for none."""
+
+    encoding: str
+    attachment_bytes: int = 0
+
+
+NO_ENVELOPE = Envelope("")
+
+
 class WriterNode(NamedTuple):
     """``writer`` of ``robot`` on the network: its Zenoh session, and its number within that session.
 
@@ -136,6 +146,10 @@ class Wire(Protocol):
 
     def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         """The messages of a sample received on ``stream`` of ``robot``. Raises MessageError."""
+        ...
+
+    def usual_envelope(self, stream: Stream) -> Envelope | None:
+        """The envelope of samples whose payloads a ``FastPath`` can compare; None if it knows no format."""
         ...
 
     def edge_writer_name(self, key: str) -> str | None:

@@ -10,7 +10,7 @@ typedef struct {
     double middle[4], normal[4];
     double angle, rate; /* the angle of the quaternion, half that of the turn [rad], [rad/ns] */
     double position[3], velocity[3]; /* [m], [m/ns] */
-    bool is_wide; /* angles exceed NARROW */
+    bool is_wide;                    /* angles exceed NARROW */
 } Arc;
 
 /* Points and their time since that of the arcs [ns]. */

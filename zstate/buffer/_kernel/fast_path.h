@@ -3,12 +3,14 @@
  * A message of the native wire is a MessagePack array: stamp, seq, session, digest of the order,
  * one or more blocks of numbers, and whatever else its type has (zstate/wire/messages.py). The
  * usual next message is the last one but for a newer stamp, seq + 1 and other numbers; all other
- * bytes are the same, so what was checked of the last message holds for it.
+ * bytes are the same, so what was checked of the last message holds for it. So it is with a message
+ * of the ros2 wire, a JointState with its attachment (ros_message.h), but for the time of sending,
+ * too.
  */
 
-#define LARGEST_BLOCKS 3
+#define LARGEST_BLOCKS 4
 
-/* A block in the bytes of a message behind its seq: there, and its first column in a history. */
+/* A block in the bytes of a message behind its head: there, and its first column in a history. */
 typedef struct {
     Py_ssize_t start;
     Py_ssize_t count;
@@ -88,10 +90,12 @@ read_bytes(const uint8_t *bytes, Py_ssize_t size, Py_ssize_t *at, Py_ssize_t *le
     return true;
 }
 
-/* The stamp and the seq of a message; *at is behind them. */
+/* The stamp and the seq of a message; *at is behind its head. */
 static bool
 read_head(const uint8_t *bytes, Py_ssize_t size, Py_ssize_t *at, int64_t *stamp, int64_t *seq)
 {
+    if (is_ros_message(bytes, size))
+        return read_ros_head(bytes, size, at, stamp, seq);
     *at = 1;
     return size > 0 && (bytes[0] & 0xf0) == 0x90 && read_integer(bytes, size, at, stamp) &&
            read_integer(bytes, size, at, seq);
@@ -117,13 +121,31 @@ read_blocks(FastPath *self, const uint8_t *bytes, Py_ssize_t size)
         return false;
     at += length;
     self->block_count = 0;
-    while (self->block_count < LARGEST_BLOCKS && read_bytes(bytes, size, &at, &length)) {
+    while (self->block_count < SEQUENCES && read_bytes(bytes, size, &at, &length)) {
         if (length % 8 != 0)
             return false;
         self->blocks[self->block_count++] = (NumberBlock){at - self->rest_at, length / 8, -1};
         at += length;
     }
     return self->block_count > 0;
+}
+
+static bool
+read_ros_blocks(FastPath *self, const uint8_t *bytes, Py_ssize_t size)
+{
+    Py_ssize_t starts[SEQUENCES], counts[SEQUENCES];
+    self->block_count = read_ros_sequences(bytes, size, starts, counts);
+    for (Py_ssize_t i = 0; i < self->block_count; i++)
+        self->blocks[i] = (NumberBlock){starts[i] - self->rest_at, counts[i], -1};
+    return self->block_count > 0 && !self->holds_poses;
+}
+
+/* Sequence number and time of the attachment, as a block that is not kept. */
+static void
+add_attachment_block(FastPath *self, Py_ssize_t size)
+{
+    Py_ssize_t start = size - ATTACHMENT_BYTES - self->rest_at;
+    self->blocks[self->block_count++] = (NumberBlock){start, GID_LENGTH_AT / 8, -1};
 }
 
 /* Decides on the columns of the blocks; false if the history has no place for one. */
@@ -179,18 +201,23 @@ fast_path_expect(FastPath *self, PyObject *args)
     const uint8_t *bytes = (const uint8_t *)PyBytes_AS_STRING(message);
     Py_ssize_t size = PyBytes_GET_SIZE(message);
     int64_t seq;
+    bool is_ros = is_ros_message(bytes, size);
     self->is_expecting = PY_LITTLE_ENDIAN && PyBytes_CheckExact(message) &&
                          read_head(bytes, size, &self->rest_at, &self->newest, &seq) && seq >= 0 &&
-                         seq < INT64_MAX && read_blocks(self, bytes, size) &&
+                         seq < INT64_MAX &&
+                         (is_ros ? read_ros_blocks : read_blocks)(self, bytes, size) &&
                          place_blocks(self, position_count);
     if (!self->is_expecting)
         forget_last(self);
-    else
+    else {
         self->next_seq = seq + 1;
+        if (is_ros)
+            add_attachment_block(self, size);
+    }
     return PyBool_FromLong(self->is_expecting);
 }
 
-/* Whether the bytes behind the seq are those of the last message, except for the blocks. */
+/* Whether the bytes behind the head are those of the last message, except for the blocks. */
 static bool
 equals_last(const FastPath *self, const uint8_t *rest, Py_ssize_t size)
 {

@@ -95,7 +95,7 @@ static_transform(const Path *self, PyObject *stamp)
 }
 
 /* The transform at an instant, or None; `stamp` is NULL or the object that the caller passed. */
-static PyObject *
+static inline PyObject *
 transform_at(const Path *self, int64_t at, PyObject *stamp, Bracket *nows)
 {
     PyObject *kind = kind_exact;
@@ -120,6 +120,22 @@ transform_at(const Path *self, int64_t at, PyObject *stamp, Bracket *nows)
     return transform;
 }
 
+/* The same, with memory for the brackets of all tracks, of which there is at least one. */
+static inline PyObject *
+transform_when(const Path *self, int64_t at, PyObject *stamp)
+{
+    Py_ssize_t tracks = track_count(self);
+    Bracket few[FEW_TRACKS];
+    if (tracks <= FEW_TRACKS)
+        return transform_at(self, at, stamp, few);
+    Bracket *nows = PyMem_New(Bracket, (size_t)tracks);
+    if (nows == NULL)
+        return PyErr_NoMemory();
+    PyObject *transform = transform_at(self, at, stamp, nows);
+    PyMem_Free(nows);
+    return transform;
+}
+
 static PyObject *
 path_at(Path *self, PyObject *const *args, Py_ssize_t count)
 {
@@ -131,23 +147,14 @@ path_at(Path *self, PyObject *const *args, Py_ssize_t count)
     }
     if (stamp != Py_None && !plain_stamp(stamp, &at))
         Py_RETURN_NONE;
-    Py_ssize_t tracks = track_count(self);
-    if (tracks == 0)
+    if (track_count(self) == 0)
         return static_transform(self, stamp);
     if (stamp == Py_None) {
         stamp = NULL;
         if (!newest_common(self, &at))
             Py_RETURN_NONE;
     }
-    Bracket few[FEW_TRACKS];
-    if (tracks <= FEW_TRACKS)
-        return transform_at(self, at, stamp, few);
-    Bracket *nows = PyMem_New(Bracket, (size_t)tracks);
-    if (nows == NULL)
-        return PyErr_NoMemory();
-    PyObject *transform = transform_at(self, at, stamp, nows);
-    PyMem_Free(nows);
-    return transform;
+    return transform_when(self, at, stamp);
 }
 
 /* failure_at(stamp): the limiting track, in the order of zstate/buffer/path.py. */

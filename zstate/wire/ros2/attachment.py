@@ -10,6 +10,7 @@ from zstate.errors import MessageError
 GID_BYTES = 16
 
 _LAYOUT = Struct("<qqB16s")  # the third is the length of the gid, as Zenoh serialises a slice
+ATTACHMENT_BYTES = _LAYOUT.size
 _LABEL = b"sequence_number"
 
 

@@ -13,8 +13,8 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, Stream
 from zstate.wire.messages import Message, check_edges, check_size
-from zstate.wire.protocol import SerializedSample, WriterNode
-from zstate.wire.ros2.attachment import session_from_gid, unpack
+from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
+from zstate.wire.ros2.attachment import ATTACHMENT_BYTES, session_from_gid, unpack
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.frame_names import FrameNames
@@ -102,6 +102,10 @@ class Ros2Wire:
 
     def robot_from_key(self, key: str) -> str:
         return self._keys.robot_from_key(key)
+
+    def usual_envelope(self, stream: Stream) -> Envelope | None:
+        is_known = self._has_gids and stream == "joint_states"
+        return Envelope(RosStreamEncoder.encoding, ATTACHMENT_BYTES) if is_known else None
 
     def edge_writer_name(self, key: str) -> str | None:
         """The name of a scan's sensor, or of a map; None for edges, whose writers share the topics."""
