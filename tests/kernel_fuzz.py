@@ -362,6 +362,9 @@ class Fuzz:
         if isinstance(numbers, np.ndarray) and numbers.size == 7 and numbers.dtype == np.float64:
             numbers = numbers / 1e5
             numbers.flat[6] = 1.0
+        if isinstance(numbers, np.ndarray):
+            items = numbers.tolist()
+            numbers = self.pick(numbers, items, tuple(items), numbers[::-1], [*items, 2**1100], [None])
         rates = [self.pick(None, self.array(velocities)) for _ in range(2)]
         seq = self.pick(0, 5, 2**40, 2**63 - 1, -1, 2**63, *ODD)
         payload = encoder.encode(numbers, *rates, self.stamp(), self.pick(3, seq))

@@ -87,7 +87,7 @@ class RobotEncoder:
         self.compiled = (
             JointStateEncoder(session, self._joint_order, *counts, quaternions) if kernel == "c" else None
         )
-        """The same for flat arrays of doubles, in the extension."""
+        """The same for flat arrays of doubles, lists and tuples, in the extension."""
 
     def encode(
         self,

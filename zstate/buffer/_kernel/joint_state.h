@@ -140,22 +140,87 @@ put_bytes(char *at, const void *bytes, size_t size)
     return at + size;
 }
 
-/* The numbers of a buffer, or nil for none. */
-static char *
-put_block(char *at, const Py_buffer *numbers)
+/* Some doubles without gaps, in the memory of an array or copied; `values` is NULL for None. */
+typedef struct {
+    const double *values;
+    Py_ssize_t size; /* in bytes */
+    Py_buffer view;  /* without an object if they are copied */
+    double *copy;
+} Row;
+
+static void
+release_row(Row *row)
 {
-    return numbers->obj == NULL ? put_typed(at, 0xc0, 0, 0)
-                                : put_bytes(at, numbers->buf, (size_t)numbers->len);
+    PyBuffer_Release(&row->view);
+    PyMem_Free(row->copy);
 }
 
-/* As plain_numbers, or a buffer without an object for None. */
-static bool
-plain_or_none(PyObject *object, Py_buffer *view, Py_ssize_t count)
+/* A block, or nil for none. */
+static char *
+put_block(char *at, const Row *row)
 {
-    if (object != Py_None)
-        return plain_numbers(object, view, count);
-    memset(view, 0, sizeof(*view));
-    return true;
+    return row->values == NULL ? put_typed(at, 0xc0, 0, 0)
+                               : put_bytes(at, row->values, (size_t)row->size);
+}
+
+/* The number in a float or an int; false, with or without an error, for anything else. */
+static bool
+plain_number(PyObject *object, double *number)
+{
+    if (PyFloat_Check(object))
+        *number = PyFloat_AS_DOUBLE(object);
+    else if (PyLong_CheckExact(object))
+        *number = PyLong_AsDouble(object);
+    else
+        return false;
+    return *number != -1.0 || !PyErr_Occurred();
+}
+
+static bool
+copy_sequence(PyObject *sequence, Row *row, Py_ssize_t count)
+{
+    if (PySequence_Fast_GET_SIZE(sequence) != count)
+        return false;
+    PyObject *const *items = PySequence_Fast_ITEMS(sequence);
+    row->copy = PyMem_New(double, (size_t)count + 1);
+    for (Py_ssize_t i = 0; row->copy != NULL && i < count; i++)
+        if (!plain_number(items[i], &row->copy[i]))
+            return false;
+    row->values = row->copy;
+    return row->copy != NULL;
+}
+
+/* Only numbers that are not in order are copied, such as a column of a matrix. */
+static bool
+read_array(PyObject *array, Row *row, Py_ssize_t count)
+{
+    Py_buffer *view = &row->view;
+    if (PyObject_GetBuffer(array, view, PyBUF_STRIDED_RO | PyBUF_FORMAT) < 0)
+        return false;
+    const char *format = view->format != NULL ? view->format : "B";
+    if (view->ndim != 1 || view->shape[0] != count || strcmp(format, "d") != 0)
+        return false;
+    row->values = view->buf;
+    if (view->strides[0] == 8 || count == 0)
+        return true;
+    row->values = row->copy = PyMem_New(double, (size_t)count);
+    for (Py_ssize_t i = 0; row->copy != NULL && i < count; i++)
+        memcpy(&row->copy[i], (const char *)view->buf + i * view->strides[0], 8);
+    return row->copy != NULL;
+}
+
+/* `count` finite numbers in a flat array of doubles, a list or a tuple. False, without an error,
+ * for anything else; release_row in either case. */
+static bool
+get_row(PyObject *object, Row *row, Py_ssize_t count)
+{
+    bool is_read = PyList_CheckExact(object) || PyTuple_CheckExact(object)
+                       ? copy_sequence(object, row, count)
+                       : plain_array(object) && read_array(object, row, count);
+    if (!is_read)
+        PyErr_Clear();
+    row->size = 8 * count;
+    return is_read && all_finite(row->values, count);
 }
 
 static bool
@@ -170,29 +235,29 @@ quaternions_are_unit(const JointStateEncoder *self, const double *positions)
     return true;
 }
 
-/* The numbers of one sample: a buffer without an object for none. */
+/* The numbers of one sample. */
 typedef struct {
-    Py_buffer positions, velocities, efforts;
+    Row positions, velocities, efforts;
 } Numbers;
 
 static void
 release_numbers(Numbers *numbers)
 {
-    PyBuffer_Release(&numbers->positions);
-    PyBuffer_Release(&numbers->velocities);
-    PyBuffer_Release(&numbers->efforts);
+    release_row(&numbers->positions);
+    release_row(&numbers->velocities);
+    release_row(&numbers->efforts);
 }
 
-/* Positions, velocities and efforts. False, without an error, for anything but flat arrays of
- * finite doubles in the right number. */
+/* Positions, velocities and efforts, the last two as get_row or None. False, without an error, for
+ * anything else, and for numbers of another count. */
 static bool
 get_numbers(const JointStateEncoder *self, PyObject *const *args, Numbers *numbers)
 {
     memset(numbers, 0, sizeof(*numbers));
-    if (PY_LITTLE_ENDIAN && plain_numbers(args[0], &numbers->positions, self->positions) &&
-        quaternions_are_unit(self, numbers->positions.buf) &&
-        plain_or_none(args[1], &numbers->velocities, self->velocities) &&
-        plain_or_none(args[2], &numbers->efforts, self->velocities))
+    if (PY_LITTLE_ENDIAN && get_row(args[0], &numbers->positions, self->positions) &&
+        quaternions_are_unit(self, numbers->positions.values) &&
+        (args[1] == Py_None || get_row(args[1], &numbers->velocities, self->velocities)) &&
+        (args[2] == Py_None || get_row(args[2], &numbers->efforts, self->velocities)))
         return true;
     release_numbers(numbers);
     return false;
@@ -202,7 +267,7 @@ static PyObject *
 encoder_payload(const JointStateEncoder *self, const Numbers *numbers, int64_t stamp, uint64_t seq)
 {
     Py_ssize_t size =
-        LONGEST_HEAD + numbers->positions.len + numbers->velocities.len + numbers->efforts.len;
+        LONGEST_HEAD + numbers->positions.size + numbers->velocities.size + numbers->efforts.size;
     PyObject *payload = PyBytes_FromStringAndSize(NULL, size);
     if (payload == NULL)
         return NULL;
@@ -239,8 +304,8 @@ encoder_encode(JointStateEncoder *self, PyObject *const *args, Py_ssize_t count)
 
 static PyMethodDef encoder_methods[] = {
     {"encode", (PyCFunction)(void (*)(void))encoder_encode, METH_FASTCALL,
-     "encode(positions, velocities, efforts, stamp, seq): the payload; None for anything but flat "
-     "arrays of finite doubles in the right number."},
+     "encode(positions, velocities, efforts, stamp, seq): the payload; None for anything but "
+     "finite numbers in the right count, in flat arrays of doubles, lists or tuples."},
     {NULL},
 };
 

@@ -218,7 +218,7 @@ publish_sample(PublishPath *self, PyObject *const *args)
         return 0;
     /* On the native wire, or as for it: what is outside limits is counted in its payloads. */
     PyObject *native = NULL, *ros = NULL;
-    bool outside = are_outside(self, numbers.positions.buf);
+    bool outside = are_outside(self, numbers.positions.values);
     if (self->ros == NULL || outside)
         native = encoder_payload(self->encoder, &numbers, stamp, self->seq);
     if (self->ros != NULL)

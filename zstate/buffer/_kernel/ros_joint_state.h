@@ -108,21 +108,21 @@ put_part(char *at, PyObject *part)
 }
 
 /* Numbers with one for each velocity, each at the index of its coordinate; NaN at the others.
- * Nothing for a buffer without an object. */
+ * Nothing for a row without values. */
 static char *
-put_spread(const RosJointStateEncoder *self, char *at, const Py_buffer *numbers)
+put_spread(const RosJointStateEncoder *self, char *at, const Row *row)
 {
     static const double unknown = NAN;
-    if (numbers->obj == NULL)
+    if (row->values == NULL)
         return at;
     if (self->velocities != self->positions) {
         for (Py_ssize_t i = 0; i < self->positions; i++)
             memcpy(at + 8 * i, &unknown, 8);
         for (Py_ssize_t i = 0; i < self->velocities; i++)
-            memcpy(at + 8 * self->slots[i], (const char *)numbers->buf + 8 * i, 8);
+            memcpy(at + 8 * self->slots[i], &row->values[i], 8);
     }
-    else if (numbers->len != 0) {
-        memcpy(at, numbers->buf, (size_t)numbers->len);
+    else if (row->size != 0) {
+        memcpy(at, row->values, (size_t)row->size);
     }
     return at + 8 * self->positions;
 }
@@ -134,7 +134,8 @@ ros_payload(const RosJointStateEncoder *self, const Numbers *numbers, int64_t st
     int64_t seconds = stamp / SECOND_NS - (stamp % SECOND_NS < 0);
     if (stamp == 0 || seconds < INT32_MIN || seconds > INT32_MAX)
         return NULL;
-    int form = (numbers->velocities.obj != NULL ? 2 : 0) + (numbers->efforts.obj != NULL ? 1 : 0);
+    int form =
+        (numbers->velocities.values != NULL ? 2 : 0) + (numbers->efforts.values != NULL ? 1 : 0);
     PyObject *const *parts = &PyTuple_GET_ITEM(PyTuple_GET_ITEM(self->parts, form), 0);
     Py_ssize_t size = 8, blocks = 1 + (form >> 1) + (form & 1);
     for (int i = 0; i < 4; i++)
@@ -146,9 +147,9 @@ ros_payload(const RosJointStateEncoder *self, const Numbers *numbers, int64_t st
     at = put_little(at, (uint64_t)seconds, 4);
     at = put_little(at, (uint64_t)(stamp - seconds * SECOND_NS), 4);
     at = put_part(at, parts[1]);
-    if (numbers->positions.len != 0)
-        memcpy(at, numbers->positions.buf, (size_t)numbers->positions.len);
-    at = put_part(at + numbers->positions.len, parts[2]);
+    if (numbers->positions.size != 0)
+        memcpy(at, numbers->positions.values, (size_t)numbers->positions.size);
+    at = put_part(at + numbers->positions.size, parts[2]);
     at = put_part(put_spread(self, at, &numbers->velocities), parts[3]);
     put_spread(self, at, &numbers->efforts);
     return payload;
@@ -200,9 +201,9 @@ ros_next_attachment(RosJointStateEncoder *self, PyObject *now)
 
 static PyMethodDef ros_methods[] = {
     {"encode", (PyCFunction)(void (*)(void))ros_encode, METH_FASTCALL,
-     "encode(positions, velocities, efforts, stamp): the payload; None for anything but flat "
-     "arrays "
-     "of finite doubles in the right number and a stamp of ROS."},
+     "encode(positions, velocities, efforts, stamp): the payload; None for anything but "
+     "finite numbers in the right count, in flat arrays of doubles, lists or tuples, and a stamp of "
+     "ROS."},
     {"attachment", (PyCFunction)ros_next_attachment, METH_O,
      "attachment(now): the attachment of the next payload; None without a gid."},
     {NULL},
