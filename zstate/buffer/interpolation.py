@@ -154,11 +154,11 @@ class LinearInterpolator:
 
 
 @dataclass(frozen=True, slots=True)
-class AngleInterpolator(LinearInterpolator):
-    """An angle of any number of turns.
+class ContinuousAngleInterpolator(LinearInterpolator):
+    """An angle of any number of turns: of a continuous joint, or the yaw of a planar one.
 
     It follows the rotation between the samples; but two angles within [-pi, pi] more than half a turn apart
-    are of an encoder that wrapped, and take the short way. ``interpolate_angle`` in ``_kernel/step.h`` is the
+    are of an encoder that wrapped, and take the short way. ``angle_difference`` in ``_kernel/step.h`` is the
     same rule in C.
     """
 
@@ -215,7 +215,7 @@ class PoseInterpolator:
         return (x + vx * seconds, y + vy * seconds, z + vz * seconds, *turned)
 
 
-Interpolator: TypeAlias = LinearInterpolator | AngleInterpolator | PoseInterpolator
+Interpolator: TypeAlias = LinearInterpolator | ContinuousAngleInterpolator | PoseInterpolator
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from zstate import se3
 from zstate.buffer.frame_tree import Edge, FrameTree, TreePath
 from zstate.buffer.history import HistoryView
 from zstate.buffer.interpolation import (
-    AngleInterpolator,
+    ContinuousAngleInterpolator,
     Interpolator,
     JointStep,
     LinearInterpolator,
@@ -435,8 +435,8 @@ def joint_interpolators(track: JointTrack, index: int) -> list[Interpolator]:
     if form.kind == "planar":
         offsets = (0, 1, 2) if velocity >= 0 else (0, 0, 0)
         x, y, yaw = ((column + n, velocity + offsets[n], cubic) for n in range(3))
-        return [LinearInterpolator(*x), LinearInterpolator(*y), AngleInterpolator(*yaw)]
-    kind = AngleInterpolator if track.is_continuous(index) else LinearInterpolator
+        return [LinearInterpolator(*x), LinearInterpolator(*y), ContinuousAngleInterpolator(*yaw)]
+    kind = ContinuousAngleInterpolator if track.is_continuous(index) else LinearInterpolator
     return [kind(column, velocity, cubic)]
 
 
@@ -453,7 +453,7 @@ def _step_tuples(steps: Sequence[Step], uses: Sequence[TrackUse]) -> tuple[StepT
                 numbers = se3.compose(before, step.origin)
             else:
                 kind, numbers = step.form.kind, _joint_numbers(step.form, before)
-            is_angle = isinstance(one, AngleInterpolator)
+            is_angle = isinstance(one, ContinuousAngleInterpolator)
             tuples.append((_KINDS.index(kind), step.use, one.column, is_angle, numbers))
             before = se3.IDENTITY
     if before != se3.IDENTITY or not tuples:

@@ -202,7 +202,8 @@ ros_next_attachment(RosJointStateEncoder *self, PyObject *now)
 static PyMethodDef ros_methods[] = {
     {"encode", (PyCFunction)(void (*)(void))ros_encode, METH_FASTCALL,
      "encode(positions, velocities, efforts, stamp): the payload; None for anything but "
-     "finite numbers in the right count, in flat arrays of doubles, lists or tuples, and a stamp of "
+     "finite numbers in the right count, in flat arrays of doubles, lists or tuples, and a stamp "
+     "of "
      "ROS."},
     {"attachment", (PyCFunction)ros_next_attachment, METH_O,
      "attachment(now): the attachment of the next payload; None without a gid."},

@@ -42,7 +42,7 @@ interpolate_linear(double a, double b, double ratio)
 }
 
 /* Angles within [-pi, pi] more than half a turn apart are of a wrapped encoder, and take the short
- * way: the same rule as AngleInterpolator in interpolation.py. */
+ * way: the same rule as ContinuousAngleInterpolator in interpolation.py. */
 static inline double
 angle_difference(double a, double b)
 {

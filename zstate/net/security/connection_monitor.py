@@ -62,7 +62,7 @@ class ConnectionMonitor(Closeable):
         self._scouts = json.loads(config.get_json("scouting/multicast/enabled")) is True
         self._checked: set[str] = set()
         self._stop = threading.Event()
-        thread = threading.Thread(target=self._run, name="zstate refusals", daemon=True)
+        thread = threading.Thread(target=self._run, name="zstate connection monitor", daemon=True)
         self._thread = join_at_exit(thread)
         if endpoints or self._scouts:
             self._thread.start()
