@@ -176,6 +176,7 @@ class ScanListener(Closeable):
             self.last_reason = reason
             self.dropped[type(reason).__name__.removesuffix("Timeout")] += 1
         else:
+            points = points.astype(np.float32, copy=False)  # for type checkers
             self._unread.add([PlacedScan(scan, sensor, self.target, points, valid)])
 
     def __iter__(self) -> Iterator[PlacedScan]:
