@@ -3,8 +3,8 @@
     python -m bench.micro.place
 
 A scan of 100 ms, in float32, while the robot turns at up to 1.5 rad/s. ``rover`` is a base with poses at
-100 Hz and a laser on it, ``arm`` a hand behind the seven joints of a panda, also at 100 Hz. The stamps: ``each
-its own`` ascend; ``by beam`` are those of 1024 columns, repeated for each beam of a spinning lidar;
+100 Hz and a laser on it, ``arm`` a hand behind the seven joints of a panda, also at 100 Hz. The stamps:
+``each its own`` ascend; ``by beam`` are those of 1024 columns, repeated for each beam of a spinning lidar;
 ``shuffled`` are in no order. ``lookup_many`` is a pose for each stamp, applied in numpy. ``two poses`` is the
 method of laser_geometry in numpy: the poses of the first and the last point, and lerp and slerp between them.
 
@@ -35,8 +35,8 @@ ROUNDS = 15
 MEASURED = 500
 
 LASER_GEOMETRY = (
-    "laser_geometry 1.6.7 in C++: 65 us for 1081 rays, 7700 us for 100000, on a machine on which lookup_many and "
-    "numpy took 128 us and 9700 us; errors of 12 to 15 mm"
+    "laser_geometry 1.6.7 in C++: 65 us for 1081 rays, 7700 us for 100000, on a machine on which lookup_many "
+    "and numpy took 128 us and 9700 us; errors of 12 to 15 mm"
 )
 
 Placed = NDArray[np.float32 | np.float64]
