@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import signal
 import subprocess
@@ -11,8 +12,10 @@ from pathlib import Path
 
 import pytest
 from helpers.processes import DEADLINE_S, Child
+from helpers.recording_builder import MS, START, RecordingBuilder, pose
 
 from zstate import TransformListener, connect
+from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
 
 pytestmark = pytest.mark.processes
 
@@ -61,6 +64,7 @@ def test_every_python_block_is_a_program_tested_here() -> None:
         "buffer.py",
         "place.py",
         "recording.py",
+        "scans.py",
         "joints.py",
     }
 
@@ -197,6 +201,24 @@ def test_recording_commands_record_describe_look_up_and_replay(
     assert joints.wait() == 0, joints.stderr
     replayed = start(replay)
     assert replayed.wait(DEADLINE_S) == 0, replayed.communicate()[1]
+
+
+def test_recorded_scans_are_placed(
+    spawn: Callable[..., Child], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ranges = to_float32_block([1.0, math.inf, 2.0])
+    with RecordingBuilder(tmp_path / "run.mcap", "rover") as builder:
+        for n in range(3):
+            builder.edges("rover", START + n * MS, {("odom", "laser"): pose(n)})
+        scan = LaserScan(START, 0, 1, "laser", -1.0, 0.5, 1000, 0, 0.1, 10.0, ranges)
+        builder.encoder.write_message("rover", scan, START, "front")
+        grid = OccupancyGrid(1, START, "map", 0.5, 2, 1, to_block(pose()), b"\0\x64")
+        builder.encoder.write_message("hall", grid, START, "floor")
+    scans = spawn(PROGRAMS["scans.py"])
+    assert scans.line() == "(2, 3)"
+    assert scans.line() == "<Grid of 2 x 1 cells of 0.5 m in 'hall/map'>"
+    assert scans.wait() == 0, scans.stderr
 
 
 @pytest.mark.robots

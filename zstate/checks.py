@@ -88,17 +88,6 @@ def check_points(points: ArrayLike) -> Points:
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
-def check_finite_points(points: Points) -> None:
-    """Raises InvalidInput if a number of ``points`` (N, 3) is NaN or infinite."""
-    unknown = ~np.isfinite(points).all(axis=1)
-    if unknown.any():
-        first = int(unknown.argmax())
-        raise InvalidInput(
-            f"{unknown.sum()} of {len(points)} points are not finite, first row {first}: "
-            f"{points[first].tolist()}; leave them out, with their stamps, by np.isfinite(points).all(axis=1)"
-        )
-
-
 def is_masked(values: object) -> bool:
     """Whether ``values`` is a masked array of numpy."""
     # Without importing numpy.ma, which takes 10 ms.

@@ -286,12 +286,6 @@ def test_lists_and_integers_are_points() -> None:
         (np.zeros((2, 3)), None, "stamps"),
         (np.zeros((2, 3)), True, "True"),
         (np.zeros((2, 3)), 2**63, "64-bit"),
-        (
-            np.array([[0, 0, 0], [0, np.nan, 1]]),
-            NOW,
-            r"1 of 2 points.*row 1: \[0.0, nan, 1.0\].*leave them out",
-        ),
-        (np.array([[0, 0, 0], [0, np.inf, 1]], np.float32), [NOW, 5], "1 of 2 points.*row 1"),
     ],
 )
 def test_wrong_points_and_stamps_are_refused(points: Any, stamps: Any, match: str) -> None:
@@ -332,3 +326,30 @@ def test_short_and_qualified_names_are_the_same_frame() -> None:
     full = buffer.place(POINTS, stamps, "r1/laser_link", "r1/base")
     assert short[1].all()
     assert short[0].tolist() == full[0].tolist()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("order", ORDERS)
+def test_rows_without_a_point_are_nan_and_change_no_other_row(order: str, dtype: type) -> None:
+    buffer, count = driving(), 500
+    stamps = scan_stamps(order, count, 3, NOW, NOW + S)
+    points = np.random.default_rng(3).normal(size=(count, 3)).astype(dtype)
+    holed = points.copy()
+    holed[::7, 1], holed[3::7, 0], holed[5::7] = np.nan, np.inf, -np.inf
+    is_point = np.isfinite(holed).all(axis=1)
+    path = buffer.path("odom", "laser", compiled=False)
+    for place in (lambda p: buffer.place(p, stamps, "laser", "odom"), lambda p: path.place(p, stamps)):
+        whole, all_valid = place(points)
+        placed, valid = place(holed)
+        assert all_valid.all()
+        assert valid.tolist() == is_point.tolist()
+        assert np.isnan(placed[~valid]).all()
+        assert np.array_equal(placed[valid], whole[valid])
+
+
+def test_static_frames_place_no_rows_without_a_point() -> None:
+    points = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0], [0.0, -np.inf, 0.0]])
+    for buffer in (filled(static("a", "b")), filled(moving("a", "b", NOW))):
+        placed, valid = buffer.place(points, NOW, "b", "a")
+        assert valid.tolist() == [True, False, False]
+        assert np.isnan(placed[1:]).all()

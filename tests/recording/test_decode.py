@@ -104,7 +104,7 @@ def test_static_writers_keep_their_names(tmp_path: Path):
     with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
         builder.statics("arm", START, {("tool", "camera"): pose(z=0.1)}, writer="camera")
         builder.statics("arm", START, {("world", "base"): pose()}, writer=MODEL_WRITER)
-        builder.encoder.withdraw("arm", "camera", START + S)
+        builder.encoder.withdraw("arm", "tf_static", "camera", START + S)
     found = DecodedFile(tmp_path / "r.mcap").of(StaticTransforms)
     assert [(decoded.writer.edge_writer, decoded.message.edges) for decoded in found] == [
         ("camera", (("tool", "camera"),)),
@@ -148,6 +148,23 @@ def test_scans_and_maps_of_a_bag_are_named_by_their_topics(tmp_path: Path):
     assert found == {"scan": ("ros", "front"), "map": ("hall", "map")}
     (one,) = read.of(LaserScan)
     assert one.message == scan(seq=1, session=one.writer.session)
+
+
+def test_messages_that_are_no_scan_or_map_are_counted_and_the_others_read(tmp_path: Path):
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        for topic, message, kind in (
+            ("/front", scan(session=0), LASER_SCAN),
+            ("/floor", grid(session=0), OCCUPANCY_GRID),
+        ):
+            payload = RosStreamEncoder(FrameNames(Ros2Options(), "ros"), SampleLayout()).encode(message)
+            channel = builder.writer.channel(topic, kind, STREAM_QOS["scan"])
+            # A grid ends with the number of its cells, 4 bytes, and its two cells.
+            lies = payload[:-6] + (2**31).to_bytes(4, "little") + payload[-2:]
+            for bad in (payload[: len(payload) // 2], payload[:-1], b"", lies, payload):
+                builder.writer.write(channel, bad, START, START)
+    read = DecodedFile(tmp_path / "r.mcap", streams=SCAN_STREAMS)
+    assert len(read.of(LaserScan)) == len(read.of(OccupancyGrid)) == 1
+    assert read.refused == ["truncated"] * 8
 
 
 def test_a_recording_with_scans_and_maps_fills_a_buffer(tmp_path: Path):

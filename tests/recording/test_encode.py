@@ -286,16 +286,16 @@ def test_latched_values_in_effect_are_repeated_in_the_next_file(case: EncoderCas
 
 def test_withdrawn_statics_end_with_an_empty_message(case: EncoderCase):
     case.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
-    case.encoder.withdraw("cart", "mount", NOW + 1)
-    case.encoder.withdraw("cart", "mount", NOW + 2)
-    case.encoder.withdraw("cart", "unknown", NOW + 2)
+    case.encoder.withdraw("cart", "tf_static", "mount", NOW + 1)
+    case.encoder.withdraw("cart", "tf_static", "mount", NOW + 2)
+    case.encoder.withdraw("cart", "tf_static", "unknown", NOW + 2)
     assert repeated(case) == []
     assert [len(message.transforms) for message in case.read("/tf_static")] == [1, 0]
 
 
 def test_static_writer_that_returns_is_latched_again(case: EncoderCase):
     case.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
-    case.encoder.withdraw("cart", "mount", NOW + 1)
+    case.encoder.withdraw("cart", "tf_static", "mount", NOW + 1)
     case.encoder.write_message("cart", statics(("arm", "tool")), NOW + 2, "mount")
     assert repeated(case) == [("/tf_static", "1", ["tool"])]
 
@@ -405,12 +405,25 @@ def test_other_readers_read_scans_and_maps(case: EncoderCase, read: Callable[[Pa
     assert (theirs.info.origin.position.y, list(theirs.data)) == (2.0, [-1, 0, 100])
 
 
-def test_a_map_is_latched_and_scans_are_not(case: EncoderCase):
-    case.encoder.write_message("cart", grid(), NOW, "floor")
-    case.encoder.write_message("cart", grid(cells=b"\0\0\0"), NOW, "floor")
+def test_a_map_is_written_again_only_if_it_changes_or_another_writer_publishes_it(case: EncoderCase):
+    maps = [grid(), grid(), grid(cells=b"\0\0\0"), grid(cells=b"\0\0\0", session=2)]
+    for second, message in enumerate(maps):
+        case.encoder.write_message("cart", message, NOW + second * S, "floor")
     case.encoder.write_message("cart", scan(), NOW, "front")
-    assert [(topic, session) for topic, session, _ in repeated(case)] == [("/floor", "1")]
-    assert case.encoder.messages == {("cart", "map"): 2, ("cart", "scan"): 1, ("cart", "clock"): 1}
+    assert [(topic, session) for topic, session, _ in repeated(case)] == [("/floor", "2")]
+    first_file, next_file = [[-1, 0, 100], [0, 0, 0], [0, 0, 0]], [[0, 0, 0]]
+    assert [list(message.data) for message in case.read("/floor")] == first_file + next_file
+    assert case.encoder.messages == {("cart", "map"): 3, ("cart", "scan"): 1, ("cart", "clock"): 1}
+
+
+def test_a_withdrawn_map_ends_with_a_grid_without_cells_and_keeps_edges_of_its_name(case: EncoderCase):
+    case.encoder.write_message("cart", statics(("arm", "tool")), NOW, "floor")
+    case.encoder.write_message("cart", grid(), NOW, "floor")
+    for n in (1, 2):
+        case.encoder.withdraw("cart", "map", "floor", NOW + n)
+    assert [(topic, session) for topic, session, _ in repeated(case)] == [("/tf_static", "1")]
+    assert [len(message.data) for message in case.read("/floor")] == [3, 0]
+    assert len(case.read("/tf_static")) == 2
 
 
 def test_a_scan_without_a_stamp_is_refused(case: EncoderCase):
@@ -425,7 +438,7 @@ def test_endless_static_writers_are_refused_and_counted(case: EncoderCase):
         case.encoder.write_message("cart", statics(("arm", "tool")), NOW, f"writer_{number}")
     assert case.refused == {"too many writers": 3}
     assert case.encoder.write_message("cart", statics(("arm", "other")), NOW, "writer_0")
-    case.encoder.withdraw("cart", "writer_0", NOW)
+    case.encoder.withdraw("cart", "tf_static", "writer_0", NOW)
     assert case.encoder.write_message("cart", statics(("arm", "other")), NOW, "another")
 
 

@@ -10,6 +10,7 @@ from helpers.recording_files import START, S, joint_states, write_run
 
 from zstate.errors import RecordingError
 from zstate.recording.info import read_info, recorded_robots
+from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
 
 
 def test_info_has_the_facts_of_the_writer(tmp_path: Path):
@@ -74,3 +75,23 @@ def test_drivers_of_a_robot_are_listed_by_their_names(tmp_path: Path):
         "upper, wrist.py@host pid 7": 1,
     }
     assert (streams["lower"].topic, streams["lower"].rate_hz) == ("/joint_states", 1.0)
+
+
+def test_sensors_are_listed_by_their_names_with_rate_and_rays(tmp_path: Path):
+    geometry = (-2.0, 0.5, 1000, 0, 0.125, 8.0)
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
+        for n in range(11):
+            stamp = START + n * 100 * MS
+            for sensor, count in (("front", 7), ("rear", 3)):
+                scan = LaserScan(stamp, n, 1, "laser", *geometry, to_float32_block([1.0] * count))
+                builder.encoder.write_message("arm", scan, stamp, sensor)
+        cells = b"\0" * 6
+        grid = OccupancyGrid(1, START, "map", 0.5, 3, 2, to_block([0, 0, 0, 0, 0, 0, 1]), cells)
+        builder.encoder.write_message("arm", grid, START, "floor")
+    (robot,) = recorded_robots(read_info(tmp_path / "r.mcap"))
+    found = {one.writer: (one.topic, one.count, one.rate_hz, one.rays) for one in robot.streams}
+    assert found == {
+        "front": ("/front", 11, 10.0, 7),
+        "rear": ("/rear", 11, 10.0, 3),
+        "floor": ("/floor", 1, None, None),
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import defaultdict
 from contextlib import closing
 from pathlib import Path
 
@@ -11,21 +12,36 @@ import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
 from helpers.recording_builder import MS, START, Bag, RecordingBuilder, S, pose, recorded_buffer
-from helpers.robots import RRBOT, SampleCollector, wait_for_stream_readers
+from helpers.robots import RRBOT, SampleCollector, wait_for_reader, wait_for_stream_readers
+from msgspec import structs
 
 from zstate.errors import SecondWriter
 from zstate.net.presence import current_tokens
 from zstate.net.session import connect
+from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.recording.decode import SCAN_STREAMS, DecodedRecording
 from zstate.recording.player import Player
+from zstate.recording.reader import RecordingReader
+from zstate.recording.recorder import Recorder
+from zstate.scans import ScanPublisher
 from zstate.transform import Transform
 from zstate.wire.keys import writer_expression
-from zstate.wire.messages import JointState, TransformSample, poses_from_block
+from zstate.wire.messages import (
+    JointState,
+    LaserScan,
+    OccupancyGrid,
+    TransformSample,
+    poses_from_block,
+    to_block,
+    to_float32_block,
+)
 from zstate.wire.native import ENCODINGS, decode
+from zstate.wire.registry import get_wire
 
 COUNT = 20
 CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
@@ -287,3 +303,75 @@ def test_nodes_of_a_bag_are_played_as_drivers(sessions, tmp_path: Path):
             bag.joints(START + n * 10 * MS, {SHOULDER: math.sin(n)})
             bag.joints(START + n * 10 * MS + 3 * MS, {ELBOW: math.cos(n)})
     assert_listener_has_the_recorded_joints(sessions, tmp_path / "bag", "ros")
+
+
+@pytest.fixture
+def scanned(tmp_path: Path) -> Path:
+    """Scans of two sensors of a cart, and a map of a hall that changes and is withdrawn."""
+    path, geometry = tmp_path / "scanned.mcap", (-2.0, 0.5, 1000, 4000, 0.125, 8.0)
+    with RecordingBuilder(path) as builder:
+        for n, cells in enumerate((b"\0\x64", b"\xff\0")):
+            grid = OccupancyGrid(4, START, "map", 0.5, 2, 1, to_block([1, 2, 0, 0, 0, 0, 1]), cells)
+            builder.encoder.write_message("hall", grid, START + n * 50 * MS, "floor")
+        for n in range(COUNT):
+            stamp, ranges = START + n * 10 * MS, to_float32_block([n, math.inf, math.nan])
+            front = LaserScan(stamp, n, 5, "laser", *geometry, ranges, ranges)
+            rear = LaserScan(stamp, n, 6, "fleet/laser", *geometry, ranges)
+            builder.encoder.write_message("cart", front, stamp, "front")
+            builder.encoder.write_message("cart", rear, stamp, "rear")
+        builder.encoder.withdraw("hall", "map", "floor", START + 195 * MS)
+    return path
+
+
+def scans_and_maps(path: Path) -> dict[tuple[str, str | None], list[object]]:
+    """The messages of each writer, without its session."""
+    found: defaultdict[tuple[str, str | None], list[object]] = defaultdict(list)
+    with RecordingReader(path) as reader:
+        for writer, message, _ in DecodedRecording(reader, lambda *_: None).messages(streams=SCAN_STREAMS):
+            facts = structs.asdict(message)
+            del facts["session"]
+            found[writer.robot, writer.edge_writer].append(facts)
+    return dict(found)
+
+
+@pytest.mark.parametrize("robots", [(), ("cart",)])
+def test_scans_and_maps_are_replayed_and_recorded_again_as_they_were(
+    sessions, scanned: Path, tmp_path: Path, robots: tuple[str, ...]
+):
+    writer, reader = sessions
+    again, expected = tmp_path / "again.mcap", scans_and_maps(scanned)
+    if robots:
+        del expected["hall", "floor"]
+    with Recorder(reader, again, ["cart", "hall"]) as recorder:
+        for sensor in ("front", "rear"):
+            wait_for_reader(writer, f"zstate/cart/scan/{sensor}")
+        with Player(writer, scanned, robots) as player:
+            report = player.run()
+        until(lambda: sum(recorder.stats.messages.values()) >= sum(map(len, expected.values())))
+    assert (report.samples, report.refused) == (2 * COUNT, {})
+    assert scans_and_maps(again) == expected
+
+
+def test_playback_in_the_middle_starts_with_the_map_in_effect(sessions, scanned: Path):
+    writer, reader = sessions
+    received: list[OccupancyGrid] = []
+
+    def add(arrivals: list[Received]) -> None:
+        received.extend(one.message for one in arrivals)
+
+    with (
+        subscribe(reader, get_wire("native"), "hall", "map", add),
+        Player(writer, scanned, start_s=0.1) as player,
+    ):
+        player.run()
+        until(lambda: received)
+    assert [one.cells for one in received] == [b"\xff\0"]
+
+
+def test_an_active_sensor_is_not_replayed(sessions, scanned: Path):
+    writer, reader = sessions
+    geometry = {"angle_min": 0.0, "angle_increment": 0.1, "range_min": 0.0, "range_max": 1.0}
+    with ScanPublisher(reader, "cart", "rear", **geometry):
+        with pytest.raises(SecondWriter, match="rear"):
+            replay(writer, scanned)
+        assert replay(writer, scanned, takeover=True) == 2 * COUNT

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
-from helpers.robots import RRBOT, STAMP, UPRIGHT, SampleCollector, wait_for_stream_readers
+from helpers.robots import RRBOT, STAMP, UPRIGHT, SampleCollector, wait_for_reader, wait_for_stream_readers
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -31,12 +32,23 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
 from zstate.recording.recording import Recording
+from zstate.scans import Grid, MapPublisher, ScanPublisher
 from zstate.sources import SineSource
 from zstate.transform import Transform
 from zstate.wire.messages import ClockMessage, JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import RmwKeys
 
 PERIOD = 1_000_000
+ROS_KEYS = RmwKeys(Ros2Options())
+SCANNER: dict[str, float] = {
+    "angle_min": -1.0,
+    "angle_increment": 0.5,
+    "range_min": 0.1,
+    "range_max": 10.0,
+    "ray_ns": 1000,
+}
 GRIPPER = load_model("gripper")
 
 
@@ -596,3 +608,61 @@ def test_joint_states_of_each_driver_are_recorded_on_a_channel_of_its_own(sessio
         positions, _ = recording.buffer().joint_positions("r1", STAMP + PERIOD // 2)
     assert {one.metadata["zstate.writer"] for one in channels} == {"lower", "upper"}
     assert positions == pytest.approx([0.75, -0.5])
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_scans_and_maps_are_recorded_as_published(sessions, tmp_path: Path, wire: str):
+    writer, reader = sessions
+    hall = Grid([[0, 100, -1], [7, 0, 0]], 0.5, (1.0, 2.0, 0.5), "map", STAMP)
+    sweeps = [np.array([k, 1.5, math.inf, math.nan, 0.25], np.float32) for k in range(5)]
+    path = tmp_path / "run.mcap"
+    with (
+        MapPublisher(writer, "r1", hall, [wire], writer="floor"),
+        ScanPublisher(writer, "r1", "front", [wire], **SCANNER) as scanner,
+        ScanPublisher(writer, "r1", "rear", [wire], **SCANNER) as rear,
+        Recorder(reader, path, ["r1"], wire=wire) as recorder,
+    ):
+        for sensor in ("front", "rear"):
+            keys = {"native": f"zstate/r1/scan/{sensor}", "ros2": ROS_KEYS.key("r1", "scan", sensor)}
+            wait_for_reader(writer, keys[wire])
+        for k, ranges in enumerate(sweeps):
+            scanner.publish(ranges, STAMP + k)
+        rear.publish(sweeps[0], STAMP, intensities=sweeps[0])
+        until(lambda: (count(recorder, "r1", "scan"), count(recorder, "r1", "map")) == (6, 1))
+    assert recorder.stats.missed == 0
+    assert not recorder.stats.refused
+    for other in OTHERS:
+        by_topic: dict[str, list[Any]] = {}
+        for topic, message in other(path):
+            by_topic.setdefault(topic, []).append(message)
+        assert [stamp_of(one.header) for one in by_topic["/front"]] == [STAMP + k for k in range(5)]
+        for message, ranges in zip(by_topic["/front"], sweeps, strict=True):
+            assert np.array_equal(np.asarray(message.ranges, np.float32), ranges, equal_nan=True)
+            assert message.time_increment == pytest.approx(1e-6)
+        assert np.array_equal(by_topic["/rear"][0].intensities, sweeps[0], equal_nan=True)
+        (floor,) = by_topic["/floor"]
+        assert (floor.info.width, floor.info.height) == (3, 2)
+        assert list(floor.data) == [0, 100, -1, 7, 0, 0]
+    with Recording(path) as recording:
+        (grid,) = recording.maps()
+        front = list(recording.scans("r1", "front"))
+        assert len(list(recording.scans())) == 6
+    assert (grid.cells.tolist(), grid.resolution, grid.stamp) == (hall.cells.tolist(), 0.5, STAMP)
+    assert [scan.ray_ns for scan in front] == [1000] * 5
+    assert all(np.array_equal(one.ranges, r, equal_nan=True) for one, r in zip(front, sweeps, strict=True))
+
+
+def test_withdrawn_map_keeps_static_edges_of_its_name(sessions, tmp_path: Path):
+    writer, reader = sessions
+    grid = Grid([[0]], 1.0, (0.0, 0.0, 0.0))
+    with (
+        StaticPublisher(writer, "r1", "floor") as statics,
+        Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder,
+    ):
+        statics.set(Transform("tool", "hook", (0.0, 0.0, 0.25), UPRIGHT))
+        with MapPublisher(writer, "r1", grid, writer="floor"):
+            until(lambda: count(recorder, "r1", "map") == count(recorder, "r1", "tf_static") == 1)
+        until(lambda: count(recorder, "r1", "map") == 2)
+    sizes = [message.info.width for message in read(tmp_path / "run.mcap", "/floor")]
+    edges = [len(message.transforms) for message in read(tmp_path / "run.mcap", "/tf_static")]
+    assert (sizes, edges) == ([1, 0], [1])

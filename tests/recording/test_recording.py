@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from pathlib import Path
 
@@ -18,10 +19,18 @@ from helpers.recording_builder import (
     swing_positions,
     swing_velocities,
 )
+from helpers.recording_files import STORE
+from rosbags.rosbag2 import StoragePlugin
 
 from zstate import Recording, TransformBuffer, UnknownFrame
 from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
 from zstate.transform import Transform
+from zstate.wire.joint_order import SampleLayout
+from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
+from zstate.wire.ros2.encoder import RosStreamEncoder
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
 
 
 def test_repr_has_duration_and_robots(tmp_path: Path):
@@ -226,3 +235,82 @@ def test_lookup_before_the_recording_does_not_suggest_a_listener(tmp_path: Path)
         with pytest.raises(InPast, match="the recording has nothing older of it") as caught:
             call()
         assert "listener" not in str(caught.value)
+
+
+SCAN_FROM = (-2.0, 0.5, 1000, 0, 0.125, 8.0)
+
+
+def scan(stamp: int, ranges: list[float]) -> LaserScan:
+    return LaserScan(stamp, 0, 1, "laser", *SCAN_FROM, to_float32_block(ranges))
+
+
+def grid(cells: bytes, session: int = 1) -> OccupancyGrid:
+    return OccupancyGrid(session, START, "map", 0.5, len(cells), 1, to_block([1, 2, 0, 0, 0, 0, 1]), cells)
+
+
+def test_recorded_scans_are_read_by_robot_and_sensor_and_placed_ray_by_ray(tmp_path: Path):
+    path = tmp_path / "r.mcap"
+    with RecordingBuilder(path) as builder:
+        for n in range(3):  # along x with 1 m a millisecond
+            builder.edges("arm", START + n * MS, {("odom", "laser"): pose(n)})
+        for name, ranges in (("front", [1.0, math.nan, 2.0]), ("rear", [3.0])):
+            builder.encoder.write_message("arm", scan(START, ranges), START + MS, name)
+        builder.encoder.write_message("cart", scan(START, [5.0]), START + MS, "front")
+    with Recording(path) as recording:
+        sizes = [len(one.ranges) for one in recording.scans()]
+        (rear,) = recording.scans("arm", "rear")
+        (front,) = recording.scans("arm", "front")
+        points, valid = recording.place(front.points(), front.stamps(), front.frame, "arm/odom")
+        with pytest.raises(InvalidInput, match="no robot 'lift'"):
+            list(recording.scans("lift"))
+    assert (sizes, rear.ranges.tolist(), front.frame) == ([3, 1, 1], [3.0], "arm/laser")
+    assert valid.tolist() == [True, False, True]
+    assert np.isnan(points[1]).all()
+    # Rays at 0 and 2 us, -2 and -1 rad, from a laser at 0 and 0.002 m.
+    expected = [[math.cos(-2.0), math.sin(-2.0), 0.0], [0.002 + 2 * math.cos(-1.0), 2 * math.sin(-1.0), 0.0]]
+    np.testing.assert_allclose(points[valid], expected, atol=1e-6)
+
+
+def test_recorded_maps_are_those_that_changed(tmp_path: Path):
+    path = tmp_path / "r.mcap"
+    with RecordingBuilder(path) as builder:
+        for second, message in enumerate([grid(b"\0"), grid(b"\0", session=2), grid(b"\x64\xff")]):
+            builder.encoder.write_message("hall", message, START + second * S, "floor")
+        builder.encoder.write_message("yard", grid(b"\x07"), START + 3 * S, "floor")
+        builder.encoder.withdraw("hall", "map", "floor", START + 4 * S)
+    with Recording(path) as recording:
+        cells = [one.cells.tolist() for one in recording.maps("hall")]
+        assert len(list(recording.maps())) == 3
+        (yard,) = recording.maps("yard")
+    assert cells == [[[0]], [[100, -1]]]
+    assert (yard.frame, yard.resolution, yard.origin.translation.tolist()) == ("yard/map", 0.5, [1, 2, 0])
+
+
+def test_scans_that_are_none_are_left_out(tmp_path: Path):
+    path = tmp_path / "r.mcap"
+    with RecordingBuilder(path, "arm") as builder:
+        for ranges in ([1.0], [], [2.0]):
+            builder.encoder.write_message("arm", scan(START, ranges), START, "front")
+    with Recording(path) as recording:
+        assert [one.ranges.tolist() for one in recording.scans()] == [[1.0], [2.0]]
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_scans_and_maps_of_a_ros_bag_are_placed_by_its_transforms(tmp_path: Path, storage: StoragePlugin):
+    encoder = RosStreamEncoder(FrameNames(Ros2Options(), "ros"), SampleLayout())
+    with Bag(tmp_path / "bag", storage) as bag:
+        for n in range(3):
+            stamp = START + n * MS
+            bag.tf(stamp, [Transform("odom", "laser", [float(n), 0, 0], [0, 0, 0, 1], stamp)])
+        for message, topic, kind in (
+            (scan(START, [1.0, 2.0]), "/scan", LASER_SCAN),
+            (grid(b"\x64\0"), "/map", OCCUPANCY_GRID),
+        ):
+            bag.write(topic, START, STORE.deserialize_cdr(encoder.encode(message), kind.name), kind.name)
+    with Recording(tmp_path / "bag") as recording:
+        (one,) = recording.scans(sensor="scan")
+        points, valid = recording.place(one.points(), one.stamps(), one.frame, "odom")
+        (floor,) = recording.maps()
+    assert valid.all()
+    assert points[1] == pytest.approx([0.001 + 2 * math.cos(-1.5), 2 * math.sin(-1.5), 0.0], abs=1e-6)
+    assert (floor.cells.tolist(), floor.frame) == ([[100, 0]], "ros/map")

@@ -214,7 +214,7 @@ def test_static_edges_of_all_writers_are_loaded(tmp_path: Path):
 def test_withdrawn_edges_stay_until_the_frame_is_placed_again(tmp_path: Path):
     with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
         builder.statics("arm", START, {("table", "cup"): pose(x=1.0), ("table", "plate"): pose(x=2.0)})
-        builder.encoder.withdraw("arm", "camera", START + S)
+        builder.encoder.withdraw("arm", "tf_static", "camera", START + S)
         builder.statics("arm", START + 2 * S, {("tray", "cup"): pose(x=3.0)}, writer="other", session=9)
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("table", "plate").translation[0] == 2.0

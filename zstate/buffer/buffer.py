@@ -21,7 +21,7 @@ from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader, TimeSpan
 from zstate.buffer.tracks import JointTrack, Track
 from zstate.buffer.waiting import MessageFilter, RequiredStamps, TransformWatch, Waiter, WakeCondition
-from zstate.checks import Points, check_finite_points, check_names, check_points
+from zstate.checks import Points, check_names, check_points
 from zstate.clock import Clock, check_stamp, check_stamps, check_stamps_of_points, wait_interruptible
 from zstate.errors import (
     AmbiguousFrame,
@@ -165,16 +165,14 @@ class TransformBuffer(BufferCore):
 
             points_in_odom, valid = buffer.place(points, stamps, source="laser", target="odom")
 
-        Rows without a transform are NaN; ``explain(target, source, int(stamps[valid.argmin()]))`` is the
-        reason of the first. Raises UnknownFrame, AmbiguousFrame, Disconnected and ClockMismatch, and
-        InvalidInput for other shapes and types, and points that are not finite.
+        Rows with NaN or infinity are no points, such as rays without a measurement (``Scan.points``). They,
+        and rows without a transform, are NaN and not valid; ``explain(target, source, int(stamp))`` is the
+        reason of the latter, for the stamp of a row. Raises UnknownFrame, AmbiguousFrame, Disconnected and
+        ClockMismatch, and InvalidInput for other shapes and types.
         """
         path = self.path(target, source)
         array = check_points(points)
-        placed, valid = path.place(array, check_stamps_of_points(stamps, len(array)))
-        if not valid.all():
-            check_finite_points(array)
-        return placed, valid
+        return path.place(array, check_stamps_of_points(stamps, len(array)))
 
     def plan(self, target: str, source: str) -> Plan:
         """Compiled lookup of one pair of frames. Raises as ``lookup`` for unknown frames."""

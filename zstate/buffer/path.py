@@ -192,7 +192,7 @@ class TransformPath:
     def place(self, points: Points, stamps: Stamps) -> tuple[Points, NDArray[np.bool_]]:
         """Points (N, 3) of the source in the target, by the pose at their own stamp, (N,), or (1,) of all.
 
-        Also (N,) which are known; the others are NaN.
+        Also (N,) which are known; the others are NaN: rows without a pose, and points that are not finite.
         """
         instants, rows = np.unique(stamps, return_inverse=True)
         found = self.poses(instants)[0][np.broadcast_to(rows, len(points))]
@@ -367,8 +367,10 @@ class CompiledPath(TransformPath):
     def place(self, points: Points, stamps: Stamps) -> tuple[Points, NDArray[np.bool_]]:
         placed, valid = np.empty_like(points, order="C"), np.empty(len(points), np.bool_)
         self._compiled.place(points, stamps, placed, valid)
-        if not valid.all():  # as in poses
-            rest = ~valid
+        rest = ~valid
+        if rest.any():
+            rest &= np.isfinite(points).all(axis=1)
+        if rest.any():  # as in poses
             their_stamps = stamps if len(stamps) == 1 else stamps[rest]
             placed[rest], valid[rest] = super().place(points[rest], their_stamps)
         return placed, valid

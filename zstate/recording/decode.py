@@ -19,7 +19,14 @@ from zstate.recording.encode import TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
 from zstate.wire.keys import Stream
-from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample
+from zstate.wire.messages import (
+    JointState,
+    Message,
+    OccupancyGrid,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+)
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
@@ -35,9 +42,6 @@ SCAN_STREAMS: tuple[Stream, ...] = ("scan", "map")
 """Further streams that can be decoded: the channels of these types, whatever their topic is."""
 
 _NAMED: dict[Stream, Stream] = {topic: named for named, topic in TOPICS.items()}
-
-LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
-"""Streams whose messages are in effect until the next."""
 
 _SESSION, _PREFIX = "zstate.session", "zstate.frame_prefix"
 
@@ -251,11 +255,13 @@ class ChannelDecoder(NamedTuple):
 
 
 class LatchedState:
-    """The robot descriptions and static edges in effect at one point of a recording."""
+    """The robot descriptions, static edges and maps in effect at one point of a recording."""
 
     def __init__(self) -> None:
         self.descriptions: dict[str, DecodedMessage] = {}
         """By robot."""
+        self.maps: dict[tuple[str, str], DecodedMessage] = {}
+        """By robot and name; of a withdrawn one a grid without cells."""
         self._statics: dict[tuple[str, str], DecodedMessage] = {}
         self._accumulated: dict[RecordedWriter, StaticAccumulator] = {}
 
@@ -280,6 +286,9 @@ class LatchedState:
             key = static_key(writer)
             before = self._statics.get(key)
             self._statics[key] = decoded
+        elif isinstance(message, OccupancyGrid):
+            before = self.maps.get(key := (writer.robot, writer.edge_writer or ""))
+            self.maps[key] = decoded
         else:
             return None
         is_same = before is not None and _latched_value(before.message) == _latched_value(decoded.message)
@@ -290,6 +299,9 @@ def _latched_value(message: Message) -> object:
     """What a latched message states, whatever session repeats it."""
     if isinstance(message, RobotDescription):
         return message.urdf
+    if isinstance(message, OccupancyGrid):
+        grid = message.stamp, message.frame, message.resolution, message.width, message.origin
+        return *grid, message.cells
     assert isinstance(message, StaticTransforms)
     return message.edges, message.poses
 

@@ -37,6 +37,7 @@ from zstate.wire.messages import (
     TransformSample,
     WriterTransforms,
     order_digest,
+    to_block,
 )
 from zstate.wire.ros2.cdr import to_time
 from zstate.wire.ros2.encoder import RosStreamEncoder
@@ -79,6 +80,9 @@ _NAMED_STREAMS: dict[type[Message], Stream] = {
 
 TOPICS: dict[Stream, Stream] = {"transforms": "tf", "partial_joint_states": "joint_states"}
 """The streams after which the topics of others are named: ROS has no topics of single writers."""
+
+NO_MAP = OccupancyGrid(0, 1, "map", 1.0, 0, 0, to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), b"")
+"""Recorded when a map is withdrawn."""
 
 _NAMED = SampleLayout()
 
@@ -146,11 +150,11 @@ class RecordingEncoder:
                     key = robot, message.session
                     edges = self._statics.setdefault(key, StaticAccumulator(message.session))
                     message, edge_writer = edges.with_edges(message), f"ros-{message.session}"
-                self._latch(robot, message, log_time, f"{robot}/{edge_writer}", edge_writer)
+                self._latch(robot, message, log_time, edge_writer)
             elif isinstance(message, RobotDescription):
                 self._write_description(robot, message, log_time)
             elif isinstance(message, OccupancyGrid):
-                self._latch(robot, message, log_time, f"{robot}/map/{edge_writer}", edge_writer or "")
+                self._latch(robot, message, log_time, edge_writer or "")
             elif isinstance(message, StampedMessage):
                 with self._lock:
                     self._write_sample(robot, message, log_time, edge_writer or "")
@@ -166,16 +170,19 @@ class RecordingEncoder:
             self._refuse(reason if stamp else "no stamp", f"{robot!r}: {error}")
         return True
 
-    def withdraw(self, robot: str, edge_writer: str, log_time: int) -> None:
-        """Write that a static writer has withdrawn all its edges."""
+    def withdraw(self, robot: str, stream: Stream, name: str, log_time: int) -> None:
+        """Write that the writer ``name`` has withdrawn its static edges (``tf_static``), or its ``map``.
+
+        ROS cannot express this: the messages are a TFMessage without transforms, and a grid without cells.
+        """
         with self._lock:
-            key = f"{robot}/{edge_writer}"
+            key = _latched_key(robot, stream, name)
             channel = self._latched.get(robot, {}).pop(key, None)
             if channel is not None:
-                payload = channel.encode(StaticTransforms(0, (), b""))
-                self._writer.latch(channel.number, key, payload, log_time, log_time)
+                empty = NO_MAP if stream == "map" else StaticTransforms(0, (), b"")
+                self._writer.latch(channel.number, key, channel.encode(empty), log_time, log_time)
                 self._writer.unlatch(channel.number, key)
-                self._counts[robot, "tf_static"] += 1
+                self._counts[robot, stream] += 1
 
     def _write_sample(self, robot: str, message: StampedMessage, log_time: int, edge_writer: str) -> None:
         sample_names = self._orders_of(robot).sample_names(message)
@@ -209,7 +216,7 @@ class RecordingEncoder:
         self._writer.write(channel.number, payload, log_time, max(sample.stamp, 0), sequence=sample.seq)
 
     def _write_description(self, robot: str, description: RobotDescription, log_time: int) -> None:
-        self._latch(robot, description, log_time, robot)
+        self._latch(robot, description, log_time)
         try:
             self._orders_of(robot).add(description, robot)
         except ModelError as error:
@@ -224,10 +231,10 @@ class RecordingEncoder:
         robot: str,
         message: StaticTransforms | RobotDescription | OccupancyGrid,
         log_time: int,
-        key: str,
         edge_writer: str = "",
     ) -> None:
         stream = _STREAMS[type(message)]
+        key = _latched_key(robot, stream, edge_writer)
         with self._lock:
             latched = self._latched.setdefault(robot, {})
             if key not in latched and len(latched) >= MAX_LATCHED:
@@ -237,12 +244,15 @@ class RecordingEncoder:
             channel = self._channel(robot, stream, message.session, log_time, edge_writer)
         payload = channel.encode(message)
         with self._lock:
-            self._writer.latch(channel.number, key, payload, log_time, log_time)
+            # The maps of a fleet, with 16 MB each, would be most of a recording if they were repeated.
+            once = stream == "map"
+            number = channel.number
+            is_new = self._writer.latch(number, key, payload, log_time, log_time, once_per_file=once)
             before = latched.get(key, channel)
             if before is not channel:
                 self._writer.unlatch(before.number, key)
             latched[key] = channel
-            self._counts[robot, stream] += 1
+            self._counts[robot, stream] += is_new
 
     def _orders_of(self, robot: str) -> OrderRegistry:
         # Atomic: descriptions are added from another thread, without the lock.
@@ -296,6 +306,11 @@ class RecordingEncoder:
                 name += "_"
             self._namespaces[robot] = name
         return Ros2Options(namespace=self._namespaces[robot], frame_prefix=f"{robot}/")
+
+
+def _latched_key(robot: str, stream: Stream, name: str) -> str:
+    """The key of a latched message, in the file and in its robot."""
+    return f"{robot}/{stream}/{name}"
 
 
 class ChannelEncoder:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,16 @@ from typing import Any
 from zstate.errors import MessageError, ModelError
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.recording.decode import LATCHED, RecordedWriter
+from zstate.recording.decode import RecordedWriter
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import ROBOT, Channel
-from zstate.wire.keys import Stream
+from zstate.wire.keys import LATCHED_STREAMS, Stream
+from zstate.wire.messages import LaserScan, from_float32_block
 from zstate.wire.ros2.cdr import decode_string
+from zstate.wire.ros2.decoder import RosDecoder
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import SHARED
 
 
 @dataclass(frozen=True)
@@ -86,7 +92,11 @@ def _unique(words: Iterable[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class RecordedStream:
-    """One writer's messages on one stream. ``rate_hz`` is the mean rate; None for latched values."""
+    """One writer's messages on one stream.
+
+    ``rate_hz`` is the mean rate; None for latched values. ``rays`` is the number of rays in the first scan of
+    the topic; None for other streams.
+    """
 
     stream: Stream
     topic: str
@@ -94,6 +104,7 @@ class RecordedStream:
     count: int
     rate_hz: float | None
     writer: str
+    rays: int | None = None
 
 
 @dataclass(frozen=True)
@@ -133,12 +144,25 @@ def recorded_robots(info: RecordingInfo) -> list[RecordedRobot]:
                     fault = str(error)
             streams: list[RecordedStream] = []
             for writer, channel in written:
-                rate = None if writer.stream in LATCHED else mean_rate(channel, info.duration_s)
+                rate = None if writer.stream in LATCHED_STREAMS else mean_rate(channel, info.duration_s)
                 names = ", ".join(filter(None, (writer.edge_writer, writer.program)))
                 facts = (channel.topic, channel.type_name, channel.count, rate, names)
-                streams.append(RecordedStream(writer.stream, *facts))
+                rays = _ray_count(reader, channel.topic) if writer.stream == "scan" else None
+                streams.append(RecordedStream(writer.stream, *facts, rays))
             robots.append(RecordedRobot(name, model, fault, tuple(streams)))
     return robots
+
+
+def _ray_count(reader: RecordingReader, topic: str) -> int | None:
+    """The rays of the first scan on a topic; None if it cannot be decoded."""
+    names = FrameNames(Ros2Options(), SHARED)
+    for record in reader.records({topic}):
+        with suppress(MessageError):
+            (message,) = RosDecoder().messages("scan", record.payload, 0, 0, names)
+            assert isinstance(message, LaserScan)
+            return len(from_float32_block(message.ranges))
+        break
+    return None
 
 
 def other_channels(info: RecordingInfo) -> list[Channel]:

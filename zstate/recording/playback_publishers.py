@@ -30,11 +30,13 @@ from zstate.wire.keys import MODEL_WRITER, NAMED_STREAMS, Stream, full_name
 from zstate.wire.messages import (
     Edges,
     JointState,
+    LaserScan,
     Message,
+    OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     TransformSample,
-    WriterTransforms,
+    renumbered,
     select_edges,
 )
 from zstate.wire.protocol import carrier
@@ -42,6 +44,9 @@ from zstate.wire.registry import get_wire
 
 EdgeWriter: TypeAlias = tuple[str, str]
 """The robot and the name of a writer of transforms."""
+
+LatchedMessage: TypeAlias = RobotDescription | StaticTransforms | OccupancyGrid
+"""Messages in effect until the next of their writer."""
 
 _SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
 
@@ -79,6 +84,7 @@ class PlaybackPublishers(Closeable):
         self._robots: dict[str, _RobotPublisher] = {}
         self._others: dict[str, PassthroughPublisher] = {}
         self._parts: dict[str, JointPartPlayback] = {}
+        self._scans: dict[tuple[str, str], PassthroughPublisher] = {}
         self._open_passthrough = partial(
             PassthroughPublisher, session, wires, sessions=self._sessions, takeover=takeover
         )
@@ -103,7 +109,12 @@ class PlaybackPublishers(Closeable):
                 ]
                 self._others[robot] = self._open_passthrough(robot, streams)
                 opening.enter_context(self._others[robot])
-            for decoded in (*latched.descriptions.values(), *latched.statics):
+            for robot, name in sorted(
+                {(one.robot, one.edge_writer or "") for one in writers if one.stream == "scan"}
+            ):
+                scans = self._open_passthrough(robot, ("scan",), name)
+                self._scans[robot, name] = opening.enter_context(scans)
+            for decoded in (*latched.descriptions.values(), *latched.statics, *latched.maps.values()):
                 self._publish_counted(decoded)
             self._opened = opening.pop_all()
 
@@ -132,14 +143,16 @@ class PlaybackPublishers(Closeable):
 
     def publish(self, decoded: DecodedMessage) -> bool:
         """Publish it; False for a repetition and for what cannot be published."""
-        if isinstance(decoded.message, RobotDescription | StaticTransforms):
+        if isinstance(decoded.message, LatchedMessage):
             changed = self._latched.update(decoded)
             return changed is not None and self._publish_counted(changed)
         return self._publish_counted(decoded)
 
     def _publish_counted(self, decoded: DecodedMessage) -> bool:
         try:
-            return self._publish(decoded.writer, decoded.message)
+            if isinstance(decoded.message, LatchedMessage):
+                return self._publish_latched(decoded.writer, decoded.message)
+            return self._publish_sample(decoded.writer, decoded.message)
         except MessageError as error:
             self._refusals.count(error.reason, f"{decoded.writer.robot!r}: {error}")
         except InvalidInput as error:
@@ -148,22 +161,26 @@ class PlaybackPublishers(Closeable):
             self._refusals.count("robot description", f"{decoded.writer.robot!r}: {error}")
         return False
 
-    def _publish(self, writer: RecordedWriter, message: Message) -> bool:
+    def _publish_latched(self, writer: RecordedWriter, message: LatchedMessage) -> bool:
         robot = self._robots.get(writer.robot)
         if isinstance(message, StaticTransforms):
             if writer.edge_writer == MODEL_WRITER and robot is not None:
                 return False
             edges = self._modelled.filter_statics(writer.robot, message)
             self._others[writer.robot].set_statics(edges, static_key(writer)[1])
-        elif isinstance(message, RobotDescription) and robot is None:
+        elif isinstance(message, OccupancyGrid):
+            self._others[writer.robot].set_map(message, writer.edge_writer or "")
+        elif robot is None:
             self._others[writer.robot].describe(message)
-        elif isinstance(message, RobotDescription):
-            assert robot is not None
-            if robot.publisher.model.urdf != message.urdf:
-                model = parse_urdf(message.urdf, f"the URDF of {writer.robot!r}")
-                robot.publisher.close()
-                self._open(writer.robot, model, "tf" in robot.streams)
-        elif isinstance(message, JointState) and (
+        elif robot.publisher.model.urdf != message.urdf:
+            model = parse_urdf(message.urdf, f"the URDF of {writer.robot!r}")
+            robot.publisher.close()
+            self._open(writer.robot, model, "tf" in robot.streams)
+        return True
+
+    def _publish_sample(self, writer: RecordedWriter, message: Message) -> bool:
+        robot = self._robots.get(writer.robot)
+        if isinstance(message, JointState) and (
             writer.stream == "partial_joint_states" or writer.robot in self._in_parts
         ):
             self._parts_of(writer.robot).publish(writer, message)
@@ -179,6 +196,8 @@ class PlaybackPublishers(Closeable):
             self._others[writer.robot].publish(rest)
         elif isinstance(message, JointState):
             self._others[writer.robot].publish(message)
+        elif isinstance(message, LaserScan):
+            self._scans[writer.robot, writer.edge_writer or ""].publish(message)
         return True
 
     def _parts_of(self, robot: str) -> JointPartPlayback:
@@ -339,11 +358,11 @@ class JointPartPlayback(Closeable):
 class PassthroughPublisher(Closeable):
     """Publishes messages of ``robot`` unchanged on all ``wires``, with its own session and sequence numbers.
 
-    ``streams`` are announced at once, latched values with the first of their name; ``transforms`` and
-    ``partial_joint_states`` under the name ``edge_writer``. A message that one of the wires cannot encode
-    raises InvalidInput, and is published on none. Raises SecondWriter if another live writer publishes the
-    same on the native wire, unless ``takeover``. Edges of the ``sessions`` of this playback, its own
-    included, may place the same frame, as in the recording.
+    ``streams`` are announced at once, latched values with the first of their name; ``transforms``,
+    ``partial_joint_states`` and ``scan`` under the name ``edge_writer``. A message that one of the wires
+    cannot encode raises InvalidInput, and is published on none. Raises SecondWriter if another live writer
+    publishes the same on the native wire, unless ``takeover``. Edges of the ``sessions`` of this playback,
+    its own included, may place the same frame, as in the recording.
     """
 
     def __init__(
@@ -385,27 +404,21 @@ class PassthroughPublisher(Closeable):
             }
             self._opened = opening.pop_all()
 
-    def publish(self, message: JointState | TransformSample) -> None:
+    def publish(self, message: JointState | TransformSample | LaserScan) -> None:
         """Publish one sample."""
         if self._claim is not None:
             self._claim.check()
             self._edge_monitor.check()
-        stream: Stream = "joint_states"
-        if "partial_joint_states" in self._streams:
-            stream = "partial_joint_states"
+        named: Stream = "partial_joint_states"
+        shared: Stream = "joint_states"
         if isinstance(message, TransformSample):
-            stream = "transforms" if "transforms" in self._streams else "tf"
-            if stream == "transforms":
+            named, shared = "transforms", "tf"
+            if named in self._streams:
                 self._own(message.edges or ())
-        head = (message.stamp, self._seqs[stream], self._session_id, message.order)
-        if isinstance(message, JointState):
-            numbers = (message.positions, message.velocities, message.efforts)
-            sample = JointState(*head, *numbers, message.names)
-        elif isinstance(message, WriterTransforms):
-            sample = WriterTransforms(*head, message.poses, message.edges, message.covariances)
-        else:
-            sample = TransformSample(*head, message.poses, message.edges)
-        write_all(self._streams[stream], sample)
+        elif isinstance(message, LaserScan):
+            named = shared = "scan"
+        stream = named if named in self._streams else shared
+        write_all(self._streams[stream], renumbered(message, self._seqs[stream], self._session_id))
         self._seqs[stream] += 1
 
     def own_joints(self, edges: Sequence[Edge]) -> None:
@@ -448,6 +461,16 @@ class PassthroughPublisher(Closeable):
                 placing.enter_context(claim_edges(self._session, announced, new, allowed=self._sessions))
             write_all(writers, StaticTransforms(self._session_id, statics.edges, statics.poses))
         self._placed[writer] = edges
+
+    def set_map(self, grid: OccupancyGrid, writer: str) -> None:
+        """Publish the map of ``writer``; one without cells withdraws the previous one."""
+        if not grid.cells:
+            for latched in self._latched.get(("map", writer), ()):
+                latched.withdraw()
+            return
+        size = grid.resolution, grid.width, grid.height
+        message = OccupancyGrid(self._session_id, grid.stamp, grid.frame, *size, grid.origin, grid.cells)
+        write_all(self._latch("map", writer), message)
 
     def _latch(self, stream: Stream, writer: str) -> list[LatchedWriter]:
         if (stream, writer) not in self._latched:

@@ -19,7 +19,8 @@ from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
 from zstate.recording.decode import (
-    LATCHED,
+    SCAN_STREAMS,
+    STREAMS,
     DecodedMessage,
     DecodedRecording,
     LatchedState,
@@ -34,7 +35,8 @@ from zstate.recording.player_clock import Lateness, PlayerClock
 from zstate.recording.reader import RecordingReader
 from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.wire.joint_order import JointNumbers
-from zstate.wire.messages import ClockMessage, JointState, Sample
+from zstate.wire.keys import LATCHED_STREAMS
+from zstate.wire.messages import ClockMessage, JointState, StampedMessage
 from zstate.wire.registry import as_wire_names
 
 CLOCK_HZ = 100.0
@@ -70,15 +72,15 @@ class Player(Closeable):
     """Publishes the recorded messages of ``robots``, or of all robots, as when they were recorded.
 
     Stamps are those of the recording, and so is the spacing, divided by ``rate`` (inf: as fast as possible).
-    Playback starts ``start_s`` [s] after the first message, with the descriptions and static edges in effect
-    at that point, and lasts ``duration_s`` of the recording. With ``loop`` it restarts at its end; each pass
-    has new writers, as stamps step back. The recording's time is published on the clock.
+    Playback starts ``start_s`` [s] after the first message, with the descriptions, static edges and maps in
+    effect at that point, and lasts ``duration_s`` of the recording. With ``loop`` it restarts at its end;
+    each pass has new writers, as stamps step back. The recording's time is published on the clock.
 
-    Robots with a recorded model are published by a StatePublisher, other messages unchanged, such as the
-    joint states of several drivers of a robot, each by a writer of the recorded name. Raises RecordingError,
-    and InvalidInput for robots and times that are not in the recording. A context manager; ``run`` plays,
-    other threads may pause and seek. ``run`` raises SecondWriter if another writer publishes one of the
-    robots, unless ``takeover``.
+    Robots with a recorded model are published by a StatePublisher, other messages unchanged, such as scans,
+    maps, and the joint states of several drivers of a robot, by writers of the recorded names. Raises
+    RecordingError, and InvalidInput for robots and times that are not in the recording. A context manager;
+    ``run`` plays, other threads may pause and seek. ``run`` raises SecondWriter if another writer publishes
+    one of the robots, unless ``takeover``.
     """
 
     def __init__(
@@ -211,7 +213,7 @@ class Player(Closeable):
         self._position = begin
         writers = self._recording.writers_of(self.robots)
         latched = LatchedState()
-        for decoded in self._recording.messages(self.robots, LATCHED, end=begin):
+        for decoded in self._recording.messages(self.robots, LATCHED_STREAMS, end=begin):
             latched.update(decoded)
         with (
             PlaybackPublishers(
@@ -229,7 +231,8 @@ class Player(Closeable):
             self._player_clock.start(begin)
             has_clock = any(writer.stream == "clock" for writer in writers)
             ticks = None if has_clock else _ClockTicks(clock, begin, self._player_clock.rate)
-            for decoded in self._recording.messages(self.robots, begin=begin, end=self._end):
+            streams = (*STREAMS, *SCAN_STREAMS)
+            for decoded in self._recording.messages(self.robots, streams, begin, self._end):
                 while ticks is not None and ticks.next <= decoded.log_time:
                     if not self._reach(ticks.next, ticks):
                         return
@@ -239,7 +242,7 @@ class Player(Closeable):
                 lateness = self._player_clock.lateness(decoded.log_time)
                 if isinstance(decoded.message, ClockMessage):
                     clock.publish(decoded.message.stamp)
-                elif publishers.publish(decoded) and isinstance(decoded.message, Sample):
+                elif publishers.publish(decoded) and isinstance(decoded.message, StampedMessage):
                     self._samples += 1
                     self._lateness.add(lateness)
 

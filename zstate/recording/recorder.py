@@ -26,12 +26,11 @@ from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.rate import Rate
-from zstate.recording.decode import LATCHED
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, NAMED_STREAMS, Stream, check_robot
-from zstate.wire.messages import ClockMessage, Message, Sample
+from zstate.wire.keys import ANY, LATCHED_STREAMS, NAMED_STREAMS, Stream, check_robot
+from zstate.wire.messages import Message, StampedMessage
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.topics import SHARED
@@ -96,7 +95,7 @@ class MessageQueue(Closeable):
                     self._waiting += len(arrivals)
                     self._bytes += sum(len(arrival.payload) for arrival in arrivals)
 
-        if stream in LATCHED:
+        if stream in LATCHED_STREAMS:
             subscriber = LatchedSubscriber(self._session, expressions, lambda arrival: put([arrival]))
         else:
             subscriber = StreamSubscriber(self._session, expressions, put)
@@ -140,7 +139,8 @@ class RecorderStats:
 class Recorder(Closeable):
     """Records ``robots``, or all robots, on ``wire`` into ``path``; a context manager.
 
-    Subscribes to all of their streams, /tf too, which makes their publishers compute it. A single selected
+    Subscribes to all of their streams, /tf too, which makes their publishers compute it, and to their scans
+    and maps. A map is written when it changes, and at the start of each file. A single selected
     robot, or the only robot when the recording starts, is in the file's root with unchanged frame names;
     others have a namespace and a frame prefix. ``max_bytes``, ``max_seconds`` and ``overwrite`` are those of
     RecordingWriter. Raises RecordingError if the file cannot be created, InvalidInput for invalid names.
@@ -166,8 +166,9 @@ class Recorder(Closeable):
         self._wire = get_wire(wire)
         # On a ROS wire all moving edges are on tf, and all joints on joint_states.
         named = self._wire.partial_joint_states, self._wire.transforms
-        samples: tuple[Stream, ...] = ("joint_states", "tf", *named)
-        self._streams: tuple[Stream, ...] = tuple(dict.fromkeys((*LATCHED, *samples)))
+        latched: tuple[Stream, ...] = ("robot_description", "tf_static", "map")
+        samples: tuple[Stream, ...] = ("joint_states", "tf", *named, "scan")
+        self._streams: tuple[Stream, ...] = tuple(dict.fromkeys((*latched, *samples)))
         self._counters = Counters()
         self._gaps = GapCounter(self._counters)
         self._programs: BoundedDict[int, str] = BoundedDict()
@@ -287,7 +288,7 @@ class Recorder(Closeable):
                 robot = self._robot(batch, arrival)
                 if robot is None:
                     continue
-                if batch.stream in LATCHED and self._large.accepts(robot, len(arrival.payload)):
+                if batch.stream in LATCHED_STREAMS and self._large.accepts(robot, len(arrival.payload)):
                     self._large.put(robot, batch, arrival)
                 else:
                     self._write_arrival(robot, batch, arrival)
@@ -317,9 +318,9 @@ class Recorder(Closeable):
         encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
         assert encoder is not None
         edge_writer = self._wire.edge_writer_name(arrival.key) if stream in NAMED_STREAMS else None
-        if not arrival.payload and stream in LATCHED:
+        if not arrival.payload and stream in LATCHED_STREAMS:
             if edge_writer is not None:
-                encoder.withdraw(robot, edge_writer, stamp)
+                encoder.withdraw(robot, stream, edge_writer, stamp)
             return
         messages: Sequence[Message] = ()
         try:
@@ -328,7 +329,7 @@ class Recorder(Closeable):
             self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
         for message in messages:
             is_known = encoder.write_message(robot, message, stamp, edge_writer)
-            if is_known and isinstance(message, Sample | ClockMessage):
+            if is_known and isinstance(message, StampedMessage):
                 self._gaps.add((robot, stream, message.session), message.seq)
 
     def _robot(self, batch: Batch, arrival: SerializedSample) -> str | None:

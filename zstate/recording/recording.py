@@ -42,6 +42,7 @@ from zstate.recording.decode import (
     STREAMS,
     DecodedMessage,
     DecodedRecording,
+    LatchedState,
     RecordedWriter,
     check_has_robot,
     first_descriptions,
@@ -52,10 +53,14 @@ from zstate.recording.info import RecordingInfo, read_info
 from zstate.recording.joint_parts import MergedJointStateReader, RecordedJoints, has_parts
 from zstate.recording.joint_states import DELAYED_NS, JointStateReader
 from zstate.recording.reader import RecordingReader
+from zstate.scans.grid import Grid, grid_from_message
+from zstate.scans.scan import Scan, scan_from_message
 from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, full_name
 from zstate.wire.messages import (
     Edges,
     JointState,
+    LaserScan,
+    OccupancyGrid,
     RobotDescription,
     Sample,
     StaticTransforms,
@@ -188,10 +193,50 @@ class Recording(Closeable):
     ) -> tuple[Points, NDArray[np.bool_]]:
         """``buffer(around=stamps).place``: each point in ``target``, (N, 3), and which are valid, (N,).
 
+        Reads the file in each call; place many scans by one ``buffer()``.
         Raises UnknownFrame, AmbiguousFrame and Disconnected, and InvalidInput as the buffer does.
         """
         instants = check_stamps_of_points(stamps, len(check_points(points)))
         return self.buffer(instants).place(points, stamps, source, target)
+
+    def scans(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Scan]:
+        """The scans of ``robot``, by default of all robots, or of one ``sensor``, in the order of recording.
+
+        They are read one after the other, and their frames have full names. Place many of them by one
+        ``buffer()``: ``Recording.place`` reads the file in each call. Messages that are no scan are left
+        out; the first of each reason is logged. Raises InvalidInput for a robot that is not in the recording.
+        """
+        refusals = Refusals("recorded scans")
+        for writer, message, _ in self._messages(robot, "scan", refusals):
+            if isinstance(message, LaserScan) and sensor in (None, writer.edge_writer):
+                try:
+                    yield scan_from_message(message, writer.robot)
+                except InvalidInput as error:
+                    refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
+
+    def maps(self, robot: str | None = None) -> Iterator[Grid]:
+        """The maps of ``robot``, by default of all robots, in the order of recording, each when it changes.
+
+        They are read one after the other, and their frames have full names. Messages that are no map are
+        left out; the first of each reason is logged. Raises InvalidInput for a robot that is not in the
+        recording.
+        """
+        refusals = Refusals("recorded maps")
+        latched = LatchedState()
+        for decoded in self._messages(robot, "map", refusals):
+            writer, message, _ = decoded
+            # Repeated for readers that start in the middle; without cells when it was withdrawn.
+            if latched.update(decoded) and isinstance(message, OccupancyGrid) and message.cells:
+                try:
+                    yield grid_from_message(message, writer.robot)
+                except InvalidInput as error:
+                    refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
+
+    def _messages(self, robot: str | None, stream: Stream, refusals: Refusals) -> Iterator[DecodedMessage]:
+        recording = DecodedRecording(self._reader, refusals.count)
+        robot = robot or self.robot
+        robots = None if robot is None else (check_has_robot(recording, robot),)
+        return recording.messages(robots, (stream,))
 
     def close(self) -> None:
         """Close the file. A second call does nothing."""

@@ -174,16 +174,13 @@ class ScanListener(Closeable):
         try:
             left_s = max(deadline - time.monotonic(), 0.0)
             self.buffer.wait(self.target, scan.frame, scan.end_stamp, left_s)
-            rays = scan.valid
-            points = np.full((len(rays), 3), np.nan, dtype=np.float32)
-            measured, stamps = scan.points()[rays], scan.stamps()[rays]
-            points[rays], valid = self.buffer.place(measured, stamps, scan.frame, self.target)
+            points, valid = self.buffer.place(scan.points(), scan.stamps(), scan.frame, self.target)
         except LookupFailed as reason:
             self.last_reason = reason
             self.dropped[type(reason).__name__.removesuffix("Timeout")] += 1
         else:
-            rays[rays] = valid
-            self._unread.add([PlacedScan(scan, sensor, self.target, points, rays)])
+            points = points.astype(np.float32, copy=False)  # for type checkers
+            self._unread.add([PlacedScan(scan, sensor, self.target, points, valid)])
 
     def __iter__(self) -> Iterator[PlacedScan]:
         return iter(self._unread)

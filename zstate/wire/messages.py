@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from hashlib import blake2b
 from math import inf, isfinite
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -87,6 +87,14 @@ class StampedMessage(Message, frozen=True, array_like=True, gc=False):
     stamp: Stamp
     seq: Count
     session: Count
+
+
+_Stamped = TypeVar("_Stamped", bound=StampedMessage)
+
+
+def renumbered(message: _Stamped, seq: int, session: int) -> _Stamped:
+    """The same message as that of another ``session``, in which it has the number ``seq``."""
+    return msgspec.structs.replace(message, seq=seq, session=session)
 
 
 class Sample(StampedMessage, frozen=True, array_like=True, gc=False):

@@ -114,6 +114,21 @@ def test_latched_values_repeat_every_ten_seconds_at_the_start_of_a_chunk(tmp_pat
     assert {r.publish_time for r in repeated} == {START}
 
 
+@pytest.mark.parametrize("is_due", [False, True])
+def test_values_once_per_file_begin_each_file_and_are_not_repeated_in_it(tmp_path: Path, is_due: bool):
+    path = tmp_path / "run.mcap"
+    with RecordingWriter(path, max_seconds=25.0) as writer:
+        described, joints = declare_channels(writer)
+        writer.write(joints, b"0", START, START)
+        first = START + is_due * 10 * S  # when a group of repetitions is due
+        assert writer.latch(described, "map", b"M", first, START, once_per_file=True)
+        assert not writer.latch(described, "map", b"M", first, START, once_per_file=True)
+        for second in (10, 20, 25, 35):
+            writer.write(joints, bytes([second]), START + second * S, START)
+    files = [[payload for _, payload in in_file_order(file)] for file in writer.files]
+    assert files == [[b"0", b"M", b"\x0a", b"\x14"], [b"M", b"\x19", b"#"]]
+
+
 def test_new_value_replaces_the_latched_one_and_an_unlatched_one_is_gone(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with RecordingWriter(path) as writer:

@@ -21,7 +21,7 @@ from zstate.cli.output.console import (
 from zstate.cli.output.text_layout import Table, in_columns
 
 if TYPE_CHECKING:
-    from zstate.recording.info import RecordedRobot, RecordingInfo
+    from zstate.recording.info import RecordedRobot, RecordedStream, RecordingInfo
 
 _HEADINGS = ("stream", "topic", "type", "count", "rate", "writer")
 _DAY_S = 86_400.0
@@ -35,8 +35,8 @@ def info_command(file: str, as_json: bool) -> None:
     """Show the contents of the recording FILE: robots, streams, models, times and counts.
 
     FILE is an MCAP file, the first of several split files, or a ROS 2 bag. Rates are means over the whole
-    recording. Latched messages (robot_description, tf_static) are written again every 10 s, and counted. The
-    size a second and a day is that of the files, compressed.
+    recording. Latched messages (robot_description, tf_static) are written again every 10 s, and counted; a
+    map only in each file. The size a second and a day is that of the files, compressed.
     """
     from zstate.recording.info import mean_rate, other_channels, read_info, recorded_robots
 
@@ -93,11 +93,16 @@ def _robot_lines(robot: RecordedRobot) -> list[str]:
         size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joints), 'joint')}"
         described = f"model {model.name!r}, {size} ({len(model.joint_names)} driven)"
     rows = [
-        ("  " + one.stream, one.topic, one.type, str(one.count), rate_text(one.rate_hz), one.writer)
+        ("  " + one.stream, one.topic, one.type, str(one.count), rate_text(one.rate_hz), _writer_text(one))
         for one in robot.streams
     ]
     table = Table(_HEADINGS, rows, optional=("type", "topic"), headed=False)
     return [f"{robot.name}: {described}", *table.lines(output_width())]
+
+
+def _writer_text(stream: RecordedStream) -> str:
+    rays = None if stream.rays is None else count_text(stream.rays, "ray")
+    return ", ".join(filter(None, (stream.writer, rays)))
 
 
 def _facts(info: RecordingInfo, robots: Sequence[RecordedRobot]) -> dict[str, Any]:

@@ -98,8 +98,9 @@ def record_command(
     """Record ROBOTs, by default all, into the MCAP file FILE until Ctrl-C.
 
     Writes ROS 2 messages, which Foxglove, PlotJuggler, Rerun and rosbags read directly. Each file of a split
-    recording is complete by itself: the model and the fixed edges are written at its start and every 10 s.
-    After a crash all but the last 0.5 s is in the file; `zstate recover` makes a complete file of it.
+    recording is complete by itself: the model and the fixed edges are written at its start and every 10 s,
+    a map at its start and when it changes. After a crash all but the last 0.5 s is in the file; `zstate
+    recover` makes a complete file of it.
 
     FILE may have the start time in its name: %Y %m %d %H %M %S are replaced by the local time (also %y and
     %j; %% is a percent sign). The default, rec-%Y%m%d-%H%M%S.mcap in the working directory, gives each start

@@ -142,7 +142,7 @@ def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequenc
         wire = get_wire(name)
         # The name of a replayed robot on this wire: ROS has only namespaces.
         names = {wire.robot_from_key(wire.expression(robot, "joint_states")): robot for robot in robots}
-        replayed = {*JOINT_STREAMS, "robot_description", "tf"} - wire.shared
+        replayed = {*JOINT_STREAMS, "robot_description", "tf", "scan", "map"} - wire.shared
         for info in discover(session, wire=name):
             writers = {str(writer) for stream, writer in info.writers if stream in replayed}
             if info.name in names and writers:

@@ -67,6 +67,13 @@ class RecordedMessage(NamedTuple):
     sequence: int
 
 
+class RepeatedMessage(NamedTuple):
+    """A message in effect until the next, and whether each file has it only once."""
+
+    message: RecordedMessage
+    once_per_file: bool
+
+
 class _ChunkBuffer(io.BytesIO):
     """Output stream of MCAP's writer, written to the file in one go: whole chunks, or nothing of them.
 
@@ -187,6 +194,11 @@ class SplitFile:
         self._group = 0
 
     @property
+    def is_empty(self) -> bool:
+        """Whether the file has no messages."""
+        return self._first is None
+
+    @property
     def is_full(self) -> bool:
         """Whether the file has all the channels that MCAP can number."""
         return len(self._numbers) >= MAX_CHANNELS
@@ -210,14 +222,18 @@ class SplitFile:
         grown = self.output.size + self._chunk_size - self._head_size
         return grown >= max_bytes or abs(log_time - self._first) >= max_ns
 
-    def start_group_if_due(self, log_time: int, latched: Iterable[RecordedMessage]) -> bool:
-        """Start a chunk with the latched messages, under this log time; False while the last group lasts."""
+    def start_group_if_due(self, log_time: int, latched: Iterable[RepeatedMessage]) -> bool:
+        """Start a chunk with the latched messages, under this log time; False while the last group lasts.
+
+        The first group has all of them, the others those that are repeated in a file.
+        """
         if self._first is not None and abs(log_time - self._group) < GROUP_NS:
             return False
         self.write_chunk()
         self._group = log_time
-        for message in latched:
-            self.add(message._replace(log_time=log_time))
+        for message, once_per_file in latched:
+            if self._first is None or not once_per_file:
+                self.add(message._replace(log_time=log_time))
         if self._first is None:
             self._first = log_time
             self._head_size = self.output.size + self._chunk_size
@@ -244,7 +260,8 @@ class RecordingWriter(Closeable):
     A file ends once it has grown by ``max_bytes`` (the chunk in progress counted without compression, the
     index at its end not counted), its log times span ``max_seconds`` or it has 60,000 channels. The next file
     starts with all channels that were not released, and the latched values. These are also repeated every
-    10 s of log time, at the start of a chunk, so that any remaining part of a recording is readable.
+    10 s of log time, at the start of a chunk, so that any remaining part of a recording is readable; except
+    those ``once_per_file``, which are missing until the next file if their one chunk is damaged.
 
     ``flush()``, to be called every half a second, makes written messages safe from ``kill -9``. Raises
     RecordingError if the file exists (unless ``overwrite``), cannot be created, or cannot grow; what was
@@ -278,7 +295,7 @@ class RecordingWriter(Closeable):
         self._declared: dict[ChannelId, ChannelDeclaration] = {}
         self._ids: dict[ChannelKey, ChannelId] = {}
         self._id = 0
-        self._latched: dict[tuple[ChannelId, str], RecordedMessage] = {}
+        self._latched: dict[tuple[ChannelId, str], RepeatedMessage] = {}
         self._files: list[Path] = []
         self._finished_bytes = 0
         self._is_open = True
@@ -327,14 +344,31 @@ class RecordingWriter(Closeable):
         """Write a message. Log times [ns] need not increase; ``sequence`` is cut to 32 bits."""
         self._write(RecordedMessage(channel, payload, log_time, publish_time, sequence))
 
-    def latch(self, channel: ChannelId, key: str, payload: bytes, log_time: int, publish_time: int) -> None:
+    def latch(
+        self,
+        channel: ChannelId,
+        key: str,
+        payload: bytes,
+        log_time: int,
+        publish_time: int,
+        *,
+        once_per_file: bool = False,
+    ) -> bool:
         """Write a message that is repeated, in the following files too, until the next of this ``key``.
 
-        A repetition carries the log time of the message it precedes, and its own publish time.
+        A repetition carries the log time of the message it precedes, and its own publish time. With
+        ``once_per_file`` only other files repeat it, and the same payload is not written again: False.
         """
-        self._write(RecordedMessage(channel, bytes(payload), log_time, publish_time, 0), key)
+        message = RecordedMessage(channel, bytes(payload), log_time, publish_time, 0)
+        before = self._latched.get((channel, key))
+        if once_per_file and before is not None and before.message.payload == message.payload:
+            return False
+        self._write(message, key, once_per_file=once_per_file)
+        return True
 
-    def _write(self, message: RecordedMessage, latched_as: str | None = None) -> None:
+    def _write(
+        self, message: RecordedMessage, latched_as: str | None = None, *, once_per_file: bool = False
+    ) -> None:
         # MCAP's writer would notice half way through a record, or not at all.
         if message.channel not in self._declared:
             text = f"{message.channel} is no channel of {str(self._first)!r}; declare it with channel()"
@@ -345,11 +379,12 @@ class RecordingWriter(Closeable):
         with self._writing():
             self._check_open()
             if latched_as is not None:
-                self._latched[message.channel, latched_as] = message
+                self._latched[message.channel, latched_as] = RepeatedMessage(message, once_per_file)
             if self._split.is_over(message.log_time, self._max_bytes, self._max_ns):
                 self._start_split()
+            is_first = self._split.is_empty
             is_repeated = self._split.start_group_if_due(message.log_time, self._latched.values())
-            if latched_as is None or not is_repeated:
+            if latched_as is None or not is_repeated or (once_per_file and not is_first):
                 self._split.add(message)
 
     def unlatch(self, channel: ChannelId, key: str) -> None:
