@@ -32,6 +32,7 @@ from zstate.view.panels.display_panels import (
 )
 from zstate.view.panels.panel import Panel, PanelContext
 from zstate.view.scene.scene import Scene
+from zstate.view.scene.world import Place
 from zstate.view.server import ViewServer
 from zstate.view.sliders import SliderPublisher
 
@@ -148,6 +149,9 @@ class View(Closeable):
             try:
                 if fixed:
                     poses = self.scene.show(snapshot, fixed)
+                    place = Place(snapshot.tree, poses, fixed)
+                    at = self.layout.stamp if self._held is None else snapshot.stamp
+                    self.scene.world.show(self._source.world, self._source.buffer, place, at)
                     self._fit_camera(snapshot, fixed, poses)
                     if self._held is not None:
                         self._held_poses = poses
