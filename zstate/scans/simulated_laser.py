@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate import se3
 from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import real_numbers
 from zstate.errors import InvalidInput, LookupFailed, NoData
@@ -30,6 +31,9 @@ DUMMY_ANGLE_INCREMENT = math.radians(0.25)
 DUMMY_RANGE_MAX = 10.0
 # dummy_laser adds 0.1 rad with each of 30 scans a second: 3 rad/s, and |sin| has a period of pi.
 _DUMMY_PERIOD_NS = round(math.pi / 3.0 * 1e9)
+
+_LEVEL_M = 1e-6
+"""A laser up to this height is in the plane of the map, and measures no floor."""
 
 _FARTHEST = 1000  # cells; a smaller square is free as well
 
@@ -89,6 +93,22 @@ class SimulatedLaser:
         """The scan that starts at ``stamp`` [ns]; see ``ranges``."""
         return replace(self._rays, stamp=stamp, ranges=self.ranges(x, y, yaw))
 
+    def scan_in_space(self, stamp: int, poses: ArrayLike) -> Scan:
+        """The scan that starts at ``stamp`` [ns] of a laser that may be tilted, as on an arm.
+
+        ``poses`` (ray_count, 7), x y z [m], qx qy qz qw, are those of the sensor at each ray, in the grid's
+        frame. Occupied cells are walls without a top; a laser above z = 0 measures a floor there as well.
+        """
+        x, y, z, *rotation = real_numbers(poses, "poses").T
+        qx, qy, qz, qw = rotation
+        east, north, up = se3.rotate((qx, qy, qz, qw), (np.cos(self._angles), np.sin(self._angles), 0.0))
+        with np.errstate(divide="ignore", invalid="ignore"):  # vertical and level rays
+            walls = self.ranges(x, y, np.arctan2(north, east) - self._angles) / np.hypot(east, north)
+            floor = np.where((z > _LEVEL_M) & (up < 0.0), -z / up, math.inf)
+        ranges = np.minimum(walls, floor)
+        ranges[ranges > self._rays.range_max] = math.inf
+        return replace(self._rays, stamp=stamp, ranges=ranges)
+
     def ranges(self, x: ArrayLike, y: ArrayLike, yaw: ArrayLike) -> NDArray[np.float32]:
         """The ranges [m] of a sensor at x, y [m], yaw [rad] in the grid's frame: (ray_count,).
 
@@ -130,8 +150,7 @@ class MountedLaser:
     Each ray is cast from the pose of the laser's frame ``frame`` at the ray's own stamp, and a sweep ends at
     the newest stamp that the buffer can place, so that it is right while the robot moves. The pose is that in
     ``map_frame`` if the buffer has that frame, else that in the root of the robot, which then stands at the
-    origin of the map's axes. Both are full names. The robot drives in the plane: z, roll and pitch are
-    ignored.
+    origin of the map's axes. Both are full names. The laser may be tilted, see ``scan_in_space``.
     """
 
     def __init__(self, laser: SimulatedLaser, buffer: TransformBuffer, frame: str, map_frame: str) -> None:
@@ -176,8 +195,7 @@ class MountedLaser:
         if not valid.all():
             return None
         self._last = end
-        x, y, _, *rotation = poses.T
-        return self._laser.scan(first, x, y, _yaw(*rotation))
+        return self._laser.scan_in_space(first, poses)
 
     def _newest(self, target: str, stamp: int) -> int:
         try:
@@ -186,10 +204,6 @@ class MountedLaser:
             if self._buffer.can_lookup(target, self._frame):  # all edges are static
                 return stamp
             raise
-
-
-def _yaw(qx: _Array, qy: _Array, qz: _Array, qw: _Array) -> _Array:
-    return np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
 
 
 def free_distances(is_occupied: NDArray[np.bool_]) -> NDArray[np.int16]:
