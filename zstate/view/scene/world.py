@@ -79,6 +79,11 @@ class World:
         """Whether a map is still being encoded."""
         return self._images.busy
 
+    @property
+    def version(self) -> int:
+        """Grows when a map appears."""
+        return self._images.version
+
     def show(self, source: WorldSource, buffer: TransformBuffer, place: Place, at: int | None) -> None:
         """Draw the maps, and the last scans until ``at`` [ns]; None: the newest."""
         missing: list[tuple[str, str]] = []
@@ -94,6 +99,10 @@ class World:
                 missing.append((f"scans of {name}", f"{sensor.dropped} dropped: {sensor.reason}"))
         missing += self._images.show(source.maps, place, is_on=self.maps)
         self.missing = missing
+
+    def corners(self, place: Place) -> NDArray[np.float64]:
+        """The corners of all drawn maps in the fixed frame: (N, 3) [m]."""
+        return self._images.corners(place)
 
 
 class ScanClouds:
@@ -194,12 +203,13 @@ class MapImages:
     """Draws each map as one image, at the pose of its origin; unknown cells are transparent.
 
     A map is encoded once for each change, in a thread: that of 4000 x 4000 cells takes a second. Until then
-    the one before remains.
+    the one before remains. ``version`` grows when a map appears.
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
         self._drawn: dict[WriterName, _MapImage] = {}
+        self.version = 0
         self._encoding: tuple[WriterName, _MapImage, threading.Thread] | None = None
         self._number = 0
 
@@ -225,6 +235,18 @@ class MapImages:
             elif place.pose(grid.frame) is None:
                 missing.append((f"map {name}", f"its frame {grid.frame!r} has no pose in {place.fixed!r}"))
         return missing
+
+    def corners(self, place: Place) -> NDArray[np.float64]:
+        """The corners of all drawn maps: (N, 3) [m]."""
+        corners: list[se3.Vector] = []
+        for image in self._drawn.values():
+            pose = place.pose(image.grid.frame)
+            if pose is not None and image.handle is not None:
+                origin = se3.compose(pose, se3.unstack(image.grid.origin.pose7))
+                width, height = image.grid.size
+                for x, y in ((0.0, 0.0), (width, 0.0), (0.0, height), (width, height)):
+                    corners.append(se3.compose(origin, (x, y, 0.0, 0.0, 0.0, 0.0, 1.0))[:3])
+        return np.array(corners, dtype=np.float64).reshape(-1, 3)
 
     def _encode(self, name: WriterName, grid: Grid) -> None:
         self._number += 1
@@ -260,6 +282,8 @@ class MapImages:
         self._encoding = None
         if name in self._drawn:
             _remove_image(self._drawn[name])
+        else:
+            self.version += 1
         self._drawn[name] = image
 
 
