@@ -182,3 +182,28 @@ def test_the_dummy_scan_is_that_of_dummy_laser():
     for counter in range(40):
         ranges = dummy_scan(round(counter * 1e9 / 30)).ranges
         assert ranges == pytest.approx(abs(math.sin(0.1 * counter)), abs=1e-6)
+
+
+def test_tilted_laser_measures_walls_and_the_floor_along_its_rays():
+    # A wall at x = 3 m. Rays along x and -x, from (0.5, 0.5, 1.0), turned down by 30 degrees about y.
+    cells = np.zeros((10, 40), int)
+    cells[:, 30:] = 100
+    laser = SimulatedLaser(
+        Grid(cells, 0.1, (0.0, 0.0, 0.0)), angle_increment=math.pi, angle_min=0.0, ray_count=2, range_max=9.0
+    )
+    down = (0.0, math.sin(math.radians(15.0)), 0.0, math.cos(math.radians(15.0)))
+    forward, backward = laser.scan_in_space(0, [(0.5, 0.5, 1.0, *down)] * 2).ranges
+    # The floor is 1 m below: 1 / sin 30. The other ray goes up, and leaves the map.
+    assert forward == pytest.approx(2.0)
+    assert backward == math.inf
+    forward, _ = laser.scan_in_space(0, [(2.0, 0.5, 1.0, *down)] * 2).ranges
+    # Here the wall is nearer: 1 m ahead, 1 / cos 30.
+    assert forward == pytest.approx(1.0 / math.cos(math.radians(30.0)))
+
+
+def test_level_laser_in_the_plane_of_the_map_measures_no_floor():
+    cells = np.zeros((10, 40), int)
+    cells[:, 30:] = 100
+    laser = SimulatedLaser(Grid(cells, 0.1, (0.0, 0.0, 0.0)), angle_min=0.0, ray_count=1)
+    (ahead,) = laser.scan_in_space(0, [(0.5, 0.5, 0.0, 0.0, 1e-12, 0.0, 1.0)]).ranges
+    assert ahead == pytest.approx(2.5)
