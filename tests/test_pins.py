@@ -380,6 +380,28 @@ quat_xyzw = [0.0, 0.0, 0.0, 1.0]
 [[static]]
 robot = "right"
 file = "edge.json"
+[[map]]
+file = "hall.yaml"
+name = "hall"
+frame = "map"
+writer = "map"
+wires = ["native", "ros2"]
+identity = "left"
+after = ["router"]
+restart = "on-failure"
+[[scan]]
+robot = "left"
+frame = "laser"
+simulate = "hall.yaml"
+dummy = false
+map_frame = "hall/map"
+rate = "${rate}"
+sensor = "front"
+wires = ["native"]
+metrics = 9200
+identity = "left"
+after = ["left"]
+restart = "always"
 """
 NETWORK_OF_UP = """
 [network]

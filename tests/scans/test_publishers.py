@@ -104,6 +104,28 @@ def test_run_publishes_sweeps_that_end_at_their_ticks_and_leaves_out_none(sessio
     assert ends == [tick for tick in ticks[1::2] if tick in set(ends)]
 
 
+def test_run_keeps_the_stamp_of_a_scan_and_refuses_another_geometry(sessions):
+    writer, reader = sessions
+    scans = Scans(reader)
+
+    class Lidar:
+        scan = Scan(777, -1.0, 0.5, 100, [1.0, 2.0], 0.1, 10.0)
+
+        def read(self, _: int) -> Scan:
+            return self.scan
+
+    lidar = Lidar()
+    with ScanPublisher(writer, "r1", "front", ray_ns=100, **GEOMETRY) as publisher:
+        publish_until_received(publisher, scans, [1.0, 2.0], stamp=0)
+        scans.clear()
+        publisher.run(lidar, 100.0, seconds=0.05)
+        until(lambda: scans)
+        assert {scan.stamp for scan in scans} <= {0, 777}
+        lidar.scan = Scan(778, -1.0, 0.25, 100, [1.0, 2.0], 0.1, 10.0)
+        with pytest.raises(InvalidInput, match=r"has angle_min.*\(-1.0, 0.5, 100\).*\(-1.0, 0.25, 100\)"):
+            publisher.run(lidar, 100.0, seconds=1.0)
+
+
 def test_scan_that_is_none_is_refused_and_counted_and_nothing_is_sent(sessions):
     writer, _ = sessions
     with ScanPublisher(writer, "r1", "front", **GEOMETRY) as publisher:

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from zstate import InvalidInput, Transform
+from zstate import InvalidInput, Transform, TransformBuffer
 from zstate.scans import Grid, SimulatedLaser, dummy_scan
-from zstate.scans.simulated_laser import free_distances
+from zstate.scans.simulated_laser import MountedLaser, free_distances
 
 QUARTER = math.pi / 2
 
@@ -182,3 +182,71 @@ def test_the_dummy_scan_is_that_of_dummy_laser():
     for counter in range(40):
         ranges = dummy_scan(round(counter * 1e9 / 30)).ranges
         assert ranges == pytest.approx(abs(math.sin(0.1 * counter)), abs=1e-6)
+
+
+def test_tilted_laser_measures_walls_and_the_floor_along_its_rays():
+    # A wall at x = 3 m. Rays along x and -x, from (0.5, 0.5, 1.0), turned down by 30 degrees about y.
+    cells = np.zeros((10, 40), int)
+    cells[:, 30:] = 100
+    laser = SimulatedLaser(
+        Grid(cells, 0.1, (0.0, 0.0, 0.0)), angle_increment=math.pi, angle_min=0.0, ray_count=2, range_max=9.0
+    )
+    down = (0.0, math.sin(math.radians(15.0)), 0.0, math.cos(math.radians(15.0)))
+    forward, backward = laser.scan_in_space(0, [(0.5, 0.5, 1.0, *down)] * 2).ranges
+    # The floor is 1 m below: 1 / sin 30. The other ray goes up, and leaves the map.
+    assert forward == pytest.approx(2.0)
+    assert backward == math.inf
+    forward, _ = laser.scan_in_space(0, [(2.0, 0.5, 1.0, *down)] * 2).ranges
+    # Here the wall is nearer: 1 m ahead, 1 / cos 30.
+    assert forward == pytest.approx(1.0 / math.cos(math.radians(30.0)))
+
+
+def test_level_laser_in_the_plane_of_the_map_measures_no_floor():
+    cells = np.zeros((10, 40), int)
+    cells[:, 30:] = 100
+    laser = SimulatedLaser(Grid(cells, 0.1, (0.0, 0.0, 0.0)), angle_min=0.0, ray_count=1)
+    (ahead,) = laser.scan_in_space(0, [(0.5, 0.5, 0.0, 0.0, 1e-12, 0.0, 1.0)]).ranges
+    assert ahead == pytest.approx(2.5)
+
+
+def mounted(buffer: TransformBuffer) -> MountedLaser:
+    """Rays every second, so that a sweep takes 3 s."""
+    return MountedLaser(laser(ray_ns=10**9), buffer, "r1/laser", "r1/map")
+
+
+def test_mounted_laser_measures_each_ray_from_its_own_pose():
+    """The robot drives from x = 1 m at 0 s to x = 2 m at 10 s, facing along x."""
+    buffer = TransformBuffer()
+    for second, x in ((0, 1.0), (10, 2.0)):
+        buffer.insert(Transform.from_rpy("r1/odom", "r1/laser", [x, 0.5, 0.2], [0, 0, 0], second * 10**9))
+    source = mounted(buffer)
+    scan = source.read(9 * 10**9)
+    assert scan is not None
+    assert (scan.stamp, scan.end_stamp) == (6 * 10**9, 9 * 10**9)
+    # Rays to the right at 6 s, ahead at 7 s (x = 1.7), to the left at 8 s, behind at 9 s (x = 1.9).
+    np.testing.assert_allclose(scan.ranges, [0.5, 4.0 - 1.7, 1.5, 1.9], rtol=1e-6)
+    # The sweep ends at the newest pose, and only once.
+    newest = source.read(20 * 10**9)
+    assert newest is not None
+    assert newest.end_stamp == 10 * 10**9
+    assert source.read(21 * 10**9) is None
+
+
+def test_mounted_laser_on_static_edges_measures_at_each_stamp():
+    buffer = TransformBuffer()
+    buffer.insert_static(Transform.from_rpy("r1/base", "r1/laser", [1.0, 0.5, 0.0], [0, 0, 0]))
+    source = mounted(buffer)
+    assert source.target == "r1/base"
+    for stamp in (5 * 10**9, 6 * 10**9):
+        scan = source.read(stamp)
+        assert scan is not None
+        assert scan.end_stamp == stamp
+    # In the map the laser is turned by a quarter.
+    buffer.insert_static(Transform.from_rpy("r1/map", "r1/base", [0.0, 0.0, 0.0], [0, 0, QUARTER]))
+    assert source.target == "r1/map"
+
+
+def test_mounted_laser_without_a_pose_has_a_problem_and_no_sweep():
+    source = mounted(TransformBuffer())
+    assert source.read(5 * 10**9) is None
+    assert "r1/laser" in str(source.problem())

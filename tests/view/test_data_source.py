@@ -19,6 +19,7 @@ from zstate import (
     load_model,
 )
 from zstate.recording.recorder import Recorder
+from zstate.scans import Grid, MapPublisher, ScanPublisher
 from zstate.view.data_source import FixedFrame, ViewSource
 
 MODEL = load_model("rrbot")
@@ -213,3 +214,24 @@ def test_requested_fixed_frame_is_used_while_it_exists():
 def test_fixed_frame_of_an_empty_tree_is_empty():
     with ViewSource(None, buffer=TransformBuffer()) as source:
         assert FixedFrame().resolve(source.snapshot().tree) == ""
+
+
+def test_scans_and_maps_are_received_until_maps_are_withdrawn(sessions):
+    geometry = {"angle_min": 0.0, "angle_increment": 0.1, "range_min": 0.1, "range_max": 10.0}
+    grid = Grid([[0, 100]], 0.5, (1.0, 2.0, 0.0))
+    with (
+        ViewSource(sessions[1], ["a"]) as source,
+        ScanPublisher(sessions[0], "a", "front", frame="laser", **geometry) as front,
+        ScanPublisher(sessions[0], "b", "front", frame="laser", **geometry) as other,
+    ):
+        with MapPublisher(sessions[0], "hall", grid):
+            until(lambda: source.world.maps)
+            ((name, received),) = source.world.maps.items()
+            assert str(name) == "hall/map"
+            assert received.frame == "hall/map"
+            assert received.cells.tolist() == [[0, 100]]
+        until(lambda: not source.world.maps)
+        until(lambda: other.publish([1.0, 2.0]) or front.publish([1.0, 2.0]) or source.world.sensors)
+        ((sensor, scans),) = source.world.sensors.items()  # not those of b, which is not selected
+        assert str(sensor) == "a/front"
+        assert scans.frame == "a/laser"

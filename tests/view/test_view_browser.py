@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from zstate import StatePublisher, load_model
 from zstate.model.geometry import read_shapes
 from zstate.net.session import Session
+from zstate.scans import Grid, MapPublisher
 from zstate.view.camera import FIELD_OF_VIEW, CameraPose, fit_camera
 from zstate.view.data_source import ViewSource
 from zstate.view.server import ViewServer
@@ -151,3 +152,33 @@ def test_beyond_loopback_a_browser_needs_the_token(browser, open_tab, sessions):
         until(page.connected.is_set)
         view.draw()
         view_tab.text("No robot is announced")
+
+
+def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):
+    # 2 x 2 m around the arm; the cells with x > 0 and y > 0 are occupied, those with x < 0 and y < 0 unknown.
+    grid = Grid([[-1, 0], [0, 100]], 1.0, (-1.0, -1.0, 0.0), "rrbot/world")
+    with standing(sessions[0], "rrbot"), MapPublisher(sessions[0], "room", grid):
+        shown = show_view(sessions[1], "rrbot")
+        world = shown.view.scene.world
+        until(lambda: shown.source.world.maps and "rrbot" in shown.source.models)
+        view_tab = open_tab(shown.page.url)
+        until(lambda: world.version == 1 and not shown.view.scene.busy, PATIENCE_S)
+        full = picture(view_tab)
+        view_tab.save_screenshot("map")
+        field(view_tab, "Maps").click()
+        until(lambda: not world.maps)
+        bare = picture(view_tab)
+
+        snapshot = shown.source.snapshot()
+        placed = snapshot.poses_in("rrbot/world")
+        corners = np.array([(x, y, 0.0) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+        meshes = shown.view.scene.corners(snapshot.tree, placed)
+        framing = fit_camera(snapshot, placed, 1.0, meshes, corners)
+        assert framing is not None
+        height, width = full.shape[:2]
+        middles = np.array([(0.7, 0.7, 0.0), (-0.7, -0.7, 0.0), (0.7, -0.7, 0.0)])
+        occupied, unknown, free = pixels_of(middles, framing, (width, height)).round().astype(int).tolist()
+        assert full[occupied[1], occupied[0]].max() < 60
+        assert bare[occupied[1], occupied[0]].min() > 180
+        for x, y in (unknown, free):
+            assert full[y, x].min() > 180

@@ -14,9 +14,7 @@ if TYPE_CHECKING:
     from zstate.metrics.collectors import Listened
     from zstate.metrics.endpoint import BindAddress, MetricsCollector
     from zstate.net.session import Session
-    from zstate.nodes.partial_publisher import PartialStatePublisher
-    from zstate.nodes.publisher import StatePublisher
-    from zstate.nodes.transform_publisher import TransformPublisher
+    from zstate.nodes.sample_publisher import SamplePublisher
     from zstate.recording.recorder import Recorder
 
 Factory = Callable[[], "MetricsCollector"]
@@ -35,7 +33,7 @@ def serve_metrics(address: BindAddress | None, *factories: Factory) -> Generator
         yield
 
 
-def publisher_collector(*publishers: StatePublisher | PartialStatePublisher | TransformPublisher) -> Factory:
+def publisher_collector(*publishers: SamplePublisher) -> Factory:
     """Metrics of publishers."""
     return lambda: _collectors().PublisherMetrics(publishers)
 

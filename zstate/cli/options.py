@@ -5,8 +5,10 @@ from __future__ import annotations
 import functools
 import math
 import os
+import re
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -367,6 +369,11 @@ def load_robot(
         return model, check_robot(robot)
     except InvalidInput as error:
         raise InvalidInput(f"{error}; choose another name with --name") from None
+
+
+def place_name(file: str) -> str:
+    """The name of the place whose map is ``file``: that of the file, as a robot may be named."""
+    return re.sub(r"[^\w.-]+", "_", Path(file).stem)
 
 
 _CLOCKS = click.Choice(["system", "sim"])

@@ -15,7 +15,7 @@ from zstate.net.presence import announce_reader
 from zstate.net.streams import CAPACITY
 from zstate.net.subscription import Received, subscribe
 from zstate.wire.keys import Stream, check_robot
-from zstate.wire.messages import Sample
+from zstate.wire.messages import OccupancyGrid, StampedMessage
 from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 
 class TimedSample(NamedTuple):
-    """A sample and its ``arrival`` [ns] by the monotonic clock."""
+    """A sample, or a map, and its ``arrival`` [ns] by the monotonic clock."""
 
     arrival: int
-    sample: Sample
+    sample: StampedMessage | OccupancyGrid
 
 
 class StreamReader(Closeable):
-    """Samples of ``stream`` of ``robot`` in order of arrival, for one reading thread.
+    """Samples of ``stream`` of ``robot``, or its maps, in order of arrival, for one reading thread.
 
     Messages that cannot be decoded are skipped; the first of each kind is reported.
     """
@@ -57,7 +57,7 @@ class StreamReader(Closeable):
     def _on_messages(self, received: list[Received]) -> None:
         now = time.monotonic_ns()
         for _, _, sample in received:
-            assert isinstance(sample, Sample)
+            assert isinstance(sample, StampedMessage | OccupancyGrid)
             # If the queue is not read, as on a stopped terminal, the newest samples are dropped.
             if self._samples.qsize() < CAPACITY:
                 self._samples.put(TimedSample(now, sample))

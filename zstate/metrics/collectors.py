@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from zstate.bridges.ros2 import Bridge
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
-    from zstate.nodes.partial_publisher import PartialStatePublisher
-    from zstate.nodes.publisher import StatePublisher
-    from zstate.nodes.transform_publisher import TransformPublisher
+    from zstate.nodes.sample_publisher import SamplePublisher
     from zstate.recording.recorder import Recorder
 
 WINDOW_S = 10.0
@@ -118,9 +116,7 @@ class MetricFamilies:
 class PublisherMetrics:
     """Metrics of publishers."""
 
-    def __init__(
-        self, publishers: Sequence[StatePublisher | PartialStatePublisher | TransformPublisher]
-    ) -> None:
+    def __init__(self, publishers: Sequence[SamplePublisher]) -> None:
         self._publishers = publishers
         self._rates = CounterRates()
         self.sample()

@@ -61,7 +61,8 @@ class RobotInfo:
     """A robot with its writers as (stream, writer), sorted.
 
     ``static_names`` are (name, writer) for the names under which static edges are written, and
-    ``transform_names`` and ``part_names`` the same for moving edges, and for drivers of some of its joints.
+    ``transform_names`` and ``part_names`` the same for moving edges, and for drivers of some of its joints;
+    ``scan_names`` are its laser scanners, ``map_names`` its maps.
     """
 
     name: str
@@ -69,6 +70,8 @@ class RobotInfo:
     static_names: tuple[tuple[str, WriterId], ...] = ()
     transform_names: tuple[tuple[str, WriterId], ...] = ()
     part_names: tuple[tuple[str, WriterId], ...] = ()
+    scan_names: tuple[tuple[str, WriterId], ...] = ()
+    map_names: tuple[tuple[str, WriterId], ...] = ()
 
     def __repr__(self) -> str:
         streams: dict[str, list[str]] = {}
@@ -83,6 +86,8 @@ class RobotInfo:
             "tf_static": self.static_names,
             "transforms": self.transform_names,
             "partial_joint_states": self.part_names,
+            "scan": self.scan_names,
+            "map": self.map_names,
         }.get(stream, ())
         return tuple(name for name, owner in names if owner == writer)
 
@@ -185,6 +190,8 @@ def by_robot(found: Iterable[Announcement]) -> tuple[RobotInfo, ...]:
             sorted_names(robot, "tf_static"),
             sorted_names(robot, "transforms"),
             sorted_names(robot, "partial_joint_states"),
+            sorted_names(robot, "scan"),
+            sorted_names(robot, "map"),
         )
         for robot in sorted(writers)
     )

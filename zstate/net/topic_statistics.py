@@ -24,7 +24,7 @@ from zstate.ingest.deadline import Deadline
 from zstate.net.streams import StreamSubscriber
 from zstate.net.subscription import decode_samples
 from zstate.wire.keys import ANY, Stream
-from zstate.wire.messages import Sample
+from zstate.wire.messages import StampedMessage
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
@@ -191,10 +191,10 @@ class TopicStatistics(Closeable):
         session: Session,
         wire: Wire,
         *,
-        sources: Callable[[str, Stream, Sample], Iterable[Hashable]] | None = None,
+        sources: Callable[[str, Stream, StampedMessage], Iterable[Hashable]] | None = None,
         clock: Clock | None = None,
         window: int = WINDOW,
-        on_sample: Callable[[Stream, Sample], None] | None = None,
+        on_sample: Callable[[Stream, StampedMessage], None] | None = None,
     ) -> None:
         self.gaps = SequenceGaps()
         self._session, self._wire = session, wire
@@ -212,14 +212,14 @@ class TopicStatistics(Closeable):
             at, now = time.monotonic_ns(), self._clock.now()
             with self._arrived:
                 for name, _, message in decode_samples(self._wire, robot, stream, samples):
-                    if isinstance(message, Sample):
+                    if isinstance(message, StampedMessage):
                         self.add(name, stream, message, at, now)
                 self._arrived.notify_all()
 
         key = self._wire.expression(robot, stream)
         self._subscriptions.enter_context(StreamSubscriber(self._session, key, on_samples))
 
-    def add(self, robot: str, stream: Stream, sample: Sample, at: int, now: int) -> None:
+    def add(self, robot: str, stream: Stream, sample: StampedMessage, at: int, now: int) -> None:
         """Count a sample that arrived ``at``, when it was ``now`` by the clock of the stamps."""
         self.gaps.add(sample.session, sample.seq)
         received = Received(at, sample.stamp, sample.seq, now - sample.stamp)

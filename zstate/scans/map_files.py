@@ -34,7 +34,7 @@ _FORMATS = ("PNG", "PPM", "BMP", "JPEG")  # PPM stands for .pgm, .pbm and .ppm
 # saved as occupied and free are those of its defaults.
 _TRINARY_PIXELS = {"occupied": 0, "unknown": 205, "free": 254}
 _TRINARY_THRESHOLDS = (0.65, 0.196)
-_SAVED_OCCUPIED, _SAVED_FREE = 65, 25
+SAVED_OCCUPIED, SAVED_FREE = 65, 25
 
 
 def read_cells(metadata: MapMetadata) -> NDArray[np.int8]:
@@ -104,8 +104,8 @@ def _pixels_by_cell(mode: Mode) -> bytes:
     if mode == "raw":
         return bytes(range(256))
     pixels = bytearray(256 * [_TRINARY_PIXELS["unknown"]])
-    pixels[: _SAVED_FREE + 1] = (_SAVED_FREE + 1) * [_TRINARY_PIXELS["free"]]
-    pixels[_SAVED_OCCUPIED:101] = (101 - _SAVED_OCCUPIED) * [_TRINARY_PIXELS["occupied"]]
+    pixels[: SAVED_FREE + 1] = (SAVED_FREE + 1) * [_TRINARY_PIXELS["free"]]
+    pixels[SAVED_OCCUPIED:101] = (101 - SAVED_OCCUPIED) * [_TRINARY_PIXELS["occupied"]]
     return bytes(pixels)
 
 

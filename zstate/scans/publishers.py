@@ -32,8 +32,11 @@ from zstate.wire.registry import as_wire_names, get_wire
 class RangeSource(Protocol):
     """Interface of programs that measure ranges: lidar drivers, simulators."""
 
-    def read(self, stamp: int) -> ArrayLike | None:
-        """The ranges [m] of the sweep whose last ray is at ``stamp`` [ns]; None when there is nothing new."""
+    def read(self, stamp: int) -> Scan | ArrayLike | None:
+        """The ranges [m] of the sweep whose last ray is at ``stamp`` [ns]; None when there is nothing new.
+
+        A source that stamps its sweeps itself returns a Scan, with the geometry of the publisher.
+        """
         ...
 
 
@@ -142,11 +145,21 @@ class ScanPublisher(SamplePublisher):
     def run(self, source: RangeSource, rate_hz: float = 30.0, *, seconds: float | None = None) -> RateReport:
         """Publish the sweeps of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
 
-        Each sweep ends at its tick. Raises as ``publish``; ``Rate`` describes late ticks.
+        Each sweep ends at its tick, unless ``source`` returns a Scan. Raises as ``publish``, and InvalidInput
+        for a Scan of another geometry; ``Rate`` describes late ticks.
         """
 
-        def publish(ranges: ArrayLike, now: int) -> None:
-            self.publish(ranges, self._first_stamp(now, ranges))
+        def publish(sweep: Scan | ArrayLike, now: int) -> None:
+            if not isinstance(sweep, Scan):
+                self.publish(sweep, self._first_stamp(now, sweep))
+                return
+            angles = sweep.angle_min, sweep.angle_increment, sweep.ray_ns
+            if angles != self._angles:
+                raise InvalidInput(
+                    f"the scan publisher {self.sensor!r} has angle_min, angle_increment and ray_ns "
+                    f"{self._angles}; its source returned a Scan with {angles}"
+                )
+            self.publish(sweep.ranges, sweep.stamp, sweep.intensities)
 
         return self._publish_at(rate_hz, seconds, source.read, publish)
 

@@ -1,4 +1,4 @@
-"""Laser scans without a sensor: rays cast through a Grid, and the pattern of ROS 2's dummy_laser.
+"""Laser scans without a sensor: rays cast through a Grid, on a robot too, and ROS 2's dummy_laser.
 
 Rays are cast by a digital differential analyser (Amanatides and Woo, "A fast voxel traversal algorithm for
 ray tracing", 1987), all rays at once. A step leaves the largest square of free cells around the present one
@@ -15,8 +15,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate import se3
+from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import real_numbers
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, LookupFailed, NoData
 from zstate.scans.grid import Grid
 from zstate.scans.scan import Scan
 
@@ -29,6 +31,9 @@ DUMMY_ANGLE_INCREMENT = math.radians(0.25)
 DUMMY_RANGE_MAX = 10.0
 # dummy_laser adds 0.1 rad with each of 30 scans a second: 3 rad/s, and |sin| has a period of pi.
 _DUMMY_PERIOD_NS = round(math.pi / 3.0 * 1e9)
+
+_LEVEL_M = 1e-6
+"""A laser up to this height is in the plane of the map, and measures no floor."""
 
 _FARTHEST = 1000  # cells; a smaller square is free as well
 
@@ -75,9 +80,34 @@ class SimulatedLaser:
         self._noise_m = noise_m
         self._random = np.random.default_rng(seed)
 
+    @property
+    def sweep_ns(self) -> int:
+        """The time from the first ray to the last [ns]."""
+        return self._rays.end_stamp
+
+    def stamps(self, stamp: int) -> NDArray[np.int64]:
+        """The instant of each ray [ns] of the scan that starts at ``stamp``: (ray_count,)."""
+        return self._rays.stamps() + stamp
+
     def scan(self, stamp: int, x: ArrayLike, y: ArrayLike, yaw: ArrayLike) -> Scan:
         """The scan that starts at ``stamp`` [ns]; see ``ranges``."""
         return replace(self._rays, stamp=stamp, ranges=self.ranges(x, y, yaw))
+
+    def scan_in_space(self, stamp: int, poses: ArrayLike) -> Scan:
+        """The scan that starts at ``stamp`` [ns] of a laser that may be tilted, as on an arm.
+
+        ``poses`` (ray_count, 7), x y z [m], qx qy qz qw, are those of the sensor at each ray, in the grid's
+        frame. Occupied cells are walls without a top; a laser above z = 0 measures a floor there as well.
+        """
+        x, y, z, *rotation = real_numbers(poses, "poses").T
+        qx, qy, qz, qw = rotation
+        east, north, up = se3.rotate((qx, qy, qz, qw), (np.cos(self._angles), np.sin(self._angles), 0.0))
+        with np.errstate(divide="ignore", invalid="ignore"):  # vertical and level rays
+            walls = self.ranges(x, y, np.arctan2(north, east) - self._angles) / np.hypot(east, north)
+            floor = np.where((z > _LEVEL_M) & (up < 0.0), -z / up, math.inf)
+        ranges = np.minimum(walls, floor)
+        ranges[ranges > self._rays.range_max] = math.inf
+        return replace(self._rays, stamp=stamp, ranges=ranges)
 
     def ranges(self, x: ArrayLike, y: ArrayLike, yaw: ArrayLike) -> NDArray[np.float32]:
         """The ranges [m] of a sensor at x, y [m], yaw [rad] in the grid's frame: (ray_count,).
@@ -112,6 +142,68 @@ class SimulatedLaser:
                 f"{name} of a laser is one finite number, or {count} of them for {count} rays; got {values!r}"
             )
         return np.broadcast_to(array, (count,))
+
+
+class MountedLaser:
+    """A RangeSource: the sweeps of ``laser`` on a robot whose transforms are in ``buffer``.
+
+    Each ray is cast from the pose of the laser's frame ``frame`` at the ray's own stamp, and a sweep ends at
+    the newest stamp that the buffer can place, so that it is right while the robot moves. The pose is that in
+    ``map_frame`` if the buffer has that frame, else that in the root of the robot, which then stands at the
+    origin of the map's axes. Both are full names. The laser may be tilted, see ``scan_in_space``.
+    """
+
+    def __init__(self, laser: SimulatedLaser, buffer: TransformBuffer, frame: str, map_frame: str) -> None:
+        self._laser, self._buffer = laser, buffer
+        self._frame, self._map_frame = frame, map_frame
+        self._last = -1
+
+    @property
+    def target(self) -> str:
+        """The frame in which the map stands now; ``frame`` itself if the buffer does not have that."""
+        parents = {frame.name: frame.parent for frame in self._buffer.frames()}
+        if self._map_frame in parents:
+            return self._map_frame
+        name = self._frame
+        while (parent := parents.get(name)) is not None:
+            name = parent
+        return name
+
+    def problem(self) -> LookupFailed | None:
+        """Why the pose of the laser is not known; None if it is."""
+        try:
+            self._buffer.lookup(self.target, self._frame)
+        except LookupFailed as reason:
+            return reason
+        return None
+
+    def read(self, stamp: int) -> Scan | None:
+        """The sweep that ends at ``stamp`` [ns] at the latest; None without newer poses than last time.
+
+        None also if the buffer cannot place all its rays yet.
+        """
+        target = self.target
+        try:
+            end = min(stamp, self._newest(target, stamp))
+            first = end - self._laser.sweep_ns
+            if end <= self._last or first < 0:
+                return None
+            stamps = self._laser.stamps(first)
+            poses, valid = self._buffer.lookup_many(target, self._frame, stamps)
+        except LookupFailed:
+            return None
+        if not valid.all():
+            return None
+        self._last = end
+        return self._laser.scan_in_space(first, poses)
+
+    def _newest(self, target: str, stamp: int) -> int:
+        try:
+            return self._buffer.latest(target, self._frame)
+        except NoData:
+            if self._buffer.can_lookup(target, self._frame):  # all edges are static
+                return stamp
+            raise
 
 
 def free_distances(is_occupied: NDArray[np.bool_]) -> NDArray[np.int16]:

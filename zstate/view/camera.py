@@ -22,6 +22,8 @@ _MIN_DISTANCE_M = 0.6
 _MIN_FLOOR_M = 3
 # Room at the edges of the picture: a robot that touches them looks cut off.
 _ROOM = 1.08
+_AROUND_M = 2.5
+"""How much of a map around the robots is in the picture [m]."""
 _NO_POINTS = np.empty((0, 3))
 
 Point = tuple[float, float, float]
@@ -60,13 +62,17 @@ class Visibility(NamedTuple):
 
 
 def fit_camera(
-    snapshot: FramePoses, poses: Poses, aspect: float = 1.0, corners: NDArray[np.float64] = _NO_POINTS
+    snapshot: FramePoses,
+    poses: Poses,
+    aspect: float = 1.0,
+    corners: NDArray[np.float64] = _NO_POINTS,
+    maps: NDArray[np.float64] = _NO_POINTS,
 ) -> CameraPose | None:
     """The camera that shows all robots of a snapshot; None if none has a pose in the fixed frame.
 
-    ``poses`` are its frames in the fixed frame, ``corners`` (N, 3) those of everything drawn; ``aspect`` is
+    ``poses`` are its frames in the fixed frame, ``corners`` (N, 3) those of the robots' meshes; ``aspect`` is
     width by height of the picture. Frames without a robot count only if there is no robot: a map may begin
-    far away.
+    far away. Of ``maps``, whose corners are (N, 3), the part around the robots is in the picture.
     """
     of_robots = np.array(["/" in name for name in snapshot.tree.names], dtype=np.bool_)
     points = poses[of_robots if of_robots.any() else slice(None), :3]
@@ -74,6 +80,8 @@ def fit_camera(
     if not len(points):
         return None
     points = np.concatenate((points, corners))
+    around = points.min(axis=0) - _AROUND_M, points.max(axis=0) + _AROUND_M
+    points = np.concatenate((points, np.clip(maps, *around)))
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     nearer, right, up = ((points - middle) @ _axes(-_DIRECTION) * (-1.0, 1.0, 1.0)).T
     half = np.maximum(np.abs(up) + _MESH_MARGIN_M, (np.abs(right) + _MESH_MARGIN_M) / aspect)

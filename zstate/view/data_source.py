@@ -18,6 +18,7 @@ from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.listener import TransformListener
 from zstate.recording.recording import Recording
+from zstate.view.world_source import WorldSource
 from zstate.wire.keys import ANY
 
 _HOLD_S = 0.5
@@ -28,8 +29,8 @@ class ViewSource(Closeable):
     """All announced robots, or only ``robots``, and their poses.
 
     With a ``session``, ``listener`` fills ``buffer`` from the wire format ``wire``; without one, ``buffer``
-    is complete, see ``from_recording``. Ages and stamps are those of ``clock``; by default, of the clock
-    that most robots use. Methods may be called from any thread.
+    is complete, see ``from_recording``. ``world`` receives scans and maps. Ages and stamps are those of
+    ``clock``; by default, of the clock that most robots use. Methods may be called from any thread.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class ViewSource(Closeable):
         if session is not None:
             robot = robots[0] if len(robots) == 1 else ANY
             self.listener = TransformListener(session, robot, self.buffer, wire)
+        self.world = WorldSource(session, robots, wire)
         self._selected = frozenset(robots)
         self._version = 0
         self._recorded: tuple[str, ...] = ()
@@ -65,6 +67,7 @@ class ViewSource(Closeable):
 
     def close(self) -> None:
         """Stop listening; the buffer keeps its samples. A second call does nothing."""
+        self.world.close()
         if self.listener is not None:
             self.listener.close()
 

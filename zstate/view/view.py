@@ -32,6 +32,7 @@ from zstate.view.panels.display_panels import (
 )
 from zstate.view.panels.panel import Panel, PanelContext
 from zstate.view.scene.scene import Scene
+from zstate.view.scene.world import Place
 from zstate.view.server import ViewServer
 from zstate.view.sliders import SliderPublisher
 
@@ -75,7 +76,7 @@ class View(Closeable):
         self._aspect = aspect
         self._version = -1
         self._drawn: dict[str, RobotModel] = {}
-        self._fitted_to: tuple[str, tuple[tuple[str, ...], tuple[str, ...]], int] | None = None
+        self._fitted_to: tuple[str, tuple[tuple[str, ...], tuple[str, ...]], int, int] | None = None
         self._fitted_unknown = 0  # number of frames without a pose then
         self._fitted_busy = False  # whether meshes were still to come then
         self._camera_pose: CameraPose | None = None
@@ -148,6 +149,9 @@ class View(Closeable):
             try:
                 if fixed:
                     poses = self.scene.show(snapshot, fixed)
+                    place = Place(snapshot.tree, poses, fixed)
+                    at = self.layout.stamp if self._held is None else snapshot.stamp
+                    self.scene.world.show(self._source.world, self._source.buffer, place, at)
                     self._fit_camera(snapshot, fixed, poses)
                     if self._held is not None:
                         self._held_poses = poses
@@ -174,12 +178,14 @@ class View(Closeable):
     def _fit_camera(self, snapshot: FramePoses, fixed: str, poses: Poses) -> None:
         """Fit camera and floor to all robots if robots, fixed frame, poses or meshes have been added."""
         robots = tuple(self._drawn), tuple(snapshot.tree.tracks_of)
-        subject = fixed, robots, self.scene.layout.version
+        subject = fixed, robots, self.scene.layout.version, self.scene.world.version
         unknown = int(np.count_nonzero(~snapshot.known))
         has_more = unknown < self._fitted_unknown or (self._fitted_busy and not self.scene.busy)
         if subject == self._fitted_to and not has_more:
             return
-        pose = fit_camera(snapshot, poses, self._aspect, self.scene.corners(snapshot.tree, poses))
+        maps = self.scene.world.corners(Place(snapshot.tree, poses, fixed))
+        corners = self.scene.corners(snapshot.tree, poses)
+        pose = fit_camera(snapshot, poses, self._aspect, corners, maps)
         if pose is None:
             return
         self._fitted_to, self._fitted_unknown, self._fitted_busy = subject, unknown, self.scene.busy

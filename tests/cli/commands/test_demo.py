@@ -151,6 +151,34 @@ def test_the_wheels_of_the_rover_have_the_measures_of_its_model():
     assert poses["right_wheel"][:3] == pytest.approx([0.0, -track / 2, radius])
 
 
+def test_laser_of_the_arm_sweeps_a_room(spawn: Spawn):
+    demo = started(spawn, "demo", "rrbot", "--world")
+    demo.line()
+    match = re.fullmatch(
+        r"processes (\d+) \(map\) and (\d+) \(laser\) publish the map of a room and the scans of laser_link "
+        r"in it",
+        demo.line(),
+    )
+    assert match
+    demo.line()
+    address = re.search(r"--connect (\S+);", demo.stderr)
+    assert address
+    robots = json.loads(zstate("ls", "--json", "--connect", address[1]).stdout)
+    streams = {(robot["robot"], one["stream"]) for robot in robots for one in robot["writers"]}
+    assert {("rrbot", "scan"), ("rrbot", "joint_states"), ("room", "map")} <= streams
+    interrupted(demo)
+    summary = (
+        r"[1-9]\d* scans? with [1-9]\d* points? placed in world, each point by the pose at its own instant; "
+        r"\d+ dropped"
+    )
+    until(lambda: re.fullmatch(summary, demo.line()))
+    until(lambda: all(is_gone(int(pid)) for pid in match.groups()))
+
+
+def test_only_the_arm_has_a_room():
+    assert "--world is for 'rrbot' alone; got 'rover'" in failure("demo", "rover", "--world", code=2)
+
+
 def test_demo_is_isolated_with_its_publisher_in_any_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZENOH_CONFIG", "/nowhere.json5")
     monkeypatch.setenv("ZSTATE_MODE", "client")

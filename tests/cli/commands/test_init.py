@@ -28,11 +28,14 @@ def test_every_example_is_valid_once_uncommented(tmp_path: Path):
     (tmp_path / "handeye.yaml").write_text(
         f"{calibration}\ntransformation: {{x: 0, y: 0, z: 0, qx: 0, qy: 0, qz: 0, qw: 1}}\n"
     )
+    (tmp_path / "hall.yaml").touch()
     shown = zstate("up", str(file), "--check")
     assert [line.split()[0] for line in shown.stdout.decode().splitlines()] == [
         "router",
         "rrbot",
         "static",
+        "hall/map",
+        "rrbot/scan",
         "driver",
     ], shown.stderr
 

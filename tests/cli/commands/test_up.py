@@ -11,6 +11,7 @@ from helpers.processes import Child, until
 
 from zstate import TransformListener, connect, discover
 from zstate.cli.commands.up import up_command
+from zstate.scans import Grid
 
 pytestmark = pytest.mark.processes
 
@@ -249,6 +250,31 @@ def test_check_prints_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
 
 
+def test_check_prints_the_commands_of_maps_and_scanners(tmp_path: Path):
+    Grid([[0, 100]], 0.1, (0.0, 0.0, 0.0)).save(tmp_path / "hall.yaml")
+    text = table("map", file="hall.yaml", frame="floor")
+    text += table("map", file="hall.yaml", name="r1", writer="slam", wires=["native", "ros2"])
+    text += table("scan", robot="r1", frame="laser", simulate="hall.yaml", map_frame="hall/floor", rate=10)
+    text += table("scan", robot="r1", frame="laser", dummy=True, sensor="front", after="r1/scan")
+    shown = zstate("up", str(file_of(tmp_path, text)), "--check").stdout.decode().splitlines()
+    file = tmp_path / "hall.yaml"
+    assert [" ".join(line.split()) for line in shown] == [
+        f"hall/map zstate map {file} --name hall --frame floor --wire native",
+        f"r1/slam zstate map {file} --name r1 --writer slam --wire native --wire ros2",
+        f"r1/scan zstate scan r1 --frame laser --simulate {file} --map-frame hall/floor --rate 10.0 "
+        "--wire native",
+        "r1/front zstate scan r1 --dummy --frame laser --sensor front --wire native",
+    ]
+
+
+def test_map_and_a_scanner_in_it_run(up, tmp_path: Path):
+    Grid([[0, 100]], 0.1, (0.0, 0.0, 0.0)).save(tmp_path / "hall.yaml")
+    scan = table("scan", robot="rrbot", frame="base", simulate="hall.yaml", after="rrbot")
+    child = up(robot() + table("map", file="hall.yaml") + scan)
+    lines_until(child, "hall: 2 x 1 cells", "rrbot: scans in base, 30 Hz")
+    interrupted(child)
+
+
 def test_json_lines_name_their_process(up):
     child = up(robot(source="joints"), "--log-format", "json")
     child.line()
@@ -262,11 +288,12 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
     help_text = up_command.help or ""
     (tmp_path / "network.toml").write_text("[network]\nmode = 'peer'\n")
     (tmp_path / "handeye.yaml").write_text("{target: panda_link0, source: eye, xyz: [0, 0, 1]}")
+    (tmp_path / "hall.yaml").touch()
     lines = [line.strip() for line in help_text[help_text.index("include =") :].splitlines()]
     text = "\n".join(lines).replace('model = "panda"', f'model = "{RRBOT}"')
     shown = zstate("up", str(file_of(tmp_path, text)), "--check", "rate=20")
     assert [line.split()[0] for line in shown.stdout.decode().splitlines()] == (
-        ["router", "left", "right", "arm1", "arm2", "arm3", "static", "driver"]
+        ["router", "left", "right", "arm1", "arm2", "arm3", "static", "hall/map", "left/scan", "driver"]
     ), shown.stderr
     assert max(map(len, lines)) <= 78, "it wraps on a terminal of 80 columns"
 
@@ -311,6 +338,9 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
         ("include = 'cell.toml'\n", "cell.toml:1: include: 'cell.toml' includes this file again"),
         ("include = 'gone.toml'\n", "include: there is no file"),
         (table("program", run=""), "program[0].run: is empty"),
+        (table("map", file="gone.yaml"), "map[0].file: there is no file"),
+        (table("scan", robot="r1", frame="f"), "scan[0]: give simulate = 'MAP.yaml' or dummy = true"),
+        (table("scan", robot="r1", frame="f", simulate="gone.yaml"), "scan[0].simulate: there is no file"),
         (
             '[parameters]\nwho = "O\'Neill"\n' + table("program", run="echo ${who}"),
             'program[0].run: "echo O\'Neill" is not a command line (No closing quotation)',

@@ -7,12 +7,14 @@ import socket
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from math import degrees
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import click
 
+from zstate._util.closeable import Closeable
 from zstate.cli import options
 from zstate.cli.options import load_robot
 from zstate.cli.output.console import (
@@ -32,6 +34,7 @@ from zstate.errors import LookupFailed, UnknownModel, format_duration
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from zstate.cli.processes import ChildProcess
     from zstate.metrics.buffer import MeteredBuffer, SampleKind
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
@@ -64,13 +67,17 @@ _ODOM, ROVER_BASE = "odom", "base_footprint"
 _ROVER_LINKS = ("lidar_link", "left_wheel", "right_wheel")
 # Radius and track of diffbot's wheels [m].
 ROVER_WHEELS = 0.08, 0.32
+# The robot with a laser in a room, and the map of that, next to its URDF file.
+_ARM = "rrbot"
+_LASER = "laser_link"
+_ROOM = "room.yaml"
 
 
 class Demo(NamedTuple):
     """A robot that moves: poses of ``links`` are shown in the frame ``root``.
 
     ``programs`` publish it: the arguments of each `zstate` process, by name. ``kinds`` are those of their
-    samples.
+    samples. ``world`` are processes that publish the robot's surroundings and its scans of them.
     """
 
     robot: str
@@ -79,12 +86,14 @@ class Demo(NamedTuple):
     links: Sequence[str]
     programs: Mapping[str, Sequence[str]]
     kinds: Sequence[SampleKind] = ("joint_states",)
+    world: Mapping[str, Sequence[str]] = MappingProxyType({})
 
 
 @click.command("demo")
 @click.argument("robot", required=False)
 @options.xacro_arguments
 @click.option("--robot", "robot_option", metavar="ROBOT", help="Same as the argument.")
+@click.option("--world", is_flag=True, help="Put rrbot into a room, which its laser sweeps.")
 @options.rate_option
 @options.seconds_option
 # Of the processes that `zstate demo rover` starts.
@@ -95,6 +104,7 @@ def demo_command(
     robot: str | None,
     xacro_args: dict[str, str],
     robot_option: str | None,
+    world: bool,
     rate: float,
     seconds: float | None,
     program: RoverProgram | None,
@@ -110,10 +120,14 @@ def demo_command(
     `zstate demo rover` is a mobile robot that drives a square: one process publishes its wheels, another one
     its odometry, odom -> base_footprint.
 
+    `zstate demo rrbot --world` has four processes: two more publish the map of a room, and the scans of the
+    laser on the arm, simulated in that map. `zstate view` draws all of it. Needs pip install 'zstate[maps]'.
+
     \b
     zstate demo
     zstate demo path/to/arm.urdf --rate 500
     zstate demo rover
+    zstate demo rrbot --world
     """
     from zstate.model.catalog import example_name
 
@@ -123,7 +137,12 @@ def demo_command(
         return
     if robot and robot_option and robot != robot_option:
         raise click.UsageError(f"two robots are named, {robot!r} and {robot_option!r}; give one")
-    source = robot or robot_option or example_name()
+    source = robot or robot_option or (_ARM if world else example_name())
+    if world:
+        if source != _ARM or xacro_args:
+            raise click.UsageError(f"--world is for {_ARM!r} alone; got {source!r}")
+        _run(_robot_in_room(), rate, seconds)
+        return
     if not (robot or robot_option) and source != _DEFAULT:
         print_status(
             f"{_DEFAULT!r} is not installed (pip install 'zstate[robots]'), so this shows {source!r}"
@@ -157,6 +176,21 @@ def _rover(xacro_args: Mapping[str, str]) -> Demo:
     return Demo(ROVER, model, _ODOM, _ROVER_LINKS, programs, ("joint_states", "transforms"))
 
 
+def _robot_in_room() -> Demo:
+    """The arm in a room: the map is one program, the laser that measures it another one."""
+    from zstate.model.catalog import find_entry
+    from zstate.scans import load_map
+
+    demo = _swinging_robot(_ARM, {})
+    file = find_entry(_ARM).path.with_name(_ROOM)
+    load_map(file)  # reports missing libraries before anything starts
+    world = {
+        "map": ("map", str(file), "--frame", f"{_ARM}/{demo.root}"),
+        "laser": ("scan", _ARM, "--frame", _LASER, "--sensor", "laser", "--simulate", str(file)),
+    }
+    return demo._replace(world=world)
+
+
 def _run_rover_program(session: Session, program: RoverProgram, rate_hz: float) -> None:
     """Publish the rover's wheels, with its model, or its odometry, until a signal."""
     from zstate.cli.commands.publish import run_publisher
@@ -184,23 +218,31 @@ def _run(demo: Demo, rate_hz: float, seconds: float | None) -> None:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     ended = threading.Event()
-    common = ("--rate", repr(rate_hz), "--connect", endpoint)
+    programs = {name: (*arguments, "--rate", repr(rate_hz)) for name, arguments in demo.programs.items()}
     with ExitStack() as running:
         children = [
-            running.enter_context(ChildProcess(name, [*arguments, *common], on_end=lambda _: ended.set()))
-            for name, arguments in demo.programs.items()
+            running.enter_context(
+                ChildProcess(name, [*arguments, "--connect", endpoint], on_end=lambda _: ended.set())
+            )
+            for name, arguments in {**programs, **demo.world}.items()
         ]
         model = demo.model
         size = f"{count_text(len(model.joint_names), 'joint')}, {count_text(len(model.links), 'link')}"
         processes = f"process {children[0].pid} publishes"
-        if len(children) > 1:
-            named = " and ".join(f"{child.pid} ({child.name})" for child in children)
-            processes = f"processes {named} publish"
+        if len(programs) > 1:
+            processes = f"{_named(children)} publish"
         print_wrapped(f"{demo.robot} ({size}): {processes} it at {rate_hz:g} Hz, this one looks it up")
+        if demo.world:
+            around = _named(children[len(programs) :])
+            print_wrapped(f"{around} publish the map of a room and the scans of {_LASER} in it")
         _show_transforms(endpoint, demo, ended, seconds)
         for child in children:
             if child.exit_code is not None:
                 fail(f"the process {child.name!r} ended with exit code {child.exit_code}: {child.last_error}")
+
+
+def _named(children: Sequence[ChildProcess]) -> str:
+    return f"processes {' and '.join(f'{child.pid} ({child.name})' for child in children)}"
 
 
 def _show_transforms(endpoint: str, demo: Demo, ended: threading.Event, seconds: float | None) -> None:
@@ -211,6 +253,7 @@ def _show_transforms(endpoint: str, demo: Demo, ended: threading.Event, seconds:
     with (
         open_session(SessionOptions(listen=(endpoint,))) as session,
         TransformListener(session, demo.robot, buffer, history_on_join=False) as listener,
+        _PlacedScans(session, demo, buffer) if demo.world else nullcontext() as scans,
     ):
         print_status(f"waiting for {demo.robot!r} ...")
         frames = f"{demo.robot}/{demo.root}", f"{demo.robot}/{demo.links[0]}"
@@ -228,6 +271,35 @@ def _show_transforms(endpoint: str, demo: Demo, ended: threading.Event, seconds:
             table.show(ended, seconds)
         finally:
             print_wrapped(table.summary())
+            if scans is not None:
+                print_wrapped(scans.summary())
+
+
+class _PlacedScans(Closeable):
+    """Counts the scans of ``demo`` whose rays have been placed in its root."""
+
+    def __init__(self, session: Session, demo: Demo, buffer: MeteredBuffer) -> None:
+        from zstate.scans import ScanListener
+
+        self._scans = ScanListener(session, demo.robot, demo.root, buffer=buffer)
+        self._root = demo.root
+        self._count = self._points = 0
+        threading.Thread(target=self._run, name="zstate demo scans", daemon=True).start()
+
+    def _run(self) -> None:
+        for placed in self._scans:
+            self._count += 1
+            self._points += int(placed.valid.sum())
+
+    def summary(self) -> str:
+        placed = f"{count_text(self._count, 'scan')} with {count_text(self._points, 'point')}"
+        return (
+            f"{placed} placed in {self._root}, each point by the pose at its own instant; "
+            f"{self._scans.dropped.total()} dropped"
+        )
+
+    def close(self) -> None:
+        self._scans.close()
 
 
 def _missing_pose(buffer: MeteredBuffer, target: str, source: str) -> LookupFailed | None:

@@ -1,10 +1,11 @@
-"""zstate echo: joint states or transforms as documents."""
+"""zstate echo: joint states, transforms, scans or maps as documents."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import click
@@ -16,7 +17,6 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from zstate.cli.output.joint_state_text import Document
     from zstate.wire.keys import Stream
 
 
@@ -30,7 +30,7 @@ def _check_amount(amount: float) -> float:
 @click.argument("robot", required=False)
 @click.option(
     "--stream",
-    type=click.Choice(["joint_states", "partial_joint_states", "transforms"]),
+    type=click.Choice(["joint_states", "partial_joint_states", "transforms", "scan", "map"]),
     default="joint_states",
     show_default=True,
 )
@@ -65,15 +65,19 @@ def echo_command(
     form: str | None,
     wire: str,
 ) -> None:
-    """Print the joint states or the transforms of ROBOT as they arrive, as YAML documents.
+    """Print the joint states, transforms, scans or maps of ROBOT as they arrive, as YAML documents.
 
     ROBOT may be left out if only one robot is announced. Transforms, and partial joint states, are those of
-    all their writers; on a ROS wire these are all messages of /tf, or /joint_states.
+    all their writers; on a ROS wire these are all messages of /tf, or /joint_states. A scan or a map is a
+    summary: geometry and counts; --json, --csv and --field also have the ranges of a scan [m], null where
+    nothing was measured.
 
     \b
     zstate echo
     zstate echo panda
     zstate echo panda --stream transforms
+    zstate echo diffbot --stream scan --json
+    zstate echo hall --stream map --once
     zstate echo panda --field panda_joint1 --csv > joint1.csv
     zstate echo panda --by 0.001
     zstate echo --wire ros2 --once                     # /joint_states
@@ -87,6 +91,7 @@ def echo_command(
         transforms_document,
         yaml_text,
     )
+    from zstate.cli.output.scan_text import map_document, scan_document
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
     from zstate.wire.protocol import carrier
@@ -113,8 +118,14 @@ def echo_command(
         ExitStack() as opened,
     ):
         selected = named_robot(session, robot, wire)
-        document: Callable[[Any], Document] = transforms_document
-        if stream != "transforms":
+        document: Callable[[Any], Any]
+        if stream == "scan":
+            document = partial(scan_document, robot=selected, has_ranges=(form or field) is not None)
+        elif stream == "map":
+            document = partial(map_document, robot=selected)
+        elif stream == "transforms":
+            document = transforms_document
+        else:
             document = opened.enter_context(DescribedJointStates(session, selected, wire)).document
         carrying = carrier(get_wire(wire), stream)
         reader = opened.enter_context(StreamReader(session, selected, carrying, wire))

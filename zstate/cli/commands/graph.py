@@ -82,7 +82,7 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.wire.registry import get_wire
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
-        always: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "transforms")
+        always: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "transforms", "scan")
         for stream in always:
             statistics.subscribe(stream)
         robots = discover(session)

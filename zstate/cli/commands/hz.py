@@ -24,7 +24,7 @@ _SETTLING_S = 0.1
 @click.argument("robot", required=False)
 @click.option(
     "--stream",
-    type=click.Choice(["joint_states", "partial_joint_states", "tf", "transforms"]),
+    type=click.Choice(["joint_states", "partial_joint_states", "tf", "transforms", "scan"]),
     default="joint_states",
     show_default=True,
 )
@@ -55,13 +55,14 @@ def hz_command(
     """Print once a second the rate at which samples of ROBOT arrive.
 
     ROBOT may be left out if only one robot is announced. On a ROS wire this is the rate of the messages of a
-    topic, from all nodes together; that of transforms, and of partial joint states, is the rate of all their
-    writers together.
+    topic, from all nodes together; that of transforms, of partial joint states and of scans is the rate of
+    all their writers together.
 
     \b
     zstate hz
     zstate hz panda
     zstate hz panda --stream transforms
+    zstate hz diffbot --stream scan
     zstate hz --wire ros2                              # /joint_states
     zstate hz --wire ros2 --stream tf --once           # /tf
     """
@@ -114,8 +115,10 @@ class MessageStatistics:
     def add(self, received: TimedSample) -> None:
         """Add a sample. Several samples of one message count once."""
         from zstate.net.topic_statistics import Received
+        from zstate.wire.messages import StampedMessage
 
         sample, statistics = received.sample, self._statistics
+        assert isinstance(sample, StampedMessage)  # not a map, which has no rate
         if self._gaps.add(sample.session, sample.seq):
             if sample.session != statistics.session and not self._of_all:
                 statistics.clear()

@@ -110,6 +110,17 @@ rate = "${{rate}}"
 #robot = {name}
 #file = "handeye.yaml"
 
+# The map of a place, from map_server's files.
+#[[map]]
+#file = "hall.yaml"
+
+# A laser scanner, simulated in that map: the robot's root frame stands in it.
+#[[scan]]
+#robot = {name}
+#frame = {tip}
+#simulate = "hall.yaml"              # or dummy = true
+#after = {name}
+
 # A program of your own, such as the driver: any terminal command.
 #[[program]]
 #run = "python driver.py"

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 _FIRST_AFTER_S = 1.0
 # Discovery takes less.
 _DISCOVERY_S = 0.3
+_SCANS_WITHIN_NS = 2_000_000_000
 
 
 @click.command("monitor")
@@ -85,9 +86,9 @@ def monitor_command(
     With --robots each robot has a line per second: rate, age of its newest sample, latency until a sample can
     be looked up, and counts since the start: received, dropped here, missed on the way, late (older than the
     history), refused, and off the clock (stamped more than a minute away from the time here). Rate, age and
-    latency are those of its joint states, if it has any; transforms besides them have a rate of their own. On
-    a ROS wire this is /tf, all nodes together; with --robot, the joint states of a robot that has a
-    description.
+    latency are those of its joint states, if it has any; transforms besides them, and scans, have a rate of
+    their own. On a ROS wire this is /tf, all nodes together; with --robot, the joint states of a robot that
+    has a description.
 
     \b
     zstate monitor
@@ -281,6 +282,9 @@ class RobotMonitor(Closeable):
     def __init__(
         self, session: Session, directory: RobotDirectory, robot: str, wire: str, clock: Clock | None
     ) -> None:
+        from zstate.net.topic_statistics import TopicStatistics
+        from zstate.wire.registry import get_wire
+
         self._selected = robot
         self._robot = None if robot == ANY else check_robot(robot)
         self._session, self._directory, self._wire, self._clock = session, directory, wire, clock
@@ -288,6 +292,9 @@ class RobotMonitor(Closeable):
         self._listeners: dict[Follow, tuple[TransformListener, MeteredBuffer]] = {}
         self._robots: BoundedDict[str, MonitoredRobot] = BoundedDict()
         self._opened = ExitStack()
+        scans = TopicStatistics(session, get_wire(wire), sources=lambda name, _, __: (name,), clock=clock)
+        self._scans = self._opened.enter_context(scans)
+        scans.subscribe("scan", robot)
 
     def close(self) -> None:
         self._opened.close()
@@ -344,13 +351,19 @@ class RobotMonitor(Closeable):
 
         for one in self.robots():
             measure, stats = one.buffer.measure(one.robot), one.stats
+            scans = self._scans.get(one.robot)
+            window = None if scans is None else scans.recent(_SCANS_WITHIN_NS)
+            scans_hz = None if window is None else window.rate_hz
             if as_json:
-                print_json({"robot": one.robot, **asdict(measure), **asdict(stats)})
+                facts = {"robot": one.robot, **asdict(measure), "scans_hz": scans_hz, **asdict(stats)}
+                print_json(facts)
                 continue
             rate = _rate_text(one.buffer.statistics_of(one.robot), measure.rate_hz)
             if measure.transforms_hz is not None:
                 transforms = one.buffer.statistics_of(one.robot, "transforms")
                 rate += f"  transforms {_rate_text(transforms, measure.transforms_hz)}"
+            if scans is not None:
+                rate += f"  scans {_rate_text(scans, scans_hz)}"
             reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
             print_wrapped(
                 f"{one.robot}  {rate}  "
@@ -362,5 +375,5 @@ class RobotMonitor(Closeable):
             )
 
 
-def _rate_text(statistics: IntervalStatistics, rate_hz: float) -> str:
+def _rate_text(statistics: IntervalStatistics, rate_hz: float | None) -> str:
     return "silent" if statistics.is_stale() else rate_text(rate_hz)

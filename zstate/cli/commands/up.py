@@ -70,6 +70,16 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     [[static]]
     robot = "right"
     file = "handeye.yaml"             # of easy_handeye, or a TransformStamped
+    [[map]]                           # options of `zstate map`
+    file = "hall.yaml"                # of map_server
+    identity = "hall"
+    [[scan]]                          # options of `zstate scan`
+    robot = "left"
+    frame = "laser"
+    simulate = "hall.yaml"            # or dummy = true
+    map_frame = "hall/map"
+    identity = "left"
+    after = "left"
     [[program]]                       # any other program, such as a driver
     run = "python driver.py ${rate}"  # or "zstate record run.mcap"
     identity = "left"

@@ -18,7 +18,7 @@ from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, foreign_edge_problem
+from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, foreign_edge_problem, full_name
 from zstate.wire.messages import Status
 
 _MIN_RECEIVED = 0.8
@@ -46,6 +46,10 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
             advice = f"zstate ls  # shows the writers of {probe.info.name}"
             yield broken("version", text, "pip install -U zstate" if is_newer else advice)
             break
+    yield from _maps_checks(probe)
+    if probe.is_place:
+        yield statics_check(probe)
+        return
     model, check = model_check(probe)
     yield check
     if probe.info.part_names and "joint_states" not in probe.streams:
@@ -53,6 +57,8 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
     elif not probe.has_only_transforms:
         yield _samples_check(probe)
     yield from _named_writers_checks(probe, "transforms", probe.transforms, probe.info.transform_names)
+    yield from _named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names)
+    yield from _scan_frames_checks(probe)
     yield clocks_check(probe)
     yield stamps_check(probe, session)
     if model is not None:
@@ -219,6 +225,34 @@ def _named_writers_checks(
             yield ok(stream, f"one sample from {known_as}, {silence} ago")
         else:
             yield ok(stream, f"{window.rate_hz:.1f} Hz from {known_as}, newest {silence} ago")
+
+
+def _maps_checks(probe: RobotProbe) -> Iterator[Check]:
+    """Whether each announced map has arrived."""
+    for name, writer in probe.info.map_names:
+        grid = probe.maps.get(writer.session)
+        if grid is None:
+            text = f"{writer} announces the map {name!r}, which has not arrived"
+            yield broken("map", text, f"zstate doctor {probe.info.name} --timeout 10")
+        else:
+            frame = full_name(probe.info.name, grid.frame)
+            size = f"{grid.width} x {grid.height} cells of {grid.resolution:g} m"
+            yield ok("map", f"{name!r}: {size} in {frame!r}, from {writer}")
+
+
+def _scan_frames_checks(probe: RobotProbe) -> Iterator[Check]:
+    """Findings for scans in frames of the robot that it does not have: no reader can place them."""
+    robot, scans = probe.info.name, {} if probe.scans is None else probe.scans.writers
+    frames = {frame.name for frame in probe.listener.buffer.frames()}
+    for sensor, writer in probe.info.scan_names:
+        for frame in scans[writer.session].names if writer.session in scans else ():
+            full = full_name(robot, frame)
+            if full.startswith(f"{robot}/") and full not in frames:
+                near = similar_frames(full, frames)
+                hint = f"; {near[0]!r} is similar" if near else ""
+                text = f"the scans of {sensor!r} are in {full!r}, which no writer places{hint}"
+                then = f"zstate static TARGET {full} --xyz X Y Z  # or start {writer} with another --frame"
+                yield broken("scan", text, then)
 
 
 def _no_writer_check(probe: RobotProbe) -> Check:

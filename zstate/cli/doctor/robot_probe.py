@@ -25,8 +25,10 @@ from zstate.wire.identity import WriterId
 from zstate.wire.keys import JOINT_STREAMS, Stream, clock_key
 from zstate.wire.messages import (
     JointState,
+    LaserScan,
+    OccupancyGrid,
     RobotDescription,
-    Sample,
+    StampedMessage,
     Status,
     TransformSample,
     from_block,
@@ -42,7 +44,10 @@ _ALL = ""
 
 
 class WriterSamples:
-    """Samples of one writer: ``statistics``, ``names`` of joints or child frames, and ranges of positions."""
+    """Samples of one writer: ``statistics``, ``names`` of joints or frames, and ranges of positions.
+
+    The frames are those that its edges place, or those of its scans.
+    """
 
     def __init__(self, statistics: IntervalStatistics) -> None:
         self.statistics = statistics
@@ -51,9 +56,11 @@ class WriterSamples:
         self._order = b""
         self._extremes = np.empty((2, 0))
 
-    def add(self, sample: Sample) -> None:
+    def add(self, sample: StampedMessage) -> None:
         """Include ``sample``; positions in another joint order replace all before."""
-        if isinstance(sample, TransformSample):
+        if isinstance(sample, LaserScan):
+            self.names[sample.frame] = None
+        elif isinstance(sample, TransformSample):
             self.names.update(dict.fromkeys(child for _, child in sample.edges or ()))
         elif isinstance(sample, JointState):
             self.names.update(dict.fromkeys(sample.names or ()))
@@ -90,7 +97,7 @@ class StreamSamples(Closeable):
     ) -> None:
         self._writers: dict[int, WriterSamples] = {}
 
-        def on_sample(_: Stream, sample: Sample) -> None:
+        def on_sample(_: Stream, sample: StampedMessage) -> None:
             writer = self._writers.get(sample.session)
             if writer is None:
                 statistics = self.topic.get(sample.session)
@@ -123,7 +130,8 @@ class RobotProbe(Closeable):
 
     ``neighbours`` are all announced robots. ``on_change()`` is called after each description and sample.
     ``nodes`` are the samples of each stream by ROS node, on a ROS wire; ``transforms`` and ``parts``, the
-    partial joint states, are the samples of these streams by writer, on the native wire.
+    partial joint states, are the samples of these streams by writer, on the native wire, and ``scans`` those
+    of its laser scanners. ``maps`` are its maps by session.
     """
 
     def __init__(
@@ -141,6 +149,7 @@ class RobotProbe(Closeable):
         self.followed: Follow = "joint_states" if is_native and moves_by_joints else "tf"
         self.description: RobotDescription | None = None
         self.statuses: dict[int, Status] = {}
+        self.maps: dict[int, OccupancyGrid] = {}
         self.events: list[WriterEvent] = []
         self.offsets: tuple[MeasuredOffset, ...] = ()
         self.unresponsive: set[WriterId] = set()
@@ -155,11 +164,17 @@ class RobotProbe(Closeable):
             self.samples = opening.enter_context(samples)
             self.transforms: StreamSamples | None = None
             self.parts: StreamSamples | None = None
+            self.scans: StreamSamples | None = None
             if is_native:
                 parts = StreamSamples(session, info.name, "partial_joint_states", wire_format, on_change)
                 self.parts = opening.enter_context(parts)
                 transforms = StreamSamples(session, info.name, "transforms", wire_format)
                 self.transforms = opening.enter_context(transforms)
+                scans = StreamSamples(session, info.name, "scan", wire_format, on_change)
+                self.scans = opening.enter_context(scans)
+                if info.map_names:
+                    maps = subscribe(session, wire_format, info.name, "map", self._on_maps)
+                    opening.enter_context(maps)
                 opening.enter_context(StatusSubscriber(session, info.name, self._on_status))
             for stream in () if is_native else _ROS_STREAMS:
                 nodes = StreamSamples(session, info.name, stream, wire_format)
@@ -177,6 +192,12 @@ class RobotProbe(Closeable):
         for _, _, message in received:
             if isinstance(message, RobotDescription):
                 self.description = message
+                self._on_change()
+
+    def _on_maps(self, received: list[Received]) -> None:
+        for _, _, message in received:
+            if isinstance(message, OccupancyGrid):
+                self.maps[message.session] = message
                 self._on_change()
 
     def _on_status(self, _: str, status: Status) -> None:
@@ -203,7 +224,10 @@ class RobotProbe(Closeable):
     def is_incomplete(self) -> bool:
         """Whether announced data has not arrived yet."""
         lacks_model = "robot_description" in self.streams and self.description is None
-        if self.parts is not None and len(self.parts.writers) < len(self.info.part_names):
+        for samples, names in ((self.parts, self.info.part_names), (self.scans, self.info.scan_names)):
+            if samples is not None and len(samples.writers) < len(names):
+                return True
+        if len(self.maps) < len(self.info.map_names):
             return True
         return lacks_model or (self.followed in self.streams and self.samples.statistics.count < 2)
 
@@ -211,12 +235,13 @@ class RobotProbe(Closeable):
     def is_silent(self) -> bool:
         """Whether nothing has arrived except announcements."""
         frames = any(frame.kind == "static" for frame in self.listener.buffer.frames())
-        return not (self.description or self.sample_count or self.statuses or self.offsets or frames)
+        has_replied = self.description or self.statuses or self.offsets or self.maps
+        return not (has_replied or self.sample_count or frames)
 
     @property
     def sample_count(self) -> int:
-        """How many samples of the followed stream, of transforms and of partial joint states have arrived."""
-        all_samples = [self.samples, self.transforms, self.parts]
+        """How many joint states, transforms and scans have arrived."""
+        all_samples = [self.samples, self.transforms, self.parts, self.scans]
         return sum(samples.statistics.count for samples in all_samples if samples is not None)
 
     def statistics(self) -> list[IntervalStatistics]:
@@ -224,6 +249,11 @@ class RobotProbe(Closeable):
         named = [samples for samples in (self.parts, self.transforms) if samples is not None]
         writers = [writer for samples in named for writer in samples.writers.values()]
         return [self.samples.statistics, *(writer.statistics for writer in writers)]
+
+    @property
+    def is_place(self) -> bool:
+        """Whether it has a map, and nothing that moves."""
+        return "map" in self.streams and self.streams <= {"map", "tf_static"}
 
     @property
     def has_only_transforms(self) -> bool:

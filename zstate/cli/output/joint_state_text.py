@@ -1,4 +1,4 @@
-"""Joint states and transforms as documents, and documents as YAML, CSV or a single field."""
+"""Joint states and transforms as documents, and all documents as YAML, CSV or a single field."""
 
 from __future__ import annotations
 
@@ -163,15 +163,15 @@ def yaml_text(value: Any, indent: str = "") -> str:
     return "\n".join(lines)
 
 
-def flatten(value: Any, name: str = "") -> dict[str, int | float]:
-    """The numbers of a document, or of a part of one, by dotted names such as "positions.elbow"."""
+def flatten(value: Any, name: str = "") -> dict[str, int | float | str]:
+    """The numbers and texts of a document, or of a part of one, by dotted names such as "positions.elbow"."""
     if isinstance(value, dict):
         items = list(cast("dict[str, Any]", value).items())
     elif isinstance(value, list):
         items = [(str(index), inner) for index, inner in enumerate(cast("list[Any]", value))]
     else:
         return {name: value}
-    numbers: dict[str, int | float] = {}
+    numbers: dict[str, int | float | str] = {}
     for key, inner in items:
         numbers |= flatten(inner, f"{name}.{key}" if name else key)
     return numbers
@@ -182,7 +182,7 @@ class ChangeFilter:
 
     def __init__(self, by: float = 0.0) -> None:
         self._by = by
-        self._last: dict[str, int | float] | None = None
+        self._last: dict[str, int | float | str] | None = None
 
     def accepts(self, value: Any) -> bool:
         """Whether ``value`` has changed; the stamp and sequence number of a whole document do not count."""
@@ -192,10 +192,15 @@ class ChangeFilter:
         if last is not None and last.keys() == numbers.keys():
             pairs = [(last[name], number) for name, number in numbers.items()]
             # NaN, which ROS drivers send for a quantity they do not measure, differs from any number.
-            if not any(abs(new - old) > self._by or isnan(new) != isnan(old) for old, new in pairs):
+            if not any(self._differ(old, new) for old, new in pairs):
                 return False
         self._last = numbers
         return True
+
+    def _differ(self, old: float | str, new: float | str) -> bool:
+        if isinstance(old, str) or isinstance(new, str):  # the frame of a scan or a map
+            return old != new
+        return abs(new - old) > self._by or isnan(new) != isnan(old)
 
 
 class CsvFormatter:

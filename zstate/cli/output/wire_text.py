@@ -86,6 +86,10 @@ class NativeMessages:
         command = f"zstate transform TARGET SOURCE --xyz X Y Z --robot {robot}"
         if stream == "partial_joint_states":
             command = f"{publish_command_for('joints', robot)} --only NAME"
+        elif stream == "scan":
+            command = f"zstate scan {robot} --frame FRAME --dummy"
+        elif stream == "map":
+            command = f"zstate map FILE.yaml --name {robot}"
         elif stream != "transforms":
             command = publish_command_for("joints" if stream == "joint_states" else "publish", robot)
         return f"{stream} of {robot!r} has no writer{' any more' * ended}; start one: `{command}`"

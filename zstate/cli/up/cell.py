@@ -158,6 +158,53 @@ class StaticSection(_Section, frozen=True):
             raise InvalidInput(f"{error}{degrees}") from None
 
 
+class MapSection(_Section, frozen=True):
+    """``[[map]]``: the arguments of `zstate map`.
+
+    The process is called ``NAME/WRITER``, such as "hall/map".
+    """
+
+    file: str
+    name: str | None = None
+    frame: str | None = None
+    writer: str | None = None
+    wires: tuple[str, ...] = ("native",)
+    identity: str | None = None
+    after: Names = ()
+    restart: Restart = "never"
+
+    def __post_init__(self) -> None:
+        _check_wires(self.wires)
+
+
+class ScanSection(_Section, frozen=True):
+    """``[[scan]]``: the arguments of `zstate scan`: ``simulate``, the file of a map, or ``dummy``.
+
+    The process is called ``ROBOT/SENSOR``, such as "r1/scan".
+    """
+
+    robot: str
+    frame: str
+    simulate: str | None = None
+    dummy: bool = False
+    map_frame: str | None = None
+    rate: float | None = None
+    sensor: str | None = None
+    wires: tuple[str, ...] = ("native",)
+    metrics: str | int | None = None
+    identity: str | None = None
+    after: Names = ()
+    restart: Restart = "never"
+
+    def __post_init__(self) -> None:
+        if self.dummy is (self.simulate is not None):
+            raise InvalidInput("give simulate = 'MAP.yaml' or dummy = true, one of them")
+        if self.rate is not None:
+            check_rate(self.rate)
+        _check_wires(self.wires)
+        _check_metrics(self.metrics)
+
+
 def as_tuple(names: Names) -> tuple[str, ...]:
     """One or several names as a tuple."""
     return (names,) if isinstance(names, str) else names
@@ -186,6 +233,8 @@ class Cell:
 
     robot: list[Located[RobotSection]] = field(default_factory=list["Located[RobotSection]"])
     static: list[Located[StaticSection]] = field(default_factory=list["Located[StaticSection]"])
+    map: list[Located[MapSection]] = field(default_factory=list["Located[MapSection]"])
+    scan: list[Located[ScanSection]] = field(default_factory=list["Located[ScanSection]"])
     program: list[Located[ProgramSection]] = field(default_factory=list["Located[ProgramSection]"])
     router: Located[RouterSection] | None = None
     network: Located[NetworkSection] | None = None
@@ -207,6 +256,10 @@ def read_cell(path: str, settings: Mapping[str, str]) -> Cell:
                 cell.robot.append(_checked(kind, table, RobotSection))
             case "static":
                 cell.static.append(_checked(kind, table, StaticSection))
+            case "map":
+                cell.map.append(_checked(kind, table, MapSection))
+            case "scan":
+                cell.scan.append(_checked(kind, table, ScanSection))
             case _:
                 cell.program.append(_checked(kind, table, ProgramSection))
     return cell

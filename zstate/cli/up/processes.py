@@ -12,14 +12,16 @@ from typing import Any
 
 from zstate._util.endpoint import format_host
 from zstate._util.format import did_you_mean
-from zstate.cli.options import load_robot, parse_xacro_args
+from zstate.cli.options import load_robot, parse_xacro_args, place_name
 from zstate.cli.up.cell import (
     Cell,
+    MapSection,
     NetworkSection,
     ProgramSection,
     Restart,
     RobotSection,
     RouterSection,
+    ScanSection,
     as_tuple,
 )
 from zstate.cli.up.static_edges import check_edges
@@ -32,6 +34,7 @@ from zstate.wire.keys import check_robot
 _Values = dict[str, tuple[str, ...]]
 """Values by key. Options and environment variables are named after the keys of [network] and [router]."""
 
+_STARTED = "[router], [[robot]], [[static]], [[map]], [[scan]] or [[program]]"
 _NETWORK_PATHS = ("config", "certs", "password_file")
 _ROUTER_PATHS = ("acl", "certs", "password_file", "users")
 
@@ -65,7 +68,7 @@ def plan_processes(cell: Cell, file: Path, settings: Mapping[str, str]) -> list[
             raise table.error(f"{other} is called {spec.name!r} already; give one of them another name")
         specs[spec.name], tables[spec.name] = spec, table
     if not specs:
-        raise ConfigError(f"{file} starts nothing; it has no [router], [[robot]], [[static]] or [[program]]")
+        raise ConfigError(f"{file} starts nothing; it has no {_STARTED}")
     for name in specs:
         _check_order(name, specs, tables[name])
     return list(specs.values())
@@ -88,6 +91,10 @@ def _specs(cell: Cell, file: Path, settings: Mapping[str, str]) -> Iterator[tupl
         sets = {"set": tuple(f"{key}={value}" for key, value in settings.items())}
         arguments = ("static", "--file", str(file), *_options(sets | _session_values(cell)))
         yield ProcessSpec("static", arguments, first), cell.static[0]
+    for place in cell.map:
+        yield _map_spec(place, cell, first), place
+    for scan in cell.scan:
+        yield _scan_spec(scan, cell, first), scan
     for program in cell.program:
         yield _program_spec(program, cell, first), program
 
@@ -160,6 +167,54 @@ def _xacro_texts(robot: RobotSection) -> tuple[str, ...]:
     )
 
 
+def _map_spec(table: Located[MapSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
+    place, file = table.section, _map_file(table, "file", table.section.file)
+    _check_identity(table, cell)
+    name = place.name or place_name(file)
+    values: _Values = {
+        "name": (name,),
+        "frame": _optional(place.frame),
+        "writer": _optional(place.writer),
+        "wire": place.wires,
+    }
+    arguments = ("map", file, *_options(values | _session_values(cell, place.identity)))
+    return ProcessSpec(
+        f"{name}/{place.writer or 'map'}", arguments, (*first, *as_tuple(place.after)), place.restart
+    )
+
+
+def _scan_spec(table: Located[ScanSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
+    scan = table.section
+    simulate = () if scan.simulate is None else (_map_file(table, "simulate", scan.simulate),)
+    _check_identity(table, cell)
+    values: _Values = {
+        "frame": (scan.frame,),
+        "simulate": simulate,
+        "map_frame": _optional(scan.map_frame),
+        "rate": () if scan.rate is None else (repr(scan.rate),),
+        "sensor": _optional(scan.sensor),
+        "wire": scan.wires,
+        "metrics": () if scan.metrics is None else (str(scan.metrics),),
+    }
+    arguments = (
+        *("scan", scan.robot, *(("--dummy",) if scan.dummy else ())),
+        *_options(values | _session_values(cell, scan.identity)),
+    )
+    name = f"{scan.robot}/{scan.sensor or 'scan'}"
+    return ProcessSpec(name, arguments, (*first, *as_tuple(scan.after)), scan.restart)
+
+
+def _map_file(table: Located[Any], key: str, path: str) -> str:
+    file = table.resolve(path)
+    if not Path(file).is_file():
+        raise table.error(f"there is no file {file!r}", key)
+    return file
+
+
+def _optional(value: str | None) -> tuple[str, ...]:
+    return () if value is None else (value,)
+
+
 def _program_spec(table: Located[ProgramSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
     program = table.section
     try:
@@ -190,7 +245,7 @@ def _program_spec(table: Located[ProgramSection], cell: Cell, first: tuple[str, 
     )
 
 
-def _check_identity(table: Located[RobotSection] | Located[ProgramSection], cell: Cell) -> None:
+def _check_identity(table: Located[Any], cell: Cell) -> None:
     network = NetworkSection() if cell.network is None else cell.network.section
     identity = table.section.identity
     if network.certs is not None and not (identity or network.identity):

@@ -24,7 +24,7 @@ else:
     import tomli as tomllib
 
 SINGLE = ("router", "network")
-LISTS = ("robot", "static", "program")
+LISTS = ("robot", "static", "map", "scan", "program")
 _TABLES = (*LISTS, *SINGLE, "parameters", "include")
 LOOPS = ("robot", "program")
 LOOP_KEYS = ("names", "count", "when")

@@ -25,6 +25,7 @@ from zstate.view.panels.panel import BoundWidget, FrameDropdown, PanelContext
 from zstate.view.scene.scene import Scene
 
 _DISPLAYS = ("visuals", "collisions", "axes", "names", "parent_lines")
+_MAX_SCANS = 50
 _MAX_LINES = 12
 _MAX_FRAMES = 10
 _NO_POSE = "no pose"
@@ -45,6 +46,13 @@ class DisplayPanel:
             name: gui.add_checkbox(name.replace("_", " ").capitalize(), getattr(scene, name))
             for name in _DISPLAYS
         }
+        world = scene.world
+        self._scans = gui.add_checkbox("Scans", world.scans)
+        hint = "How many scans of each sensor are drawn; older ones are paler."
+        self._scan_count = gui.add_slider(
+            "Last scans", min=1, max=_MAX_SCANS, step=1, initial_value=world.scan_count, hint=hint
+        )
+        self._maps = gui.add_checkbox("Maps", world.maps)
 
     def update(self, context: PanelContext) -> None:
         tree = context.snapshot.tree
@@ -58,6 +66,9 @@ class DisplayPanel:
         self._unknown.content = html.paragraph(text, color=html.WARNING) if is_unknown else ""
         for name, box in self._boxes.items():
             setattr(self._scene, name, box.value)
+        world = self._scene.world
+        world.scans, world.maps = self._scans.value, self._maps.value
+        world.scan_count = int(self._scan_count.value)
 
 
 class RobotsPanel:
@@ -93,11 +104,13 @@ class RobotsPanel:
         poses = [track for track in silent if isinstance(track, PoseTrack)]
         edges = [f"{track.name}: {silent[track]}" for track in poses]
         meshes = [f"{uri}\n    {why}" for robot in robots for uri, why in self._scene.missing_meshes(robot)]
+        around = [f"{name}: {why}" for name, why in self._scene.world.missing]
         self._missing.content = (
             disconnected_html(tree, context.fixed)
             + unplaced_html(context.snapshot)
             + _listing("edge is stale", "edges are stale", edges, sum(len(track.edges) for track in poses))
             + _listing("mesh is missing", "meshes are missing", meshes)
+            + _listing("display is incomplete", "displays are incomplete", around)
         )
 
     def _silent_tracks(self, tree: FrameTable) -> dict[Track, str]:

@@ -28,6 +28,7 @@ from zstate.view.scene.frames import (
     in_frame,
 )
 from zstate.view.scene.robot_meshes import InstancedMeshes, RenderStyle, RobotKind, RobotMeshes
+from zstate.view.scene.world import World
 
 _MIN_INSTANCES = 4  # identical robots that are drawn by instances
 _GAP_M = 0.3
@@ -42,8 +43,9 @@ class Scene:
     """Draws robots and frames at one instant after the other.
 
     Attributes, used by the next ``show``: ``visuals`` and ``collisions`` of robots (the latter translucent),
-    and ``axes``, ``names`` and ``parent_lines`` of frames. ``layout`` places unconnected trees. Meshes are
-    loaded in the background; the scene is ``busy`` until all are drawn. To be used by one thread.
+    and ``axes``, ``names`` and ``parent_lines`` of frames. ``layout`` places unconnected trees; ``world``
+    draws scans and maps. Meshes and maps are loaded in the background; the scene is ``busy`` until all are
+    drawn. To be used by one thread.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -67,14 +69,15 @@ class Scene:
         self._names = FrameLabels(scene)
         self._lines = ParentLines(scene)
         self._trails = Trails(scene)
+        self.world = World(scene)
         self.layout = TreeLayout()
         self._stale_labels = NodeLabels(scene, "stale", anchor="top-center")
         self._tree_labels = NodeLabels(scene, "tree", anchor="bottom-center")
 
     @property
     def busy(self) -> bool:
-        """Whether meshes are still being loaded."""
-        return any(meshes.pending for meshes in self._meshes())
+        """Whether meshes or maps are still being loaded."""
+        return self.world.busy or any(meshes.pending for meshes in self._meshes())
 
     def set_robot(
         self, name: str, model: RobotModel, shapes: Sequence[Shape] | None = None, base: Path | None = None

@@ -1,0 +1,170 @@
+"""zstate scan: publisher of laser scans without a sensor."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import click
+
+from zstate.cli import options
+from zstate.cli.metrics import publisher_collector, serve_metrics
+from zstate.cli.output.console import fail, print_status, print_wrapped
+from zstate.cli.output.wire_text import messages_for
+from zstate.cli.session import SessionOptions, open_session
+
+if TYPE_CHECKING:
+    from zstate.metrics.endpoint import BindAddress
+    from zstate.net.session import Session
+    from zstate.scans import RangeSource, Scan, SimulatedLaser
+
+_RATE_HZ = 30.0
+_RAYS_PER_TURN = 1440
+"""Of a scanner with a ray every 0.25 degrees, which turns once per scan."""
+
+
+@click.command("scan")
+@click.argument("robot")
+@click.option(
+    "--frame", required=True, metavar="FRAME", help="The frame of the scanner: ray 0 degrees is along its x."
+)
+@click.option(
+    "--simulate",
+    "map_file",
+    type=options.EXISTING_FILE,
+    metavar="MAP.yaml",
+    help="Measure this map of map_server from the robot's pose.",
+)
+@click.option(
+    "--dummy", is_flag=True, help="The pattern of ROS 2's dummy_laser: all ranges are |sin(3 t)| [m]."
+)
+@click.option(
+    "--map-frame",
+    default="map",
+    show_default=True,
+    metavar="FRAME",
+    help="The frame in which the map of --simulate stands, if the robot has that frame; else the map stands "
+    "in the root of the robot.",
+)
+@click.option("--rate", type=options.RATE, default=_RATE_HZ, show_default=True, help="Scans a second.")
+@options.seconds_option
+@click.option(
+    "--sensor",
+    default="scan",
+    show_default=True,
+    metavar="NAME",
+    help="The scanner's name; in ROS the topic.",
+)
+@options.wires_option
+@options.metrics_option
+@options.session_options
+def scan_command(
+    *,
+    robot: str,
+    frame: str,
+    map_file: str | None,
+    dummy: bool,
+    map_frame: str,
+    rate: float,
+    seconds: float | None,
+    sensor: str,
+    wires: tuple[str, ...],
+    metrics: BindAddress | None,
+    network: SessionOptions,
+) -> None:
+    """Publish the scans of a laser scanner of ROBOT: simulated in a map, or a dummy.
+
+    A scan has 1081 rays from -135 to 135 degrees, up to 10 m. The simulated scanner turns once per scan: each
+    ray is measured from the robot's pose at its own instant, as ROBOT's transforms on the network give it,
+    and a scan ends at the newest of them. While no newer transforms arrive there are no scans.
+
+    \b
+    zstate publish diffbot --source sine
+    zstate scan diffbot --frame lidar_link --simulate hall.yaml
+    zstate scan r1 --frame laser --simulate hall.yaml --map-frame hall/map
+    zstate scan r1 --frame laser --dummy --sensor front
+    zstate scan rrbot --frame hokuyo_link --dummy --wire ros2       # /scan
+    """
+    from zstate.cli.commands.publish import run_publisher
+    from zstate.scans import ScanPublisher, SimulatedLaser, load_map
+    from zstate.scans.simulated_laser import (
+        DUMMY_ANGLE_INCREMENT,
+        DUMMY_ANGLE_MIN,
+        DUMMY_RANGE_MAX,
+    )
+    from zstate.wire.keys import check_robot
+
+    if dummy is (map_file is not None):
+        raise click.UsageError("give --simulate MAP.yaml or --dummy, one of them")
+    check_robot(robot)
+    ray_ns = 0 if dummy else round(1e9 / (rate * _RAYS_PER_TURN))
+    laser = None
+    if map_file is not None:
+        laser = SimulatedLaser(load_map(map_file), ray_ns=ray_ns, frame=frame)
+    with open_session(network, wires) as session, ExitStack() as opened:
+        source: RangeSource = _DummyLaser()
+        if laser is not None:
+            source = _mounted_laser(session, laser, robot, frame, map_frame, wires[0], opened, seconds)
+        publisher = ScanPublisher(
+            session,
+            robot,
+            sensor,
+            wires,
+            angle_min=DUMMY_ANGLE_MIN,
+            angle_increment=DUMMY_ANGLE_INCREMENT,
+            range_min=0.0,
+            range_max=DUMMY_RANGE_MAX,
+            ray_ns=ray_ns,
+            frame=frame,
+        )
+        opened.enter_context(publisher)
+        opened.enter_context(serve_metrics(metrics, publisher_collector(publisher)))
+        places = [messages_for(wire).place(robot, ("scan",)) for wire in wires]
+        places = [f"{one}/{sensor}" if one.startswith("zstate/") else one for one in places]
+        print_wrapped(f"{robot}: scans in {frame}, {rate:g} Hz, on {' and on '.join(places)}")
+        run_publisher(publisher, source, rate, seconds)
+
+
+def _mounted_laser(  # noqa: PLR0917 - one use, in the order of the options
+    session: Session,
+    laser: SimulatedLaser,
+    robot: str,
+    frame: str,
+    map_frame: str,
+    wire: str,
+    opened: ExitStack,
+    seconds: float | None,
+) -> RangeSource:
+    """``laser`` on the robot, once its pose is known; what is missing is printed."""
+    from zstate.cli.robot_directory import RobotDirectory
+    from zstate.cli.waiting import ConditionWaiter
+    from zstate.nodes.listener import TransformListener
+    from zstate.scans.simulated_laser import MountedLaser
+    from zstate.wire.keys import full_name
+
+    messages, waiter = messages_for(wire), ConditionWaiter()
+    listener = opened.enter_context(TransformListener(session, robot, wire=wire))
+    listener.add_observer(waiter.notify)
+    directory = opened.enter_context(RobotDirectory(session, robot, wire, waiter.notify))
+    owner = messages.robot or robot
+    source = MountedLaser(laser, listener.buffer, full_name(owner, frame), full_name(owner, map_frame))
+
+    def reason() -> str:
+        if not directory.streams(robot):
+            return messages.unknown(robot, directory.robots())
+        return messages.translate(str(source.problem()))
+
+    if not waiter.wait_for(lambda: source.problem() is None, seconds, reason):
+        fail(f"no scan in {seconds:g} s: {reason()}")
+    shown = messages.translate(source.target)
+    print_status(f"simulating a scanner in {frame}; the map stands in {shown}")
+    return source
+
+
+class _DummyLaser:
+    """A source of the scans of ROS 2's dummy_laser."""
+
+    def read(self, stamp: int) -> Scan:
+        from zstate.scans import dummy_scan
+
+        return dummy_scan(stamp)

@@ -1,0 +1,195 @@
+"""Scans and maps to draw, from the network."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
+from zstate._util.refusals import Refusals
+from zstate.buffer.buffer import TransformBuffer
+from zstate.errors import InvalidInput, LookupFailed
+from zstate.ingest.deadline import Deadline
+from zstate.net.presence import announce_reader
+from zstate.net.session import Session
+from zstate.net.subscription import Received, subscribe
+from zstate.scans.grid import Grid, grid_from_message
+from zstate.scans.scan import Scan, scan_from_message
+from zstate.wire.keys import ANY, shortened
+from zstate.wire.messages import LaserScan, OccupancyGrid
+from zstate.wire.registry import get_wire
+
+_TIMEOUT_S = 1.0
+"""How long a scan waits for the pose of its last ray, as in ``ScanListener``."""
+_MAX_WAITING = 256
+_MAX_RAYS = 1_000_000
+"""Rays of one sensor that are kept: 4 MB, half a minute of a scanner with 1081 rays and 30 Hz."""
+_MAX_WRITERS = 64
+_TIME_JUMP_NS = 1_000_000_000
+
+
+class WriterName(NamedTuple):
+    """A sensor or a map of a robot: ``robot/name``."""
+
+    robot: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.robot}/{self.name}"
+
+
+@dataclass(eq=False)
+class SensorScans:
+    """The scans of one sensor: those that wait for the pose of their last ray, and the last ones with it.
+
+    ``dropped`` counts scans whose pose did not come within a second. ``reason`` is why the newest scan was
+    dropped, None if it was not.
+    """
+
+    dropped: int = 0
+    reason: LookupFailed | InvalidInput | None = None
+    _waiting: deque[tuple[Scan, float]] = field(default_factory=lambda: deque(maxlen=_MAX_WAITING))
+    _scans: deque[Scan] = field(default_factory=deque[Scan])
+    _deadline: Deadline = field(default_factory=Deadline)
+
+    def add(self, scan: Scan) -> None:
+        """Keep a scan that has arrived. Called by one thread, the other methods by another."""
+        now_s = time.monotonic()
+        self._deadline.on_sample(now_s)
+        self._waiting.append((scan, now_s + _TIMEOUT_S))
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether the sensor has missed its deadline."""
+        return self._deadline.is_missed(time.monotonic())
+
+    @property
+    def frame(self) -> str | None:
+        """The frame of the newest scan."""
+        newest = self._waiting[0][0] if self._waiting else self._scans[-1] if self._scans else None
+        return None if newest is None else newest.frame
+
+    def settle(self, buffer: TransformBuffer, target: str) -> None:
+        """Keep the scans whose last ray has a pose in ``target`` by now, and drop those that are too late."""
+        while self._waiting:
+            scan, deadline_s = self._waiting[0]
+            self.reason = reason = buffer.explain(target, scan.frame, scan.end_stamp)
+            if reason is None:
+                self._keep(scan)
+            elif time.monotonic() < deadline_s:
+                self.reason = None
+                return
+            else:
+                self.dropped += 1
+            self._waiting.popleft()
+
+    def _keep(self, scan: Scan) -> None:
+        if self._scans and scan.stamp < self._scans[-1].stamp - _TIME_JUMP_NS:
+            self._scans.clear()  # the clock was set back, or a replay has begun again
+        self._scans.append(scan)
+        while len(self._scans) * len(scan.ranges) > _MAX_RAYS and len(self._scans) > 1:
+            self._scans.popleft()
+
+    def latest(self, count: int, at: int | None = None) -> Sequence[Scan]:
+        """The last ``count`` scans that ended until ``at`` [ns]; None: of all. The oldest first."""
+        found: list[Scan] = []
+        for scan in reversed(self._scans):
+            if len(found) == count:
+                break
+            if at is None or scan.end_stamp <= at:
+                found.append(scan)
+        return found[::-1]
+
+
+class WorldSource(Closeable):
+    """Receives the scans of all robots, or of ``robots`` only, and all maps; nothing without a ``session``.
+
+    ``maps`` and ``sensors`` are by the names of their writers; a map that is withdrawn is removed from
+    ``maps``. ``refused`` counts messages that are no scan or map, by reason; the first of each is logged.
+    """
+
+    def __init__(self, session: Session | None, robots: Sequence[str] = (), wire: str = "native") -> None:
+        self._selected = frozenset(robots)
+        self._wire = get_wire(wire)
+        self._lock = fork_safe_lock()
+        self._sensors: dict[WriterName, SensorScans] = {}
+        self._maps: dict[str, tuple[WriterName, Grid]] = {}
+        self._refusals = Refusals()
+        self.refused: Mapping[str, int] = self._refusals.counts
+        with ExitStack() as opening:
+            if session is not None:
+                robot = robots[0] if len(robots) == 1 else ANY
+                count = self._refusals.count
+                scans = subscribe(session, self._wire, robot, "scan", self._on_scans, on_error=count)
+                opening.enter_context(scans)
+                maps = subscribe(
+                    session,
+                    self._wire,
+                    ANY,
+                    "map",
+                    self._on_maps,
+                    on_error=count,
+                    on_withdrawn=self._on_withdrawn,
+                )
+                opening.enter_context(maps)
+                for announcement in announce_reader(session, self._wire, robot, ("scan", "map")):
+                    opening.enter_context(announcement)
+            self._opened = opening.pop_all()
+
+    @property
+    def maps(self) -> Mapping[WriterName, Grid]:
+        """The newest map of each writer."""
+        with self._lock:
+            return dict(self._maps.values())
+
+    @property
+    def sensors(self) -> Mapping[WriterName, SensorScans]:
+        """The scans of each sensor."""
+        with self._lock:
+            return dict(self._sensors)
+
+    def _on_scans(self, received: list[Received]) -> None:
+        for robot, key, message in received:
+            if self._selected and robot not in self._selected:
+                continue
+            try:
+                assert isinstance(message, LaserScan)
+                self._scans_of(self._writer(robot, key)).add(scan_from_message(message, robot))
+            except InvalidInput as error:
+                self._refusals.count("malformed scan", f"{shortened(key)}: {error}")
+
+    def _scans_of(self, sensor: WriterName) -> SensorScans:
+        with self._lock:
+            if sensor not in self._sensors and len(self._sensors) >= _MAX_WRITERS:
+                raise InvalidInput(f"there are more than {_MAX_WRITERS} sensors")
+            return self._sensors.setdefault(sensor, SensorScans())
+
+    def _on_maps(self, received: list[Received]) -> None:
+        for robot, key, message in received:
+            try:
+                assert isinstance(message, OccupancyGrid)
+                self._set_map(key, self._writer(robot, key), grid_from_message(message, robot))
+            except InvalidInput as error:  # noqa: PERF203 - the other maps are still drawn
+                self._refusals.count("malformed map", f"{shortened(key)}: {error}")
+
+    def _set_map(self, key: str, name: WriterName, grid: Grid) -> None:
+        with self._lock:
+            if key not in self._maps and len(self._maps) >= _MAX_WRITERS:
+                raise InvalidInput(f"there are more than {_MAX_WRITERS} maps")
+            self._maps[key] = name, grid
+
+    def _on_withdrawn(self, key: str) -> None:
+        with self._lock:
+            self._maps.pop(key, None)
+
+    def _writer(self, robot: str, key: str) -> WriterName:
+        return WriterName(robot, self._wire.edge_writer_name(key) or "")
+
+    def close(self) -> None:
+        """Stop listening. A second call does nothing."""
+        self._opened.close()
