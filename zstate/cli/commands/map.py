@@ -48,7 +48,7 @@ def map_command(
     zstate map hall.yaml
     zstate static hall/map r1/odom --xyz 2 1 0          # r1 is in the hall
     zstate map floor2.yaml --name hall --writer floor2
-    zstate map slam.yaml --name r1                      # the map that r1 has made, in r1/map
+    zstate map slam.yaml --name r1                      # made by r1, in r1/map
     zstate map hall.yaml --wire ros2                    # /map, for rviz2 and nav2
     """
     from zstate.clock import wait_interruptible

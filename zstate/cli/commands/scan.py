@@ -83,7 +83,7 @@ def scan_command(
     zstate scan diffbot --frame lidar_link --simulate hall.yaml
     zstate scan r1 --frame laser --simulate hall.yaml --map-frame hall/map
     zstate scan r1 --frame laser --dummy --sensor front
-    zstate scan rrbot --frame hokuyo_link --dummy --wire ros2       # /scan
+    zstate scan rrbot --frame lower --dummy --wire ros2    # /scan
     """
     from zstate.cli.commands.publish import run_publisher
     from zstate.scans import ScanPublisher, SimulatedLaser, load_map
