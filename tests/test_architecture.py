@@ -398,11 +398,11 @@ class Ratchet:
 RATCHETS = (
     Ratchet("dialect words", dialect_words, 10, 150),
     Ratchet("banned methods", banned_methods, 1, 0),
-    Ratchet("single importers", single_importers, 28, 25),
+    Ratchet("single importers", single_importers, 27, 25),
     Ratchet("modules in largest folder", modules_in_largest_folder, 18, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
-    Ratchet("modules", lambda: len(modules()), 250, 270),
-    Ratchet("lines", lines, 49_500, 36_000),  # 40,026 before moving frames, joints as data, several drivers
+    Ratchet("modules", lambda: len(modules()), 254, 270),
+    Ratchet("lines", lines, 50_600, 36_000),  # 40,026 before moving frames, drivers, scans
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
 

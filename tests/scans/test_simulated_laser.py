@@ -201,6 +201,17 @@ def test_tilted_laser_measures_walls_and_the_floor_along_its_rays():
     assert forward == pytest.approx(1.0 / math.cos(math.radians(30.0)))
 
 
+def test_ray_above_the_top_of_a_wall_has_no_echo():
+    # A wall 2.5 m away and 2.5 m high, seen from z = 1 m: its top is atan(1.5 / 2.5) = 31 degrees up.
+    cells = np.zeros((10, 40), int)
+    cells[:, 30:] = 100
+    laser = SimulatedLaser(Grid(cells, 0.1, (0.0, 0.0, 0.0)), angle_min=0.0, ray_count=1)
+    for degrees, distance in ((30.0, 2.5 / math.cos(math.radians(30.0))), (32.0, math.inf)):
+        half = -math.radians(degrees) / 2.0
+        (ahead,) = laser.scan_in_space(0, [(0.5, 0.5, 1.0, 0.0, math.sin(half), 0.0, math.cos(half))]).ranges
+        assert ahead == pytest.approx(distance)
+
+
 def test_level_laser_in_the_plane_of_the_map_measures_no_floor():
     cells = np.zeros((10, 40), int)
     cells[:, 30:] = 100

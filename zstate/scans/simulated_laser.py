@@ -35,6 +35,7 @@ _DUMMY_PERIOD_NS = round(math.pi / 3.0 * 1e9)
 _LEVEL_M = 1e-6
 """A laser up to this height is in the plane of the map, and measures no floor."""
 
+_WALL_HEIGHT_M = 2.5
 _FARTHEST = 1000  # cells; a smaller square is free as well
 
 # The state of all rays while they are cast has these rows; the first five are pairs, along columns and rows.
@@ -97,7 +98,7 @@ class SimulatedLaser:
         """The scan that starts at ``stamp`` [ns] of a laser that may be tilted, as on an arm.
 
         ``poses`` (ray_count, 7), x y z [m], qx qy qz qw, are those of the sensor at each ray, in the grid's
-        frame. Occupied cells are walls without a top; a laser above z = 0 measures a floor there as well.
+        frame. Occupied cells are walls up to z = 2.5 m; a laser above z = 0 measures a floor there as well.
         """
         x, y, z, *rotation = real_numbers(poses, "poses").T
         qx, qy, qz, qw = rotation
@@ -105,6 +106,7 @@ class SimulatedLaser:
         with np.errstate(divide="ignore", invalid="ignore"):  # vertical and level rays
             walls = self.ranges(x, y, np.arctan2(north, east) - self._angles) / np.hypot(east, north)
             floor = np.where((z > _LEVEL_M) & (up < 0.0), -z / up, math.inf)
+            walls[z + walls * up > _WALL_HEIGHT_M] = math.inf
         ranges = np.minimum(walls, floor)
         ranges[ranges > self._rays.range_max] = math.inf
         return replace(self._rays, stamp=stamp, ranges=ranges)
