@@ -164,7 +164,7 @@ def test_samples_that_wait_for_the_model_are_bounded_in_bytes(sessions):
             )
 
         def last_is_waiting() -> bool:
-            with source._changed:
+            with source._lock:
                 return any(len(one.message.positions) == 16 for one in source._undescribed)
 
         until(last_is_waiting)
