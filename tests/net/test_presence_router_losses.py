@@ -1,10 +1,15 @@
-"""Lost routers, distinguished from writers that left."""
+"""Routers that are lost, or do not reply, distinguished from writers that left."""
 
 from __future__ import annotations
 
+import os
+import signal
+
+import pytest
 from helpers.processes import until
 
-from zstate.net.presence import RouterLossDetector, WriterWatch, announce
+from zstate.errors import Unreachable
+from zstate.net.presence import RouterLossDetector, WriterWatch, announce, discover
 from zstate.net.session import connect
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import writer_key
@@ -50,3 +55,22 @@ def test_peers_lose_no_router(sessions):
     with RouterLossDetector(ours) as losses:
         theirs.close()
         assert not losses.lost_recently()
+
+
+def test_discovery_without_the_whole_reply_is_an_error(spawn, free_port, monkeypatch: pytest.MonkeyPatch):
+    """The router answers no more: that is not a network without robots."""
+    monkeypatch.setattr("zstate.net.presence._ALL_TOKENS_WITHIN_S", 0.2)
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    router = spawn(ROUTER, endpoint)
+    router.line()
+    with (
+        connect(mode="client", endpoints=endpoint) as theirs,
+        connect(mode="client", endpoints=endpoint) as ours,
+        announce(theirs, TOKEN),
+    ):
+        assert [robot.name for robot in discover(ours)] == ["r1"]
+        os.kill(router.process.pid, signal.SIGSTOP)
+        with pytest.raises(Unreachable, match=r"discovery is incomplete: 0 announcements in 0.3 s"):
+            discover(ours, 0.3)
+        os.kill(router.process.pid, signal.SIGCONT)
+        assert [robot.name for robot in discover(ours)] == ["r1"]

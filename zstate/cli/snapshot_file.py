@@ -4,42 +4,29 @@ from __future__ import annotations
 
 import json
 import shlex
-import socket
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, cast
 
 import msgspec
 import tomli_w
 
-from zstate import __version__
-from zstate._util.closeable import Closeable
 from zstate.cli.output.console import count_text, fail, print_result, print_status
-from zstate.cli.output.wire_text import messages_for
 from zstate.cli.processes import BackgroundCall
 from zstate.cli.session import SessionOptions
 from zstate.cli.up.toml_file import TomlFile
-from zstate.cli.waiting import ConditionWaiter
 from zstate.clock import SystemClock
-from zstate.errors import ConfigError, InvalidInput, MessageError
-from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, JointType, RobotModel
+from zstate.errors import ConfigError, InvalidInput
+from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import RobotInfo, discover
 from zstate.net.session import Session
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.rate import Rate
-from zstate.sources import JointReading, JointStateListener
-from zstate.sources.joint_state_listener import DescriptionSubscriber
 from zstate.transform import Transform
-from zstate.wire.keys import MODEL_WRITER, check_robot
-from zstate.wire.messages import StaticTransforms, poses_from_block
-from zstate.wire.protocol import SerializedSample
-from zstate.wire.registry import get_wire
+from zstate.wire.keys import check_robot
 
 FORMAT = 1
 _HEADING = "# Robots, by `zstate snapshot save`; `zstate snapshot load FILE` publishes them again.\n"
@@ -197,144 +184,6 @@ def read_snapshot(path: Path) -> Snapshot:
         raise ConfigError(f"{str(path)!r} cannot be read: {error.strerror}", path=str(path)) from None
     except ValueError as error:
         raise ConfigError(f"{path} is not JSON: {error}", path=str(path)) from None
-
-
-def capture(
-    session: Session, network: SessionOptions, robots: Sequence[str], wire: str, timeout_s: float
-) -> Snapshot:
-    """Capture the named robots, or all announced ones, as soon as everything announced has arrived.
-
-    Fails if a robot is not announced; logs what does not arrive within ``timeout_s``.
-    """
-    messages = messages_for(wire)
-    announced = discover(session, wire=wire)
-    selected = [info for info in announced if info.name in robots or not robots]
-    for name in robots:
-        if name not in [info.name for info in selected]:
-            fail(messages.unknown(name, announced))
-    if not selected:
-        fail(messages.announced(announced))
-    with ExitStack() as opened:
-        waiter = ConditionWaiter()
-        captures = [opened.enter_context(_RobotCapture(session, info, wire, waiter)) for info in selected]
-        waiter.wait_for(lambda: not any(one.missing() for one in captures), timeout_s)
-        for one in captures:
-            for text in one.missing():
-                print_status(f"{one.info.name}: {text} within {timeout_s:g} s", robot=one.info.name)
-        saved = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
-        config = network.config if isinstance(network.config, str) else None
-        endpoints = (network.connect, network.listen, config)
-        return Snapshot(
-            FORMAT,
-            saved,
-            Configuration(__version__, socket.gethostname(), network.joins_as, wire, *endpoints),
-            tuple(robot for one in captures if (robot := one.robot()) is not None),
-            tuple(edge for one in captures for edge in one.static_edges()),
-        )
-
-
-class _RobotCapture(Closeable):
-    """Collects the model, the newest joint state and the static edges of one robot."""
-
-    def __init__(self, session: Session, info: RobotInfo, wire: str, waiter: ConditionWaiter) -> None:
-        self.info = info
-        self._session, self._waiter = session, waiter
-        self._wire_name, self._wire = wire, get_wire(wire)
-        self._model: RobotModel | None = None
-        self._source: JointStateListener | None = None
-        self._reading: JointReading | None = None
-        self._statics: dict[str, StaticTransforms] = {}
-        self._opened = ExitStack()
-        self._opened.enter_context(DescriptionSubscriber(session, info.name, self._on_model, wire))
-        key = self._wire.expression(info.name, "tf_static")
-        self._opened.enter_context(LatchedSubscriber(session, key, self._on_statics))
-
-    def close(self) -> None:
-        self._opened.close()
-        if self._source is not None:
-            self._source.close()
-
-    def _on_model(self, _: str, model: RobotModel) -> None:
-        if self._source is not None:
-            self._source.close()
-        self._model = model
-        self._source = JointStateListener(
-            self._session,
-            self.info.name,
-            model,
-            wire=self._wire_name,
-            on_reading=lambda _: self._waiter.notify(),
-        )
-        self._waiter.notify()
-
-    def _on_statics(self, arrival: SerializedSample) -> None:
-        try:
-            writer = self._wire.edge_writer_name(arrival.key) or arrival.key
-            if not arrival.payload or writer == MODEL_WRITER:
-                self._statics.pop(writer, None)  # the model has the same edges
-            else:
-                for message in self._wire.decode("tf_static", arrival, self.info.name):
-                    if isinstance(message, StaticTransforms):
-                        name = f"{writer}.{message.session:08x}" if self._wire.shared else writer
-                        self._statics[name] = message
-        except (InvalidInput, MessageError) as error:
-            print_status(f"{arrival.key}: {error}")
-        self._waiter.notify()
-
-    def missing(self) -> list[str]:
-        streams = {stream for stream, _ in self.info.writers}
-        if self._source is not None:
-            self._reading = self._source.read(0) or self._reading
-        static_names = {name for name, _ in self.info.static_names} - {MODEL_WRITER}
-        conditions = {
-            "its model has not arrived": "robot_description" in streams and self._model is None,
-            "no joint states have arrived": "joint_states" in streams and self._reading is None,
-            "not all of its static edges have arrived": bool(static_names - self._statics.keys()),
-        }
-        return [text for text, is_missing in conditions.items() if is_missing]
-
-    def robot(self) -> RobotSnapshot | None:
-        model, reading = self._model, self._reading
-        if model is None:
-            return None
-        writers = tuple(sorted(f"{stream}: {writer}" for stream, writer in self.info.writers))
-        snapshot = RobotSnapshot(name=self.info.name, urdf=model.urdf, writers=writers)
-        if reading is None:
-            return snapshot
-        return msgspec.structs.replace(
-            snapshot,
-            stamp=reading.stamp,
-            positions=_by_joint(model, reading.positions, POSITION_COUNTS),
-            velocities=_by_joint(model, reading.velocities, VELOCITY_COUNTS),
-            efforts=_by_joint(model, reading.efforts, VELOCITY_COUNTS),
-        )
-
-    def static_edges(self) -> list[StaticTransformSnapshot]:
-        """The static edges that are not in the model."""
-        links = set[str]() if self._model is None else set(self._model.links)
-        return [
-            StaticTransformSnapshot(
-                self.info.name,
-                writer,
-                target,
-                source,
-                cast("tuple[float, float, float]", tuple(pose[:3].tolist())),
-                cast("tuple[float, float, float, float]", tuple(pose[3:].tolist())),
-            )
-            for writer, message in sorted(self._statics.items())
-            for (target, source), pose in zip(message.edges, poses_from_block(message.poses), strict=True)
-            if source not in links
-        ]
-
-
-def _by_joint(model: RobotModel, numbers: Any, counts: Mapping[JointType, int]) -> Numbers:
-    named: Numbers = {}
-    if numbers is not None:
-        rest = [float(number) for number in numbers]
-        for joint in model.driven_joints:
-            values, rest = rest[: counts[joint.type]], rest[counts[joint.type] :]
-            named[joint.name] = values[0] if len(values) == 1 else tuple(values)
-    return named
 
 
 def publish_snapshot(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from zstate._util.closeable import Closeable
-from zstate.errors import NetworkError
+from zstate.errors import NetworkError, Unreachable
 from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
 from zstate.net.status import StatusSubscriber
@@ -187,6 +187,8 @@ class GraphMonitor(Closeable):
             try:
                 robots = discover(self._session, _DISCOVERY_TIMEOUT_S)
                 graph = build_graph(robots, discover_readers(self._session, _DISCOVERY_TIMEOUT_S))
+            except Unreachable:
+                continue
             except NetworkError:
                 return
             # The process of this monitor may itself read all robots, which is no stream of a robot.

@@ -22,7 +22,7 @@ import zenoh
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, Unreachable
 from zstate.net.queryable import MAX_REPLIES, check_timeout, query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
@@ -121,6 +121,8 @@ def discover(session: Session, timeout_s: float = 1.0, *, wire: str = "native") 
 
     A session that has just connected has not discovered all others yet: queries until two replies in a row,
     a tenth of a second apart, have the same writers; without any writer for ``timeout_s`` [s].
+
+    Raises Unreachable if Zenoh has not received the whole reply within 5 s, or ``timeout_s`` if that is more.
     """
     format_ = get_wire(wire)
     tokens = discover_tokens(session, format_.writers_expression(ANY), timeout_s)
@@ -140,28 +142,39 @@ def discover_readers(session: Session, timeout_s: float = 1.0) -> tuple[Announce
 
 
 def discover_tokens(session: Session, expression: str, timeout_s: float = 1.0) -> frozenset[str]:
-    """The liveliness tokens that match ``expression``, queried like ``discover``."""
+    """The liveliness tokens that match ``expression``, queried like ``discover``. Raises Unreachable."""
     deadline = time.monotonic() + check_timeout(timeout_s)
     found = last = frozenset[str]()
+    is_complete = True
     while (remaining_s := deadline - time.monotonic()) > 0.0:
         # Thousands of tokens take a moment: no query is cut short.
         within_s, start_s = max(remaining_s, _ALL_TOKENS_WITHIN_S), time.monotonic()
-        tokens = current_tokens(session, expression, within_s)
+        tokens, is_complete = query_tokens(session.zenoh, expression, within_s)
         if tokens and tokens == found:
             break
-        if time.monotonic() - start_s >= within_s:
+        if not is_complete:
             found |= tokens
         elif tokens or not last:  # one reply without tokens may be wrong; two are not
             found = tokens
         last = tokens
         now_s = time.monotonic()
         time.sleep(max(0.0, min(start_s + ROUND_S, deadline) - now_s))
+    if not is_complete:
+        waited_s = max(timeout_s, _ALL_TOKENS_WITHIN_S)
+        raise Unreachable(
+            f"discovery is incomplete: {len(found)} announcements in {waited_s:g} s, and then no end of the "
+            "reply; this host, its router or the link between them is overloaded: try again",
+            endpoints=(),
+        )
     return found
 
 
 def current_tokens(session: Session, expression: str, timeout_s: float) -> frozenset[str]:
-    """The liveliness tokens known to the routers or peers of this session; waits up to ``timeout_s`` [s]."""
-    return frozenset(query_tokens(session.zenoh, expression, timeout_s))
+    """The liveliness tokens known to the routers or peers of this session; waits up to ``timeout_s`` [s].
+
+    After a timeout these are only those that arrived.
+    """
+    return query_tokens(session.zenoh, expression, timeout_s).keys
 
 
 def confirmed_tokens(session: Session, expression: str) -> frozenset[str]:

@@ -77,11 +77,27 @@ def query(
     return _bounded(replies, selector)
 
 
-def query_tokens(session: zenoh.Session, expression: str, timeout_s: float) -> Iterator[str]:
-    """The keys of the liveliness tokens that match ``expression``. Sent at once, like ``query``."""
+class Tokens(NamedTuple):
+    """Keys of liveliness tokens; not all of them if the query timed out (``is_complete`` is False)."""
+
+    keys: frozenset[str]
+    is_complete: bool
+
+
+def query_tokens(session: zenoh.Session, expression: str, timeout_s: float) -> Tokens:
+    """The keys of the liveliness tokens that match ``expression``; waits up to ``timeout_s`` [s].
+
+    Raises ZError if the session is closed.
+    """
     channel: _Channel = zenoh.handlers.FifoChannel(_NEVER_FULL)
-    replies = _bounded(session.liveliness().get(expression, channel, timeout=timeout_s), expression)
-    return (str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+    keys: set[str] = set()
+    is_complete = True
+    for reply in _bounded(session.liveliness().get(expression, channel, timeout=timeout_s), expression):
+        if reply.ok is not None:
+            keys.add(str(reply.ok.key_expr))
+        else:  # Zenoh's own reply at the timeout
+            is_complete = False
+    return Tokens(frozenset(keys), is_complete)
 
 
 def _bounded(replies: Iterable[zenoh.Reply], selector: str) -> Iterator[zenoh.Reply]:

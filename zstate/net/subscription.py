@@ -47,19 +47,21 @@ def decode_samples(
 def subscribe(
     session: Session,
     wire: Wire,
-    robot: str,
+    robots: str | Sequence[str],
     stream: Stream,
     on_messages: Callable[[list[Received]], object],
     *,
     on_error: Callable[[str, str], object] | None = None,
     on_withdrawn: Callable[[str], object] | None = None,
 ) -> StreamSubscriber | LatchedSubscriber:
-    """Subscribe to ``stream`` of ``robot``, or of all robots with ``"*"``.
+    """Subscribe to ``stream`` of a robot, of several, or of all robots with ``"*"``: with the same threads.
 
     ``on_messages`` is called from one thread of the subscription with the messages of each batch, oldest
     first; ``on_error(reason, text)`` for each payload that cannot be decoded; ``on_withdrawn(key)`` if a
     latched value is withdrawn.
     """
+    names = (robots,) if isinstance(robots, str) else robots
+    robot = names[0] if len(names) == 1 else ANY
 
     def on_samples(samples: Sequence[SerializedSample]) -> None:
         if messages := list(decode_samples(wire, robot, stream, samples, on_error)):
@@ -72,7 +74,7 @@ def subscribe(
         elif on_withdrawn is not None:
             on_withdrawn(sample.key)
 
-    key = wire.expression(robot, stream)
+    keys = [wire.expression(name, stream) for name in names]
     if stream in LATCHED_STREAMS:
-        return LatchedSubscriber(session, key, on_value)
-    return StreamSubscriber(session, key, on_samples)
+        return LatchedSubscriber(session, keys, on_value)
+    return StreamSubscriber(session, keys, on_samples)

@@ -177,7 +177,7 @@ def check_may_write(session: Session, robot: str, token: str) -> None:
             return
         deadline = time.monotonic() + _PERMISSION_TIMEOUT_S
         while time.monotonic() < deadline:
-            if any(query_tokens(other, token, _PERMISSION_TIMEOUT_S)):
+            if query_tokens(other, token, _PERMISSION_TIMEOUT_S).keys:
                 return
             time.sleep(_PERMISSION_ROUND_S)
     raise AccessDenied(

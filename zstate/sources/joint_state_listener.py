@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 
 from zstate._util.bounded import BoundedQueue
@@ -23,6 +23,7 @@ from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.sources.joint_state_merger import JointStateMerger
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, RobotDescription, message_size
+from zstate.wire.protocol import Wire
 from zstate.wire.registry import get_wire
 
 _LOG = logging.getLogger("zstate")
@@ -32,6 +33,68 @@ MAX_AGE_S = 0.5
 
 # Samples kept for a slow reader, or until the model is known.
 _CAPACITY = 1024
+
+
+class JointStateReader:
+    """Computes readings of all joints of ``robot`` from its messages of whole or partial joint states.
+
+    ``max_age_s`` and incomplete readings are those of ``JointStateListener``. ``on_error(reason, text)`` is
+    called for each unusable message.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        model: RobotModel,
+        wire: Wire,
+        max_age_s: float,
+        on_error: Callable[[str, object], object],
+    ) -> None:
+        self.model = model
+        self.newest: JointReading | None = None
+        """The last reading so far."""
+        self._robot = robot
+        self._on_error = on_error
+        self._is_shared = bool(wire.shared)
+        self._whole_key = wire.expression(robot, "joint_states")
+        self._validator = JointStateValidator(model)
+        self._merger = JointStateMerger(model, max_age_s, others=self._is_shared)
+        self._explained: set[tuple[str, ...]] = set()
+
+    @property
+    def incomplete(self) -> int:
+        """How many messages of some joints gave no reading, because of other joints."""
+        return self._merger.incomplete
+
+    def readings(self, received: Iterable[Received]) -> list[JointReading]:
+        """The reading of each usable message, in their order."""
+        readings = [reading for one in received if (reading := self._reading(one))]
+        if readings:
+            self.newest = readings[-1]
+        return readings
+
+    def _reading(self, received: Received) -> JointReading | None:
+        state = received.message
+        assert isinstance(state, JointState)
+        try:
+            if self._is_shared:
+                if not self._merger.has_all_joints(state):
+                    return self._merged(state, f"the ROS node of session {state.session:016x}")
+            elif received.key != self._whole_key:
+                return self._merged(state, repr(received.key.rpartition("/")[2]))
+            return JointReading(*self._validator.read(state), stamp=state.stamp)
+        except (MessageError, InvalidInput) as error:
+            reason = error.reason if isinstance(error, MessageError) else "bad numbers"
+            self._on_error(reason, error)
+            return None
+
+    def _merged(self, state: JointState, writer: str) -> JointReading | None:
+        merger = self._merger
+        reading = merger.add(state, writer)
+        if reading is None and (missing := merger.missing_joints()) and missing not in self._explained:
+            self._explained.add(missing)
+            _LOG.warning("%s: no whole joint states: %s", self._robot, merger.explanation())
+        return reading
 
 
 class JointStateListener(Closeable):
@@ -70,13 +133,9 @@ class JointStateListener(Closeable):
         self.robot = robot
         self._refusals = Refusals("joint_states")
         self.refused: dict[str, int] = self._refusals.counts
-        self._model = model
         self._max_age_s = max_age_s
         self._wire = get_wire(wire)
-        self._whole_key = self._wire.expression(robot, "joint_states")
-        self._validator: JointStateValidator | None = None
-        self._merger: JointStateMerger | None = None
-        self._explained: set[tuple[str, ...]] = set()
+        self._reader: JointStateReader | None = None
         self._undescribed: BoundedQueue[Received] = BoundedQueue(_CAPACITY, EARLY_BYTES)
         self._unread: Inbox[JointReading] = Inbox(_CAPACITY, session.check)
         self._lock = fork_safe_lock()
@@ -102,36 +161,37 @@ class JointStateListener(Closeable):
     @property
     def model(self) -> RobotModel | None:
         """The model of the robot; None before its description has arrived."""
-        return self._model
+        return None if self._reader is None else self._reader.model
 
     @property
     def incomplete(self) -> int:
         """How many samples of drivers of some joints gave no reading, because of other joints."""
-        return 0 if self._merger is None else self._merger.incomplete
+        return 0 if self._reader is None else self._reader.incomplete
 
-    def _set_model(self, model: RobotModel) -> None:
-        self._model, self._validator = model, JointStateValidator(model)
-        self._merger = JointStateMerger(model, self._max_age_s, others=bool(self._wire.shared))
+    def _set_model(self, model: RobotModel) -> JointStateReader:
+        on_error = self._refusals.count
+        self._reader = JointStateReader(self.robot, model, self._wire, self._max_age_s, on_error)
+        return self._reader
 
     def _on_description(self, _: str, model: RobotModel) -> None:
         with self._lock:
-            self._set_model(model)
+            reader = self._set_model(model)
             undescribed = list(self._undescribed)
             self._undescribed.clear()
-            readings = self._add(undescribed)  # before samples that arrive now
+            readings = self._add(reader, undescribed)  # before samples that arrive now
         self._call_back(readings)
 
     def _on_messages(self, received: list[Received]) -> None:
         with self._lock:
-            if self._validator is None:
+            if self._reader is None:
                 for one in received:
                     self._undescribed.append(one, message_size(one.message))
                 return
-            readings = self._add(received)
+            readings = self._add(self._reader, received)
         self._call_back(readings)
 
-    def _add(self, received: list[Received]) -> list[JointReading]:
-        readings = [reading for one in received if (reading := self._reading(one))]
+    def _add(self, reader: JointStateReader, received: list[Received]) -> list[JointReading]:
+        readings = reader.readings(received)
         self._unread.add(readings)
         return readings
 
@@ -139,30 +199,6 @@ class JointStateListener(Closeable):
         if self._on_reading is not None:
             for reading in readings:
                 self._on_reading(reading)
-
-    def _reading(self, received: Received) -> JointReading | None:
-        state, validator, merger = received.message, self._validator, self._merger
-        assert isinstance(state, JointState)
-        assert validator is not None
-        assert merger is not None
-        try:
-            if self._wire.shared:
-                if not merger.has_all_joints(state):
-                    return self._merged(merger, state, f"the ROS node of session {state.session:016x}")
-            elif received.key != self._whole_key:
-                return self._merged(merger, state, repr(received.key.rpartition("/")[2]))
-            return JointReading(*validator.read(state), stamp=state.stamp)
-        except (MessageError, InvalidInput) as error:
-            reason = error.reason if isinstance(error, MessageError) else "bad numbers"
-            self._refusals.count(reason, error)
-            return None
-
-    def _merged(self, merger: JointStateMerger, state: JointState, writer: str) -> JointReading | None:
-        reading = merger.add(state, writer)
-        if reading is None and (missing := merger.missing_joints()) and missing not in self._explained:
-            self._explained.add(missing)
-            _LOG.warning("%s: no whole joint states: %s", self.robot, merger.explanation())
-        return reading
 
     def read(self, stamp: int) -> JointReading | None:
         """The newest reading, independent of ``stamp``; None if none arrived since the last call.
@@ -184,7 +220,7 @@ class JointStateListener(Closeable):
 
 
 class DescriptionSubscriber(Closeable):
-    """Subscriber of the ``robot_description`` of ``robot`` ("*": of all robots), earlier ones included.
+    """Subscriber of the ``robot_description`` of a robot, of several or of all ("*"), earlier ones included.
 
     ``on_description(robot, model)`` is called from one thread with the first model of a robot, and
     with each replacement. ``refused`` counts unusable descriptions by reason; the first of each reason is
@@ -194,7 +230,7 @@ class DescriptionSubscriber(Closeable):
     def __init__(
         self,
         session: Session,
-        robot: str,
+        robots: str | Sequence[str],
         on_description: Callable[[str, RobotModel], object],
         wire: str = "native",
     ) -> None:
@@ -205,7 +241,7 @@ class DescriptionSubscriber(Closeable):
         self._subscriber = subscribe(
             session,
             get_wire(wire),
-            robot,
+            robots,
             "robot_description",
             self._on_messages,
             on_error=self._refusals.count,

@@ -44,7 +44,7 @@ def save_command(
     zstate snapshot save cell.toml
     zstate snapshot save - panda | less
     """
-    from zstate.cli.snapshot_file import capture
+    from zstate.cli.snapshot_capture import capture
 
     path = Path(file)
     if file != "-" and path.exists() and not force:

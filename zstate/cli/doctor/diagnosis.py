@@ -74,7 +74,12 @@ def diagnosis(network: SessionOptions, robot: str, wire: str, timeout_s: float) 
         except click.ClickException as error:
             yield broken("network", error.format_message(), "zstate router --ros2")
             return
-        robots = discover(session, wire=wire)
+        incomplete: Unreachable | None = None
+        robots: tuple[RobotInfo, ...] = ()
+        try:
+            robots = discover(session, wire=wire)
+        except Unreachable as error:
+            incomplete = error
         # After discovery: this check counts the links that discovery had time to establish.
         check = _network_check(session, network.for_wires((wire,)))
         yield check
@@ -82,6 +87,9 @@ def diagnosis(network: SessionOptions, robot: str, wire: str, timeout_s: float) 
             return
         if access := _access_check(session, network, robot):
             yield access
+        if incomplete:
+            yield broken("robots", str(incomplete), "zstate doctor")
+            return
         selected = [info for info in robots if robot in (ANY, info.name)]
         if is_ros(wire) and messages_for(wire).robot:
             selected = list(robots)  # at most one, which has no name in ROS

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate.cli.waiting import ConditionWaiter
+from zstate.errors import Unreachable
 from zstate.ingest.events import WriterEvent
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.clock_offset import MeasuredOffset
@@ -278,7 +279,10 @@ class RobotProbe(Closeable):
                 self.unresponsive.add(writer)
 
     def _is_announced(self, writer: WriterId) -> bool:
-        robots = discover(self._session, _REPLY_WITHIN_S)
+        try:
+            robots = discover(self._session, _REPLY_WITHIN_S)
+        except Unreachable:
+            return True
         return any(writer == one for robot in robots for _, one in robot.writers)
 
 
