@@ -401,7 +401,7 @@ RATCHETS = (
     Ratchet("single importers", single_importers, 27, 25),
     Ratchet("modules in largest folder", modules_in_largest_folder, 18, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
-    Ratchet("modules", lambda: len(modules()), 254, 270),
+    Ratchet("modules", lambda: len(modules()), 256, 270),
     Ratchet("lines", lines, 50_800, 36_000),  # 40,026 before moving frames, drivers, scans
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
