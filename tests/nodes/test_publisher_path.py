@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from helpers.processes import until
 from helpers.robots import RRBOT, STAMP, SampleCollector, wait_for_reader
 
-from zstate.clock import ManualClock
+from zstate.clock import ManualClock, SystemClock
 from zstate.errors import Closed, InvalidInput
 from zstate.extension import kernel
 from zstate.model.load import load_model
@@ -141,6 +142,67 @@ def test_another_clock_gives_the_stamp(sessions):
         publisher.publish(POSITIONS)
         assert publisher.cache is not None
         assert publisher.cache.since(1)[0].stamp == STAMP + 5
+
+
+class ClockAhead(SystemClock):
+    def now(self) -> int:
+        return super().now() + 10**12
+
+
+def test_a_clock_that_adjusts_the_system_time_gives_the_stamp(sessions):
+    with open_publisher(sessions[0], clock=ClockAhead()) as publisher:
+        before = time.time_ns()
+        publisher.publish(POSITIONS)
+        assert publisher.cache is not None
+        assert publisher.cache.since(1)[0].stamp >= before + 10**12
+
+
+class CallingHandler(logging.Handler):
+    """Calls ``function`` with each record."""
+
+    def __init__(self, function: Callable[[], object]) -> None:
+        super().__init__()
+        self._function = function
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._function()
+
+
+@pytest.fixture
+def on_warning() -> Iterator[Callable[[Callable[[], object]], None]]:
+    """``on_warning(function)``: the function is called when zstate logs a warning."""
+    handlers: list[logging.Handler] = []
+
+    def add(function: Callable[[], object]) -> None:
+        handlers.append(CallingHandler(function))
+        logging.getLogger("zstate").addHandler(handlers[-1])
+
+    yield add
+    for handler in handlers:
+        logging.getLogger("zstate").removeHandler(handler)
+
+
+def test_a_log_handler_may_publish_and_close(sessions, on_warning):
+    with open_publisher(sessions[0], LIFT) as publisher:
+        on_warning(lambda: (publisher.publish([0.0]), publisher.close()))
+        publisher.publish([3.0])
+        assert publisher.stats.sent == 3
+        with pytest.raises(Closed):
+            publisher.publish([0.0])
+
+
+def test_a_number_is_not_used_again_after_a_log_handler_failed(sessions, on_warning):
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    on_warning(fail)
+    with StatePublisher(sessions[0], LIFT, "r1", takeover=True) as publisher:
+        with pytest.raises(ZeroDivisionError):
+            publisher.publish([3.0], stamp=STAMP)
+        publisher.publish([0.0], stamp=STAMP + 1)
+        publisher.publish([0.0], stamp=STAMP + 2)
+        assert publisher.cache is not None
+        assert [sample.seq for sample in publisher.cache.since(0)] == [0, 1, 2]
 
 
 @pytest.mark.parametrize(

@@ -301,16 +301,19 @@ def test_clock_an_hour_ahead_and_back_is_logged_and_followed_without_effect_on_o
 @FOLLOW
 def test_clock_set_back_by_less_than_the_history_starts_a_new_history_of_that_robot(sessions, caplog, follow):
     writer, reader = sessions
-    clock = ManualClock(NOW)
-    with (
-        caplog.at_level(logging.WARNING, "zstate"),
-        StatePublisher(writer, RRBOT, "r1", clock=clock) as stepping,
-        StatePublisher(writer, RRBOT, "r2", clock=ManualClock(NOW)) as steady,
-        TransformListener(reader, follow=follow, clock=ManualClock(NOW), history_s=10.0) as listener,
-    ):
+    clock = ManualClock(NOW - 10 * MS)
+    with ExitStack() as opened:
+        opened.enter_context(caplog.at_level(logging.WARNING, "zstate"))
+        stepping = opened.enter_context(StatePublisher(writer, RRBOT, "r1", clock=clock))
+        steady = opened.enter_context(StatePublisher(writer, RRBOT, "r2", clock=ManualClock(NOW)))
+        stepping.publish([0.0, 0.0])
+        listener = opened.enter_context(
+            TransformListener(reader, follow=follow, clock=ManualClock(NOW), history_s=10.0)
+        )
         buffer = listener.buffer
         wait_for_stream_readers(writer, "r1", follow)
         wait_for_stream_readers(writer, "r2", follow)
+        until(lambda: listener.stats_of("r1").recalled == 1)  # the writer's history has arrived
         steady.publish([0.5, 0.5])
         for number, stamp in enumerate((0, 10, 20, 30, -5_000, -4_990, -4_980)):
             clock.set(NOW + stamp * MS)

@@ -43,7 +43,11 @@ class _IngestLock:
 
     def __enter__(self) -> None:
         self._lock.acquire()
-        self._stop_fast_path()
+        try:
+            self._stop_fast_path()
+        except BaseException:
+            self._lock.release()
+            raise
 
     def __exit__(self, *_: object) -> None:
         self._lock.release()

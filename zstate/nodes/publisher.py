@@ -228,7 +228,7 @@ class StatePublisher(SamplePublisher):
             writers[0].zenoh_put,
             *JointLimits(self.model).bounds(self.model.position_count),
             None if self._limits is None else self._limits.add_outside,
-            isinstance(self._clock, SystemClock),
+            type(self._clock) is SystemClock,
         )
         writers[0].path = path
         if self._claim is not None:
@@ -288,7 +288,12 @@ class StatePublisher(SamplePublisher):
         a unit quaternion, and a stamp that a wire cannot represent; SecondWriter; and Closed. If it raises,
         nothing was sent.
         """
-        if self._path is not None and self._path.publish(positions, velocities, efforts, stamp):
+        path = self._path
+        if (
+            path is not None
+            and self._session.is_usable
+            and path.publish(positions, velocities, efforts, stamp)
+        ):
             return
         try:
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
@@ -328,7 +333,7 @@ class StatePublisher(SamplePublisher):
 
     def _stop_path(self) -> int:
         """Wait for the end of a call of the path in another thread. Returns the next sequence number."""
-        return self._seq if self._path is None else self._path.stop()
+        return self._seq if self._path is None else max(self._seq, self._path.stop())
 
     def _resume_path(self) -> None:
         """Publish the next samples in one call each, while joint states are all that is sent."""
@@ -336,9 +341,13 @@ class StatePublisher(SamplePublisher):
             return
         self._path.resume(self._seq)
         # Checked after that: what changes now pauses the path.
-        is_owner = self._claim is None or self._claim.is_settled
-        if not is_owner or any(writer.has_readers for writer in self._transforms):
-            self._path.pause()
+        is_alone = False
+        try:
+            is_owner = self._claim is None or self._claim.is_settled
+            is_alone = is_owner and not any(writer.has_readers for writer in self._transforms)
+        finally:
+            if not is_alone:
+                self._path.pause()
 
     @property
     def _sent(self) -> int:

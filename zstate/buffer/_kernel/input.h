@@ -28,9 +28,12 @@ get_items(PyObject *object, Py_buffer *view, const char *formats, int flags)
     if (PyObject_GetBuffer(object, view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | flags) < 0)
         return -1;
     const char *format = view->format != NULL ? view->format : "B";
-    if (view->itemsize == 8 && strlen(format) == 1 && strchr(formats, format[0]) != NULL)
+    bool is_aligned = (uintptr_t)view->buf % 8 == 0 || view->len == 0;
+    if (view->itemsize == 8 && strlen(format) == 1 && strchr(formats, format[0]) != NULL &&
+        is_aligned)
         return 0;
-    PyErr_Format(PyExc_ValueError, "a buffer of format %s is wanted, not '%s'", formats, format);
+    PyErr_Format(PyExc_ValueError, "an aligned buffer of format %s is wanted, not '%s'", formats,
+                 format);
     PyBuffer_Release(view);
     return -1;
 }

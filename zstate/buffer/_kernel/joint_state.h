@@ -190,7 +190,7 @@ copy_sequence(PyObject *sequence, Row *row, Py_ssize_t count)
     return row->copy != NULL;
 }
 
-/* Only numbers that are not in order are copied, such as a column of a matrix. */
+/* Only numbers that are not in order, such as a column of a matrix, or not aligned are copied. */
 static bool
 read_array(PyObject *array, Row *row, Py_ssize_t count)
 {
@@ -201,7 +201,7 @@ read_array(PyObject *array, Row *row, Py_ssize_t count)
     if (view->ndim != 1 || view->shape[0] != count || strcmp(format, "d") != 0)
         return false;
     row->values = view->buf;
-    if (view->strides[0] == 8 || count == 0)
+    if ((view->strides[0] == 8 && (uintptr_t)view->buf % 8 == 0) || count == 0)
         return true;
     row->values = row->copy = PyMem_New(double, (size_t)count);
     for (Py_ssize_t i = 0; row->copy != NULL && i < count; i++)

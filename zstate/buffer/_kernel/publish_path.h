@@ -23,6 +23,7 @@ typedef struct {
     bool reads_clock;
     bool ready;
     bool busy;
+    unsigned long thread; /* that is, or was last, in publish */
     bool is_awaited;
 } PublishPath;
 
@@ -136,8 +137,13 @@ static bool
 present_time(int64_t *stamp)
 {
     struct timespec now;
+#ifdef _WIN32
     if (timespec_get(&now, TIME_UTC) != TIME_UTC)
         return false;
+#else
+    if (clock_gettime(CLOCK_REALTIME, &now) != 0)
+        return false;
+#endif
     *stamp = (int64_t)now.tv_sec * SECOND_NS + now.tv_nsec;
     return true;
 }
@@ -208,18 +214,18 @@ send_payload(PublishPath *self, int64_t stamp, PyObject *payload)
     return 0;
 }
 
-/* As send_payload, and calls `on_outside` after it; 0 also for a sample that is not a usual one. */
+/* As send_payload; 0 also for a sample that is not a usual one. `outside` receives the payload of a
+ * sample with positions outside limits, on the native wire or as for it. */
 static int
-publish_sample(PublishPath *self, PyObject *const *args)
+publish_sample(PublishPath *self, PyObject *const *args, PyObject **outside)
 {
     Numbers numbers;
     int64_t stamp;
     if (!sample_stamp(self, args[3], &stamp) || !get_numbers(self->encoder, args, &numbers))
         return 0;
-    /* On the native wire, or as for it: what is outside limits is counted in its payloads. */
     PyObject *native = NULL, *ros = NULL;
-    bool outside = are_outside(self, numbers.positions.values);
-    if (self->ros == NULL || outside)
+    bool is_outside = are_outside(self, numbers.positions.values);
+    if (self->ros == NULL || is_outside)
         native = encoder_payload(self->encoder, &numbers, stamp, self->seq);
     if (self->ros != NULL)
         ros = ros_payload(self->ros, &numbers, stamp);
@@ -228,12 +234,8 @@ publish_sample(PublishPath *self, PyObject *const *args)
     PyObject *payload = self->ros == NULL ? native : ros;
     if (result == 0 && payload != NULL)
         result = send_payload(self, stamp, payload);
-    if (result == 1 && outside) {
-        PyObject *counted = PyObject_CallOneArg(self->on_outside, native);
-        if (counted == NULL)
-            result = -1;
-        Py_XDECREF(counted);
-    }
+    if (result == 1 && is_outside)
+        *outside = Py_NewRef(native);
     Py_XDECREF(native);
     Py_XDECREF(ros);
     return result;
@@ -248,12 +250,21 @@ publish_path_publish(PublishPath *self, PyObject *const *args, Py_ssize_t count)
     }
     if (!self->ready || self->busy)
         Py_RETURN_FALSE;
+    PyObject *outside = NULL;
     self->busy = true;
-    int result = publish_sample(self, args);
+    self->thread = PyThread_get_thread_ident();
+    int result = publish_sample(self, args, &outside);
     self->busy = false;
     if (self->is_awaited) {
         self->is_awaited = false;
         PyThread_release_lock(self->ended);
+    }
+    if (outside != NULL) { /* no longer busy: its log handlers may publish or close */
+        PyObject *counted = PyObject_CallOneArg(self->on_outside, outside);
+        Py_DECREF(outside);
+        if (counted == NULL)
+            return NULL;
+        Py_DECREF(counted);
     }
     return result < 0 ? NULL : PyBool_FromLong(result);
 }
@@ -284,6 +295,10 @@ static PyObject *
 publish_path_stop(PublishPath *self, PyObject *Py_UNUSED(none))
 {
     self->ready = false;
+    if (self->busy && self->thread == PyThread_get_thread_ident()) {
+        PyErr_SetString(PyExc_RuntimeError, "publish() called what waits for its own end");
+        return NULL;
+    }
     while (self->busy) {
         self->is_awaited = true;
         Py_BEGIN_ALLOW_THREADS PyThread_acquire_lock(self->ended, WAIT_LOCK);

@@ -112,7 +112,7 @@ put_part(char *at, PyObject *part)
 static char *
 put_spread(const RosJointStateEncoder *self, char *at, const Row *row)
 {
-    static const double unknown = NAN;
+    const double unknown = Py_NAN;
     if (row->values == NULL)
         return at;
     if (self->velocities != self->positions) {
