@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -48,9 +48,10 @@ class SensorScans:
     """The scans of one sensor: those that wait for the pose of their last ray, and the last ones with it.
 
     ``dropped`` counts scans whose pose did not come within a second. ``reason`` is why the newest scan was
-    dropped, None if it was not.
+    dropped, None if it was kept; one that still waits does not count. ``clock`` is a monotonic clock [s].
     """
 
+    clock: Callable[[], float] = time.monotonic
     dropped: int = 0
     reason: LookupFailed | InvalidInput | None = None
     _waiting: deque[tuple[Scan, float]] = field(default_factory=lambda: deque(maxlen=_MAX_WAITING))
@@ -59,14 +60,14 @@ class SensorScans:
 
     def add(self, scan: Scan) -> None:
         """Keep a scan that has arrived. Called by one thread, the other methods by another."""
-        now_s = time.monotonic()
+        now_s = self.clock()
         self._deadline.on_sample(now_s)
         self._waiting.append((scan, now_s + _TIMEOUT_S))
 
     @property
     def is_stale(self) -> bool:
         """Whether the sensor has missed its deadline."""
-        return self._deadline.is_missed(time.monotonic())
+        return self._deadline.is_missed(self.clock())
 
     @property
     def frame(self) -> str | None:
@@ -78,12 +79,12 @@ class SensorScans:
         """Keep the scans whose last ray has a pose in ``target`` by now, and drop those that are too late."""
         while self._waiting:
             scan, deadline_s = self._waiting[0]
-            self.reason = reason = buffer.explain(target, scan.frame, scan.end_stamp)
+            reason = buffer.explain(target, scan.frame, scan.end_stamp)
+            if reason is not None and self.clock() < deadline_s:
+                return
+            self.reason = reason
             if reason is None:
                 self._keep(scan)
-            elif time.monotonic() < deadline_s:
-                self.reason = None
-                return
             else:
                 self.dropped += 1
             self._waiting.popleft()

@@ -1,0 +1,56 @@
+"""SensorScans and WorldSource: what of the network's scans and maps is kept, and what is dropped."""
+
+from __future__ import annotations
+
+import pytest
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.scans import Scan
+from zstate.transform import Transform
+from zstate.view.world_source import SensorScans
+
+MS = 1_000_000
+
+
+class ManualClock:
+    """A monotonic clock that a test sets [s]."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> ManualClock:
+    return ManualClock()
+
+
+@pytest.fixture
+def buffer() -> TransformBuffer:
+    """Poses of the laser from 0 to 10 ms."""
+    buffer = TransformBuffer(history_s=3600.0)
+    for stamp in (0, 10 * MS):
+        buffer.insert(Transform("odom", "r1/laser", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp=stamp))
+    return buffer
+
+
+def scan_at(stamp: int, rays: int = 1) -> Scan:
+    """A scan whose rays are all measured at ``stamp``."""
+    return Scan(stamp, 0.0, 1e-6, 0, [1.0] * rays, 0.1, 10.0, "r1/laser")
+
+
+def test_reason_of_a_dropped_scan_stays_while_a_newer_one_waits(clock: ManualClock, buffer: TransformBuffer):
+    sensor = SensorScans(clock=clock)
+    sensor.add(scan_at(20 * MS))  # after the last pose
+    clock.now_s += 2.0
+    sensor.add(scan_at(21 * MS))
+    sensor.settle(buffer, "odom")
+    assert (sensor.dropped, sensor.latest(5)) == (1, [])
+    assert sensor.reason is not None
+    assert "r1/laser" in str(sensor.reason)
+    sensor.add(scan_at(5 * MS))
+    clock.now_s += 2.0
+    sensor.settle(buffer, "odom")
+    assert (sensor.dropped, sensor.reason) == (2, None)
