@@ -54,3 +54,23 @@ def test_reason_of_a_dropped_scan_stays_while_a_newer_one_waits(clock: ManualClo
     clock.now_s += 2.0
     sensor.settle(buffer, "odom")
     assert (sensor.dropped, sensor.reason) == (2, None)
+
+
+def test_kept_scans_are_bounded_by_number_and_by_rays(buffer: TransformBuffer):
+    few_rays, many_rays = SensorScans(), SensorScans()
+    for _ in range(1100):
+        few_rays.add(scan_at(5 * MS))
+        few_rays.settle(buffer, "odom")
+    assert len(few_rays.latest(2000)) == 1000
+    for rays in (300_000, 300_000, 300_000, 300_000, 1):  # 4 bytes each, of 4 MB
+        many_rays.add(scan_at(5 * MS, rays))
+        many_rays.settle(buffer, "odom")
+    assert [len(scan.ranges) for scan in many_rays.latest(9)] == [300_000, 300_000, 300_000, 1]
+
+
+def test_waiting_scans_are_bounded_by_bytes(buffer: TransformBuffer):
+    sensor = SensorScans()
+    for _ in range(5):
+        sensor.add(scan_at(5 * MS, 300_000))
+    sensor.settle(buffer, "odom")
+    assert len(sensor.latest(9)) == 3

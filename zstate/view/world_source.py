@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from zstate._util.bounded import BoundedQueue
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
@@ -27,8 +27,9 @@ from zstate.wire.registry import get_wire
 _TIMEOUT_S = 1.0
 """How long a scan waits for the pose of its last ray, as in ``ScanListener``."""
 _MAX_WAITING = 256
-_MAX_RAYS = 1_000_000
-"""Rays of one sensor that are kept: 4 MB, half a minute of a scanner with 1081 rays and 30 Hz."""
+_MAX_SCANS = 1000
+_MAX_BYTES = 4_000_000
+"""Of the waiting and of the kept scans of one sensor: half a minute of 1081 rays and 30 Hz."""
 _MAX_WRITERS = 64
 _TIME_JUMP_NS = 1_000_000_000
 
@@ -54,15 +55,17 @@ class SensorScans:
     clock: Callable[[], float] = time.monotonic
     dropped: int = 0
     reason: LookupFailed | InvalidInput | None = None
-    _waiting: deque[tuple[Scan, float]] = field(default_factory=lambda: deque(maxlen=_MAX_WAITING))
-    _scans: deque[Scan] = field(default_factory=deque[Scan])
+    _waiting: BoundedQueue[tuple[Scan, float]] = field(
+        default_factory=lambda: BoundedQueue(_MAX_WAITING, _MAX_BYTES)
+    )
+    _scans: BoundedQueue[Scan] = field(default_factory=lambda: BoundedQueue(_MAX_SCANS, _MAX_BYTES))
     _deadline: Deadline = field(default_factory=Deadline)
 
     def add(self, scan: Scan) -> None:
         """Keep a scan that has arrived. Called by one thread, the other methods by another."""
         now_s = self.clock()
         self._deadline.on_sample(now_s)
-        self._waiting.append((scan, now_s + _TIMEOUT_S))
+        self._waiting.append((scan, now_s + _TIMEOUT_S), _size(scan))
 
     @property
     def is_stale(self) -> bool:
@@ -92,9 +95,7 @@ class SensorScans:
     def _keep(self, scan: Scan) -> None:
         if self._scans and scan.stamp < self._scans[-1].stamp - _TIME_JUMP_NS:
             self._scans.clear()  # the clock was set back, or a replay has begun again
-        self._scans.append(scan)
-        while len(self._scans) * len(scan.ranges) > _MAX_RAYS and len(self._scans) > 1:
-            self._scans.popleft()
+        self._scans.append(scan, _size(scan))
 
     def latest(self, count: int, at: int | None = None) -> Sequence[Scan]:
         """The last ``count`` scans that ended until ``at`` [ns]; None: of all. The oldest first."""
@@ -105,6 +106,11 @@ class SensorScans:
             if at is None or scan.end_stamp <= at:
                 found.append(scan)
         return found[::-1]
+
+
+def _size(scan: Scan) -> int:
+    """The bytes of the rays of a scan."""
+    return scan.ranges.nbytes + (0 if scan.intensities is None else scan.intensities.nbytes)
 
 
 class WorldSource(Closeable):
