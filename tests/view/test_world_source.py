@@ -74,3 +74,39 @@ def test_waiting_scans_are_bounded_by_bytes(buffer: TransformBuffer):
         sensor.add(scan_at(5 * MS, 300_000))
     sensor.settle(buffer, "odom")
     assert len(sensor.latest(9)) == 3
+
+
+def test_scans_that_overflow_the_queue_are_counted_with_the_reason(
+    clock: ManualClock, buffer: TransformBuffer
+):
+    sensor = SensorScans(clock=clock)
+    for _ in range(300):
+        sensor.add(scan_at(20 * MS))  # waits for its pose
+    sensor.settle(buffer, "odom")
+    assert sensor.dropped == 300 - 256
+    assert "r1/laser" in str(sensor.reason)
+
+
+class ReceivingBuffer(TransformBuffer):
+    """A buffer whose first lookup of a scan is overtaken by 256 further scans."""
+
+    sensor: SensorScans | None = None
+
+    def explain(self, *args, **options):
+        sensor, self.sensor = self.sensor, None
+        if sensor is not None:
+            for _ in range(256):
+                sensor.add(scan_at(5 * MS))
+        return super().explain(*args, **options)
+
+
+def test_scans_that_arrive_during_a_lookup_are_all_kept_or_counted():
+    buffer, sensor = ReceivingBuffer(history_s=3600.0), SensorScans()
+    for stamp in (0, 10 * MS):
+        buffer.insert(Transform("odom", "r1/laser", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp=stamp))
+    sensor.add(scan_at(4 * MS))
+    buffer.sensor = sensor
+    sensor.settle(buffer, "odom")
+    # The first one was lost to the queue's bound while its pose was looked up.
+    assert [scan.stamp for scan in sensor.latest(999)] == [5 * MS] * 256
+    assert sensor.dropped == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -48,8 +49,9 @@ class WriterName(NamedTuple):
 class SensorScans:
     """The scans of one sensor: those that wait for the pose of their last ray, and the last ones with it.
 
-    ``dropped`` counts scans whose pose did not come within a second. ``reason`` is why the newest scan was
-    dropped, None if it was kept; one that still waits does not count. ``clock`` is a monotonic clock [s].
+    ``dropped`` counts scans whose pose did not come within a second, or before too many others waited.
+    ``reason`` is why the newest scan was dropped, None if it was kept; one that still waits does not count.
+    ``clock`` is a monotonic clock [s].
     """
 
     clock: Callable[[], float] = time.monotonic
@@ -60,12 +62,17 @@ class SensorScans:
     )
     _scans: BoundedQueue[Scan] = field(default_factory=lambda: BoundedQueue(_MAX_SCANS, _MAX_BYTES))
     _deadline: Deadline = field(default_factory=Deadline)
+    _has_overflowed: bool = False
+    _lock: threading.Lock = field(default_factory=fork_safe_lock)
 
     def add(self, scan: Scan) -> None:
         """Keep a scan that has arrived. Called by one thread, the other methods by another."""
         now_s = self.clock()
         self._deadline.on_sample(now_s)
-        self._waiting.append((scan, now_s + _TIMEOUT_S), _size(scan))
+        with self._lock:
+            lost = self._waiting.append((scan, now_s + _TIMEOUT_S), _size(scan))
+            self.dropped += lost
+            self._has_overflowed |= lost > 0
 
     @property
     def is_stale(self) -> bool:
@@ -75,22 +82,36 @@ class SensorScans:
     @property
     def frame(self) -> str | None:
         """The frame of the newest scan."""
-        newest = self._waiting[0][0] if self._waiting else self._scans[-1] if self._scans else None
+        with self._lock:
+            newest = self._waiting[0][0] if self._waiting else self._scans[-1] if self._scans else None
         return None if newest is None else newest.frame
 
     def settle(self, buffer: TransformBuffer, target: str) -> None:
         """Keep the scans whose last ray has a pose in ``target`` by now, and drop those that are too late."""
-        while self._waiting:
-            scan, deadline_s = self._waiting[0]
+        while (waiting := self._first_waiting()) is not None:
+            scan, deadline_s = waiting
             reason = buffer.explain(target, scan.frame, scan.end_stamp)
             if reason is not None and self.clock() < deadline_s:
+                if self._has_overflowed:
+                    self.reason, self._has_overflowed = reason, False
                 return
-            self.reason = reason
-            if reason is None:
-                self._keep(scan)
-            else:
-                self.dropped += 1
+            if self._remove_first(waiting, is_dropped=reason is not None):
+                self.reason = reason
+                if reason is None:
+                    self._keep(scan)
+
+    def _first_waiting(self) -> tuple[Scan, float] | None:
+        with self._lock:
+            return self._waiting[0] if self._waiting else None
+
+    def _remove_first(self, waiting: tuple[Scan, float], *, is_dropped: bool) -> bool:
+        """Remove ``waiting``, unless it was lost as the queue overflowed. Returns whether it was there."""
+        with self._lock:
+            if not self._waiting or self._waiting[0] is not waiting:
+                return False
             self._waiting.popleft()
+            self.dropped += is_dropped
+        return True
 
     def _keep(self, scan: Scan) -> None:
         if self._scans and scan.stamp < self._scans[-1].stamp - _TIME_JUMP_NS:
