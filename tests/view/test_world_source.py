@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.net.subscription import Received
 from zstate.scans import Scan
 from zstate.transform import Transform
-from zstate.view.world_source import SensorScans
+from zstate.view.world_source import SensorScans, WorldSource, WriterName
+from zstate.wire.messages import LaserScan, to_float32_block
 
 MS = 1_000_000
 
@@ -110,3 +112,27 @@ def test_scans_that_arrive_during_a_lookup_are_all_kept_or_counted():
     # The first one was lost to the queue's bound while its pose was looked up.
     assert [scan.stamp for scan in sensor.latest(999)] == [5 * MS] * 256
     assert sensor.dropped == 1
+
+
+def sensor_name(number: int) -> WriterName:
+    return WriterName(f"r{number}", "front")
+
+
+def scans_of(source: WorldSource, *numbers: int) -> None:
+    """One scan of each sensor."""
+    message = LaserScan(0, 0, 1, "laser", 0.0, 0.1, 0, 0, 0.1, 10.0, to_float32_block([1.0]))
+    source._on_scans([Received(f"r{n}", f"zstate/r{n}/scan/front", message) for n in numbers])
+
+
+def test_stalest_sensor_makes_room_for_a_new_one(clock: ManualClock):
+    with WorldSource(None, clock=clock) as source:
+        for number in range(64):
+            clock.now_s += 0.001
+            scans_of(source, number)
+        scans_of(source, 64, 65)
+        assert set(source.sensors) == {sensor_name(n) for n in range(64)}
+        assert source.refused == {"too many sensors": 2}
+        clock.now_s += 9.99  # more than 10 s after the first scans, less after the last
+        scans_of(source, 0, 65)
+        assert set(source.sensors) == {sensor_name(n) for n in (0, *range(2, 64), 65)}
+        assert source.refused == {"too many sensors": 2}

@@ -32,6 +32,10 @@ _MAX_SCANS = 1000
 _MAX_BYTES = 4_000_000
 """Of the waiting and of the kept scans of one sensor: half a minute of 1081 rays and 30 Hz."""
 _MAX_WRITERS = 64
+_UNKNOWN_S = 10.0
+"""How long a sensor may be silent after its first scan."""
+TOO_MANY_SENSORS = "too many sensors"
+"""Reason in ``WorldSource.refused``."""
 _TIME_JUMP_NS = 1_000_000_000
 
 
@@ -61,7 +65,7 @@ class SensorScans:
         default_factory=lambda: BoundedQueue(_MAX_WAITING, _MAX_BYTES)
     )
     _scans: BoundedQueue[Scan] = field(default_factory=lambda: BoundedQueue(_MAX_SCANS, _MAX_BYTES))
-    _deadline: Deadline = field(default_factory=Deadline)
+    _deadline: Deadline = field(default_factory=lambda: Deadline(_UNKNOWN_S))
     _has_overflowed: bool = False
     _lock: threading.Lock = field(default_factory=fork_safe_lock)
 
@@ -78,6 +82,11 @@ class SensorScans:
     def is_stale(self) -> bool:
         """Whether the sensor has missed its deadline."""
         return self._deadline.is_missed(self.clock())
+
+    @property
+    def received_s(self) -> float:
+        """When the newest scan arrived, by ``clock``."""
+        return self._deadline.last_s
 
     @property
     def frame(self) -> str | None:
@@ -138,10 +147,19 @@ class WorldSource(Closeable):
     """Receives the scans of all robots, or of ``robots`` only, and all maps; nothing without a ``session``.
 
     ``maps`` and ``sensors`` are by the names of their writers; a map that is withdrawn is removed from
-    ``maps``. ``refused`` counts messages that are no scan or map, by reason; the first of each is logged.
+    ``maps``, and the longest stale sensor when there are more than 64. ``refused`` counts messages that are
+    no scan or map, or for which there is no room, by reason; the first of each is logged.
     """
 
-    def __init__(self, session: Session | None, robots: Sequence[str] = (), wire: str = "native") -> None:
+    def __init__(
+        self,
+        session: Session | None,
+        robots: Sequence[str] = (),
+        wire: str = "native",
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock = clock
         self._selected = frozenset(robots)
         self._wire = get_wire(wire)
         self._lock = fork_safe_lock()
@@ -187,15 +205,26 @@ class WorldSource(Closeable):
                 continue
             try:
                 assert isinstance(message, LaserScan)
-                self._scans_of(self._writer(robot, key)).add(scan_from_message(message, robot))
+                scan = scan_from_message(message, robot)
             except InvalidInput as error:
                 self._refusals.count("malformed scan", f"{shortened(key)}: {error}")
+                continue
+            sensor = self._scans_of(self._writer(robot, key))
+            if sensor is None:
+                text = f"{shortened(key)}: {_MAX_WRITERS} other sensors are drawn already"
+                self._refusals.count(TOO_MANY_SENSORS, text)
+            else:
+                sensor.add(scan)
 
-    def _scans_of(self, sensor: WriterName) -> SensorScans:
+    def _scans_of(self, name: WriterName) -> SensorScans | None:
+        """The scans of a sensor, which replaces the longest stale one; None if there is no room."""
         with self._lock:
-            if sensor not in self._sensors and len(self._sensors) >= _MAX_WRITERS:
-                raise InvalidInput(f"there are more than {_MAX_WRITERS} sensors")
-            return self._sensors.setdefault(sensor, SensorScans())
+            if name not in self._sensors and len(self._sensors) >= _MAX_WRITERS:
+                stale = [(one.received_s, other) for other, one in self._sensors.items() if one.is_stale]
+                if not stale:
+                    return None
+                del self._sensors[min(stale)[1]]
+            return self._sensors.setdefault(name, SensorScans(self._clock))
 
     def _on_maps(self, received: list[Received]) -> None:
         for robot, key, message in received:
