@@ -132,6 +132,7 @@ def test_scans_and_maps_are_decoded_as_written(tmp_path: Path):
         ("hall", "map", "map"),
     ]
     assert [one.message for one in read.decoded] == [scan(), grid()]
+    assert read.robots == ("arm",)  # a hall with a map is none
     assert not DecodedFile(tmp_path / "r.mcap").decoded
 
 

@@ -282,6 +282,7 @@ def test_recorded_maps_are_those_that_changed(tmp_path: Path):
         cells = [one.cells.tolist() for one in recording.maps("hall")]
         assert len(list(recording.maps())) == 3
         (yard,) = recording.maps("yard")
+        assert recording.robots == ()
     assert cells == [[[0]], [[100, -1]]]
     assert (yard.frame, yard.resolution, yard.origin.translation.tolist()) == ("yard/map", 0.5, [1, 2, 0])
 

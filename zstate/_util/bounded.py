@@ -38,6 +38,12 @@ class BoundedQueue(Generic[T]):
     def __iter__(self) -> Iterator[T]:
         return (item for item, _ in self._items)
 
+    def __reversed__(self) -> Iterator[T]:
+        return (item for item, _ in reversed(self._items))
+
+    def __getitem__(self, index: int) -> T:
+        return self._items[index][0]
+
     def append(self, item: T, size: int) -> int:
         """Add ``item`` of ``size`` bytes. Returns how many items were dropped for it."""
         self._items.append((item, size))
@@ -46,6 +52,12 @@ class BoundedQueue(Generic[T]):
         while len(self._items) > self._max_items or self._bytes > self._max_bytes:
             self._bytes -= self._items.popleft()[1]
         return count - len(self._items)
+
+    def popleft(self) -> T:
+        """Remove the oldest item and return it. Raises IndexError if there is none."""
+        item, size = self._items.popleft()
+        self._bytes -= size
+        return item
 
     def clear(self) -> None:
         """Drop all items."""

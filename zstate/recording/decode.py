@@ -141,8 +141,16 @@ class DecodedRecording:
 
     @property
     def robots(self) -> tuple[str, ...]:
-        """The robots in the recording, by name; "ros" for what is in no namespace of a bag."""
-        return tuple(sorted({writer.robot for writer in self.writers if writer.robot}))
+        """The robots in the recording, by name; "ros" for what is in no namespace of a bag.
+
+        Without the places that have maps only.
+        """
+        return tuple(sorted({writer.robot for writer in self.writers if writer.stream != "map"} - {""}))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The robots, and the places that have maps only."""
+        return tuple(sorted({writer.robot for writer in self.writers} - {""}))
 
     def writers_of(self, robots: Collection[str] | None) -> set[RecordedWriter]:
         """The writers of ``robots`` (None: of all).
@@ -312,8 +320,8 @@ def static_key(writer: RecordedWriter) -> tuple[str, str]:
 
 
 def check_has_robot(recording: DecodedRecording, robot: str) -> str:
-    """``robot``, if the recording has it. Raises InvalidInput, which names the robots it has."""
-    if robot not in recording.robots:
+    """``robot``, if the recording has it or maps of it. Raises InvalidInput, which names its robots."""
+    if robot not in recording.names:
         names = ", ".join(map(repr, recording.robots)) or "none"
         raise InvalidInput(f"the recording has no robot {robot!r}; its robots: {names}")
     return robot

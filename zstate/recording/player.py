@@ -113,7 +113,7 @@ class Player(Closeable):
         try:
             self._recording = DecodedRecording(self._reader, self._refusals.count)
             selected = tuple(check_has_robot(self._recording, robot) for robot in robots)
-            self.robots = selected or self._recording.robots
+            self.robots = selected or self._recording.names
             self._begin, self._end = self._bounds(path, start_s, duration_s)
             self._models: dict[str, RobotModel] = {}
             self._in_parts: set[str] = set()

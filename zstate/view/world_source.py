@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from zstate._util.bounded import BoundedQueue
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
@@ -27,9 +28,14 @@ from zstate.wire.registry import get_wire
 _TIMEOUT_S = 1.0
 """How long a scan waits for the pose of its last ray, as in ``ScanListener``."""
 _MAX_WAITING = 256
-_MAX_RAYS = 1_000_000
-"""Rays of one sensor that are kept: 4 MB, half a minute of a scanner with 1081 rays and 30 Hz."""
+_MAX_SCANS = 1000
+_MAX_BYTES = 4_000_000
+"""Of the waiting and of the kept scans of one sensor: half a minute of 1081 rays and 30 Hz."""
 _MAX_WRITERS = 64
+_UNKNOWN_S = 10.0
+"""How long a sensor may be silent after its first scan."""
+TOO_MANY_SENSORS = "too many sensors"
+"""Reason in ``WorldSource.refused``."""
 _TIME_JUMP_NS = 1_000_000_000
 
 
@@ -47,53 +53,79 @@ class WriterName(NamedTuple):
 class SensorScans:
     """The scans of one sensor: those that wait for the pose of their last ray, and the last ones with it.
 
-    ``dropped`` counts scans whose pose did not come within a second. ``reason`` is why the newest scan was
-    dropped, None if it was not.
+    ``dropped`` counts scans whose pose did not come within a second, or before too many others waited.
+    ``reason`` is why the newest scan was dropped, None if it was kept; one that still waits does not count.
+    ``clock`` is a monotonic clock [s].
     """
 
+    clock: Callable[[], float] = time.monotonic
     dropped: int = 0
     reason: LookupFailed | InvalidInput | None = None
-    _waiting: deque[tuple[Scan, float]] = field(default_factory=lambda: deque(maxlen=_MAX_WAITING))
-    _scans: deque[Scan] = field(default_factory=deque[Scan])
-    _deadline: Deadline = field(default_factory=Deadline)
+    _waiting: BoundedQueue[tuple[Scan, float]] = field(
+        default_factory=lambda: BoundedQueue(_MAX_WAITING, _MAX_BYTES)
+    )
+    _scans: BoundedQueue[Scan] = field(default_factory=lambda: BoundedQueue(_MAX_SCANS, _MAX_BYTES))
+    _deadline: Deadline = field(default_factory=lambda: Deadline(_UNKNOWN_S))
+    _has_overflowed: bool = False
+    _lock: threading.Lock = field(default_factory=fork_safe_lock)
 
     def add(self, scan: Scan) -> None:
         """Keep a scan that has arrived. Called by one thread, the other methods by another."""
-        now_s = time.monotonic()
+        now_s = self.clock()
         self._deadline.on_sample(now_s)
-        self._waiting.append((scan, now_s + _TIMEOUT_S))
+        with self._lock:
+            lost = self._waiting.append((scan, now_s + _TIMEOUT_S), _size(scan))
+            self.dropped += lost
+            self._has_overflowed |= lost > 0
 
     @property
     def is_stale(self) -> bool:
         """Whether the sensor has missed its deadline."""
-        return self._deadline.is_missed(time.monotonic())
+        return self._deadline.is_missed(self.clock())
+
+    @property
+    def received_s(self) -> float:
+        """When the newest scan arrived, by ``clock``."""
+        return self._deadline.last_s
 
     @property
     def frame(self) -> str | None:
         """The frame of the newest scan."""
-        newest = self._waiting[0][0] if self._waiting else self._scans[-1] if self._scans else None
+        with self._lock:
+            newest = self._waiting[0][0] if self._waiting else self._scans[-1] if self._scans else None
         return None if newest is None else newest.frame
 
     def settle(self, buffer: TransformBuffer, target: str) -> None:
         """Keep the scans whose last ray has a pose in ``target`` by now, and drop those that are too late."""
-        while self._waiting:
-            scan, deadline_s = self._waiting[0]
-            self.reason = reason = buffer.explain(target, scan.frame, scan.end_stamp)
-            if reason is None:
-                self._keep(scan)
-            elif time.monotonic() < deadline_s:
-                self.reason = None
+        while (waiting := self._first_waiting()) is not None:
+            scan, deadline_s = waiting
+            reason = buffer.explain(target, scan.frame, scan.end_stamp)
+            if reason is not None and self.clock() < deadline_s:
+                if self._has_overflowed:
+                    self.reason, self._has_overflowed = reason, False
                 return
-            else:
-                self.dropped += 1
+            if self._remove_first(waiting, is_dropped=reason is not None):
+                self.reason = reason
+                if reason is None:
+                    self._keep(scan)
+
+    def _first_waiting(self) -> tuple[Scan, float] | None:
+        with self._lock:
+            return self._waiting[0] if self._waiting else None
+
+    def _remove_first(self, waiting: tuple[Scan, float], *, is_dropped: bool) -> bool:
+        """Remove ``waiting``, unless it was lost as the queue overflowed. Returns whether it was there."""
+        with self._lock:
+            if not self._waiting or self._waiting[0] is not waiting:
+                return False
             self._waiting.popleft()
+            self.dropped += is_dropped
+        return True
 
     def _keep(self, scan: Scan) -> None:
         if self._scans and scan.stamp < self._scans[-1].stamp - _TIME_JUMP_NS:
             self._scans.clear()  # the clock was set back, or a replay has begun again
-        self._scans.append(scan)
-        while len(self._scans) * len(scan.ranges) > _MAX_RAYS and len(self._scans) > 1:
-            self._scans.popleft()
+        self._scans.append(scan, _size(scan))
 
     def latest(self, count: int, at: int | None = None) -> Sequence[Scan]:
         """The last ``count`` scans that ended until ``at`` [ns]; None: of all. The oldest first."""
@@ -106,14 +138,28 @@ class SensorScans:
         return found[::-1]
 
 
+def _size(scan: Scan) -> int:
+    """The bytes of the rays of a scan."""
+    return scan.ranges.nbytes + (0 if scan.intensities is None else scan.intensities.nbytes)
+
+
 class WorldSource(Closeable):
     """Receives the scans of all robots, or of ``robots`` only, and all maps; nothing without a ``session``.
 
     ``maps`` and ``sensors`` are by the names of their writers; a map that is withdrawn is removed from
-    ``maps``. ``refused`` counts messages that are no scan or map, by reason; the first of each is logged.
+    ``maps``, and the longest stale sensor when there are more than 64. ``refused`` counts messages that are
+    no scan or map, or for which there is no room, by reason; the first of each is logged.
     """
 
-    def __init__(self, session: Session | None, robots: Sequence[str] = (), wire: str = "native") -> None:
+    def __init__(
+        self,
+        session: Session | None,
+        robots: Sequence[str] = (),
+        wire: str = "native",
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock = clock
         self._selected = frozenset(robots)
         self._wire = get_wire(wire)
         self._lock = fork_safe_lock()
@@ -159,15 +205,26 @@ class WorldSource(Closeable):
                 continue
             try:
                 assert isinstance(message, LaserScan)
-                self._scans_of(self._writer(robot, key)).add(scan_from_message(message, robot))
+                scan = scan_from_message(message, robot)
             except InvalidInput as error:
                 self._refusals.count("malformed scan", f"{shortened(key)}: {error}")
+                continue
+            sensor = self._scans_of(self._writer(robot, key))
+            if sensor is None:
+                text = f"{shortened(key)}: {_MAX_WRITERS} other sensors are drawn already"
+                self._refusals.count(TOO_MANY_SENSORS, text)
+            else:
+                sensor.add(scan)
 
-    def _scans_of(self, sensor: WriterName) -> SensorScans:
+    def _scans_of(self, name: WriterName) -> SensorScans | None:
+        """The scans of a sensor, which replaces the longest stale one; None if there is no room."""
         with self._lock:
-            if sensor not in self._sensors and len(self._sensors) >= _MAX_WRITERS:
-                raise InvalidInput(f"there are more than {_MAX_WRITERS} sensors")
-            return self._sensors.setdefault(sensor, SensorScans())
+            if name not in self._sensors and len(self._sensors) >= _MAX_WRITERS:
+                stale = [(one.received_s, other) for other, one in self._sensors.items() if one.is_stale]
+                if not stale:
+                    return None
+                del self._sensors[min(stale)[1]]
+            return self._sensors.setdefault(name, SensorScans(self._clock))
 
     def _on_maps(self, received: list[Received]) -> None:
         for robot, key, message in received:

@@ -9,10 +9,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from helpers.cli_runner import RRBOT, failure, published_robot, zstate
+from helpers.recording_builder import START, RecordingBuilder
 
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
 from zstate.cli.commands.plot import joint_series, path_series
 from zstate.errors import InvalidInput
+from zstate.wire.messages import OccupancyGrid, to_block
 
 SECOND = 1_000_000_000
 DOCUMENTS = [
@@ -111,6 +113,21 @@ def test_a_recording_is_drawn_whole_or_in_part(tmp_path: Path):
     assert "no joint state of 'rrbot' in that time" in message
     assert "no robot" not in message
     assert "its robots: 'rrbot'" in failure("plot", "panda", "--file", str(recording))
+
+
+@pytest.mark.processes
+def test_only_robot_with_joint_states_is_drawn_by_default(tmp_path: Path):
+    needs_matplotlib()
+    path = tmp_path / "r.mcap"
+    hall = OccupancyGrid(4, START, "map", 0.5, 1, 1, to_block([0, 0, 0, 0, 0, 0, 1]), b"\0")
+    with RecordingBuilder(path) as builder:
+        builder.describe("rrbot")
+        for n in range(2):
+            builder.joints("rrbot", START + n * SECOND, [0.25, 0.5])
+        builder.edges("cart", START, {("odom", "base"): [0, 0, 0, 0, 0, 0, 1]})
+        builder.encoder.write_message("hall", hall, START, "floor")
+    ended = zstate("plot", "--file", str(path), "--output", str(tmp_path / "joints.svg"))
+    assert "2 curves, " in ended.stdout.decode(), ended.stderr
 
 
 @pytest.mark.processes

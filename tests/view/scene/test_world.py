@@ -45,6 +45,12 @@ class FixedSource(WorldSource):
     def set_map(self, grid: Grid) -> None:
         self._maps["key"] = HALL, grid
 
+    def remove_sensor(self) -> None:
+        del self._sensors[FRONT]
+
+    def refuse_sensor(self) -> None:
+        self._refusals.count("too many sensors", "r65/front")
+
     def withdraw_map(self) -> None:
         self._on_withdrawn("key")
 
@@ -158,6 +164,17 @@ def test_scan_whose_pose_does_not_come_is_dropped_with_the_reason(shown):
     shown.source.front.add(scan_at(3 * MS))
     shown.show()
     assert shown.world.missing == []
+
+
+def test_clouds_of_a_removed_sensor_vanish_and_refused_sensors_are_reported(shown):
+    shown.source.front.add(scan_at(2 * MS))
+    shown.show()
+    shown.source.remove_sensor()
+    shown.show()
+    assert handles(shown.server, viser.PointCloudHandle) == {}
+    shown.source.refuse_sensor()
+    shown.show()
+    assert shown.world.missing == [("scans of further sensors", "1 refused: too many sensors")]
 
 
 def test_scans_until_an_instant_of_the_past_are_drawn(shown):

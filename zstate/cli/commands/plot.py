@@ -261,17 +261,18 @@ def _live_path(
 def _recorded_joints(path: str, robot: str | None, start_s: float, seconds: float | None) -> TimeSeries:
     """The joints of ``robot``, or of the only robot, in a recording. Raises RecordingError, InvalidInput."""
     from zstate.cli.output.joint_state_text import JointStateFormatter
-    from zstate.recording.decode import DecodedRecording, check_has_robot, first_descriptions
+    from zstate.recording.decode import (
+        DecodedRecording,
+        check_has_robot,
+        first_descriptions,
+        robot_with_joint_states,
+    )
     from zstate.recording.reader import RecordingReader
     from zstate.wire.messages import JointState, RobotDescription
 
     with RecordingReader(path) as reader:
         decoded = DecodedRecording(reader, partial(_LOG.warning, "left out (%s): %s"))
-        robots = decoded.robots
-        if robot is None and len(robots) != 1:
-            content = f"robots {', '.join(robots)}: name one of them" if robots else "no robot"
-            fail(f"the recording has {content}")
-        name = robots[0] if robot is None else check_has_robot(decoded, robot)
+        name = robot_with_joint_states(decoded, None) if robot is None else check_has_robot(decoded, robot)
         formatter = JointStateFormatter()
         for described in first_descriptions(decoded, (name,)).values():
             if isinstance(described.message, RobotDescription):

@@ -16,7 +16,7 @@ from zstate.buffer.snapshot import FrameTable, Poses
 from zstate.errors import LookupFailed
 from zstate.scans.grid import Grid
 from zstate.scans.scan import Scan
-from zstate.view.world_source import SensorScans, WorldSource, WriterName
+from zstate.view.world_source import TOO_MANY_SENSORS, SensorScans, WorldSource, WriterName
 
 _POINT_SIZE_M = 0.03
 _COLORS = ((224, 49, 49), (25, 113, 194), (47, 158, 68), (174, 62, 201), (232, 89, 12), (12, 133, 153))
@@ -72,6 +72,7 @@ class World:
         self.missing: Sequence[tuple[str, str]] = ()
         self._scene = scene
         self._clouds: dict[WriterName, ScanClouds] = {}
+        self._cloud_count = 0
         self._images = MapImages(scene)
 
     @property
@@ -87,16 +88,23 @@ class World:
     def show(self, source: WorldSource, buffer: TransformBuffer, place: Place, at: int | None) -> None:
         """Draw the maps, and the last scans until ``at`` [ns]; None: the newest."""
         missing: list[tuple[str, str]] = []
-        for name, sensor in source.sensors.items():
+        sensors = source.sensors
+        for name in self._clouds.keys() - sensors.keys():
+            self._clouds.pop(name).remove()
+        for name, sensor in sensors.items():
             clouds = self._clouds.get(name)
             if clouds is None:
-                color = _COLORS[len(self._clouds) % len(_COLORS)]
+                color = _COLORS[self._cloud_count % len(_COLORS)]
                 clouds = self._clouds[name] = ScanClouds(
-                    self._scene, buffer, f"/scans/{len(self._clouds)}", color
+                    self._scene, buffer, f"/scans/{self._cloud_count}", color
                 )
+                self._cloud_count += 1
             clouds.show(sensor, place, self.scan_count if self.scans else 0, at)
             if sensor.reason is not None:
                 missing.append((f"scans of {name}", f"{sensor.dropped} dropped: {sensor.reason}"))
+        refused = source.refused.get(TOO_MANY_SENSORS)
+        if refused:
+            missing.append(("scans of further sensors", f"{refused} refused: {TOO_MANY_SENSORS}"))
         missing += self._images.show(source.maps, place, is_on=self.maps)
         self.missing = missing
 
@@ -144,6 +152,11 @@ class ScanClouds:
         if state != self._state:
             self._state = state
             self._update(*state)
+
+    def remove(self) -> None:
+        """Remove the clouds from the scene."""
+        if self._root is not None:
+            self._root.remove()
 
     def _update(self, scans: Sequence[Scan], target: str, count: int, is_stale: bool) -> None:
         is_moved, self._target = target != self._target, target
