@@ -51,6 +51,17 @@ def test_each_ray_is_placed_by_the_pose_at_its_own_stamp(sessions):
     assert (placed.stamp, placed.sensor, placed.scan.frame) == (2 * MS, "laser", "r1/laser")
 
 
+def test_bare_target_is_a_frame_of_the_robot_among_others(sessions):
+    writer, reader = sessions
+    buffer = buffer_until(10 * MS)
+    buffer.insert(pose_at(10 * MS, "r2/"))
+    with ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=0.0) as scans:
+        with ScanPublisher(writer, "r1", "laser", **GEOMETRY) as publisher:
+            until(lambda: publisher.publish([1.0], 2 * MS) or len(scans) or scans.dropped)
+        assert not scans.dropped
+        assert next(iter(scans)).target == "r1/odom"
+
+
 def test_rays_without_times_are_placed_rigidly_and_marked(sessions):
     writer, reader = sessions
     with ScanListener(reader, "r1", "odom", buffer=buffer_until(10 * MS)) as scans:

@@ -25,7 +25,7 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.scans.scan import Scan, scan_from_message
-from zstate.wire.keys import ANY, check_robot, check_writer, shortened
+from zstate.wire.keys import ANY, check_robot, check_writer, full_name, shortened
 from zstate.wire.messages import LaserScan
 from zstate.wire.registry import get_wire
 
@@ -117,7 +117,7 @@ class ScanListener(Closeable):
         check_duration("timeout_s", timeout_s)
         self.robot = check_robot(robot)
         self.sensor = sensor if sensor == ANY else check_writer(sensor)
-        self.target = target
+        self.target = full_name(robot, target)
         self.dropped: Counter[str] = Counter()
         self.last_reason: LookupFailed | None = None
         self._refusals = Refusals("scan")
