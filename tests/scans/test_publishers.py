@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,12 +105,12 @@ def test_run_publishes_sweeps_that_end_at_their_ticks_and_leaves_out_none(sessio
     assert ends == [tick for tick in ticks[1::2] if tick in set(ends)]
 
 
-def test_run_keeps_the_stamp_of_a_scan_and_refuses_another_geometry(sessions):
+def test_run_keeps_the_stamp_of_a_scan(sessions):
     writer, reader = sessions
     scans = Scans(reader)
 
     class Lidar:
-        scan = Scan(777, -1.0, 0.5, 100, [1.0, 2.0], 0.1, 10.0)
+        scan = Scan(777, -1.0, 0.5, 100, [1.0, 2.0], 0.1, 10.0, "front")
 
         def read(self, _: int) -> Scan:
             return self.scan
@@ -121,9 +122,27 @@ def test_run_keeps_the_stamp_of_a_scan_and_refuses_another_geometry(sessions):
         publisher.run(lidar, 100.0, seconds=0.05)
         until(lambda: scans)
         assert {scan.stamp for scan in scans} <= {0, 777}
-        lidar.scan = Scan(778, -1.0, 0.25, 100, [1.0, 2.0], 0.1, 10.0)
-        with pytest.raises(InvalidInput, match=r"has angle_min.*\(-1.0, 0.5, 100\).*\(-1.0, 0.25, 100\)"):
-            publisher.run(lidar, 100.0, seconds=1.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"angle_increment": 0.25}, "has angle_increment=0.5; its source returned.* angle_increment=0.25"),
+        ({"ray_ns": 50}, "has ray_ns=100; .* ray_ns=50"),
+        ({"range_max": 5.0}, "has range_max=10.0; .* range_max=5.0"),
+        ({"frame": "rear"}, "has frame='r1/front'; .* frame='r1/rear'"),
+    ],
+)
+def test_run_refuses_a_scan_of_another_geometry_or_frame(sessions, changes: dict[str, Any], message: str):
+    class Lidar:
+        def read(self, stamp: int) -> Scan:
+            own = {**GEOMETRY, "ray_ns": 100, "frame": "r1/front"}
+            return Scan(stamp, ranges=[1.0, 2.0], **{**own, **changes})
+
+    with ScanPublisher(sessions[0], "r1", "front", ray_ns=100, **GEOMETRY) as publisher:
+        with pytest.raises(InvalidInput, match=message):
+            publisher.run(Lidar(), 100.0, seconds=0.05)
+        assert publisher.stats.sent == 0
 
 
 def test_scan_that_is_none_is_refused_and_counted_and_nothing_is_sent(sessions):
