@@ -15,7 +15,7 @@ from zstate.net.subscription import Received, subscribe
 from zstate.scans import Grid, MapPublisher, Scan, ScanPublisher
 from zstate.scans.grid import grid_from_message
 from zstate.scans.scan import scan_from_message
-from zstate.wire.messages import LaserScan, OccupancyGrid
+from zstate.wire.messages import SCAN_RAYS, LaserScan, OccupancyGrid
 from zstate.wire.registry import get_wire
 
 GEOMETRY = {"angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.1, "range_max": 10.0}
@@ -156,6 +156,19 @@ def test_scan_that_is_none_is_refused_and_counted_and_nothing_is_sent(sessions):
             publisher.publish([1.0, 2.0], intensities=[1.0])
         assert publisher.stats.sent == 0
         assert publisher.stats.refused == 3
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_scan_of_the_largest_size_arrives_and_a_larger_one_is_refused(sessions, wire: str):
+    writer, reader = sessions
+    scans = Scans(reader, wire)
+    geometry = {**GEOMETRY, "angle_increment": 1e-5}
+    rays = np.ones(SCAN_RAYS, dtype=np.float32)
+    with ScanPublisher(writer, "r1", "front", wire, frame="f" * 500, **geometry) as publisher:
+        scan = publish_until_received(publisher, scans, rays, intensities=rays)
+        with pytest.raises(InvalidInput, match="100001 rays, where 100000 are allowed"):
+            publisher.publish(np.ones(SCAN_RAYS + 1, dtype=np.float32))
+    assert len(scan.ranges) == SCAN_RAYS
 
 
 def test_wrong_geometry_is_refused_when_the_publisher_opens(sessions):

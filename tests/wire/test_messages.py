@@ -7,6 +7,8 @@ import pytest
 from zstate.errors import InvalidInput
 from zstate.wire.messages import (
     GRID_CELLS,
+    MAX_BYTES,
+    SCAN_RAYS,
     JointState,
     LaserScan,
     OccupancyGrid,
@@ -20,6 +22,7 @@ from zstate.wire.messages import (
     to_block,
     to_float32_block,
 )
+from zstate.wire.native import encode
 
 EDGES = (("base", "arm"), ("arm", "hand"))
 
@@ -103,6 +106,14 @@ def test_a_block_of_ranges_is_little_endian_float32():
     # 1.0 is sign 0, exponent 127, fraction 0: 3f 80 00 00 read from the high end
     assert to_float32_block([1, -2]) == bytes.fromhex("0000803f 000000c0")
     np.testing.assert_array_equal(from_float32_block(to_float32_block([0.5, np.inf])), [0.5, np.inf])
+
+
+def test_a_scan_has_at_most_100000_rays():
+    ranges = bytes(4 * SCAN_RAYS)
+    largest = scan(ranges=ranges, intensities=ranges, frame="\U0001f916" * 1024)
+    assert len(encode(largest)) <= MAX_BYTES["scan"]
+    with pytest.raises(InvalidInput, match="100001 rays, where 100000 are allowed"):
+        scan(ranges=bytes(4 * SCAN_RAYS + 4))
 
 
 def test_ranges_that_are_no_measurements_are_part_of_a_scan():
