@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import threading
 
 import numpy as np
 import pytest
@@ -183,3 +184,34 @@ def test_wrong_arguments_are_refused_at_once(sessions):
         ScanListener(sessions[1], "r1", "odom", timeout_s=-1.0)
     with pytest.raises(InvalidInput, match="robot"):
         ScanListener(sessions[1], "a/b", "odom")
+
+
+def is_placing(sensor: str) -> bool:
+    return any(thread.name == f"zstate scans of {sensor}" for thread in threading.enumerate())
+
+
+def test_thread_of_a_sensor_outlives_the_session_and_ends_with_the_listener(sessions, monkeypatch):
+    writer, reader = sessions
+    failures: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", failures.append)
+    buffer = buffer_until(3 * MS)
+    with ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=60.0) as scans:
+        with ScanPublisher(writer, "r1", "outliving", frame="laser", **GEOMETRY) as publisher:
+            until(lambda: publisher.publish([1.0], 5 * MS) or buffer.waiter_count)
+        reader.close()
+        buffer.insert(pose_at(5 * MS, "r1/"))
+        until(lambda: len(scans) > 0)
+        assert is_placing("outliving")
+    until(lambda: not is_placing("outliving"))
+    assert not failures
+
+
+def test_scan_that_waits_for_its_pose_ends_with_the_listener(sessions):
+    writer, reader = sessions
+    buffer = buffer_until(3 * MS)
+    with ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=3600.0) as scans:
+        with ScanPublisher(writer, "r1", "waiting_long", frame="laser", **GEOMETRY) as publisher:
+            until(lambda: publisher.publish([1.0], 5 * MS) or buffer.waiter_count)
+    until(lambda: not is_placing("waiting_long"))
+    assert len(scans) == 0
+    assert not scans.dropped

@@ -19,7 +19,7 @@ from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer, check_duration
 from zstate.checks import check_names
 from zstate.clock import Clock
-from zstate.errors import InvalidInput, LookupFailed
+from zstate.errors import InvalidInput, LookupFailed, WaitTimeout
 from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
@@ -32,6 +32,8 @@ from zstate.wire.registry import get_wire
 _CAPACITY = 256
 """Scans kept for a slow reader, and scans of one sensor that wait for their poses."""
 _MAX_SENSORS = 64
+_LONGEST_WAIT_S = 0.5
+"""After this time at the latest a thread that waits for a pose ends with its listener."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +69,10 @@ class PlacedScan:
 class _SensorScans(Closeable):
     """The scans of one sensor, which wait for their poses in a thread of their own."""
 
-    def __init__(
-        self, place: Callable[[Scan, float], object], sensor: str, check_reception: Callable[[], object]
-    ) -> None:
+    def __init__(self, place: Callable[[Scan, float], object], sensor: str) -> None:
         self._place = place
-        self._waiting: Inbox[tuple[Scan, float]] = Inbox(_CAPACITY, check_reception)
+        # The thread ends with the listener, not with its session.
+        self._waiting: Inbox[tuple[Scan, float]] = Inbox(_CAPACITY, lambda: None)
         threading.Thread(target=self._run, name=f"zstate scans of {sensor}", daemon=True).start()
 
     def add(self, scan: Scan, deadline: float) -> None:
@@ -126,7 +127,6 @@ class ScanListener(Closeable):
         self._unread: Inbox[PlacedScan] = Inbox(_CAPACITY, session.check)
         self._sensors: dict[str, _SensorScans] = {}
         self._wire = get_wire(wire)
-        self._check = session.check
         self._closed = False
         with ExitStack() as opening:
             if buffer is None:
@@ -164,16 +164,14 @@ class ScanListener(Closeable):
         if sensor not in self._sensors:
             if len(self._sensors) >= _MAX_SENSORS:
                 raise InvalidInput(f"the robot {self.robot!r} has more than {_MAX_SENSORS} sensors")
-            self._sensors[sensor] = _SensorScans(partial(self._place, sensor), sensor, self._check)
+            self._sensors[sensor] = _SensorScans(partial(self._place, sensor), sensor)
         return self._sensors[sensor]
 
     def _place(self, sensor: str, scan: Scan, deadline: float) -> None:
         """Add the placed scan to the unread ones once the pose of its last ray is known, or count it."""
-        if self._closed:
-            return
         try:
-            left_s = max(deadline - time.monotonic(), 0.0)
-            self.buffer.wait(self.target, scan.frame, scan.end_stamp, left_s)
+            if not self._wait_for_pose(scan, deadline):
+                return
             points, valid = self.buffer.place(scan.points(), scan.stamps(), scan.frame, self.target)
         except LookupFailed as reason:
             self.last_reason = reason
@@ -181,6 +179,21 @@ class ScanListener(Closeable):
         else:
             points = points.astype(np.float32, copy=False)  # for type checkers
             self._unread.add([PlacedScan(scan, sensor, self.target, points, valid)])
+
+    def _wait_for_pose(self, scan: Scan, deadline: float) -> bool:
+        """Wait for the pose of the last ray. False if this listener is closed; raises LookupFailed."""
+        began = time.monotonic()
+        while not self._closed:
+            left_s = max(deadline - time.monotonic(), 0.0)
+            try:
+                self.buffer.wait(self.target, scan.frame, scan.end_stamp, min(left_s, _LONGEST_WAIT_S))
+            except WaitTimeout as reason:
+                if left_s <= _LONGEST_WAIT_S:
+                    reason.waited_s = max(deadline - began, 0.0)
+                    raise
+            else:
+                return True
+        return False
 
     def __iter__(self) -> Iterator[PlacedScan]:
         return iter(self._unread)
