@@ -54,6 +54,15 @@ def test_cancelled_wait_leaves_nothing_behind():
     assert not inbox._waiting_tasks
 
 
+def test_items_lost_for_newer_ones_are_counted():
+    inbox: Inbox[int] = Inbox(3, lambda: None)
+    assert inbox.add([1, 2]) == 0
+    assert inbox.add([3, 4, 5]) == 2
+    assert inbox.add([6]) == 1
+    inbox.close()
+    assert list(inbox) == [4, 5, 6]
+
+
 def test_item_added_after_close_is_lost():
     inbox: Inbox[int] = Inbox(3, lambda: None)
     inbox.add([1])

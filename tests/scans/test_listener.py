@@ -111,6 +111,15 @@ def test_scan_whose_pose_does_not_come_is_dropped_with_the_limiting_edge(session
         assert len(scans) == 0
 
 
+@pytest.mark.parametrize("stamp", [2 * MS, 5 * MS], ids=["unread", "waiting"])
+def test_scans_lost_for_newer_ones_are_counted(sessions, stamp: int):
+    writer, reader = sessions
+    with ScanListener(reader, "r1", "odom", buffer=buffer_until(3 * MS), timeout_s=60.0) as scans:
+        with ScanPublisher(writer, "r1", "laser", **GEOMETRY) as publisher:
+            until(lambda: [publisher.publish([1.0], stamp) for _ in range(50)] and scans.dropped)
+        assert set(scans.dropped) == {"Overflow"}
+
+
 def test_scan_that_is_late_does_not_delay_another_sensor(sessions):
     writer, reader = sessions
     with ScanListener(reader, "r1", "odom", buffer=buffer_until(3 * MS), timeout_s=60.0) as scans:

@@ -24,6 +24,7 @@ class Inbox(Generic[T]):
     """
 
     def __init__(self, capacity: int, check_reception: Callable[[], object]) -> None:
+        self._capacity = capacity
         self._items: deque[T] = deque(maxlen=capacity)
         self._check_reception = check_reception
         self._changed = fork_safe(threading.Condition())
@@ -33,12 +34,19 @@ class Inbox(Generic[T]):
     def __len__(self) -> int:
         return len(self._items)
 
-    def add(self, items: Iterable[T]) -> None:
-        """Add items, oldest first. Of more than ``capacity`` the oldest are lost; after ``close()``, all."""
+    def add(self, items: Iterable[T]) -> int:
+        """Add items, oldest first; after ``close()`` none.
+
+        Of more than ``capacity`` the oldest are lost; returns how many.
+        """
+        added = list(items)
         with self._changed:
-            if not self._closed:
-                self._items.extend(items)
-                self._wake()
+            if self._closed:
+                return 0
+            lost = max(len(self._items) + len(added) - self._capacity, 0)
+            self._items.extend(added)
+            self._wake()
+        return lost
 
     def take_newest(self) -> T | None:
         """The newest item, None if there is none; the others are lost."""
