@@ -267,8 +267,8 @@ class LaserScan(StampedMessage, frozen=True, array_like=True, gc=False):
             )
 
 
-GRID_CELLS = 16_000_000
-"""The most cells of an occupancy grid: 4000 x 4000."""
+GRID_CELLS = 4096 * 4096
+"""The most cells of an occupancy grid."""
 
 
 class OccupancyGrid(Message, frozen=True, array_like=True, gc=False):
@@ -302,7 +302,7 @@ class OccupancyGrid(Message, frozen=True, array_like=True, gc=False):
             )
         if len(self.cells) > GRID_CELLS:
             raise InvalidInput(
-                f"a grid of {len(self.cells)} cells, where {GRID_CELLS} are allowed (4000 x 4000)"
+                f"a grid of {len(self.cells)} cells, where {GRID_CELLS} are allowed (4096 x 4096)"
             )
         values = np.frombuffer(self.cells, dtype=np.int8)
         if values.size and not -1 <= values.min() <= values.max() <= 100:
@@ -392,7 +392,7 @@ SAMPLE_BYTES = 256_000
 SCAN_BYTES = 810_000
 """A scan of ``SCAN_RAYS`` with intensities takes less on each wire."""
 
-LATCHED_BYTES = 16 * 2**20
+LATCHED_BYTES = GRID_CELLS + 8 * 2**10
 """A grid of ``GRID_CELLS`` takes less on each wire."""
 ATTACHMENT_BYTES = 1_024
 STATIC_EDGES = 10_000
