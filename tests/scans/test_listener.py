@@ -218,9 +218,11 @@ def test_thread_of_a_sensor_outlives_the_session_and_ends_with_the_listener(sess
 def test_scan_that_waits_for_its_pose_ends_with_the_listener(sessions):
     writer, reader = sessions
     buffer = buffer_until(3 * MS)
-    with ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=3600.0) as scans:
-        with ScanPublisher(writer, "r1", "waiting_long", frame="laser", **GEOMETRY) as publisher:
-            until(lambda: publisher.publish([1.0], 5 * MS) or buffer.waiter_count)
+    with (
+        ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=3600.0) as scans,
+        ScanPublisher(writer, "r1", "waiting_long", frame="laser", **GEOMETRY) as publisher,
+    ):
+        until(lambda: publisher.publish([1.0], 5 * MS) or buffer.waiter_count)
     until(lambda: not is_placing("waiting_long"))
     assert len(scans) == 0
     assert not scans.dropped

@@ -221,7 +221,7 @@ def test_level_laser_in_the_plane_of_the_map_measures_no_floor():
 
 
 def test_limits_of_a_tilted_laser_hold_along_the_ray():
-    # A wall at x = 3 m. A ray from x = 2.94, z = 1 m that goes down by 60 degrees hits it after 0.06 m / cos 60.
+    # A wall at x = 3 m. A ray from x = 2.94, z = 1 m, 60 degrees down, hits it after 0.06 m / cos 60.
     cells = np.zeros((10, 40), int)
     cells[:, 30:] = 100
     pose = (2.94, 0.55, 1.0, 0.0, math.sin(math.radians(30.0)), 0.0, math.cos(math.radians(30.0)))

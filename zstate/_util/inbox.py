@@ -20,7 +20,8 @@ class Inbox(Generic[T]):
     """The last ``capacity`` items that were added and not taken. Any thread may add.
 
     Iterations return each item once, in the order of arrival, and end with ``close()``, after the last item.
-    ``check_reception()`` is called before a wait and every 0.5 s of it; it raises if nothing can arrive, as in a forked process.
+    ``check_reception()`` is called before a wait and every 0.5 s of it; it raises if nothing can arrive, as
+    in a forked process.
     """
 
     def __init__(self, capacity: int, check_reception: Callable[[], object]) -> None:

@@ -35,7 +35,8 @@ class RangeSource(Protocol):
     def read(self, stamp: int) -> Scan | ArrayLike | None:
         """The ranges [m] of the sweep whose last ray is at ``stamp`` [ns]; None when there is nothing new.
 
-        A source that stamps its sweeps itself returns a Scan, with the geometry and the frame of the publisher.
+        A source that stamps its sweeps itself returns a Scan, with the geometry and the frame of the
+        publisher.
         """
         ...
 

@@ -143,7 +143,7 @@ class SimulatedLaser:
         return steps * self._resolution
 
     def _measured(self, distances: _Array) -> NDArray[np.float32]:
-        """What the sensor measures of true ``distances`` [m] along its rays: with noise, within its limits."""
+        """What the sensor measures of ``distances`` [m] along its rays: with noise, within its limits."""
         ranges = distances.copy()
         if self._noise_m:
             ranges += self._random.normal(0.0, self._noise_m, len(ranges))
