@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import threading
 
 import numpy as np
 import pytest
@@ -49,6 +50,17 @@ def test_each_ray_is_placed_by_the_pose_at_its_own_stamp(sessions):
     assert placed.valid.all()
     assert not placed.is_rigid
     assert (placed.stamp, placed.sensor, placed.scan.frame) == (2 * MS, "laser", "r1/laser")
+
+
+def test_bare_target_is_a_frame_of_the_robot_among_others(sessions):
+    writer, reader = sessions
+    buffer = buffer_until(10 * MS)
+    buffer.insert(pose_at(10 * MS, "r2/"))
+    with ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=0.0) as scans:
+        with ScanPublisher(writer, "r1", "laser", **GEOMETRY) as publisher:
+            until(lambda: publisher.publish([1.0], 2 * MS) or len(scans) or scans.dropped)
+        assert not scans.dropped
+        assert next(iter(scans)).target == "r1/odom"
 
 
 def test_rays_without_times_are_placed_rigidly_and_marked(sessions):
@@ -97,6 +109,15 @@ def test_scan_whose_pose_does_not_come_is_dropped_with_the_limiting_edge(session
         assert set(scans.dropped) == {"InFuture"}
         assert "r1/odom" in str(scans.last_reason)
         assert len(scans) == 0
+
+
+@pytest.mark.parametrize("stamp", [2 * MS, 5 * MS], ids=["unread", "waiting"])
+def test_scans_lost_for_newer_ones_are_counted(sessions, stamp: int):
+    writer, reader = sessions
+    with ScanListener(reader, "r1", "odom", buffer=buffer_until(3 * MS), timeout_s=60.0) as scans:
+        with ScanPublisher(writer, "r1", "laser", **GEOMETRY) as publisher:
+            until(lambda: [publisher.publish([1.0], stamp) for _ in range(50)] and scans.dropped)
+        assert set(scans.dropped) == {"Overflow"}
 
 
 def test_scan_that_is_late_does_not_delay_another_sensor(sessions):
@@ -172,3 +193,36 @@ def test_wrong_arguments_are_refused_at_once(sessions):
         ScanListener(sessions[1], "r1", "odom", timeout_s=-1.0)
     with pytest.raises(InvalidInput, match="robot"):
         ScanListener(sessions[1], "a/b", "odom")
+
+
+def is_placing(sensor: str) -> bool:
+    return any(thread.name == f"zstate scans of {sensor}" for thread in threading.enumerate())
+
+
+def test_thread_of_a_sensor_outlives_the_session_and_ends_with_the_listener(sessions, monkeypatch):
+    writer, reader = sessions
+    failures: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", failures.append)
+    buffer = buffer_until(3 * MS)
+    with ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=60.0) as scans:
+        with ScanPublisher(writer, "r1", "outliving", frame="laser", **GEOMETRY) as publisher:
+            until(lambda: publisher.publish([1.0], 5 * MS) or buffer.waiter_count)
+        reader.close()
+        buffer.insert(pose_at(5 * MS, "r1/"))
+        until(lambda: len(scans) > 0)
+        assert is_placing("outliving")
+    until(lambda: not is_placing("outliving"))
+    assert not failures
+
+
+def test_scan_that_waits_for_its_pose_ends_with_the_listener(sessions):
+    writer, reader = sessions
+    buffer = buffer_until(3 * MS)
+    with (
+        ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=3600.0) as scans,
+        ScanPublisher(writer, "r1", "waiting_long", frame="laser", **GEOMETRY) as publisher,
+    ):
+        until(lambda: publisher.publish([1.0], 5 * MS) or buffer.waiter_count)
+    until(lambda: not is_placing("waiting_long"))
+    assert len(scans) == 0
+    assert not scans.dropped

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from zstate.net.subscription import Received, subscribe
 from zstate.scans import Grid, MapPublisher, Scan, ScanPublisher
 from zstate.scans.grid import grid_from_message
 from zstate.scans.scan import scan_from_message
-from zstate.wire.messages import LaserScan, OccupancyGrid
+from zstate.wire.messages import SCAN_RAYS, LaserScan, OccupancyGrid
 from zstate.wire.registry import get_wire
 
 GEOMETRY = {"angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.1, "range_max": 10.0}
@@ -104,12 +105,12 @@ def test_run_publishes_sweeps_that_end_at_their_ticks_and_leaves_out_none(sessio
     assert ends == [tick for tick in ticks[1::2] if tick in set(ends)]
 
 
-def test_run_keeps_the_stamp_of_a_scan_and_refuses_another_geometry(sessions):
+def test_run_keeps_the_stamp_of_a_scan(sessions):
     writer, reader = sessions
     scans = Scans(reader)
 
     class Lidar:
-        scan = Scan(777, -1.0, 0.5, 100, [1.0, 2.0], 0.1, 10.0)
+        scan = Scan(777, -1.0, 0.5, 100, [1.0, 2.0], 0.1, 10.0, "front")
 
         def read(self, _: int) -> Scan:
             return self.scan
@@ -121,9 +122,27 @@ def test_run_keeps_the_stamp_of_a_scan_and_refuses_another_geometry(sessions):
         publisher.run(lidar, 100.0, seconds=0.05)
         until(lambda: scans)
         assert {scan.stamp for scan in scans} <= {0, 777}
-        lidar.scan = Scan(778, -1.0, 0.25, 100, [1.0, 2.0], 0.1, 10.0)
-        with pytest.raises(InvalidInput, match=r"has angle_min.*\(-1.0, 0.5, 100\).*\(-1.0, 0.25, 100\)"):
-            publisher.run(lidar, 100.0, seconds=1.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"angle_increment": 0.25}, "has angle_increment=0.5; its source returned.* angle_increment=0.25"),
+        ({"ray_ns": 50}, "has ray_ns=100; .* ray_ns=50"),
+        ({"range_max": 5.0}, "has range_max=10.0; .* range_max=5.0"),
+        ({"frame": "rear"}, "has frame='r1/front'; .* frame='r1/rear'"),
+    ],
+)
+def test_run_refuses_a_scan_of_another_geometry_or_frame(sessions, changes: dict[str, Any], message: str):
+    class Lidar:
+        def read(self, stamp: int) -> Scan:
+            own = {**GEOMETRY, "ray_ns": 100, "frame": "r1/front"}
+            return Scan(stamp, ranges=[1.0, 2.0], **{**own, **changes})
+
+    with ScanPublisher(sessions[0], "r1", "front", ray_ns=100, **GEOMETRY) as publisher:
+        with pytest.raises(InvalidInput, match=message):
+            publisher.run(Lidar(), 100.0, seconds=0.05)
+        assert publisher.stats.sent == 0
 
 
 def test_scan_that_is_none_is_refused_and_counted_and_nothing_is_sent(sessions):
@@ -137,6 +156,19 @@ def test_scan_that_is_none_is_refused_and_counted_and_nothing_is_sent(sessions):
             publisher.publish([1.0, 2.0], intensities=[1.0])
         assert publisher.stats.sent == 0
         assert publisher.stats.refused == 3
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_scan_of_the_largest_size_arrives_and_a_larger_one_is_refused(sessions, wire: str):
+    writer, reader = sessions
+    scans = Scans(reader, wire)
+    geometry = {**GEOMETRY, "angle_increment": 1e-5}
+    rays = np.ones(SCAN_RAYS, dtype=np.float32)
+    with ScanPublisher(writer, "r1", "front", wire, frame="f" * 500, **geometry) as publisher:
+        scan = publish_until_received(publisher, scans, rays, intensities=rays)
+        with pytest.raises(InvalidInput, match="100001 rays, where 100000 are allowed"):
+            publisher.publish(np.ones(SCAN_RAYS + 1, dtype=np.float32))
+    assert len(scan.ranges) == SCAN_RAYS
 
 
 def test_wrong_geometry_is_refused_when_the_publisher_opens(sessions):
@@ -188,14 +220,15 @@ def test_map_is_replaced_and_then_withdrawn(sessions):
         publisher.set(ROOM)
 
 
-def test_map_of_4000_x_4000_cells_arrives(sessions):
+def test_map_of_4096_x_4096_cells_arrives(sessions):
     writer, reader = sessions
-    cells = np.zeros((4000, 4000), dtype=np.int8)
+    cells = np.zeros((4096, 4096), dtype=np.int8)
     cells[::7, ::3] = 100
-    with MapPublisher(writer, "hall", Grid(cells, 0.05, (0, 0, 0))):
+    with MapPublisher(writer, "hall", Grid(cells, 0.05, (0, 0, 0)), frame="f" * 500):
         maps = Maps(reader)
         until(lambda: maps)
-        assert np.array_equal(maps["zstate/hall/map/map"].cells, cells)
+        (grid,) = maps.values()
+        assert np.array_equal(grid.cells, cells)
 
 
 def test_second_writer_of_a_map_is_refused(sessions):

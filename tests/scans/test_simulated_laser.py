@@ -220,6 +220,35 @@ def test_level_laser_in_the_plane_of_the_map_measures_no_floor():
     assert ahead == pytest.approx(2.5)
 
 
+def test_limits_of_a_tilted_laser_hold_along_the_ray():
+    # A wall at x = 3 m. A ray from x = 2.94, z = 1 m, 60 degrees down, hits it after 0.06 m / cos 60.
+    cells = np.zeros((10, 40), int)
+    cells[:, 30:] = 100
+    pose = (2.94, 0.55, 1.0, 0.0, math.sin(math.radians(30.0)), 0.0, math.cos(math.radians(30.0)))
+    for range_min, distance in ((0.1, 0.12), (0.13, -math.inf)):
+        one = SimulatedLaser(
+            Grid(cells, 0.1, (0.0, 0.0, 0.0)), angle_min=0.0, ray_count=1, range_min=range_min
+        )
+        (ahead,) = one.scan_in_space(0, [pose]).ranges
+        assert ahead == pytest.approx(distance)
+
+
+def test_noise_of_a_tilted_laser_is_along_the_ray_and_on_the_floor_as_well():
+    # Rays from z = 1 m, 60 degrees down, without a wall: the floor after 1 m / sin 60.
+    free = Grid(np.zeros((4, 4), int), 1.0, (0.0, 0.0, 0.0))
+    rays = {"angle_min": 0.0, "angle_increment": 1e-9, "ray_count": 2000}
+    noisy = SimulatedLaser(free, **rays, noise_m=0.02, seed=7)
+    pose = (2.0, 2.0, 1.0, 0.0, math.sin(math.radians(30.0)), 0.0, math.cos(math.radians(30.0)))
+    errors = noisy.scan_in_space(0, [pose] * 2000).ranges - 1.0 / math.sin(math.radians(60.0))
+    assert abs(errors.std() - 0.02) < 5 * 0.02 / math.sqrt(4000)
+
+
+@pytest.mark.parametrize("shape", [(7,), (3, 7), (4, 6)])
+def test_poses_of_another_shape_are_refused(shape: tuple[int, ...]):
+    with pytest.raises(InvalidInput, match=r"have the shape \(4, 7\), one pose for each ray"):
+        laser().scan_in_space(0, np.ones(shape))
+
+
 def mounted(buffer: TransformBuffer) -> MountedLaser:
     """Rays every second, so that a sweep takes 3 s."""
     return MountedLaser(laser(ray_ns=10**9), buffer, "r1/laser", "r1/map")
@@ -255,6 +284,18 @@ def test_mounted_laser_on_static_edges_measures_at_each_stamp():
     # In the map the laser is turned by a quarter.
     buffer.insert_static(Transform.from_rpy("r1/map", "r1/base", [0.0, 0.0, 0.0], [0, 0, QUARTER]))
     assert source.target == "r1/map"
+
+
+def test_mounted_laser_measures_again_after_the_clock_is_set_back():
+    buffer = TransformBuffer()
+    buffer.insert_static(Transform.from_rpy("r1/base", "r1/laser", [1.0, 0.5, 0.0], [0, 0, 0]))
+    source = mounted(buffer)
+    assert source.read(60 * 10**9) is not None
+    # A late tick is no older clock.
+    assert source.read(60 * 10**9 - 1) is None
+    again = source.read(5 * 10**9)
+    assert again is not None
+    assert again.end_stamp == 5 * 10**9
 
 
 def test_mounted_laser_without_a_pose_has_a_problem_and_no_sweep():

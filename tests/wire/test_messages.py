@@ -7,6 +7,8 @@ import pytest
 from zstate.errors import InvalidInput
 from zstate.wire.messages import (
     GRID_CELLS,
+    MAX_BYTES,
+    SCAN_RAYS,
     JointState,
     LaserScan,
     OccupancyGrid,
@@ -20,6 +22,7 @@ from zstate.wire.messages import (
     to_block,
     to_float32_block,
 )
+from zstate.wire.native import encode
 
 EDGES = (("base", "arm"), ("arm", "hand"))
 
@@ -105,6 +108,14 @@ def test_a_block_of_ranges_is_little_endian_float32():
     np.testing.assert_array_equal(from_float32_block(to_float32_block([0.5, np.inf])), [0.5, np.inf])
 
 
+def test_a_scan_has_at_most_100000_rays():
+    ranges = bytes(4 * SCAN_RAYS)
+    largest = scan(ranges=ranges, intensities=ranges, frame="\U0001f916" * 1024)
+    assert len(encode(largest)) <= MAX_BYTES["scan"]
+    with pytest.raises(InvalidInput, match="100001 rays, where 100000 are allowed"):
+        scan(ranges=bytes(4 * SCAN_RAYS + 4))
+
+
 def test_ranges_that_are_no_measurements_are_part_of_a_scan():
     ranges = to_float32_block([-np.inf, np.inf, np.nan, 99.0])
     assert scan(ranges=ranges, intensities=ranges, range_max=np.inf).ranges == ranges
@@ -151,7 +162,7 @@ def test_row_0_of_the_cells_is_the_first_width_cells():
         ({"width": -3, "height": -2}, "-3 x -2 needs"),
         ({"cells": bytes([0, 0, 0, 0, 0, 101])}, "not 0 to 101"),
         ({"cells": bytes([0, 0, 0, 0, 0, 254])}, "not -2 to 0"),
-        ({"width": GRID_CELLS + 1, "height": 1, "cells": bytes(GRID_CELLS + 1)}, "16000000 are allowed"),
+        ({"width": GRID_CELLS + 1, "height": 1, "cells": bytes(GRID_CELLS + 1)}, "16777216 are allowed"),
     ],
 )
 def test_a_grid_with_impossible_geometry_or_cells_cannot_be_made(changed: dict[str, Any], text: str):

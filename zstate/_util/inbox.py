@@ -12,7 +12,7 @@ from zstate._util.fork_safe import fork_safe
 
 T = TypeVar("T")
 
-# Ctrl-C that arrives as a thread starts to wait is handled only after that wait.
+# Ctrl-C that arrives as a thread starts to wait is handled only after that wait; so is the end of reception.
 _LONGEST_WAIT_S = 0.5
 
 
@@ -20,10 +20,12 @@ class Inbox(Generic[T]):
     """The last ``capacity`` items that were added and not taken. Any thread may add.
 
     Iterations return each item once, in the order of arrival, and end with ``close()``, after the last item.
-    ``check_reception()`` is called before a wait; it raises if nothing can arrive, as in a forked process.
+    ``check_reception()`` is called before a wait and every 0.5 s of it; it raises if nothing can arrive, as
+    in a forked process.
     """
 
     def __init__(self, capacity: int, check_reception: Callable[[], object]) -> None:
+        self._capacity = capacity
         self._items: deque[T] = deque(maxlen=capacity)
         self._check_reception = check_reception
         self._changed = fork_safe(threading.Condition())
@@ -33,11 +35,19 @@ class Inbox(Generic[T]):
     def __len__(self) -> int:
         return len(self._items)
 
-    def add(self, items: Iterable[T]) -> None:
-        """Add items, oldest first. Of more than ``capacity`` the oldest are lost."""
+    def add(self, items: Iterable[T]) -> int:
+        """Add items, oldest first; after ``close()`` none.
+
+        Of more than ``capacity`` the oldest are lost; returns how many.
+        """
+        added = list(items)
         with self._changed:
-            self._items.extend(items)
+            if self._closed:
+                return 0
+            lost = max(len(self._items) + len(added) - self._capacity, 0)
+            self._items.extend(added)
             self._wake()
+        return lost
 
     def take_newest(self) -> T | None:
         """The newest item, None if there is none; the others are lost."""
@@ -79,8 +89,12 @@ class Inbox(Generic[T]):
                     self._waiting_tasks.append(wake)
             if items:
                 yield items[0]
-            else:
-                await arrived.wait()
+                continue
+            try:
+                with suppress(TimeoutError, asyncio.TimeoutError):
+                    await asyncio.wait_for(arrived.wait(), _LONGEST_WAIT_S)
+            finally:
+                self._remove_task(wake)
 
     def close(self) -> None:
         """End the iterations. A second call does nothing."""
@@ -91,6 +105,12 @@ class Inbox(Generic[T]):
     def _check(self) -> None:
         if not (self._items or self._closed):
             self._check_reception()
+
+    def _remove_task(self, wake: Callable[[], object]) -> None:
+        """Remove the callback of a task that was cancelled, or has waited long enough."""
+        with self._changed:
+            if wake in self._waiting_tasks:
+                self._waiting_tasks.remove(wake)
 
     def _wake(self) -> None:
         self._changed.notify_all()

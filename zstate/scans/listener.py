@@ -14,24 +14,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.inbox import Inbox
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer, check_duration
 from zstate.checks import check_names
 from zstate.clock import Clock
-from zstate.errors import InvalidInput, LookupFailed
+from zstate.errors import InvalidInput, LookupFailed, WaitTimeout
 from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.scans.scan import Scan, scan_from_message
-from zstate.wire.keys import ANY, check_robot, check_writer, shortened
+from zstate.wire.keys import ANY, check_robot, check_writer, full_name, shortened
 from zstate.wire.messages import LaserScan
 from zstate.wire.registry import get_wire
 
 _CAPACITY = 256
 """Scans kept for a slow reader, and scans of one sensor that wait for their poses."""
+_OVERFLOW = "Overflow"
 _MAX_SENSORS = 64
+_LONGEST_WAIT_S = 0.5
+"""After this time at the latest a thread that waits for a pose ends with its listener."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +71,18 @@ class PlacedScan:
 class _SensorScans(Closeable):
     """The scans of one sensor, which wait for their poses in a thread of their own."""
 
-    def __init__(
-        self, place: Callable[[Scan, float], object], sensor: str, check_reception: Callable[[], object]
-    ) -> None:
+    def __init__(self, place: Callable[[Scan, float], object], sensor: str) -> None:
         self._place = place
-        self._waiting: Inbox[tuple[Scan, float]] = Inbox(_CAPACITY, check_reception)
+        # The thread ends with the listener, not with its session.
+        self._waiting: Inbox[tuple[Scan, float]] = Inbox(_CAPACITY, lambda: None)
         threading.Thread(target=self._run, name=f"zstate scans of {sensor}", daemon=True).start()
 
-    def add(self, scan: Scan, deadline: float) -> None:
-        """Place ``scan`` until ``deadline`` [s, ``time.monotonic``], after the scans before it."""
-        self._waiting.add([(scan, deadline)])
+    def add(self, scan: Scan, deadline: float) -> int:
+        """Place ``scan`` until ``deadline`` [s, ``time.monotonic``], after the scans before it.
+
+        Returns how many older scans are lost.
+        """
+        return self._waiting.add([(scan, deadline)])
 
     def _run(self) -> None:
         for scan, deadline in self._waiting:
@@ -91,9 +97,10 @@ class ScanListener(Closeable):
     """Receives the scans of ``robot``, and places each ray in ``target`` by the pose at its own instant.
 
     ``for placed in scans`` and ``async for placed in scans`` return a PlacedScan for each scan, in the order
-    in which they became placeable, and end with ``close()``; of more than 256 unread ones the oldest are
-    lost. A scan waits for the pose of its *last* ray, at most ``timeout_s`` from its arrival: then it is
-    counted in ``dropped`` by the name of the error, and ``last_reason`` names the edge that was too late.
+    in which they became placeable, and end with ``close()``. A scan waits for the pose of its *last* ray, at
+    most ``timeout_s`` from its arrival: then it is counted in ``dropped`` by the name of the error, and
+    ``last_reason`` names the edge that was too late. Of more than 256 scans that are unread, or of one
+    sensor that wait, the oldest are lost; ``dropped["Overflow"]`` counts them.
     ``refused`` counts messages that are no scan, by reason; the first of each reason is also logged.
 
     ``sensor`` selects one scanner of the robot, on the native wire; "*": all of them. Frames come from
@@ -117,8 +124,9 @@ class ScanListener(Closeable):
         check_duration("timeout_s", timeout_s)
         self.robot = check_robot(robot)
         self.sensor = sensor if sensor == ANY else check_writer(sensor)
-        self.target = target
+        self.target = full_name(robot, target)
         self.dropped: Counter[str] = Counter()
+        self._dropped_lock = fork_safe_lock()
         self.last_reason: LookupFailed | None = None
         self._refusals = Refusals("scan")
         self.refused: dict[str, int] = self._refusals.counts
@@ -126,7 +134,6 @@ class ScanListener(Closeable):
         self._unread: Inbox[PlacedScan] = Inbox(_CAPACITY, session.check)
         self._sensors: dict[str, _SensorScans] = {}
         self._wire = get_wire(wire)
-        self._check = session.check
         self._closed = False
         with ExitStack() as opening:
             if buffer is None:
@@ -156,31 +163,52 @@ class ScanListener(Closeable):
                 continue
             try:
                 assert isinstance(message, LaserScan)
-                self._scans_of(sensor).add(scan_from_message(message, robot), deadline)
+                lost = self._scans_of(sensor).add(scan_from_message(message, robot), deadline)
             except InvalidInput as error:
                 self._refusals.count("malformed", f"{shortened(key)}: {error}")
+            else:
+                self._count_dropped(_OVERFLOW, lost)
 
     def _scans_of(self, sensor: str) -> _SensorScans:
         if sensor not in self._sensors:
             if len(self._sensors) >= _MAX_SENSORS:
                 raise InvalidInput(f"the robot {self.robot!r} has more than {_MAX_SENSORS} sensors")
-            self._sensors[sensor] = _SensorScans(partial(self._place, sensor), sensor, self._check)
+            self._sensors[sensor] = _SensorScans(partial(self._place, sensor), sensor)
         return self._sensors[sensor]
 
     def _place(self, sensor: str, scan: Scan, deadline: float) -> None:
         """Add the placed scan to the unread ones once the pose of its last ray is known, or count it."""
-        if self._closed:
-            return
         try:
-            left_s = max(deadline - time.monotonic(), 0.0)
-            self.buffer.wait(self.target, scan.frame, scan.end_stamp, left_s)
+            if not self._wait_for_pose(scan, deadline):
+                return
             points, valid = self.buffer.place(scan.points(), scan.stamps(), scan.frame, self.target)
         except LookupFailed as reason:
             self.last_reason = reason
-            self.dropped[type(reason).__name__.removesuffix("Timeout")] += 1
+            self._count_dropped(type(reason).__name__.removesuffix("Timeout"))
         else:
             points = points.astype(np.float32, copy=False)  # for type checkers
-            self._unread.add([PlacedScan(scan, sensor, self.target, points, valid)])
+            placed = PlacedScan(scan, sensor, self.target, points, valid)
+            self._count_dropped(_OVERFLOW, self._unread.add([placed]))
+
+    def _count_dropped(self, reason: str, count: int = 1) -> None:
+        if count:
+            with self._dropped_lock:
+                self.dropped[reason] += count
+
+    def _wait_for_pose(self, scan: Scan, deadline: float) -> bool:
+        """Wait for the pose of the last ray. False if this listener is closed; raises LookupFailed."""
+        began = time.monotonic()
+        while not self._closed:
+            left_s = max(deadline - time.monotonic(), 0.0)
+            try:
+                self.buffer.wait(self.target, scan.frame, scan.end_stamp, min(left_s, _LONGEST_WAIT_S))
+            except WaitTimeout as reason:
+                if left_s <= _LONGEST_WAIT_S:
+                    reason.waited_s = max(deadline - began, 0.0)
+                    raise
+            else:
+                return True
+        return False
 
     def __iter__(self) -> Iterator[PlacedScan]:
         return iter(self._unread)

@@ -25,7 +25,7 @@ from zstate.rate import RateReport
 from zstate.scans.grid import Grid, grid_to_message
 from zstate.scans.scan import Scan, scan_to_message
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import check_robot, check_writer
+from zstate.wire.keys import check_robot, check_writer, full_name
 from zstate.wire.registry import as_wire_names, get_wire
 
 
@@ -35,7 +35,8 @@ class RangeSource(Protocol):
     def read(self, stamp: int) -> Scan | ArrayLike | None:
         """The ranges [m] of the sweep whose last ray is at ``stamp`` [ns]; None when there is nothing new.
 
-        A source that stamps its sweeps itself returns a Scan, with the geometry of the publisher.
+        A source that stamps its sweeps itself returns a Scan, with the geometry and the frame of the
+        publisher.
         """
         ...
 
@@ -76,7 +77,7 @@ class ScanPublisher(SamplePublisher):
         self.frame = sensor if frame is None else frame
         self._angles = angle_min, angle_increment, ray_ns
         self._limits_m = range_min, range_max
-        self._scan(0, [range_max, range_max], None)  # raises here, where the mistake is made
+        self._empty = self._scan(0, [range_max, range_max], None)  # raises here, where the mistake is made
         self._claim: WriterClaim | None = None
         self._second_writer: SecondWriter | None = None
         announced = Announcement(self.robot, "scan", identity, self.sensor)
@@ -142,26 +143,44 @@ class ScanPublisher(SamplePublisher):
         if self._second_writer is not None:
             raise self._second_writer.with_traceback(None)
 
+    def _check_geometry(self, sweep: Scan) -> None:
+        own, other = _geometry(self._empty, self.robot), _geometry(sweep, self.robot)
+        wrong = [name for name in own if own[name] != other[name]]
+        if wrong:
+            raise InvalidInput(
+                f"the scan publisher {self.sensor!r} has "
+                f"{', '.join(f'{name}={own[name]!r}' for name in wrong)}; its source returned a Scan with "
+                f"{', '.join(f'{name}={other[name]!r}' for name in wrong)}: open the publisher with the "
+                "geometry and the frame of its source"
+            )
+
     def run(self, source: RangeSource, rate_hz: float = 30.0, *, seconds: float | None = None) -> RateReport:
         """Publish the sweeps of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
 
         Each sweep ends at its tick, unless ``source`` returns a Scan. Raises as ``publish``, and InvalidInput
-        for a Scan of another geometry; ``Rate`` describes late ticks.
+        for a Scan of another geometry or frame; ``Rate`` describes late ticks.
         """
 
         def publish(sweep: Scan | ArrayLike, now: int) -> None:
             if not isinstance(sweep, Scan):
                 self.publish(sweep, self._first_stamp(now, sweep))
                 return
-            angles = sweep.angle_min, sweep.angle_increment, sweep.ray_ns
-            if angles != self._angles:
-                raise InvalidInput(
-                    f"the scan publisher {self.sensor!r} has angle_min, angle_increment and ray_ns "
-                    f"{self._angles}; its source returned a Scan with {angles}"
-                )
+            self._check_geometry(sweep)
             self.publish(sweep.ranges, sweep.stamp, sweep.intensities)
 
         return self._publish_at(rate_hz, seconds, source.read, publish)
+
+
+def _geometry(scan: Scan, robot: str) -> dict[str, object]:
+    """What all scans of one sensor have in common."""
+    return {
+        "angle_min": scan.angle_min,
+        "angle_increment": scan.angle_increment,
+        "ray_ns": scan.ray_ns,
+        "range_min": scan.range_min,
+        "range_max": scan.range_max,
+        "frame": full_name(robot, scan.frame),
+    }
 
 
 class MapPublisher(Closeable):

@@ -99,6 +99,13 @@ class Scan:
                 f"angles of a scan are in radians, at most a full turn; got angle_min={self.angle_min:g}. If "
                 f"it is in degrees, it is {math.radians(self.angle_min):.6g} rad"
             )
+        increment = abs(self.angle_increment)
+        if increment > _FULL_TURN or increment * (len(self.ranges) - 1) > _FULL_TURN + increment:
+            raise InvalidInput(
+                f"the rays of a scan cover at most a full turn [rad]; got {len(self.ranges)} rays with "
+                f"angle_increment={self.angle_increment:g}. If it is in degrees, it is "
+                f"{math.radians(self.angle_increment):.6g} rad"
+            )
         if self.angle_increment == 0.0 and len(self.ranges) > 1:
             raise InvalidInput(
                 f"angle_increment is 0, so that all {len(self.ranges)} rays would have one direction; pass "
@@ -226,4 +233,4 @@ def _ray_ns(value: Any) -> int:
             f"ray_ns is the time between two rays as a whole number of nanoseconds, 0 or more; got "
             f"{value!r}. From ROS: round(time_increment * 1e9)"
         )
-    return ray_ns
+    return check_stamp(ray_ns)

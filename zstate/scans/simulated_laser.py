@@ -36,6 +36,9 @@ _LEVEL_M = 1e-6
 """A laser up to this height is in the plane of the map, and measures no floor."""
 
 _WALL_HEIGHT_M = 2.5
+_SET_BACK_NS = 10**9
+"""A clock earlier by more than this was set back; by less, a tick was late."""
+
 _FARTHEST = 1000  # cells; a smaller square is free as well
 
 # The state of all rays while they are cast has these rows; the first five are pairs, along columns and rows.
@@ -100,16 +103,20 @@ class SimulatedLaser:
         ``poses`` (ray_count, 7), x y z [m], qx qy qz qw, are those of the sensor at each ray, in the grid's
         frame. Occupied cells are walls up to z = 2.5 m; a laser above z = 0 measures a floor there as well.
         """
-        x, y, z, *rotation = real_numbers(poses, "poses").T
+        array = real_numbers(poses, "poses")
+        if array.shape != (len(self._angles), 7):
+            raise InvalidInput(
+                f"poses of a laser have the shape ({len(self._angles)}, 7), one pose for each ray; got "
+                f"{array.shape}"
+            )
+        x, y, z, *rotation = array.T
         qx, qy, qz, qw = rotation
         east, north, up = se3.rotate((qx, qy, qz, qw), (np.cos(self._angles), np.sin(self._angles), 0.0))
         with np.errstate(divide="ignore", invalid="ignore"):  # vertical and level rays
-            walls = self.ranges(x, y, np.arctan2(north, east) - self._angles) / np.hypot(east, north)
+            walls = self._cast(x, y, np.arctan2(north, east) - self._angles) / np.hypot(east, north)
             floor = np.where((z > _LEVEL_M) & (up < 0.0), -z / up, math.inf)
             walls[z + walls * up > _WALL_HEIGHT_M] = math.inf
-        ranges = np.minimum(walls, floor)
-        ranges[ranges > self._rays.range_max] = math.inf
-        return replace(self._rays, stamp=stamp, ranges=ranges)
+        return replace(self._rays, stamp=stamp, ranges=self._measured(np.fmin(walls, floor)))
 
     def ranges(self, x: ArrayLike, y: ArrayLike, yaw: ArrayLike) -> NDArray[np.float32]:
         """The ranges [m] of a sensor at x, y [m], yaw [rad] in the grid's frame: (ray_count,).
@@ -118,6 +125,10 @@ class SimulatedLaser:
         117 requires, a ray without a hit up to ``range_max`` is inf, one that hits below ``range_min`` is
         -inf. Raises InvalidInput for other shapes and for numbers that are not finite.
         """
+        return self._measured(self._cast(x, y, yaw))
+
+    def _cast(self, x: ArrayLike, y: ArrayLike, yaw: ArrayLike) -> _Array:
+        """The horizontal distance to the wall [m] that each ray hits: (ray_count,), inf without one."""
         x, y, yaw = (self._by_ray(values, name) for values, name in ((x, "x"), (y, "y"), (yaw, "yaw")))
         corner_x, corner_y, corner_yaw = self._origin
         cosine, sine = math.cos(corner_yaw), math.sin(corner_yaw)
@@ -129,7 +140,11 @@ class SimulatedLaser:
             np.stack((np.cos(directions), np.sin(directions))),
             self._rays.range_max / self._resolution,
         )
-        ranges = steps * self._resolution
+        return steps * self._resolution
+
+    def _measured(self, distances: _Array) -> NDArray[np.float32]:
+        """What the sensor measures of ``distances`` [m] along its rays: with noise, within its limits."""
+        ranges = distances.copy()
         if self._noise_m:
             ranges += self._random.normal(0.0, self._noise_m, len(ranges))
         ranges[ranges > self._rays.range_max] = math.inf
@@ -182,9 +197,12 @@ class MountedLaser:
     def read(self, stamp: int) -> Scan | None:
         """The sweep that ends at ``stamp`` [ns] at the latest; None without newer poses than last time.
 
-        None also if the buffer cannot place all its rays yet.
+        None also if the buffer cannot place all its rays yet. A clock that is set back by more than 1 s, as
+        at the start of each loop of a recording, starts again.
         """
         target = self.target
+        if stamp < self._last - _SET_BACK_NS:
+            self._last = -1
         try:
             end = min(stamp, self._newest(target, stamp))
             first = end - self._laser.sweep_ns

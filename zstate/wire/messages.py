@@ -218,6 +218,10 @@ class RobotDescription(Message, frozen=True, array_like=True, gc=False):
     clock: str = "system"
 
 
+SCAN_RAYS = 100_000
+"""The most rays of a laser scan."""
+
+
 class LaserScan(StampedMessage, frozen=True, array_like=True, gc=False):
     """One scan of a planar laser, which measures its rays one after the other.
 
@@ -247,6 +251,10 @@ class LaserScan(StampedMessage, frozen=True, array_like=True, gc=False):
         count, rest = divmod(len(self.ranges), _FLOAT32.itemsize)
         if rest:
             raise InvalidInput(f"a block of float32 has a multiple of 4 bytes, not {len(self.ranges)}")
+        if count > SCAN_RAYS:
+            raise InvalidInput(
+                f"a scan of {count} rays, where {SCAN_RAYS} are allowed: publish it in several scans"
+            )
         if self.intensities is not None and len(self.intensities) != len(self.ranges):
             raise InvalidInput(
                 f"{count} ranges take as many intensities; got {len(self.intensities)} bytes, not {4 * count}"
@@ -259,8 +267,8 @@ class LaserScan(StampedMessage, frozen=True, array_like=True, gc=False):
             )
 
 
-GRID_CELLS = 16_000_000
-"""The most cells of an occupancy grid: 4000 x 4000."""
+GRID_CELLS = 4096 * 4096
+"""The most cells of an occupancy grid."""
 
 
 class OccupancyGrid(Message, frozen=True, array_like=True, gc=False):
@@ -294,7 +302,7 @@ class OccupancyGrid(Message, frozen=True, array_like=True, gc=False):
             )
         if len(self.cells) > GRID_CELLS:
             raise InvalidInput(
-                f"a grid of {len(self.cells)} cells, where {GRID_CELLS} are allowed (4000 x 4000)"
+                f"a grid of {len(self.cells)} cells, where {GRID_CELLS} are allowed (4096 x 4096)"
             )
         values = np.frombuffer(self.cells, dtype=np.int8)
         if values.size and not -1 <= values.min() <= values.max() <= 100:
@@ -381,7 +389,10 @@ def _check_order(order: bytes, items: Sequence[str] | Sequence[tuple[str, str]])
 SAMPLE_BYTES = 256_000
 """The transforms of 2000 links, names included, take less; in CDR they take up to four times as many."""
 
-LATCHED_BYTES = 16 * 2**20
+SCAN_BYTES = 810_000
+"""A scan of ``SCAN_RAYS`` with intensities takes less on each wire."""
+
+LATCHED_BYTES = GRID_CELLS + 8 * 2**10
 """A grid of ``GRID_CELLS`` takes less on each wire."""
 ATTACHMENT_BYTES = 1_024
 STATIC_EDGES = 10_000
@@ -392,7 +403,7 @@ MAX_BYTES: Mapping[Stream, int] = {
     "tf": SAMPLE_BYTES,
     "transforms": SAMPLE_BYTES,
     "joint_commands": SAMPLE_BYTES,
-    "scan": SAMPLE_BYTES,
+    "scan": SCAN_BYTES,
     "tf_static": 1_000_000,
     "robot_description": LATCHED_BYTES,
     "map": LATCHED_BYTES,

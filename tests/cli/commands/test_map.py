@@ -80,6 +80,12 @@ def test_bad_file_is_reported_with_every_line(hall: str):
     assert "resolution" in message
 
 
+def test_map_too_large_for_the_network_is_refused_with_its_file(tmp_path: Path):
+    path = tmp_path / "city.yaml"
+    Grid(np.zeros((4096, 4097), dtype=np.int8), 0.5, (0.0, 0.0, 0.0)).save(path)
+    assert f"{path} has 4097 x 4096 cells" in failure("map", str(path)).replace("\n", " ")
+
+
 def test_missing_file_and_bad_names_are_refused(hall: str):
     assert "does not exist" in failure("map", "none.yaml", code=2)
     assert "'a/b'" in failure("map", hall, "--name", "a/b")

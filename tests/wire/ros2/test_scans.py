@@ -15,7 +15,14 @@ from mcap_ros2._dynamic import generate_dynamic
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import LaserScan, Message, OccupancyGrid, to_block, to_float32_block
+from zstate.wire.messages import (
+    MAX_BYTES,
+    LaserScan,
+    Message,
+    OccupancyGrid,
+    to_block,
+    to_float32_block,
+)
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.frame_names import FrameNames
@@ -125,6 +132,10 @@ def test_a_grid_has_the_bytes_of_rosbags(one: OccupancyGrid):
     assert encoded(one) == theirs
     turned = rosbags_grid(one, little_endian=False)
     assert [decoded("map", payload) for payload in (theirs, turned, theirs + b"\x07\0\0")] == [one] * 3
+
+
+def test_a_grid_of_4096_x_4096_cells_has_an_allowed_size():
+    assert len(encoded(grid(4096, 4096, frame="f" * 1024))) <= MAX_BYTES["map"]
 
 
 def test_mcap_ros2_support_decodes_scans_and_grids():

@@ -52,14 +52,21 @@ def map_command(
     zstate map hall.yaml --wire ros2                    # /map, for rviz2 and nav2
     """
     from zstate.clock import wait_interruptible
+    from zstate.errors import InvalidInput
     from zstate.scans import MapPublisher, load_map
     from zstate.wire.keys import check_robot, check_writer
+    from zstate.wire.messages import GRID_CELLS
 
     place = check_robot(name or options.place_name(file), "place")
     check_writer(writer)
     grid = load_map(file, frame)
+    height, width = grid.cells.shape
+    if width * height > GRID_CELLS:
+        raise InvalidInput(
+            f"{file} has {width} x {height} cells; a map on the network has at most {GRID_CELLS}, for "
+            "instance 4096 x 4096: publish parts of it, each with its own --writer, or a map of larger cells"
+        )
     with open_session(network, wires) as session, MapPublisher(session, place, grid, wires, writer=writer):
-        height, width = grid.cells.shape
         width_m, height_m = grid.size
         places = [messages_for(wire).place(place, ("map",)) for wire in wires]
         places = [f"{one}/{writer}" if one.startswith("zstate/") else one for one in places]

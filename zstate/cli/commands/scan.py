@@ -102,7 +102,7 @@ def scan_command(
     if map_file is not None:
         laser = SimulatedLaser(load_map(map_file), ray_ns=ray_ns, frame=frame)
     with open_session(network, wires) as session, ExitStack() as opened:
-        source: RangeSource = _DummyLaser()
+        source: RangeSource = _DummyLaser(frame)
         if laser is not None:
             source = _mounted_laser(session, laser, robot, frame, map_frame, wires[0], opened, seconds)
         publisher = ScanPublisher(
@@ -162,9 +162,12 @@ def _mounted_laser(  # noqa: PLR0917 - one use, in the order of the options
 
 
 class _DummyLaser:
-    """A source of the scans of ROS 2's dummy_laser."""
+    """A source of the scans of ROS 2's dummy_laser, in ``frame``."""
+
+    def __init__(self, frame: str) -> None:
+        self._frame = frame
 
     def read(self, stamp: int) -> Scan:
         from zstate.scans import dummy_scan
 
-        return dummy_scan(stamp)
+        return dummy_scan(stamp, self._frame)
