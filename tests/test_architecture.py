@@ -396,13 +396,13 @@ class Ratchet:
 
 
 RATCHETS = (
-    Ratchet("dialect words", dialect_words, 10, 150),
+    Ratchet("dialect words", dialect_words, 7, 150),
     Ratchet("banned methods", banned_methods, 1, 0),
     Ratchet("single importers", single_importers, 27, 25),
     Ratchet("modules in largest folder", modules_in_largest_folder, 18, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
     Ratchet("modules", lambda: len(modules()), 256, 270),
-    Ratchet("lines", lines, 50_800, 36_000),  # 40,026 before moving frames, drivers, scans
+    Ratchet("lines", lines, 51_000, 36_000),  # 40,026 before moving frames, drivers, scans
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
 
