@@ -84,6 +84,7 @@ def test_stamp_is_that_of_the_transforms_or_now(sessions):
         TransformPublisher(writer, "r1", "tracker", clock=ManualClock(7 * SECOND)) as tracker,
         TransformListener(reader, "r1", history_s=1000.0) as listener,
     ):
+        wait_for_reader(writer, "zstate/r1/transforms/tracker")
         tracker.publish([pose("map", "ball", 1.0)])
         tracker.publish([pose("map", "ball", 2.0, 9 * SECOND)])
         tracker.publish([pose("map", "ball", 3.0, 9 * SECOND)], 8 * SECOND)
