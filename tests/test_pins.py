@@ -23,6 +23,7 @@ import click
 import pytest
 import zenoh
 from helpers.processes import Child, repeated, until
+from helpers.robots import wait_for_reader
 
 import zstate.errors
 from zstate import (
@@ -115,6 +116,7 @@ def facts_of(sniffers: list[Sniffer]) -> dict[str, list[Any]]:
 def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
     """Every stream of robot r1, its static edges, its clock and a reader of it, on ``wire``."""
     model = load_model(RRBOT)
+    wait_for_reader(writer, "zstate/r1/any")  # the sniffers: the description is published once
     with (
         StatePublisher(writer, model, "r1", (wire,), streams=EVERYTHING, program="driver") as publisher,
         StaticPublisher(writer, "r1", "camera", (wire,), program="driver") as statics,

@@ -36,7 +36,7 @@ def threads_of_a_capture(session: Session, robots: list[str]) -> int:
 
 
 @pytest.mark.parametrize("robots", [[f"r{number}" for number in range(12)], []], ids=["named", "all"])
-def test_capture_of_twelve_robots_has_no_more_threads_than_of_two(
+def test_capture_of_twelve_robots_needs_less_than_one_thread_a_robot(
     sessions: tuple[Session, Session], robots: list[str]
 ):
     ours, theirs = sessions
@@ -48,4 +48,4 @@ def test_capture_of_twelve_robots_has_no_more_threads_than_of_two(
         opened.enter_context(
             repeated(lambda: [one.publish([float(number), 0.0]) for number, one in enumerate(publishers)])
         )
-        assert threads_of_a_capture(ours, robots) <= threads_of_a_capture(ours, ["r0", "r1"])
+        assert threads_of_a_capture(ours, robots) < len(publishers)

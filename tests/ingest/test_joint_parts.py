@@ -213,6 +213,18 @@ def test_further_joints_are_left_out_where_a_topic_has_them():
     assert positions == pytest.approx([1.0, 0.5])
 
 
+@pytest.mark.parametrize("is_announced", [True, False])
+def test_fewer_joints_of_a_writer_are_refused_whether_it_is_announced_or_not(is_announced: bool):
+    drivers = Drivers(others=True)
+    drivers.describe()
+    if is_announced:
+        drivers.announce(1, since=1)
+    drivers.part(1, ("shoulder", "elbow"), [0.5, 0.25])
+    drivers.part(1, ("shoulder",), [0.0])
+    assert drivers.counters.stats().refused == {"missing joints": 1}
+    assert drivers.buffer.joint_positions("r1")[0] == pytest.approx([0.5, 0.25])
+
+
 def test_writer_of_any_number_of_sets_of_joints_is_refused():
     links = "".join(f'<link name="l{n}"/>' for n in range(9))
     hinges = "".join(

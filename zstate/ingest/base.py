@@ -413,7 +413,8 @@ class StreamIngests:
 
     def all(self, robot: str | None = None) -> list[StreamIngest]:
         """All ingests, or those of one robot; any thread may add others at the same time."""
-        ingests = (*list(self.ingests.values()), *list(self.unannounced.values()))
+        # In this order: ``announce`` moves an ingest from one to the other, and none may be overlooked.
+        ingests = dict.fromkeys((*list(self.unannounced.values()), *list(self.ingests.values())))
         return [one for one in ingests if robot in (None, one.robot)]
 
     def add(self, ingest: StreamIngest, session: int, writer: str | None) -> StreamIngest:

@@ -79,7 +79,7 @@ def shared_joint_names(model: RobotModel) -> JointNames:
 class JointPart:
     """The joints that the writer of a ``session`` publishes together; ``track`` has their samples.
 
-    The session is None if there is no writer yet. ``appeared`` numbers parts and departures in their order.
+    The session is None if there is no writer yet. ``appeared`` numbers writers and departures in their order.
     """
 
     session: int | None
@@ -185,11 +185,13 @@ class RobotParts:
         joints = self._joint_names.joints(state.names, others=others)
         part = self._parts.get((session, frozenset(joints)))
         if part is None:
-            if len(self._parts_of(session)) >= _MAX_SETS:
+            own = self._parts_of(session)
+            if len(own) >= _MAX_SETS:
                 text = f"a writer of more than {_MAX_SETS} sets of joints; now {', '.join(map(repr, joints))}"
                 raise MessageError(text, reason="too many sets of joints")
             track = self._buffer.add_part(whole, joints, self._names.get((self._robot, session)))
-            part = JointPart(session, joints, track, joint_order(track.model), next(self._moments))
+            appeared = own[0].appeared if own else next(self._moments)
+            part = JointPart(session, joints, track, joint_order(track.model), appeared)
             track.check_positions(part.order.read(state).positions)  # unusable ones take no joint
             self._parts[session, frozenset(joints)] = part
             self._resolve()
