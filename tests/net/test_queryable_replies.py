@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import pytest
 import zenoh
@@ -22,7 +23,7 @@ from zstate.net.presence import (
     discover_readers,
     local_writer,
 )
-from zstate.net.queryable import query, query_tokens
+from zstate.net.queryable import Tokens, query, query_tokens
 from zstate.net.session import Session, connect
 from zstate.net.writer import WireWriter, write_all
 from zstate.nodes.static_publisher import StaticPublisher
@@ -142,6 +143,36 @@ def test_watch_loses_no_token_if_a_burst_overflows_its_ring(monkeypatch: pytest.
             may_go_on.set()
             until(lambda: len(alive) == 300)
         until(lambda: not alive)
+
+
+def test_watch_keeps_the_writers_that_a_reply_lacks_which_was_cut_off(monkeypatch: pytest.MonkeyPatch):
+    alive: set[str] = set()
+    left: list[str] = []
+    may_go_on = threading.Event()
+    may_go_on.set()
+    cut_off: list[Tokens] = []
+
+    def note(announced: Announcement, is_alive: bool) -> None:
+        (alive.add if is_alive else left.append)(announced.robot)
+        may_go_on.wait()
+
+    def query(*args: Any) -> Tokens:
+        return cut_off.pop() if cut_off else query_tokens(*args)
+
+    monkeypatch.setattr("zstate.net.presence.CAPACITY", 64)
+    monkeypatch.setattr("zstate.net.presence.query_tokens", query)
+    with ExitStack() as opened:
+        writer, reader = opened.enter_context(connect()), opened.enter_context(connect())
+        opened.enter_context(many_tokens(writer, 10))
+        watch = opened.enter_context(WriterWatch(reader, "*", note))
+        until(lambda: len(alive) == 10)
+        may_go_on.clear()
+        cut_off += [Tokens(frozenset(), is_complete=False)] * 3
+        opened.enter_context(many_tokens(writer, 300))
+        until(lambda: len(query_tokens(reader.zenoh, "zstate/*/@writer/*/*", 1.0).keys) == 310)
+        may_go_on.set()
+        until(lambda: len(alive) == 300)
+        assert (watch.full_batches > 0, left, cut_off) == (True, [], [])
 
 
 def test_failing_callback_does_not_affect_other_tokens(monkeypatch: pytest.MonkeyPatch):

@@ -23,7 +23,7 @@ import zenoh
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, Unreachable
-from zstate.net.queryable import MAX_REPLIES, check_timeout, query_tokens
+from zstate.net.queryable import MAX_REPLIES, Tokens, check_timeout, query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
 from zstate.wire.identity import Announcement, WriterId
@@ -179,9 +179,13 @@ def current_tokens(session: Session, expression: str, timeout_s: float) -> froze
 
 def confirmed_tokens(session: Session, expression: str) -> frozenset[str]:
     """The current liveliness tokens, queried a second time if the first reply has none."""
+    return _confirmed(session, expression, ANSWER_WITHIN_S).keys
+
+
+def _confirmed(session: Session, expression: str, timeout_s: float) -> Tokens:
     # Of a router's replies to a session that subscribes to the same tokens, one in 1500 was empty.
-    found = current_tokens(session, expression, ANSWER_WITHIN_S)
-    return found or current_tokens(session, expression, ANSWER_WITHIN_S)
+    found = query_tokens(session.zenoh, expression, timeout_s)
+    return found if found.keys else query_tokens(session.zenoh, expression, timeout_s)
 
 
 def by_robot(found: Iterable[Announcement]) -> tuple[RobotInfo, ...]:
@@ -290,13 +294,24 @@ class WriterWatch(Receiver[zenoh.Sample]):
             changes = [(str(sample.key_expr), sample.kind == puts) for sample in batch]
         else:
             # Differences since the last batch; later changes are still in the ring.
-            tokens = (confirmed_tokens(self._session, expression) for expression in self._expressions)
-            current, known = frozenset[str]().union(*tokens), self._known.keys()
+            current, known = self._current_tokens(), self._known.keys()
+            if self._closed:
+                return
             changes = [(token, False) for token in known - current]
             changes += [(token, True) for token in current - known]
         is_loss = any(not alive for _, alive in changes)
         cut_off = is_loss and self._routers is not None and self._routers.lost_recently()
         call_for_each(changes, lambda change: self._on_change(*change, cut_off=cut_off))
+
+    def _current_tokens(self) -> set[str]:
+        """All tokens, queried until the replies are complete: a token that a reply lacks may be alive."""
+        current: set[str] = set()
+        for expression in self._expressions:
+            is_complete = False
+            while not (is_complete or self._closed):
+                tokens, is_complete = _confirmed(self._session, expression, _ALL_TOKENS_WITHIN_S)
+                current |= tokens
+        return current
 
     def _on_change(self, token: str, alive: bool, *, cut_off: bool) -> None:
         if alive == (token in self._known):
