@@ -162,9 +162,10 @@ class Limits:
         return vector
 
     def _degrees_text(self, row: int, value: float) -> str:
-        within = self.lower[row] <= math.radians(value) <= self.upper[row]
-        looks_like_degrees = self.units[row] == "rad" and abs(value) > math.tau and within
-        return "; this looks like degrees: convert with math.radians" * looks_like_degrees
+        is_angle = self.units[row] == "rad" and abs(value) > math.tau
+        if is_angle and self.lower[row] <= math.radians(value) <= self.upper[row]:
+            return "; this looks like degrees: convert with math.radians"
+        return ""
 
 
 def check_joint_names(names: Sequence[str]) -> tuple[str, ...]:
