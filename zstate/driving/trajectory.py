@@ -94,9 +94,9 @@ class Trajectory:
         times = real_numbers(t_s, "times of samples")
         if not np.isfinite(times).all():
             raise InvalidInput(f"times of samples must be finite; got {t_s!r}")
-        last = len(self._times) - 2
-        segments = np.clip(np.searchsorted(self._times, times, side="right") - 1, 0, last)
-        along = np.clip((times - self._times[segments]) / self._durations[segments], 0.0, 1.0)[..., None]
+        segments = self._times[1:-1].searchsorted(times, side="right")
+        along = (times - self._times[segments]) / self._durations[segments]
+        along = np.minimum(np.maximum(along, 0.0), 1.0)[..., None]
         positions, velocities, accelerations = (
             _evaluated(coefficients[:, segments], along) for coefficients in self._coefficients
         )
