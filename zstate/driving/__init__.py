@@ -1,0 +1,1 @@
+"""Commands to the program that owns a robot's hardware, within limits. Not a safety-rated channel."""
