@@ -32,12 +32,22 @@ from zstate.errors import InvalidInput
 from zstate.model.urdf import parse_urdf
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
+from zstate.net.subscription import Received, subscribe
 from zstate.recording.player import CLOCK_HZ, Player, PlayerReport
 from zstate.recording.recorder import Recorder
 from zstate.transform import Transform
-from zstate.wire.messages import ClockMessage, JointState, StaticTransforms, TransformSample, from_block
+from zstate.wire.messages import (
+    ClockMessage,
+    JointState,
+    OccupancyGrid,
+    StaticTransforms,
+    TransformSample,
+    from_block,
+    to_block,
+)
 from zstate.wire.native import ENCODINGS, decode
 from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
 
@@ -430,3 +440,48 @@ def test_invalid_playback_arguments_are_refused(sessions, arm: Path):
         Player(session, arm, duration_s=0.0)
     with pytest.raises(InvalidInput, match="rate above 0"):
         Player(session, arm, rate=0.0)
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> Path:
+    """A recording of one map alone."""
+    path = tmp_path / "maps.mcap"
+    grid = OccupancyGrid(4, START, "map", 0.5, 1, 1, to_block([0, 0, 0, 0, 0, 0, 1]), b"\x64")
+    with RecordingBuilder(path) as builder:
+        builder.encoder.write_message("hall", grid, START, "floor")
+    return path
+
+
+@contextmanager
+def received_maps(session: Session) -> Iterator[dict[str, bytes]]:
+    """The cells of the maps of the hall by key, until they are withdrawn."""
+    found: dict[str, bytes] = {}
+
+    def add(arrivals: list[Received]) -> None:
+        found.update((one.key, one.message.cells) for one in arrivals)
+
+    with subscribe(
+        session, get_wire("native"), "hall", "map", add, on_withdrawn=lambda key: found.pop(key, None)
+    ):
+        yield found
+
+
+def test_recording_of_maps_is_published_until_it_is_closed(sessions, maps: Path):
+    writer, reader = sessions
+    with Player(writer, maps) as player, received_maps(reader) as received:
+        assert player.is_held
+        with replaying(player) as reports:
+            until(lambda: received == {"zstate/hall/map/floor": b"\x64"})
+            player.seek(START)
+            until(lambda: player.report().passes == 2)
+            assert not reports
+        assert [report.refused for report in reports] == [{}]
+        until(lambda: not received)
+
+
+@pytest.mark.parametrize("options", [{"duration_s": 0.05}, {"rate": math.inf}])
+def test_recording_of_maps_ends_after_its_duration_or_at_once(sessions, maps: Path, options):
+    with Player(sessions[0], maps, **options) as player:
+        assert not player.is_held
+        player.run()
+        assert player.position == START + round(options.get("duration_s", 0.0) * 1e9)

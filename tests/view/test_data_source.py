@@ -225,12 +225,12 @@ def test_scans_and_maps_are_received_until_maps_are_withdrawn(sessions):
         ScanPublisher(sessions[0], "b", "front", frame="laser", **geometry) as other,
     ):
         with MapPublisher(sessions[0], "hall", grid):
-            until(lambda: source.world.maps)
-            ((name, received),) = source.world.maps.items()
+            until(lambda: source.world.maps_at(None))
+            ((name, received),) = source.world.maps_at(None).items()
             assert str(name) == "hall/map"
             assert received.frame == "hall/map"
             assert received.cells.tolist() == [[0, 100]]
-        until(lambda: not source.world.maps)
+        until(lambda: not source.world.maps_at(None))
         until(lambda: other.publish([1.0, 2.0]) or front.publish([1.0, 2.0]) or source.world.sensors)
         ((sensor, scans),) = source.world.sensors.items()  # not those of b, which is not selected
         assert str(sensor) == "a/front"

@@ -5,10 +5,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.processes import DEADLINE_S, until
+from helpers.recording_builder import MS, START, RecordingBuilder, pose
 from helpers.robots import RRBOT
 
 pytest.importorskip("viser")
@@ -20,6 +22,7 @@ from zstate.view.camera import Camera, Visibility, fit_camera
 from zstate.view.data_source import ViewSource
 from zstate.view.server import ViewServer
 from zstate.view.view import View
+from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
 
 CART = load_model("diffbot")
 STILL = [0.0, 0.0, 0.0, 1.0]
@@ -140,3 +143,39 @@ def test_page_starts_with_the_requested_fixed_frame_and_camera(page):
         np.testing.assert_allclose(handle.position, at_tool[0, :3], atol=1e-6)
         np.testing.assert_allclose(page.server.initial_camera.position, camera.position)
         np.testing.assert_allclose(page.server.initial_camera.look_at, camera.look_at)
+
+
+def test_recording_is_drawn_with_the_map_and_the_scans_of_the_instant(page, server, tmp_path: Path):
+    from helpers.scene_drawing import handles, is_visible
+    from viser import ImageHandle, PointCloudHandle
+
+    path = tmp_path / "run.mcap"
+    with RecordingBuilder(path) as builder:
+        for n in range(21):  # the laser is at n metres, and measures 1 m ahead
+            stamp = START + n * 100 * MS
+            builder.edges("cart", stamp, {("odom", "laser"): pose(n)})
+            ranges = to_float32_block([1.0])
+            scan = LaserScan(stamp, n, 1, "laser", 0.0, 0.1, 0, 0, 0.1, 10.0, ranges)
+            builder.encoder.write_message("cart", scan, stamp + MS, "front")
+            if n == 10:
+                origin = to_block([0, 0, 0, 0, 0, 0, 1])
+                floor = OccupancyGrid(4, stamp, "odom", 1.0, 1, 1, origin, b"\x64")
+                builder.encoder.write_message("cart", floor, stamp + MS, "floor")
+
+    def drawn(n: int) -> tuple[list[float], int]:
+        """The x of the visible scans, and the number of visible maps, once maps are encoded."""
+        view.layout.cursor.seek(START + n * 100 * MS + 50 * MS)
+        view.draw()
+        until(lambda: view.draw() and not view.scene.busy)
+        clouds, maps = (
+            [node for path, node in handles(server, kind).items() if is_visible(server, path)]
+            for kind in (PointCloudHandle, ImageHandle)
+        )
+        return sorted(float(cloud.points[0, 0]) for cloud in clouds), len(maps)
+
+    with ViewSource.from_recording(path) as source, View(source, page, fixed_frame="cart/odom") as view:
+        view.layout.cursor.pause()
+        assert drawn(3) == ([1.0, 2.0, 3.0, 4.0], 0)
+        assert drawn(15) == ([12.0, 13.0, 14.0, 15.0, 16.0], 1)
+        assert drawn(6) == ([3.0, 4.0, 5.0, 6.0, 7.0], 0)  # backwards
+        assert not view.scene.world.missing

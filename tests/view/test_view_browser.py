@@ -160,7 +160,7 @@ def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):
     with standing(sessions[0], "rrbot"), MapPublisher(sessions[0], "room", grid):
         shown = show_view(sessions[1], "rrbot")
         world = shown.view.scene.world
-        until(lambda: shown.source.world.maps and "rrbot" in shown.source.models)
+        until(lambda: shown.source.world.maps_at(None) and "rrbot" in shown.source.models)
         view_tab = open_tab(shown.page.url)
         until(lambda: world.version == 1 and not shown.view.scene.busy, PATIENCE_S)
         full = picture(view_tab)

@@ -9,7 +9,7 @@ from zstate.net.subscription import Received
 from zstate.scans import Scan
 from zstate.transform import Transform
 from zstate.view.world_source import SensorScans, WorldSource, WriterName
-from zstate.wire.messages import LaserScan, to_float32_block
+from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
 
 MS = 1_000_000
 
@@ -132,7 +132,29 @@ def test_stalest_sensor_makes_room_for_a_new_one(clock: ManualClock):
         scans_of(source, 64, 65)
         assert set(source.sensors) == {sensor_name(n) for n in range(64)}
         assert source.refused == {"too many sensors": 2}
+        ((what, why),) = source.problems
+        assert what == "scans of further sensors"
+        assert why.startswith(
+            "2 refused; the first: zstate/r64/scan/front is not drawn, as 64 other sensors are; "
+        )
+        assert "`zstate view ROBOT`" in why
         clock.now_s += 9.99  # more than 10 s after the first scans, less after the last
         scans_of(source, 0, 65)
         assert set(source.sensors) == {sensor_name(n) for n in (0, *range(2, 64), 65)}
         assert source.refused == {"too many sensors": 2}
+
+
+def test_map_beyond_the_limit_is_reported_with_what_to_do():
+    message = OccupancyGrid(1, 0, "map", 1.0, 1, 1, to_block([0, 0, 0, 0, 0, 0, 1]), b"\x64")
+    with WorldSource(None) as source:
+        received = [Received(f"hall{n}", f"zstate/hall{n}/map/floor", message) for n in range(65)]
+        source._on_maps(received)
+        assert set(source.maps_at()) == {WriterName(f"hall{n}", "floor") for n in range(64)}
+        ((what, why),) = source.problems
+        assert what == "further maps"
+        assert why.startswith(
+            "1 refused; the first: zstate/hall64/map/floor is not drawn, as 64 other maps are; "
+        )
+        assert "`zstate ls`" in why
+        source._on_maps(received[:64])  # maps that are drawn may change
+        assert source.refused == {"too many maps": 1}

@@ -385,6 +385,7 @@ class PassthroughPublisher(Closeable):
         self._seqs: Counter[Stream] = Counter()
         self._latched: dict[tuple[Stream, str], list[LatchedWriter]] = {}
         self._placed: dict[str, set[Edge]] = {}
+        self._maps: set[str] = set()
         self._writer = writer = local_writer(self._session_id)
         sessions.add(self._session_id)
         with ExitStack() as opening:
@@ -465,12 +466,18 @@ class PassthroughPublisher(Closeable):
     def set_map(self, grid: OccupancyGrid, writer: str) -> None:
         """Publish the map of ``writer``; one without cells withdraws the previous one."""
         if not grid.cells:
-            for latched in self._latched.get(("map", writer), ()):
-                latched.withdraw()
+            self._withdraw_map(writer)
             return
         size = grid.resolution, grid.width, grid.height
         message = OccupancyGrid(self._session_id, grid.stamp, grid.frame, *size, grid.origin, grid.cells)
         write_all(self._latch("map", writer), message)
+        self._maps.add(writer)
+
+    def _withdraw_map(self, writer: str) -> None:
+        if writer in self._maps:
+            self._maps.discard(writer)
+            for latched in self._latched["map", writer]:
+                latched.withdraw()
 
     def _latch(self, stream: Stream, writer: str) -> list[LatchedWriter]:
         if (stream, writer) not in self._latched:
@@ -493,7 +500,9 @@ class PassthroughPublisher(Closeable):
         return opening.enter_context(WriterClaim(self._session, streams))
 
     def close(self) -> None:
-        """Stop; readers keep the latched values. A second call does nothing."""
+        """Stop, and withdraw maps; readers keep the other latched values. A second call does nothing."""
+        for name in tuple(self._maps):
+            self._withdraw_map(name)
         self._opened.close()
 
 

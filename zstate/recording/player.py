@@ -74,7 +74,9 @@ class Player(Closeable):
     Stamps are those of the recording, and so is the spacing, divided by ``rate`` (inf: as fast as possible).
     Playback starts ``start_s`` [s] after the first message, with the descriptions, static edges and maps in
     effect at that point, and lasts ``duration_s`` of the recording. With ``loop`` it restarts at its end;
-    each pass has new writers, as stamps step back. The recording's time is published on the clock.
+    each pass has new writers, as stamps step back. The recording's time is published on the clock. Without
+    samples (``has_samples``), what is latched stays in effect after the last message, for ``duration_s`` in
+    all, by default until ``close``; not at an infinite rate.
 
     Robots with a recorded model are published by a StatePublisher, other messages unchanged, such as scans,
     maps, and the joint states of several drivers of a robot, by writers of the recorded names. Raises
@@ -114,6 +116,8 @@ class Player(Closeable):
             self._recording = DecodedRecording(self._reader, self._refusals.count)
             selected = tuple(check_has_robot(self._recording, robot) for robot in robots)
             self.robots = selected or self._recording.names
+            streams = {writer.stream for writer in self._recording.writers_of(self.robots)}
+            self.has_samples = not streams <= {*LATCHED_STREAMS, "clock"}
             self._begin, self._end = self._bounds(path, start_s, duration_s)
             self._models: dict[str, RobotModel] = {}
             self._in_parts: set[str] = set()
@@ -127,6 +131,8 @@ class Player(Closeable):
             self._reader.close()
             raise
         self._position = self._begin
+        is_endless = duration_s is None and not (loop and self._end - self._begin > 1)
+        self._is_held = not self.has_samples and is_endless and math.isfinite(rate)
 
     def _bounds(self, path: str | Path, start_s: float, duration_s: float | None) -> tuple[int, int]:
         span = self._reader.span
@@ -138,8 +144,10 @@ class Player(Closeable):
         if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0.0):
             raise InvalidInput(f"duration_s is a positive number of seconds, not {duration_s!r}")
         begin = span[0] + round(start_s * 1e9)
-        last = span[1] if duration_s is None else min(span[1], begin + round(duration_s * 1e9))
-        return begin, last + 1
+        if duration_s is None:
+            return begin, span[1] + 1
+        last = begin + round(duration_s * 1e9)
+        return begin, (min(span[1], last) if self.has_samples else last) + 1
 
     @property
     def span(self) -> tuple[int, int]:
@@ -155,6 +163,11 @@ class Player(Closeable):
     def is_paused(self) -> bool:
         """Whether playback waits for ``resume``."""
         return self._is_paused
+
+    @property
+    def is_held(self) -> bool:
+        """Whether playback does not end by itself: there are no samples and no duration."""
+        return self._is_held
 
     def report(self) -> PlayerReport:
         """Progress so far."""
@@ -233,11 +246,7 @@ class Player(Closeable):
             ticks = None if has_clock else _ClockTicks(clock, begin, self._player_clock.rate)
             streams = (*STREAMS, *SCAN_STREAMS)
             for decoded in self._recording.messages(self.robots, streams, begin, self._end):
-                while ticks is not None and ticks.next <= decoded.log_time:
-                    if not self._reach(ticks.next, ticks):
-                        return
-                    ticks.publish(decoded.log_time)
-                if not self._reach(decoded.log_time, ticks):
+                if not self._advance(decoded.log_time, ticks):
                     return
                 lateness = self._player_clock.lateness(decoded.log_time)
                 if isinstance(decoded.message, ClockMessage):
@@ -245,6 +254,27 @@ class Player(Closeable):
                 elif publishers.publish(decoded) and isinstance(decoded.message, StampedMessage):
                     self._samples += 1
                     self._lateness.add(lateness)
+            if not self.has_samples and self._advance(self._end - 1, ticks) and self._is_held:
+                self._hold(ticks)
+
+    def _advance(self, log_time: int, ticks: _ClockTicks | None) -> bool:
+        """Publish the clock until ``log_time``; False when this pass is over."""
+        while ticks is not None and ticks.next <= log_time:
+            if not self._reach(ticks.next, ticks):
+                return False
+            ticks.publish(log_time)
+        return self._reach(log_time, ticks)
+
+    def _hold(self, ticks: _ClockTicks | None) -> None:
+        """Publish nothing but the clock, which stands still, until ``close`` or ``seek``."""
+        self._player_clock.pause()
+        while True:
+            self._wake.clear()  # before the checks, as in _reach
+            if not self._is_open or self._target is not None:
+                return
+            if ticks is not None:
+                ticks.clock.publish(self._position)
+            self._wake.wait(1.0 / CLOCK_HZ)
 
     def _reach(self, log_time: int, ticks: _ClockTicks | None) -> bool:
         """Wait until ``log_time``; False when this pass is over."""

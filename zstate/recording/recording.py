@@ -153,9 +153,14 @@ class Recording(Closeable):
                 buffer.keep_only_around(stamps)
         return buffer
 
-    def fill(self, buffer: TransformBuffer) -> Iterator[DecodedMessage]:
-        """Insert all of the recording into an empty ``buffer``; each message is returned when it is in."""
-        return self._fill(buffer, Counters(), None if self.robot is None else (self.robot,), STREAMS)
+    def fill(
+        self, buffer: TransformBuffer, streams: Collection[Stream] = STREAMS
+    ) -> Iterator[DecodedMessage]:
+        """Insert all of the recording into an empty ``buffer``; each message is returned when it is in.
+
+        Scans and maps, which no buffer has, are returned if they are among ``streams``.
+        """
+        return self._fill(buffer, Counters(), None if self.robot is None else (self.robot,), streams)
 
     def _fill(
         self,

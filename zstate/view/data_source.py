@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,14 +12,16 @@ import numpy as np
 
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.snapshot import FramePoses, FrameTable
+from zstate.buffer.snapshot import FramePoses, FrameTable, TimeSpan
 from zstate.buffer.tracks import Track
 from zstate.clock import Clock
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.listener import TransformListener
-from zstate.recording.recording import Recording
-from zstate.view.world_source import WorldSource
+from zstate.recording.decode import SCAN_STREAMS, STREAMS
+from zstate.recording.recording import HISTORY_S, Recording
+from zstate.view.recorded_world import RecordedWorld
+from zstate.view.world_source import WorldData, WorldSource
 from zstate.wire.keys import ANY
 
 _HOLD_S = 0.5
@@ -29,8 +32,9 @@ class ViewSource(Closeable):
     """All announced robots, or only ``robots``, and their poses.
 
     With a ``session``, ``listener`` fills ``buffer`` from the wire format ``wire``; without one, ``buffer``
-    is complete, see ``from_recording``. ``world`` receives scans and maps. Ages and stamps are those of
-    ``clock``; by default, of the clock that most robots use. Methods may be called from any thread.
+    and ``world`` are complete, see ``from_recording``. ``world`` has the scans and maps; it is closed with
+    the source. Ages and stamps are those of ``clock``; by default, of the clock that most robots use.
+    Methods may be called from any thread.
     """
 
     def __init__(
@@ -40,6 +44,7 @@ class ViewSource(Closeable):
         *,
         wire: str = "native",
         buffer: TransformBuffer | None = None,
+        world: WorldData | None = None,
         history_s: float = 30.0,
         clock: Clock | None = None,
     ) -> None:
@@ -49,7 +54,7 @@ class ViewSource(Closeable):
         if session is not None:
             robot = robots[0] if len(robots) == 1 else ANY
             self.listener = TransformListener(session, robot, self.buffer, wire)
-        self.world = WorldSource(session, robots, wire)
+        self.world: WorldData = WorldSource(session, robots, wire) if world is None else world
         self._selected = frozenset(robots)
         self._version = 0
         self._recorded: tuple[str, ...] = ()
@@ -59,10 +64,15 @@ class ViewSource(Closeable):
 
     @classmethod
     def from_recording(cls, path: str | Path) -> ViewSource:
-        """The robots of a recording, an MCAP file or a bag. Raises RecordingError."""
-        with Recording(path) as recording:
-            source = cls(None, buffer=recording.buffer())
+        """The robots, scans and maps of a recording, an MCAP file or a bag. Raises RecordingError."""
+        buffer = TransformBuffer(HISTORY_S)
+        with Recording(path) as recording, ExitStack() as opening:
+            world = opening.enter_context(RecordedWorld(path))
+            for decoded in recording.fill(buffer, (*STREAMS, *SCAN_STREAMS)):
+                world.add(decoded, buffer)
+            source = cls(None, buffer=buffer, world=world)
             source._recorded = recording.robots
+            opening.pop_all()
         return source
 
     def close(self) -> None:
@@ -70,6 +80,11 @@ class ViewSource(Closeable):
         self.world.close()
         if self.listener is not None:
             self.listener.close()
+
+    @property
+    def span(self) -> TimeSpan | None:
+        """The stamps of all samples; where nothing moves, those of the recorded scans; None without any."""
+        return self.buffer.span() or self.world.span
 
     @property
     def version(self) -> int:

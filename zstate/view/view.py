@@ -272,7 +272,7 @@ class PanelLayout(Closeable):
     @property
     def stamp(self) -> int | None:
         """The stamp to show [ns]; None for the newest samples."""
-        return self.cursor.stamp(self._source.buffer.span())
+        return self.cursor.stamp(self._source.span)
 
     def update(self, snapshot: FramePoses) -> None:
         """Apply the user's input, and show what has changed."""
@@ -281,7 +281,7 @@ class PanelLayout(Closeable):
         now = buffer.clock.now() if is_live and domain in (None, buffer.clock.domain) else None
         for panel in self._panels:
             fixed = self.fixed.resolve(snapshot.tree)
-            panel.update(PanelContext(snapshot, fixed, buffer, is_live, now, domain))
+            panel.update(PanelContext(snapshot, fixed, buffer, is_live, now, domain, self._source.span))
 
     def show_fault(self, fault: str) -> None:
         """Show why the last picture could not be drawn; nothing if it was drawn."""

@@ -7,13 +7,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from zstate._util.bounded import BoundedQueue
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.snapshot import TimeSpan
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.ingest.deadline import Deadline
 from zstate.net.presence import announce_reader
@@ -34,9 +35,11 @@ _MAX_BYTES = 4_000_000
 _MAX_WRITERS = 64
 _UNKNOWN_S = 10.0
 """How long a sensor may be silent after its first scan."""
-TOO_MANY_SENSORS = "too many sensors"
-"""Reason in ``WorldSource.refused``."""
-_TIME_JUMP_NS = 1_000_000_000
+_TOO_MANY_SENSORS = "too many sensors"
+_TOO_MANY_MAPS = "too many maps"
+_FURTHER = {_TOO_MANY_SENSORS: "scans of further sensors", _TOO_MANY_MAPS: "further maps"}
+TIME_JUMP_NS = 1_000_000_000
+"""A scan that is so much older than the last one begins again."""
 
 
 class WriterName(NamedTuple):
@@ -47,6 +50,54 @@ class WriterName(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.robot}/{self.name}"
+
+
+class Sensor(Protocol):
+    """The scans of one sensor, as they are drawn. ``problem`` is why some are not; None if all are."""
+
+    @property
+    def frame(self) -> str | None:
+        """The frame of the newest scan."""
+        ...
+
+    @property
+    def problem(self) -> str | None: ...
+
+    def settle(self, buffer: TransformBuffer, target: str, at: int | None) -> None:
+        """Decide which scans have poses in ``target``, and update ``problem``."""
+        ...
+
+    def latest(self, count: int, at: int | None) -> Sequence[Scan]:
+        """The last ``count`` scans that ended until ``at`` [ns]; None: of all. The oldest first."""
+        ...
+
+    def is_stale(self, at: int | None) -> bool:
+        """Whether the sensor has missed its deadline."""
+        ...
+
+
+class WorldData(Protocol):
+    """What is around the robots, as it is drawn: scans and maps.
+
+    ``problems`` are what cannot be drawn at all, with the reason.
+    """
+
+    @property
+    def sensors(self) -> Mapping[WriterName, Sensor]: ...
+
+    @property
+    def problems(self) -> Sequence[tuple[str, str]]: ...
+
+    @property
+    def span(self) -> TimeSpan | None:
+        """The stamps of all scans; None if they are only drawn as they arrive."""
+        ...
+
+    def maps_at(self, at: int | None) -> Mapping[WriterName, Grid]:
+        """The map of each writer ``at`` a stamp [ns]; None: the newest."""
+        ...
+
+    def close(self) -> None: ...
 
 
 @dataclass(eq=False)
@@ -78,9 +129,8 @@ class SensorScans:
             self.dropped += lost
             self._has_overflowed |= lost > 0
 
-    @property
-    def is_stale(self) -> bool:
-        """Whether the sensor has missed its deadline."""
+    def is_stale(self, at: int | None = None) -> bool:
+        """Whether the sensor has missed its deadline, at present."""
         return self._deadline.is_missed(self.clock())
 
     @property
@@ -95,7 +145,12 @@ class SensorScans:
             newest = self._waiting[0][0] if self._waiting else self._scans[-1] if self._scans else None
         return None if newest is None else newest.frame
 
-    def settle(self, buffer: TransformBuffer, target: str) -> None:
+    @property
+    def problem(self) -> str | None:
+        """Why the newest scan was dropped, and how many were; None if it was kept."""
+        return None if self.reason is None else f"{self.dropped} dropped: {self.reason}"
+
+    def settle(self, buffer: TransformBuffer, target: str, at: int | None = None) -> None:
         """Keep the scans whose last ray has a pose in ``target`` by now, and drop those that are too late."""
         while (waiting := self._first_waiting()) is not None:
             scan, deadline_s = waiting
@@ -123,7 +178,7 @@ class SensorScans:
         return True
 
     def _keep(self, scan: Scan) -> None:
-        if self._scans and scan.stamp < self._scans[-1].stamp - _TIME_JUMP_NS:
+        if self._scans and scan.stamp < self._scans[-1].stamp - TIME_JUMP_NS:
             self._scans.clear()  # the clock was set back, or a replay has begun again
         self._scans.append(scan, _size(scan))
 
@@ -187,11 +242,21 @@ class WorldSource(Closeable):
                     opening.enter_context(announcement)
             self._opened = opening.pop_all()
 
-    @property
-    def maps(self) -> Mapping[WriterName, Grid]:
-        """The newest map of each writer."""
+    span = None
+
+    def maps_at(self, at: int | None = None) -> Mapping[WriterName, Grid]:
+        """The newest map of each writer: those before it are not kept."""
         with self._lock:
             return dict(self._maps.values())
+
+    @property
+    def problems(self) -> Sequence[tuple[str, str]]:
+        """The sensors and maps for which there was no room."""
+        return [
+            (further, f"{self.refused[reason]} refused; the first: {self._refusals.first[reason]}")
+            for reason, further in _FURTHER.items()
+            if reason in self.refused
+        ]
 
     @property
     def sensors(self) -> Mapping[WriterName, SensorScans]:
@@ -211,8 +276,11 @@ class WorldSource(Closeable):
                 continue
             sensor = self._scans_of(self._writer(robot, key))
             if sensor is None:
-                text = f"{shortened(key)}: {_MAX_WRITERS} other sensors are drawn already"
-                self._refusals.count(TOO_MANY_SENSORS, text)
+                text = (
+                    f"{shortened(key)} is not drawn, as {_MAX_WRITERS} other sensors are; "
+                    "`zstate view ROBOT` draws those of one robot"
+                )
+                self._refusals.count(_TOO_MANY_SENSORS, text)
             else:
                 sensor.add(scan)
 
@@ -220,7 +288,7 @@ class WorldSource(Closeable):
         """The scans of a sensor, which replaces the longest stale one; None if there is no room."""
         with self._lock:
             if name not in self._sensors and len(self._sensors) >= _MAX_WRITERS:
-                stale = [(one.received_s, other) for other, one in self._sensors.items() if one.is_stale]
+                stale = [(one.received_s, other) for other, one in self._sensors.items() if one.is_stale()]
                 if not stale:
                     return None
                 del self._sensors[min(stale)[1]]
@@ -230,15 +298,24 @@ class WorldSource(Closeable):
         for robot, key, message in received:
             try:
                 assert isinstance(message, OccupancyGrid)
-                self._set_map(key, self._writer(robot, key), grid_from_message(message, robot))
-            except InvalidInput as error:  # noqa: PERF203 - the other maps are still drawn
+                grid = grid_from_message(message, robot)
+            except InvalidInput as error:
                 self._refusals.count("malformed map", f"{shortened(key)}: {error}")
+                continue
+            if not self._set_map(key, self._writer(robot, key), grid):
+                text = (
+                    f"{shortened(key)} is not drawn, as {_MAX_WRITERS} other maps are; stop publishing one "
+                    "of them (`zstate ls` lists them), and open the view again"
+                )
+                self._refusals.count(_TOO_MANY_MAPS, text)
 
-    def _set_map(self, key: str, name: WriterName, grid: Grid) -> None:
+    def _set_map(self, key: str, name: WriterName, grid: Grid) -> bool:
+        """Whether there was room for the map."""
         with self._lock:
             if key not in self._maps and len(self._maps) >= _MAX_WRITERS:
-                raise InvalidInput(f"there are more than {_MAX_WRITERS} maps")
+                return False
             self._maps[key] = name, grid
+            return True
 
     def _on_withdrawn(self, key: str) -> None:
         with self._lock:

@@ -8,6 +8,7 @@ from helpers.processes import until
 from helpers.recording_builder import LATENCY, MS, START, Bag, RecordingBuilder, S, swing_positions
 
 from zstate import TransformListener, connect, discover
+from zstate.wire.messages import OccupancyGrid, to_block
 
 pytestmark = pytest.mark.processes
 
@@ -110,3 +111,18 @@ def test_missing_robot_rate_start_or_wire_is_refused(
 def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):
     (tmp_path / "x.mcap").write_text("hello")
     assert "is not a recording" in failure("replay", str(tmp_path / "x.mcap"))
+
+
+def test_maps_alone_are_published_until_the_command_is_interrupted(tmp_path: Path, spawn: Spawn):
+    path = tmp_path / "maps.mcap"
+    grid = OccupancyGrid(4, START, "map", 0.5, 1, 1, to_block([0, 0, 0, 0, 0, 0, 1]), b"\x64")
+    with RecordingBuilder(path) as builder:
+        builder.encoder.write_message("hall", grid, START, "floor")
+    child = started(spawn, "replay", str(path))
+    assert child.line().endswith("no samples; what is latched is published until Ctrl-C")
+    with connect() as session:
+        until(lambda: discover(session))
+        (place,) = discover(session)
+    assert [name for name, _ in place.map_names] == ["floor"]
+    interrupted(child)
+    assert child.line() == "replayed what is latched"

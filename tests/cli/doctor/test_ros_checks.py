@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 import re
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers.cli_runner import RRBOT, published_robot, zstate
+from helpers.processes import repeated
 
+from zstate import connect
 from zstate.cli.doctor.diagnosis import with_same_options
 from zstate.cli.session import SessionOptions
 from zstate.net.config import ROUTER_ENDPOINT
+from zstate.scans import Grid, MapPublisher, ScanPublisher
 from zstate.wire.keys import Stream
 
 WITHOUT_JOINTS: tuple[Stream, ...] = ("tf", "tf_static", "robot_description")
@@ -162,3 +166,35 @@ def test_degrees_on_the_topic_are_a_warning(ros_router: str, tmp_path: Path):
         "is outside -2 to 2; this looks like degrees: convert with math.radians"
     )
     assert found.next["limits"].startswith("zstate echo --once --wire ros2")
+
+
+@contextmanager
+def scanning(router: str, frame: str) -> Iterator[None]:
+    """A map, and a laser scanner in ``frame`` that measures a hundred times a second."""
+    geometry = {"angle_min": 0.0, "angle_increment": 0.1, "range_min": 0.1, "range_max": 10.0}
+    with (
+        connect(mode="client", endpoints=router) as session,
+        MapPublisher(session, "ros", Grid([[0, 100]], 0.5, (0.0, 0.0, 0.0), "world"), wires="ros2"),
+        ScanPublisher(session, "ros", "front", frame=frame, wires="ros2", **geometry) as scans,
+        repeated(lambda: scans.publish([1.0, 2.0]), every_s=0.01),
+    ):
+        yield
+
+
+@pytest.mark.processes
+def test_scans_and_maps_of_nodes_are_sound_if_they_have_a_frame(ros_router: str):
+    with published_robot(wire="ros2", router=ros_router), scanning(ros_router, "tool"):
+        found = Found()
+    assert set(found.states.values()) == {"ok"}, found.texts
+    assert re.match(r"\d+\.\d Hz from .*, as 'front', newest ", found.texts["scan"])
+    assert found.texts["map"].startswith("'map': 2 x 1 cells of 0.5 m in 'world', from ")
+
+
+@pytest.mark.processes
+def test_scans_of_nodes_in_a_frame_that_no_node_places_are_broken(ros_router: str):
+    with published_robot(wire="ros2", router=ros_router), scanning(ros_router, "tol"):
+        found = Found(code=1)
+    assert found.states["scan"] == "broken"
+    text = "the scans of 'front' are in 'tol', which no writer places; 'tool' is similar"
+    assert found.texts["scan"] == text
+    assert found.next["scan"].startswith("zstate static TARGET tol --xyz X Y Z --wire ros2")

@@ -49,7 +49,7 @@ class FixedSource(WorldSource):
         del self._sensors[FRONT]
 
     def refuse_sensor(self) -> None:
-        self._refusals.count("too many sensors", "r65/front")
+        self._refusals.count("too many sensors", "r65/front is not drawn")
 
     def withdraw_map(self) -> None:
         self._on_withdrawn("key")
@@ -174,7 +174,9 @@ def test_clouds_of_a_removed_sensor_vanish_and_refused_sensors_are_reported(show
     assert handles(shown.server, viser.PointCloudHandle) == {}
     shown.source.refuse_sensor()
     shown.show()
-    assert shown.world.missing == [("scans of further sensors", "1 refused: too many sensors")]
+    assert shown.world.missing == [
+        ("scans of further sensors", "1 refused; the first: r65/front is not drawn")
+    ]
 
 
 def test_scans_until_an_instant_of_the_past_are_drawn(shown):

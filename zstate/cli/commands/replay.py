@@ -67,6 +67,9 @@ def replay_command(
     FILE is an MCAP file of `zstate record`, or a ROS 2 bag. The time of the recording is published on
     zstate/clock, and on /clock for a ROS wire. Fails if the same robots have live writers, unless --takeover.
 
+    A recording of maps alone, or of models and static edges, has no samples: they are published until Ctrl-C,
+    or for --duration.
+
     \b
     zstate replay run.mcap
     zstate replay run.mcap panda --rate 0.5 --start 30 --duration 10 --loop
@@ -97,16 +100,18 @@ def replay_command(
         names = ", ".join(map(repr, player.robots))
         speed = "as fast as possible" if rate == float("inf") else f"at {rate:g} times its speed"
         span = f"{(last - first) / 1e9:.1f} s, {format_stamp(first)} to {format_stamp(last)}"
+        if not player.has_samples:
+            speed = "no samples; what is latched is published" + (" until Ctrl-C" if player.is_held else "")
         print_wrapped(f"replaying {names} from {file}: {span}, {speed}")
         call = BackgroundCall("zstate replay", player.run)
         try:
             report = _show(player, call)
         except SystemExit:
             player.close()
-            print_wrapped(_summary(player.report()))
+            print_wrapped(_summary(player))
             raise
-        print_wrapped(_summary(report))
-        if not report.samples:
+        print_wrapped(_summary(player))
+        if player.has_samples and not report.samples:
             fail("no sample was published; `zstate info` shows the contents of the file")
 
 
@@ -160,15 +165,18 @@ def _line(player: Player) -> str:
     return f"{position}  {format_stamp(now)}  {report.samples} samples  {report.rate:.2f}x  late {late}"
 
 
-def _summary(report: PlayerReport) -> str:
+def _summary(player: Player) -> str:
+    report = player.report()
+    reasons = ", ".join(f"{reason} {count}" for reason, count in report.refused.items())
+    refused = f"; not published: {reasons}" if reasons else ""
+    if not player.has_samples:
+        return f"replayed what is latched{refused}"
     late = (
         f"late by {format_duration(report.lateness_p50)} (median), {format_duration(report.lateness_p99)} "
         f"(p99), {format_duration(report.lateness_max)} (maximum)"
     )
     passes = f" in {report.passes} passes" if report.passes > 1 else ""
     delays = f"; fell {count_text(report.delays, 'time')} more than a second behind" if report.delays else ""
-    reasons = ", ".join(f"{reason} {count}" for reason, count in report.refused.items())
-    refused = f"; not published: {reasons}" if reasons else ""
     return (
         f"replayed {count_text(report.samples, 'sample')}{passes} at {report.rate:.3f} times the speed, "
         f"{late}{delays}{refused}"

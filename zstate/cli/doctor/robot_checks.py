@@ -46,7 +46,7 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
             advice = f"zstate ls  # shows the writers of {probe.info.name}"
             yield broken("version", text, "pip install -U zstate" if is_newer else advice)
             break
-    yield from _maps_checks(probe)
+    yield from maps_checks(probe, f"zstate doctor {probe.info.name} --timeout 10")
     if probe.is_place:
         yield statics_check(probe)
         return
@@ -56,9 +56,9 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
         yield from _parts_checks(probe, model)
     elif not probe.has_only_transforms:
         yield _samples_check(probe)
-    yield from _named_writers_checks(probe, "transforms", probe.transforms, probe.info.transform_names)
-    yield from _named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names)
-    yield from _scan_frames_checks(probe)
+    yield from named_writers_checks(probe, "transforms", probe.transforms, probe.info.transform_names)
+    yield from named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names)
+    yield from scan_frames_checks(probe)
     yield clocks_check(probe)
     yield stamps_check(probe, session)
     if model is not None:
@@ -187,7 +187,7 @@ def _parts_checks(probe: RobotProbe, model: RobotModel | None) -> Iterator[Check
     refused = refused_check(probe)
     if refused is not None:
         yield refused
-    yield from _named_writers_checks(probe, stream, probe.parts, probe.info.part_names)
+    yield from named_writers_checks(probe, stream, probe.parts, probe.info.part_names)
     parts = {} if probe.parts is None else probe.parts.writers
     written = {name for samples in parts.values() for name in samples.names}
     if model is not None and not written.issuperset(coordinate_names(model)):
@@ -201,15 +201,16 @@ def _parts_checks(probe: RobotProbe, model: RobotModel | None) -> Iterator[Check
         yield broken(stream, text, f"{publish_command_for('joints', robot)} {only}  # until its driver runs")
 
 
-def _named_writers_checks(
+def named_writers_checks(
     probe: RobotProbe,
     stream: Stream,
     stream_samples: StreamSamples | None,
     names: Sequence[tuple[str, WriterId]],
+    hz: str | None = None,
 ) -> Iterator[Check]:
-    """Whether each announced writer of a stream with names publishes."""
+    """Whether each announced writer of a stream with names publishes; ``hz`` is the command for the rate."""
     samples = {} if stream_samples is None else stream_samples.writers
-    hz, what = f"zstate hz {probe.info.name} --stream {stream}", stream.replace("_", " ")
+    hz, what = hz or f"zstate hz {probe.info.name} --stream {stream}", stream.replace("_", " ")
     for name, writer in names:
         received, known_as = samples.get(writer.session), f"{writer}, as {name!r}"
         if received is None:
@@ -227,22 +228,22 @@ def _named_writers_checks(
             yield ok(stream, f"{window.rate_hz:.1f} Hz from {known_as}, newest {silence} ago")
 
 
-def _maps_checks(probe: RobotProbe) -> Iterator[Check]:
-    """Whether each announced map has arrived."""
+def maps_checks(probe: RobotProbe, patient: str) -> Iterator[Check]:
+    """Whether each announced map has arrived; ``patient`` is the command that waits longer for them."""
     for name, writer in probe.info.map_names:
-        grid = probe.maps.get(writer.session)
+        grid = probe.maps.get(name)
         if grid is None:
             text = f"{writer} announces the map {name!r}, which has not arrived"
-            yield broken("map", text, f"zstate doctor {probe.info.name} --timeout 10")
+            yield broken("map", text, patient)
         else:
             frame = full_name(probe.info.name, grid.frame)
             size = f"{grid.width} x {grid.height} cells of {grid.resolution:g} m"
             yield ok("map", f"{name!r}: {size} in {frame!r}, from {writer}")
 
 
-def _scan_frames_checks(probe: RobotProbe) -> Iterator[Check]:
+def scan_frames_checks(probe: RobotProbe) -> Iterator[Check]:
     """Findings for scans in frames of the robot that it does not have: no reader can place them."""
-    robot, scans = probe.info.name, {} if probe.scans is None else probe.scans.writers
+    robot, scans = probe.info.name, probe.scans.writers
     frames = {frame.name for frame in probe.listener.buffer.frames()}
     for sensor, writer in probe.info.scan_names:
         for frame in scans[writer.session].names if writer.session in scans else ():

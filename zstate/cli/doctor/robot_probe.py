@@ -131,8 +131,8 @@ class RobotProbe(Closeable):
 
     ``neighbours`` are all announced robots. ``on_change()`` is called after each description and sample.
     ``nodes`` are the samples of each stream by ROS node, on a ROS wire; ``transforms`` and ``parts``, the
-    partial joint states, are the samples of these streams by writer, on the native wire, and ``scans`` those
-    of its laser scanners. ``maps`` are its maps by session.
+    partial joint states, are the samples of these streams by writer, on the native wire. ``scans`` are those
+    of its laser scanners, ``maps`` its maps by name.
     """
 
     def __init__(
@@ -150,12 +150,13 @@ class RobotProbe(Closeable):
         self.followed: Follow = "joint_states" if is_native and moves_by_joints else "tf"
         self.description: RobotDescription | None = None
         self.statuses: dict[int, Status] = {}
-        self.maps: dict[int, OccupancyGrid] = {}
+        self.maps: dict[str, OccupancyGrid] = {}
         self.events: list[WriterEvent] = []
         self.offsets: tuple[MeasuredOffset, ...] = ()
         self.unresponsive: set[WriterId] = set()
         self.nodes: dict[Stream, StreamSamples] = {}
-        self._session, self._on_change, wire_format = session, on_change, get_wire(wire)
+        self._session, self._on_change = session, on_change
+        self._wire = wire_format = get_wire(wire)
         with ExitStack() as opening:
             description = subscribe(
                 session, wire_format, info.name, "robot_description", self._on_description
@@ -165,17 +166,16 @@ class RobotProbe(Closeable):
             self.samples = opening.enter_context(samples)
             self.transforms: StreamSamples | None = None
             self.parts: StreamSamples | None = None
-            self.scans: StreamSamples | None = None
+            scans = StreamSamples(session, info.name, "scan", wire_format, on_change)
+            self.scans = opening.enter_context(scans)
+            if info.map_names:
+                maps = subscribe(session, wire_format, info.name, "map", self._on_maps)
+                opening.enter_context(maps)
             if is_native:
                 parts = StreamSamples(session, info.name, "partial_joint_states", wire_format, on_change)
                 self.parts = opening.enter_context(parts)
                 transforms = StreamSamples(session, info.name, "transforms", wire_format)
                 self.transforms = opening.enter_context(transforms)
-                scans = StreamSamples(session, info.name, "scan", wire_format, on_change)
-                self.scans = opening.enter_context(scans)
-                if info.map_names:
-                    maps = subscribe(session, wire_format, info.name, "map", self._on_maps)
-                    opening.enter_context(maps)
                 opening.enter_context(StatusSubscriber(session, info.name, self._on_status))
             for stream in () if is_native else _ROS_STREAMS:
                 nodes = StreamSamples(session, info.name, stream, wire_format)
@@ -196,9 +196,9 @@ class RobotProbe(Closeable):
                 self._on_change()
 
     def _on_maps(self, received: list[Received]) -> None:
-        for _, _, message in received:
+        for _, key, message in received:
             if isinstance(message, OccupancyGrid):
-                self.maps[message.session] = message
+                self.maps[self._wire.edge_writer_name(key) or ""] = message
                 self._on_change()
 
     def _on_status(self, _: str, status: Status) -> None:
@@ -226,9 +226,9 @@ class RobotProbe(Closeable):
         """Whether announced data has not arrived yet."""
         lacks_model = "robot_description" in self.streams and self.description is None
         for samples, names in ((self.parts, self.info.part_names), (self.scans, self.info.scan_names)):
-            if samples is not None and len(samples.writers) < len(names):
+            if samples is not None and not {one.session for _, one in names} <= samples.writers.keys():
                 return True
-        if len(self.maps) < len(self.info.map_names):
+        if not {name for name, _ in self.info.map_names} <= self.maps.keys():
             return True
         return lacks_model or (self.followed in self.streams and self.samples.statistics.count < 2)
 

@@ -10,9 +10,12 @@ from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import stamps_check
 from zstate.cli.doctor.robot_checks import (
     limits_check,
+    maps_checks,
     model_check,
+    named_writers_checks,
     poses_check,
     refused_check,
+    scan_frames_checks,
     statics_check,
 )
 from zstate.cli.doctor.robot_probe import RobotProbe
@@ -55,11 +58,18 @@ class _RosChecks:
             why = "no node publishes, or the router denies reading"
             yield broken("writers", f"{names} announced, but no message arrives: {why}", "zstate ls")
             return
+        yield from maps_checks(probe, f"zstate doctor{self._robot} --timeout 10")
+        if probe.is_place:
+            yield statics_check(probe)
+            return
         model, check = self._model_check(model_name)
         yield check
         nodes, publishers = self._by_node["joint_states"], self._by_node["tf"]
         yield self._joints_check(model) if nodes else self._no_joints_check(model)
         yield self._transforms_check() if publishers else self._no_transforms_check()
+        hz = f"zstate hz{self._robot} --stream scan"
+        yield from named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names, hz)
+        yield from scan_frames_checks(probe)
         yield stamps_check(probe, self._session)
         if model is not None:
             yield from limits_check(probe, model, nodes.values(), f"zstate echo{self._robot}")

@@ -331,7 +331,7 @@ class TimePanel:
         if seconds is not None and self._span is not None:
             cursor.seek(self._origin(self._span) + round(seconds * 1e9))
             return
-        span = context.buffer.span()
+        span = context.span
         if span is None:
             return
         if cursor.is_live and self._span is not None and self._seconds.value == 0.0:

@@ -8,7 +8,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import viser
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.snapshot import FramePoses
+from zstate.buffer.snapshot import FramePoses, TimeSpan
 
 T = TypeVar("T")
 
@@ -17,7 +17,7 @@ class PanelContext(NamedTuple):
     """The snapshot on display, seen from the frame ``fixed``; ``is_live`` if it is the newest.
 
     ``now`` [ns] is for ages. It is None for a snapshot of the past, and if the stamps are not of the domain
-    of the buffer's clock. ``domain`` is the time domain of the stamps.
+    of the buffer's clock. ``domain`` is the time domain of the stamps, ``span`` all that can be shown.
     """
 
     snapshot: FramePoses
@@ -26,6 +26,7 @@ class PanelContext(NamedTuple):
     is_live: bool
     now: int | None
     domain: str | None
+    span: TimeSpan | None
 
     @property
     def at(self) -> int | None:

@@ -16,7 +16,7 @@ from zstate.buffer.snapshot import FrameTable, Poses
 from zstate.errors import LookupFailed
 from zstate.scans.grid import Grid
 from zstate.scans.scan import Scan
-from zstate.view.world_source import TOO_MANY_SENSORS, SensorScans, WorldSource, WriterName
+from zstate.view.world_source import Sensor, WorldData, WriterName
 
 _POINT_SIZE_M = 0.03
 _COLORS = ((224, 49, 49), (25, 113, 194), (47, 158, 68), (174, 62, 201), (232, 89, 12), (12, 133, 153))
@@ -85,8 +85,8 @@ class World:
         """Grows when a map appears."""
         return self._images.version
 
-    def show(self, source: WorldSource, buffer: TransformBuffer, place: Place, at: int | None) -> None:
-        """Draw the maps, and the last scans until ``at`` [ns]; None: the newest."""
+    def show(self, source: WorldData, buffer: TransformBuffer, place: Place, at: int | None) -> None:
+        """Draw the maps and the last scans ``at`` a stamp [ns]; None: the newest."""
         missing: list[tuple[str, str]] = []
         sensors = source.sensors
         for name in self._clouds.keys() - sensors.keys():
@@ -100,12 +100,10 @@ class World:
                 )
                 self._cloud_count += 1
             clouds.show(sensor, place, self.scan_count if self.scans else 0, at)
-            if sensor.reason is not None:
-                missing.append((f"scans of {name}", f"{sensor.dropped} dropped: {sensor.reason}"))
-        refused = source.refused.get(TOO_MANY_SENSORS)
-        if refused:
-            missing.append(("scans of further sensors", f"{refused} refused: {TOO_MANY_SENSORS}"))
-        missing += self._images.show(source.maps, place, is_on=self.maps)
+            if sensor.problem is not None:
+                missing.append((f"scans of {name}", sensor.problem))
+        missing += source.problems
+        missing += self._images.show(source.maps_at(at), place, is_on=self.maps)
         self.missing = missing
 
     def corners(self, place: Place) -> NDArray[np.float64]:
@@ -134,13 +132,13 @@ class ScanClouds:
         self._count = 0
         self._state: tuple[Sequence[Scan], str, int, bool] | None = None
 
-    def show(self, sensor: SensorScans, place: Place, count: int, at: int | None) -> None:
+    def show(self, sensor: Sensor, place: Place, count: int, at: int | None) -> None:
         """Draw the last ``count`` scans of ``sensor`` until ``at`` [ns]."""
         frame = sensor.frame
         if frame is None:
             return
         target = place.connected(frame)
-        sensor.settle(self._buffer, target)
+        sensor.settle(self._buffer, target, at)
         if self._root is None:
             self._root = self._scene.add_frame(self._path, show_axes=False)
         pose = place.pose(target)
@@ -148,7 +146,7 @@ class ScanClouds:
             count = 0
         else:
             _move(self._root, pose)
-        state = sensor.latest(count, at), target, count, sensor.is_stale
+        state = sensor.latest(count, at), target, count, sensor.is_stale(at)
         if state != self._state:
             self._state = state
             self._update(*state)
