@@ -129,6 +129,23 @@ def test_scan_of_a_turning_rover_is_placed_as_looked_up(frames: tuple[str, str],
     assert assert_placed_as_looked_up(driving(), points, stamps, *frames).all()
 
 
+@pytest.mark.parametrize("bend", [0.01, 0.1, 0.7, 3.0, 40.0])
+@pytest.mark.parametrize("order", ["ascending", "descending", "jumps"])
+def test_many_points_between_two_samples_of_any_motion_are_placed_as_looked_up(
+    bend: float, order: str
+) -> None:
+    """Joints of all types; of those that turn, some do it by ``bend`` [rad] between two samples."""
+    buffer, track = every_joint()
+    for n in range(3):
+        free = (n, 0.0, -n, *quaternion_from_rpy(0.3 * n * n, bend * n, 0.1))
+        turned = {"spin": n * n * bend, "bend": n * bend, "slide": (n * n, n, n * bend)}
+        buffer.insert_joints(track, NOW + n * S, pose_of_every(track, free=free, lift=0.5 * n, **turned))
+    points = np.random.default_rng(3).uniform(-30.0, 30.0, (3000, 3))
+    stamps = scan_stamps(order, 3000, 0, NOW, NOW + 2 * S)
+    assert assert_placed_as_looked_up(buffer, points, stamps, "second", "root").all()
+    assert assert_placed_as_looked_up(buffer, points, stamps, "root", "second").all()
+
+
 def test_wall_seen_while_turning_is_straight() -> None:
     """Rays of a laser that turns at 1.5 rad/s measure the wall x = 5; in the map their ends are on it."""
     buffer = filled(*(moving("map", "laser", NOW + n * 10 * MS, yaw=0.015 * n) for n in range(20)))

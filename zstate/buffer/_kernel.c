@@ -38,7 +38,7 @@
 #include "_kernel/transform_fields.h"
 #include "_kernel/step.h"
 #include "_kernel/path.h"
-#include "_kernel/arc.h"
+#include "_kernel/curve.h"
 #include "_kernel/place.h"
 #include "_kernel/newer_transforms.h"
 #include "_kernel/edges.h"

@@ -178,10 +178,11 @@ class ScanListener(Closeable):
 
     def _place(self, sensor: str, scan: Scan, deadline: float) -> None:
         """Add the placed scan to the unread ones once the pose of its last ray is known, or count it."""
+        points, stamps = scan.points(), scan.stamps()  # before the wait, not after it
         try:
             if not self._wait_for_pose(scan, deadline):
                 return
-            points, valid = self.buffer.place(scan.points(), scan.stamps(), scan.frame, self.target)
+            points, valid = self.buffer.place(points, stamps, scan.frame, self.target)
         except LookupFailed as reason:
             self.last_reason = reason
             self._count_dropped(type(reason).__name__.removesuffix("Timeout"))

@@ -25,6 +25,28 @@ FIELDS = {
         "Transform transform",
     ),
     "tf2_msgs/msg/TFMessage": ("geometry_msgs/TransformStamped[] transforms",),
+    "sensor_msgs/msg/LaserScan": (
+        "std_msgs/Header header",
+        "float32 angle_min",
+        "float32 angle_max",
+        "float32 angle_increment",
+        "float32 time_increment",
+        "float32 scan_time",
+        "float32 range_min",
+        "float32 range_max",
+        "float32[] ranges",
+        "float32[] intensities",
+    ),
+    "geometry_msgs/msg/Point": ("float64 x", "float64 y", "float64 z"),
+    "geometry_msgs/msg/Pose": ("Point position", "Quaternion orientation"),
+    "nav_msgs/msg/MapMetaData": (
+        "builtin_interfaces/Time map_load_time",
+        "float32 resolution",
+        "uint32 width",
+        "uint32 height",
+        "geometry_msgs/Pose origin",
+    ),
+    "nav_msgs/msg/OccupancyGrid": ("std_msgs/Header header", "MapMetaData info", "int8[] data"),
 }
 
 

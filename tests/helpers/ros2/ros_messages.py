@@ -14,8 +14,19 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 STRING = "std_msgs/msg/String"
 CLOCK = "rosgraph_msgs/msg/Clock"
+LASER_SCAN = "sensor_msgs/msg/LaserScan"
+OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 
 XYZ, XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
+SCAN_NUMBERS = (
+    "angle_min",
+    "angle_max",
+    "angle_increment",
+    "time_increment",
+    "scan_time",
+    "range_min",
+    "range_max",
+)
 
 
 def time(stamp: int) -> dict[str, int]:
@@ -48,6 +59,27 @@ def transform_stamped(stamp: int, parent: str, child: str, pose7: Sequence[float
 
 def tf_message(*transforms: dict[str, Any]) -> dict[str, Any]:
     return {"transforms": list(transforms)}
+
+
+def laser_scan(stamp: int, frame: str, numbers: Sequence[float], *arrays: Sequence[float]) -> dict[str, Any]:
+    """``numbers`` are those of SCAN_NUMBERS; ``arrays`` the ranges and the intensities."""
+    geometry = dict(zip(SCAN_NUMBERS, numbers, strict=True))
+    ranges, intensities = map(list, arrays)
+    return {"header": header(stamp, frame), **geometry, "ranges": ranges, "intensities": intensities}
+
+
+def occupancy_grid(
+    stamp: int, frame: str, resolution: float, pose7: Sequence[float], cells: Sequence[Sequence[int]]
+) -> dict[str, Any]:
+    """``cells`` are rows of one length; the map was loaded at its stamp."""
+    numbers = [float(number) for number in pose7]
+    origin = {
+        "position": dict(zip(XYZ, numbers[:3], strict=True)),
+        "orientation": dict(zip(XYZW, numbers[3:], strict=True)),
+    }
+    extent = {"resolution": resolution, "width": len(cells[0]), "height": len(cells)}
+    info = {"map_load_time": time(stamp), **extent, "origin": origin}
+    return {"header": header(stamp, frame), "info": info, "data": [cell for row in cells for cell in row]}
 
 
 def edges_of(message: dict[str, Any]) -> dict[tuple[str, str], NDArray[np.float64]]:

@@ -50,8 +50,8 @@ class Messages:
             return self.build(what, value)
         if kind == Nodetype.SEQUENCE:
             element = what[0]
-            if element[0] == Nodetype.BASE and element[1][0] == "float64":
-                return np.array(value, dtype=np.float64)
+            if element[0] == Nodetype.BASE and element[1][0] != "string":
+                return np.array(value, dtype=element[1][0])
             return [self._field(element, item) for item in value]
         return value
 

@@ -53,7 +53,7 @@ typedef struct {
     Pose pose;
 } KeptPose;
 
-/* One call: its arrays, and the poses or the arcs that several points share. */
+/* One call: its arrays, and the poses or the curve that several points share. */
 typedef struct {
     const Path *path;
     Batch batch;
@@ -62,10 +62,11 @@ typedef struct {
     char *out;
     char *valid;
     KeptPose *kept;      /* SLOTS of them; NULL if few points share a stamp */
-    Arc *arcs;           /* of the steps, in the order of the path */
-    Interval *intervals; /* of the tracks, for the instants from `from` until `until` */
-    int64_t from;
+    Interval *intervals; /* of the tracks; NULL if points are placed one by one */
+    int64_t from;        /* the instants of one curve, up to `until` */
     int64_t until;
+    int halvings; /* of the period between two samples, so that a curve follows the path */
+    Curve curve;
 } Placing;
 
 /* NaN, and not valid, if a number is not finite in the format of the points. */
@@ -99,7 +100,7 @@ slot_of(int64_t stamp)
     return (size_t)(((uint64_t)stamp * UINT64_C(0x9E3779B97F4A7C15)) >> (64 - SLOT_BITS));
 }
 
-/* Whether kept poses would serve most points; with fewer points to a stamp, arcs cost less. The
+/* Whether kept poses would serve most points; with fewer points to a stamp, curves cost less. The
  * first stamps show it. */
 static bool
 are_repeated(const int64_t *stamps, Py_ssize_t count)
@@ -146,8 +147,9 @@ place_each(Placing *placing, Py_ssize_t first, Py_ssize_t end, Py_ssize_t step)
     }
 }
 
-/* The samples of all tracks around an instant, and the instants that have the same samples before
- * and after them. False if a track ends before or at this instant. */
+/* The samples of all tracks around an instant, and the instants that one curve may describe: those
+ * with the same samples before and after them, or a part of them. False if a track ends before or
+ * at this instant. */
 static bool
 find_intervals(Placing *placing, int64_t at)
 {
@@ -164,53 +166,62 @@ find_intervals(Placing *placing, int64_t at)
         near += block->stamps[near] == at; /* an instant of a sample begins an interval */
         int64_t earlier = block->stamps[near - 1], later = block->stamps[near];
         const double *row = block->rows + (size_t)near * (size_t)block->width;
-        placing->intervals[i] =
-            (Interval){row - block->width, row, (double)((uint64_t)at - (uint64_t)earlier),
-                       (double)((uint64_t)later - (uint64_t)earlier)};
+        batch->nows[i] = (Bracket){row - block->width, row, 0.0};
+        placing->intervals[i] = (Interval){earlier, (double)((uint64_t)later - (uint64_t)earlier)};
         placing->from = earlier > placing->from ? earlier : placing->from;
         placing->until = later < placing->until ? later : placing->until;
     }
-    return (uint64_t)placing->until - (uint64_t)placing->from <= INT64_MAX;
+    if ((uint64_t)placing->until - (uint64_t)placing->from > INT64_MAX)
+        return false;
+    int64_t part = (placing->until - placing->from) >> placing->halvings;
+    part = part > 0 ? part : 1;
+    placing->from += (at - placing->from) / part * part;
+    if (placing->until - placing->from > part)
+        placing->until = placing->from + part;
+    return true;
 }
 
 static void
-place_chunk(Placing *placing, Py_ssize_t first, Py_ssize_t count, int64_t start)
+place_chunk(Placing *placing, Py_ssize_t first, Py_ssize_t count)
 {
+    const Curve *curve = &placing->curve;
     Chunk chunk;
-    Py_ssize_t to_target = placing->path->to_target, steps = to_target + placing->path->to_source;
     chunk.count = count;
     for (Py_ssize_t i = 0; i < count; i++) {
         double p[3];
         read_point(placing->points, first + i, p);
-        chunk.since[i] = (double)(placing->stamps[first + i] - start);
+        chunk.at[i] = (double)(placing->stamps[first + i] - curve->begin) * curve->rate - 1.0;
         chunk.x[i] = p[0];
         chunk.y[i] = p[1];
         chunk.z[i] = p[2];
     }
-    for (Py_ssize_t i = steps; i-- > to_target;)
-        arc_run(&placing->arcs[i], false, &chunk);
-    for (Py_ssize_t i = 0; i < to_target; i++)
-        arc_run(&placing->arcs[i], true, &chunk);
+    curve_apply(curve, &chunk);
     for (Py_ssize_t i = 0; i < count; i++) {
         const double placed[3] = {chunk.x[i], chunk.y[i], chunk.z[i]};
         write_point(placing, first + i, placed);
     }
 }
 
-/* Points first to end, all of them between the same samples. */
+/* Points first to end, all of them on the curve. */
 static void
-place_between_samples(Placing *placing, Py_ssize_t first, Py_ssize_t end)
+place_on_curve(Placing *placing, Py_ssize_t first, Py_ssize_t end)
 {
-    Py_ssize_t steps = placing->path->to_target + placing->path->to_source;
-    int64_t start = placing->stamps[first];
-    for (Py_ssize_t i = 0; i < steps; i++)
-        arc_of(&placing->arcs[i], &placing->path->steps[i], placing->intervals);
     for (Py_ssize_t i = first; i < end; i += CHUNK)
-        place_chunk(placing, i, end - i < CHUNK ? end - i : CHUNK, start);
+        place_chunk(placing, i, end - i < CHUNK ? end - i : CHUNK);
 }
 
-/* For fewer points the arcs of their interval cost more than their poses. */
-#define FEW_POINTS 8
+/* For fewer points a curve costs more than their poses. */
+#define FEW_POINTS 12
+#define MAX_HALVINGS 6
+
+/* The curve of the instants that find_intervals has found; as curve_of. */
+static double
+find_curve(Placing *placing)
+{
+    Batch *batch = &placing->batch;
+    return curve_of(&placing->curve, placing->path, batch->nows, placing->intervals, batch->tracks,
+                    placing->from, placing->until);
+}
 
 static void
 place_intervals(Placing *placing)
@@ -222,8 +233,13 @@ place_intervals(Placing *placing)
         if (find_intervals(placing, stamps[first]))
             while (end < count && stamps[end] >= placing->from && stamps[end] < placing->until)
                 end++;
-        if (end - first > FEW_POINTS)
-            place_between_samples(placing, first, end);
+        double last = end - first > FEW_POINTS ? find_curve(placing) : Py_NAN;
+        if (last <= LAST_TERMS)
+            place_on_curve(placing, first, end);
+        else if (last > LAST_TERMS && placing->halvings < MAX_HALVINGS) {
+            placing->halvings++;
+            end = first;
+        }
         else
             place_each(placing, first, end, 1);
     }
@@ -232,23 +248,20 @@ place_intervals(Placing *placing)
 static bool
 placing_begin(Placing *placing, bool is_one_stamp)
 {
-    Py_ssize_t tracks = placing->batch.tracks;
     if (is_one_stamp)
         return true;
     if (are_repeated(placing->stamps, placing->points->count)) {
         placing->kept = PyMem_RawCalloc(SLOTS, sizeof(KeptPose));
         return placing->kept != NULL;
     }
-    size_t steps = (size_t)(placing->path->to_target + placing->path->to_source);
-    placing->arcs = PyMem_New(Arc, steps + 1);
-    placing->intervals = PyMem_New(Interval, (size_t)tracks + 1);
-    return placing->arcs != NULL && placing->intervals != NULL;
+    placing->intervals = PyMem_New(Interval, (size_t)placing->batch.tracks);
+    return placing->intervals != NULL;
 }
 
 static void
 place_run(Placing *placing)
 {
-    if (placing->arcs != NULL)
+    if (placing->intervals != NULL)
         place_intervals(placing);
     else
         place_each(placing, 0, placing->points->count, placing->kept != NULL);
@@ -281,7 +294,6 @@ place_into(const Path *self, const Points *points, const Py_buffer *stamps, cons
         Py_END_ALLOW_THREADS
     }
     PyMem_RawFree(placing.kept);
-    PyMem_Free(placing.arcs);
     PyMem_Free(placing.intervals);
     batch_release(&placing.batch);
     if (!has_memory)

@@ -19,11 +19,12 @@ from ros_messages import (
     XYZ,
     XYZW,
     joint_state,
+    laser_scan,
+    occupancy_grid,
     tf_message,
     time,
     transform_stamped,
 )
-from ros_messages import header as message_header
 
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
@@ -140,8 +141,6 @@ def test_transforms_are_the_same_bytes(kilted: Program, stamp: int, transforms: 
     assert (decoded.stamps, decoded.edges, decoded.poses) == ((stamp,) * len(edges), edges, poses)
 
 
-_TIMES = ("time_increment", "scan_time")
-SCAN_FIELDS = ("angle_min", "angle_max", "angle_increment", *_TIMES, "range_min", "range_max")
 PLAIN = FrameNames(Ros2Options(), "r1")
 
 frames = texts.filter(lambda text: text.strip("/") == text != "")
@@ -163,8 +162,7 @@ def test_scans_are_the_same_bytes(kilted: Program, stamp: int, frame: str, range
     # exact in float32: 1953125 ns and 31250000 ns are 2^-9 s and 2^-5 s
     angle_max = -0.5 + 0.25 * max(0, len(ranges) - 1)
     numbers = (-0.5, angle_max, 0.25, 2.0**-9, 2.0**-5, 0.125, 8.0)
-    geometry = dict(zip(SCAN_FIELDS, numbers, strict=True))
-    message = {"header": message_header(stamp, frame), **geometry, "ranges": ranges, "intensities": ranges}
+    message = laser_scan(stamp, frame, numbers, ranges, ranges)
     genuine = genuine_bytes(kilted, types.LASER_SCAN.name, message)
     block = to_float32_block(ranges)
     times = (1_953_125, 31_250_000)
@@ -177,15 +175,10 @@ def test_scans_are_the_same_bytes(kilted: Program, stamp: int, frame: str, range
 @many
 @given(stamps, frames, st.lists(st.integers(-1, 100), max_size=6))
 def test_grids_are_the_same_bytes(kilted: Program, stamp: int, frame: str, cells: list[int]):
-    pose = {
-        "position": dict(zip(XYZ, (1.0, 2.0, 3.0), strict=True)),
-        "orientation": dict(zip(XYZW, (0.0, 0.0, 0.0, 1.0), strict=True)),
-    }
-    size = {"width": len(cells), "height": 1}
-    info = {"map_load_time": time(stamp), "resolution": 0.25, **size, "origin": pose}
-    message = {"header": message_header(stamp, frame), "info": info, "data": cells}
+    pose7 = [1, 2, 3, 0, 0, 0, 1]
+    message = occupancy_grid(stamp, frame, 0.25, pose7, [cells])
     genuine = genuine_bytes(kilted, types.OCCUPANCY_GRID.name, message)
-    origin, block = to_block([1, 2, 3, 0, 0, 0, 1]), np.array(cells, np.int8).tobytes()
+    origin, block = to_block(pose7), np.array(cells, np.int8).tobytes()
     grid = OccupancyGrid(77, stamp, frame, 0.25, len(cells), 1, origin, block)
     pieces = [*header(frame), *[("u32", 0)] * 5, *[("f64", 0.0)] * 7, ("u32", 0), *[("i8", 0)] * len(cells)]
     assert_same(encoded(grid), genuine, mask(pieces))

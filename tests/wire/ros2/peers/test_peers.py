@@ -9,29 +9,46 @@ from helpers.robots import RRBOT, SECOND, STAMP, assert_pose, kinematic_pose
 from peers import DOMAIN, Peer, repeat_until
 from ros_messages import (
     JOINT_STATE,
+    LASER_SCAN,
+    OCCUPANCY_GRID,
     STRING,
     TF_MESSAGE,
     edges_of,
     joint_state,
+    laser_scan,
+    occupancy_grid,
     tf_message,
     transform_stamped,
 )
 
+from zstate.buffer.buffer import TransformBuffer
 from zstate.net.session import Session
+from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.scans import Grid, MapPublisher, Scan, ScanListener, ScanPublisher
+from zstate.scans.grid import grid_from_message
 from zstate.transform import Transform
+from zstate.wire.messages import OccupancyGrid
+from zstate.wire.registry import get_wire
 
 WIRE = f"ros2:domain={DOMAIN}"
 POSITIONS, VELOCITIES = [0.4, -1.25], [0.5, 2.0]
 TURN = [0.1, -0.2, 0.3, 0.0, 0.0, 0.6, 0.8]
+# Exact in float32: 1953125 ns are 2^-9 s.
+RAY_NS = 1_953_125
+SCAN = laser_scan(
+    STAMP, "laser", (-0.5, 0.25, 0.25, 2.0**-9, 0.0, 0.125, 8.0), [1.0, 9.5, 2.5, 0.5], [3.0] * 4
+)
+CELLS = [[0, 100, -1], [50, 1, 0]]
+GRID = occupancy_grid(STAMP, "map", 0.25, TURN, CELLS)
 
 SDK = pytest.param("sdk", marks=pytest.mark.ros2_peer)
 PYZEROS = pytest.param("pyzeros", marks=pytest.mark.heavy)
 KILTED = pytest.param("kilted", marks=pytest.mark.heavy)
 every_peer = pytest.mark.parametrize("peer", [SDK, PYZEROS, KILTED], indirect=True)
-# pyzeros has no transient local durability.
+# pyzeros has no transient local durability, and its peer no scans.
 every_peer_that_latches = pytest.mark.parametrize("peer", [SDK, KILTED], indirect=True)
 # zenoh-ros2-sdk signs with numbers of its own, not with the hash of its token.
 every_peer_that_signs = pytest.mark.parametrize("peer", [PYZEROS, KILTED], indirect=True)
@@ -143,6 +160,57 @@ def test_late_listener_receives_the_model_and_the_static_edges(peer: Peer, sessi
         until(lambda: early.buffer.can_lookup("hand", "camera"))
     with TransformListener(session, "r1", wire=WIRE) as late:
         until(lambda: {"r1/tool", "r1/camera"} <= {frame.name for frame in late.buffer.frames()})
+
+
+@every_peer_that_latches
+def test_peer_receives_a_scan_as_published(peer: Peer, session: Session):
+    peer.subscribe("/front", LASER_SCAN)
+    geometry = {"angle_min": -0.5, "angle_increment": 0.25, "range_min": 0.125, "range_max": 8.0}
+    with ScanPublisher(session, "r1", "front", WIRE, ray_ns=RAY_NS, frame="laser", **geometry) as publisher:
+        received = peer.receive(
+            "/front", lambda: publisher.publish(SCAN["ranges"], STAMP, SCAN["intensities"])
+        )
+    assert received == SCAN
+
+
+@every_peer_that_latches
+def test_listener_places_the_scans_of_a_peer(peer: Peer, session: Session):
+    peer.advertise("/front", LASER_SCAN)
+    buffer = TransformBuffer()
+    buffer.insert_static(Transform.from_pose7("r1/odom", "r1/laser", TURN))
+    with ScanListener(session, "r1", "odom", buffer=buffer, wire=WIRE) as scans:
+        repeat_until(lambda: peer.publish("/front", SCAN), lambda: len(scans))
+        placed = next(iter(scans))
+    scan = Scan(STAMP, -0.5, 0.25, RAY_NS, SCAN["ranges"], 0.125, 8.0)
+    assert (placed.sensor, placed.stamp, placed.scan.ray_ns) == ("front", STAMP, RAY_NS)
+    assert placed.valid.tolist() == [True, False, True, True]
+    expected = Transform.from_pose7("odom", "laser", TURN).apply(scan.points())
+    assert np.allclose(placed.points, expected, rtol=0, atol=1e-6, equal_nan=True)
+    assert not scans.refused
+
+
+@every_peer_that_latches
+def test_late_peer_receives_the_map(peer: Peer, session: Session):
+    with MapPublisher(session, "hall", Grid(CELLS, 0.25, TURN, stamp=STAMP), WIRE):
+        peer.subscribe("/map", OCCUPANCY_GRID, latched=True)
+        assert peer.receive("/map") == GRID
+
+
+@every_peer_that_latches
+def test_map_of_a_peer_is_received(peer: Peer, session: Session):
+    peer.advertise("/map", OCCUPANCY_GRID, latched=True)
+    maps: list[Grid] = []
+
+    def on_messages(received: list[Received]) -> None:
+        for robot, _, message in received:
+            assert isinstance(message, OccupancyGrid)
+            maps.append(grid_from_message(message, robot))
+
+    with subscribe(session, get_wire(WIRE), "hall", "map", on_messages):
+        repeat_until(lambda: peer.publish("/map", GRID), lambda: maps)
+    assert (maps[0].stamp, maps[0].frame, maps[0].resolution) == (STAMP, "hall/map", 0.25)
+    assert maps[0].cells.tolist() == CELLS
+    assert maps[0].origin.pose7.tolist() == TURN
 
 
 @every_peer

@@ -8,10 +8,12 @@ from helpers.processes import until
 from helpers.robots import RRBOT, STAMP
 from peers import DOMAIN, Peer, repeat_until
 from rmw_format import Attachment, gid
-from ros_messages import JOINT_STATE, STRING, TF_MESSAGE
+from ros_messages import JOINT_STATE, LASER_SCAN, OCCUPANCY_GRID, STRING, TF_MESSAGE
 
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
+from zstate.scans import Grid, MapPublisher, ScanPublisher
+from zstate.wire.ros2 import types
 from zstate.wire.ros2.graph import EndpointToken, NodeToken, parse_token
 from zstate.wire.ros2.qos import Qos
 
@@ -68,6 +70,33 @@ def test_a_peer_finds_what_we_publish_with_its_types_and_qos(peer: Peer, session
         assert endpoint["qos"] == qos.encode_rmw()
         assert endpoint["hash"].startswith("RIHS01_")
     until(lambda: not set(OURS) & set(peer.ask("graph")))
+
+
+@pytest.mark.parametrize("peer", [SDK], indirect=True)
+def test_a_peer_finds_scans_and_maps_with_their_types_and_qos(peer: Peer, session: Session):
+    geometry = {"angle_min": 0.0, "angle_increment": 0.1, "range_min": 0.1, "range_max": 10.0}
+    published = {
+        "/r1/front": (LASER_SCAN, Qos("best_effort", depth=5)),
+        "/r1/map": (OCCUPANCY_GRID, LATCHED),
+    }
+    with (
+        ScanPublisher(session, "r1", "front", WIRE, **geometry),
+        MapPublisher(session, "r1", Grid([[0]], 1.0, (0.0, 0.0, 0.0), stamp=STAMP), WIRE),
+    ):
+        until(lambda: set(published) <= set(peer.ask("graph")))
+        found = peer.ask("graph")
+    for topic, (type_name, qos) in published.items():
+        (endpoint,) = found[topic]["publishers"]
+        assert found[topic]["types"] == [type_name]
+        assert endpoint["qos"] == qos.encode_rmw()
+
+
+@pytest.mark.parametrize("peer", [SDK], indirect=True)
+def test_a_peer_computes_the_type_hashes_in_our_keys(peer: Peer, session: Session):
+    known = (types.JOINT_STATE, types.TF_MESSAGE, types.STRING, types.LASER_SCAN, types.OCCUPANCY_GRID)
+    for number, kind in enumerate(known):
+        key = peer.ask("advertise", topic=f"/topic{number}", type=kind.name)
+        assert key == f"{DOMAIN}/topic{number}/{kind.dds}/{kind.hash}"
 
 
 @pytest.mark.parametrize("peer", [SDK, PYZEROS], indirect=True)
