@@ -35,7 +35,7 @@ FLOORS = (
     {"net"},
     {"sources"},
     {"nodes"},
-    {"scans"},
+    {"scans", "driving"},
     {"bridges", "recording"},
     {"zstate"},
     {"metrics"},

@@ -22,6 +22,7 @@ from zstate.wire.messages import (
     LATCHED_BYTES,
     SAMPLE_BYTES,
     ClockMessage,
+    DriverState,
     HistoryPage,
     JointCommand,
     JointState,
@@ -31,6 +32,7 @@ from zstate.wire.messages import (
     RobotDescription,
     StaticTransforms,
     Status,
+    Stop,
     TransformSample,
     WriterTransforms,
     check_edges,
@@ -48,6 +50,8 @@ ENCODINGS: dict[type[Message], str] = {
     TransformSample: "zstate/TransformSample;v=1",
     WriterTransforms: "zstate/WriterTransforms;v=1",
     JointCommand: "zstate/JointCommand;v=1",
+    DriverState: "zstate/DriverState;v=1",
+    Stop: "zstate/Stop;v=1",
     StaticTransforms: "zstate/StaticTransforms;v=1",
     RobotDescription: "zstate/RobotDescription;v=1",
     LaserScan: "zstate/LaserScan;v=1",
@@ -73,7 +77,12 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
 _MIN_LIMIT_BYTES = 1_000
 
 # Of messages without a stream.
-_MAX_BYTES: dict[type[Message], int] = {Status: 64_000, HistoryPage: 4 * SAMPLE_BYTES}
+_MAX_BYTES: dict[type[Message], int] = {
+    Status: 64_000,
+    DriverState: 256_000,
+    Stop: 8_000,
+    HistoryPage: 4 * SAMPLE_BYTES,
+}
 
 _DEFLATED_BYTES = 64_000
 _DEFLATED = b"\x78"
