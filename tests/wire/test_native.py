@@ -21,6 +21,7 @@ from zstate.wire.messages import (
     LaserScan,
     Message,
     OccupancyGrid,
+    Release,
     RobotDescription,
     StaticTransforms,
     Status,
@@ -126,11 +127,16 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         Stop(STAMP, 300, 2**63 + 5, "hold", "door open"),
         header(5)[: -len(bin8(ORDER))] + fixstr("hold") + fixstr("door open"),
     ),
+    "release": (
+        Release(STAMP, 300, 2**63 + 5, ((1, 2), (3, 4))),
+        header(4)[: -len(bin8(ORDER))] + b"\x92\x92\x01\x02\x92\x03\x04",
+    ),
     "driver state": (
         DriverState(
-            *(5, 7, "active", "", NAMES, 100, "teleop", 6, ("j2",), 0.5, 4, 3, 2, {"old": 1}, "late")
+            *(5, 7, "active", "", NAMES, 100, "teleop", 6, ("j2",), 0.5, 4, 3, 2, {"old": 1}, "late"),
+            *(((8, 9),),),
         ),
-        b"\x9f\x05\x07"
+        b"\xdc\x00\x10\x05\x07"
         + fixstr("active")
         + fixstr("")
         + b"\x92"
@@ -145,7 +151,8 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + b"\x04\x03\x02\x81"
         + fixstr("old")
         + b"\x01"
-        + fixstr("late"),
+        + fixstr("late")
+        + b"\x91\x92\x08\x09",
     ),
     "statics": (
         StaticTransforms(7, (("b", "c"),), to_block([0, 0, 1, 0, 0, 0, 1])),

@@ -204,13 +204,13 @@ class JointCommand(Sample, frozen=True, array_like=True, gc=False):
 
 
 class Stop(StampedMessage, frozen=True, array_like=True, gc=False):
-    """A stop of a driver, or its release.
+    """A stop of a driver, until it is released.
 
-    With ``how`` "hold" the joints stay where they are, with "relax" without torque. "release" ends all stops
-    that the driver has received. ``reason`` is shown to users.
+    With ``how`` "hold" the joints stay where they are, with "relax" without torque. ``reason`` is shown to
+    users.
     """
 
-    how: Literal["hold", "relax", "release"]
+    how: Literal["hold", "relax"]
     reason: str = ""
 
     def __post_init__(self) -> None:
@@ -220,12 +220,22 @@ class Stop(StampedMessage, frozen=True, array_like=True, gc=False):
             )
 
 
+StopIds = tuple[tuple[Count, Count], ...]
+"""Stops, each by its ``session`` and its ``seq``."""
+
+
+class Release(StampedMessage, frozen=True, array_like=True, gc=False):
+    """The end of ``stops``, and of no others: a stop that arrives at the same time stays."""
+
+    stops: StopIds
+
+
 class DriverState(Message, frozen=True, array_like=True, gc=False):
     """The state of the driver of a robot's ``joint_names``. Not a safety-rated channel.
 
     ``state`` is "off" before and after the control loop; "ready" if it reads and writes nothing; "active"
-    while setpoints are valid; "holding" after their end; "stopped" until the stop is released; "fault" after
-    too many failures in a row. ``reason`` is why. ``commander`` is the program of the newest setpoints, whose
+    while setpoints are valid; "holding" after their end; "stopped" until all ``stops`` are released; "fault"
+    after too many failures in a row. ``reason`` is why. ``commander`` is the program of the newest setpoints, whose
     age since their arrival is ``command_age`` [ns], None without any; ``ttl`` [ns] is the longest that is
     granted. ``limited`` are the joints that moved slower than commanded at the last tick. ``faults`` counts
     failed calls of the driver, ``refused`` commands by reason, the newest described by ``last_refusal``.
@@ -247,6 +257,7 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     faults: Count = 0
     refused: dict[str, int] = {}
     last_refusal: str = ""
+    stops: StopIds = ()
 
 
 class StaticTransforms(Message, frozen=True, array_like=True, gc=False):

@@ -29,6 +29,7 @@ from zstate.wire.messages import (
     LaserScan,
     Message,
     OccupancyGrid,
+    Release,
     RobotDescription,
     StaticTransforms,
     Status,
@@ -52,6 +53,7 @@ ENCODINGS: dict[type[Message], str] = {
     JointCommand: "zstate/JointCommand;v=1",
     DriverState: "zstate/DriverState;v=1",
     Stop: "zstate/Stop;v=1",
+    Release: "zstate/Release;v=1",
     StaticTransforms: "zstate/StaticTransforms;v=1",
     RobotDescription: "zstate/RobotDescription;v=1",
     LaserScan: "zstate/LaserScan;v=1",
@@ -81,6 +83,7 @@ _MAX_BYTES: dict[type[Message], int] = {
     Status: 64_000,
     DriverState: 256_000,
     Stop: 8_000,
+    Release: 64_000,
     HistoryPage: 4 * SAMPLE_BYTES,
 }
 

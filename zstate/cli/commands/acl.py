@@ -11,9 +11,10 @@ from zstate.cli.output.console import print_result
 _ROLES = {
     "robot": "A robot: writes its own keys; reads these and the clock",
     "viewer": "Reads everything and writes nothing",
-    "operator": "A viewer that also commands joints",
+    "operator": "A commander that also calls ROS services",
     "timekeeper": "A viewer that also writes the simulated time",
     "placer": "Writes static edges as robot NAME and nothing else, for instance where robots are in a map",
+    "commander": "A viewer that also commands joints, and releases stops",
 }
 
 
@@ -40,7 +41,7 @@ def _role_options(command: Any) -> Any:
 def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, ...]) -> None:
     """Print the access control of a fleet as a router's configuration (JSON5).
 
-    Everything that is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`)
+    Everything that is not allowed there is denied. Every NAME may stop the driver of a robot. NAME is the common name of a certificate (`zstate certs`)
     or a user; for a robot or a placer it is also the name in the keys. One NAME may have several roles: a
     robot that reads other robots is also a viewer.
 
@@ -63,6 +64,6 @@ def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, .
     if not any(roles.values()):
         *others, last = (f"--{role} NAME" for role in _ROLES)
         raise click.UsageError(f"give at least one of {', '.join(others)} and {last}")
-    robots, viewers, operators, timekeepers, placers = (roles[role] for role in _ROLES)
-    fleet = AclRoles(robots, viewers, operators, timekeepers, namespace, wires, placers)
+    robots, viewers, operators, timekeepers, placers, commanders = (roles[role] for role in _ROLES)
+    fleet = AclRoles(robots, viewers, operators, timekeepers, namespace, wires, placers, commanders)
     print_result(access_text(fleet).rstrip("\n"))
