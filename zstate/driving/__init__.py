@@ -1,1 +1,1 @@
-"""Commands to the one program that owns a robot's hardware. Not a safety-rated channel."""
+"""Commands to the program that owns a robot's hardware, within limits. Not a safety-rated channel."""

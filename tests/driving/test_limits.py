@@ -1,0 +1,158 @@
+"""Limits: what the URDF states, what a user may add or lower, and what is refused with joint and value."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from zstate.driving.limits import Limits
+from zstate.errors import InvalidInput
+from zstate.model.load import load_model
+
+JOINTS = {
+    "shoulder": ("revolute", '<limit lower="-1" upper="2" velocity="3" effort="4"/>'),
+    "wheel": ("continuous", ""),
+    "lift": ("prismatic", '<limit lower="0" upper="0.5" velocity="0.2" effort="4"/>'),
+    "slow": ("revolute", '<limit lower="-1" upper="1" velocity="0" effort="4"/>'),
+    "base": ("floating", ""),
+    "thumb": ("revolute", '<limit lower="-1" upper="1" velocity="1" effort="4"/><mimic joint="shoulder"/>'),
+}
+
+
+def robot(*names: str):
+    """A chain of these joints."""
+    links = "".join(f'<link name="l{number}"/>' for number in range(len(names) + 1))
+    chain = "".join(
+        f'<joint name="{name}" type="{JOINTS[name][0]}"><parent link="l{number}"/>'
+        f'<child link="l{number + 1}"/><axis xyz="0 0 1"/>{JOINTS[name][1]}</joint>'
+        for number, name in enumerate(names)
+    )
+    return load_model(f'<robot name="arm">{links}{chain}</robot>')
+
+
+ARM = robot("shoulder", "wheel", "lift", "base", "thumb")
+
+
+def one(lower: float = -1.0, upper: float = 2.0, velocity: float = 1.0, acceleration: float = 4.0) -> Limits:
+    return Limits(
+        ("elbow",), np.array([lower]), np.array([upper]), np.array([velocity]), np.array([acceleration])
+    )
+
+
+def test_limits_are_those_of_the_urdf_for_all_joints_with_one_position():
+    limits = Limits.of(ARM, acceleration=8.0)
+    assert limits.joint_names == ("shoulder", "wheel", "lift")
+    assert limits.lower.tolist() == [-1.0, -math.inf, 0.0]
+    assert limits.upper.tolist() == [2.0, math.inf, 0.5]
+    assert limits.velocity.tolist() == [3.0, math.inf, 0.2]
+    assert limits.acceleration.tolist() == [8.0, 8.0, 8.0]
+    assert limits.units == ("rad", "rad", "m")
+
+
+def test_limits_of_some_joints_have_their_order():
+    limits = Limits.of(ARM, ["lift", "shoulder"])
+    assert limits.joint_names == ("lift", "shoulder")
+    assert limits.upper.tolist() == [0.5, 2.0]
+    assert limits.acceleration.tolist() == [math.inf, math.inf]
+
+
+def test_velocities_are_lowered_and_accelerations_given_by_joint():
+    limits = Limits.of(ARM, velocity={"shoulder": 1.0, "wheel": 20.0}, acceleration={"lift": 0.5})
+    assert limits.velocity.tolist() == [1.0, 20.0, 0.2]
+    assert limits.acceleration.tolist() == [math.inf, math.inf, 0.5]
+
+
+def test_a_velocity_of_zero_in_the_urdf_can_be_replaced_and_is_refused_otherwise():
+    assert Limits.of(robot("slow"), velocity=0.7).velocity.tolist() == [0.7]
+    with pytest.raises(InvalidInput, match="the URDF limits the velocity of 'slow' to 0"):
+        Limits.of(robot("slow"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (
+            {"velocity": 3.5},
+            "velocity 3.5 of 'shoulder' is above 3, the limit in the URDF; velocity 3.5 of 'l",
+        ),
+        ({"velocity": {"lift": 0.3}}, "velocity 0.3 of 'lift' is above 0.2, the limit in the URDF"),
+        ({"velocity": {"lift": 0.0}}, "the velocity limit of 'lift' is 0.0; it must be a number above zero"),
+        ({"velocity": math.nan}, "the velocity limit is nan; it must be a number above zero"),
+        ({"acceleration": -8.0}, "the acceleration limit is -8.0; it must be a number above zero"),
+        ({"acceleration": {"lift": [1.0, 2.0]}}, r"the acceleration limit of 'lift' is \[1.0, 2.0\]"),
+        (
+            {"acceleration": {"lft": 8.0}},
+            "acceleration limits of unknown joints: 'lft'; did you mean 'lift'?",
+        ),
+        ({"joints": ["sholder"]}, "unknown joint 'sholder'; did you mean 'shoulder'?"),
+        ({"joints": ["base"]}, "'base' is floating; only joints with one position have limits"),
+        ({"joints": ["thumb"]}, "'thumb' follows 'shoulder' and is not driven itself"),
+        ({"joints": ["lift", "lift"]}, "joints given twice: 'lift'"),
+        ({"joints": []}, r"joint names are a sequence of names, at least one; got \[\]"),
+        ({"joints": "lift"}, "joint names are a sequence of names, at least one; got 'lift'"),
+    ],
+)
+def test_unusable_limits_are_refused_with_joint_and_value(arguments, text):
+    with pytest.raises(InvalidInput, match=text):
+        Limits.of(ARM, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"lower": 3.0}, "positions of 'elbow' reach from 3 to 2"),
+        ({"upper": math.nan}, "positions of 'elbow' reach from -1 to nan"),
+        ({"velocity": 0.0}, "the velocity limit of 'elbow' is 0; it must be above zero"),
+        ({"acceleration": math.nan}, "the acceleration limit of 'elbow' is nan; it must be above zero"),
+    ],
+)
+def test_the_constructor_refuses_nan_zero_and_reversed_limits(values, text):
+    with pytest.raises(InvalidInput, match=text):
+        one(**values)
+
+
+def test_the_constructor_refuses_other_counts_and_units():
+    two = np.ones(2)
+    with pytest.raises(InvalidInput, match=r"lower limits of 1 joints have shape \(1,\); got \(2,\)"):
+        Limits(("elbow",), two, two, two, two)
+    with pytest.raises(
+        InvalidInput, match=r"units are 'rad' or 'm' for each of \('a', 'b'\); got \('deg',\)"
+    ):
+        Limits(("a", "b"), two, two, two, two, ("deg",))
+
+
+def test_limits_are_read_only_copies():
+    upper = np.array([2.0])
+    limits = Limits(("elbow",), np.array([-1.0]), upper, np.ones(1), np.ones(1))
+    upper[0] = 5.0
+    assert limits.upper.tolist() == [2.0]
+    with pytest.raises(ValueError, match="read-only"):
+        limits.upper[0] = 5.0
+
+
+def test_positions_within_the_limits_are_accepted_as_a_vector():
+    assert Limits.of(ARM).check_positions([2.0, -1e6, 0]).tolist() == [2.0, -1e6, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("positions", "text"),
+    [
+        ([2.001, 0.0, 0.0], "'shoulder' at 2.001 rad is outside -1 to 2$"),
+        ([-1.5, 0.0, 0.7], "'shoulder' at -1.5 rad is outside -1 to 2; 'lift' at 0.7 m is outside 0 to 0.5"),
+        ([90.0, 0.0, 0.0], "'shoulder' at 90 rad .* this looks like degrees: convert with math.radians"),
+        ([math.nan, 0.0, math.inf], r"positions must be finite; not so: 'shoulder' \(nan\), 'lift' \(inf\)"),
+        ([0.0], r"positions of 3 joints have shape \(3,\), in the order shoulder, wheel, lift; got \(1,\)"),
+    ],
+)
+def test_positions_outside_the_limits_are_refused_with_values_and_limits(positions, text):
+    with pytest.raises(InvalidInput, match=text):
+        Limits.of(ARM).check_positions(positions)
+
+
+def test_limits_containing_positions_extend_to_those_outside_only():
+    limits = Limits.of(ARM).containing([2.1, 7.0, 0.1])
+    assert limits.upper.tolist() == [2.1, math.inf, 0.5]
+    assert limits.lower.tolist() == [-1.0, -math.inf, 0.0]
+    assert limits.units == ("rad", "rad", "m")

@@ -1,0 +1,219 @@
+"""Limits of driven joints: positions, velocities and accelerations.
+
+A URDF states positions and velocities; accelerations come from the manual of the actuators.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zstate._util.format import suggestion_text
+from zstate.checks import real_numbers
+from zstate.errors import InvalidInput
+from zstate.model.robot import POSITION_COUNTS, Joint, RobotModel, near_joint
+
+Floats = NDArray[np.float64]
+
+ROUNDING = 1e-9
+"""[rad] or [m], and as a ratio for rates: rounding of interpolated values, far below any encoder."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Limits:
+    """Limits of the joints ``joint_names``, one number each, (n,); infinite where there is none.
+
+    ``lower`` and ``upper`` are positions [rad] or [m]; ``velocity`` and ``acceleration`` are bounds of the
+    absolute value, per s and per s^2. ``units`` are "rad" or "m"; "rad" for each joint if left out. The
+    arrays are read-only copies. Raises InvalidInput for no or repeated joints, other shapes, NaN, a lower
+    limit above the upper one, and rates that are not above zero, with all joints and values.
+    """
+
+    joint_names: tuple[str, ...]
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+    acceleration: Floats
+    units: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "joint_names", check_joint_names(self.joint_names))
+        object.__setattr__(self, "units", tuple(self.units) or ("rad",) * len(self.joint_names))
+        if len(self.units) != len(self.joint_names) or not {"rad", "m"}.issuperset(self.units):
+            raise InvalidInput(f"units are 'rad' or 'm' for each of {self.joint_names}; got {self.units}")
+        for name in ("lower", "upper", "velocity", "acceleration"):
+            values = real_numbers(getattr(self, name), f"{name} limits").copy()
+            if values.shape != (len(self.joint_names),):
+                raise InvalidInput(
+                    f"{name} limits of {len(self.joint_names)} joints have shape "
+                    f"({len(self.joint_names)},); got {values.shape}"
+                )
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+        if problems := self._problems():
+            raise InvalidInput(f"joint limits: {'; '.join(problems)}")
+
+    def _problems(self) -> list[str]:
+        ranges = zip(self.joint_names, self.lower.tolist(), self.upper.tolist(), strict=True)
+        problems = [
+            f"positions of {name!r} reach from {lower:g} to {upper:g}"
+            for name, lower, upper in ranges
+            if not lower <= upper
+        ]
+        for kind, values in (("velocity", self.velocity), ("acceleration", self.acceleration)):
+            problems += [
+                f"the {kind} limit of {name!r} is {value:g}; it must be above zero"
+                for name, value in zip(self.joint_names, values.tolist(), strict=True)
+                if not value > 0.0
+            ]
+        return problems
+
+    @classmethod
+    def of(
+        cls,
+        model: RobotModel,
+        joints: Sequence[str] | None = None,
+        *,
+        velocity: float | Mapping[str, float] | None = None,
+        acceleration: float | Mapping[str, float] | None = None,
+    ) -> Limits:
+        """The limits that the URDF of ``model`` states for ``joints``, which are all if left out.
+
+        All are the driven joints with one position each: floating and planar joints have no limits in a URDF.
+        Continuous joints have no position limits. ``velocity`` and ``acceleration`` are one number for all
+        joints, or numbers by joint. A velocity may be lower than that of the URDF, never higher, unless that
+        is zero, as exporters write for an unknown one. Raises InvalidInput for other joints, NaN, and rates
+        that are not above zero, with the joint and the value.
+        """
+        chosen = _driven_joints(model, joints)
+        names = tuple(joint.name for joint in chosen)
+        stated = np.array([joint.limits.velocity for joint in chosen])
+        velocities = _rates(velocity, names, stated, "velocity")
+        problems = [
+            f"velocity {asked:g} of {name!r} is above {limit:g}, the limit in the URDF"
+            if asked > 0.0
+            else f"the URDF limits the velocity of {name!r} to {limit:g}, where it could not move"
+            for name, asked, limit in zip(names, velocities.tolist(), stated.tolist(), strict=True)
+            if asked > limit > 0.0 or asked <= 0.0
+        ]
+        if problems:
+            raise InvalidInput(f"{'; '.join(problems)}; pass another velocity=..., or correct the URDF")
+        return cls(
+            names,
+            np.array([joint.limits.lower for joint in chosen]),
+            np.array([joint.limits.upper for joint in chosen]),
+            velocities,
+            _rates(acceleration, names, np.full(len(names), np.inf), "acceleration"),
+            tuple("m" if joint.type == "prismatic" else "rad" for joint in chosen),
+        )
+
+    def check_positions(self, positions: ArrayLike) -> Floats:
+        """``positions`` as a vector (n,) in the order of ``joint_names``.
+
+        Raises InvalidInput for another shape, NaN, infinity, and positions outside the limits, with each
+        joint, its value and its limits.
+        """
+        vector = self.vector(positions, "positions")
+        if findings := self.position_findings(vector):
+            raise InvalidInput("; ".join(findings))
+        return vector
+
+    def position_findings(self, positions: Floats) -> tuple[str, ...]:
+        """A text for each joint that is outside its limits at ``positions``, (n,)."""
+        outside = (positions < self.lower - ROUNDING) | (positions > self.upper + ROUNDING)
+        return tuple(
+            f"{self.joint_names[row]!r} at {positions[row]:.6g} {self.units[row]} is outside "
+            f"{self.range_text(row)}{self._degrees_text(row, float(positions[row]))}"
+            for row in np.flatnonzero(outside).tolist()
+        )
+
+    def range_text(self, row: int) -> str:
+        """The position limits of the joint ``joint_names[row]``: "-2 to 2"."""
+        return f"{self.lower[row]:.6g} to {self.upper[row]:.6g}"
+
+    def containing(self, positions: ArrayLike) -> Limits:
+        """The same limits, as far extended as ``positions``, (n,), are outside.
+
+        For a robot that is outside its limits: each joint may stay where it is, or move inwards.
+        """
+        vector = self.vector(positions, "positions")
+        return replace(self, lower=np.minimum(self.lower, vector), upper=np.maximum(self.upper, vector))
+
+    def vector(self, values: ArrayLike, what: str) -> Floats:
+        """``values``, a number for each joint, as a finite vector (n,) of float64. Raises InvalidInput.
+
+        ``what`` names them in the error: "positions".
+        """
+        vector = real_numbers(values, what)
+        if vector.shape != (len(self.joint_names),):
+            raise InvalidInput(
+                f"{what} of {len(self.joint_names)} joints have shape ({len(self.joint_names)},), in the "
+                f"order {', '.join(self.joint_names)}; got {vector.shape}"
+            )
+        if not math.isfinite(sum(vector.tolist())) and not np.isfinite(vector).all():
+            pairs = zip(self.joint_names, vector.tolist(), strict=True)
+            bad = ", ".join(f"{name!r} ({value})" for name, value in pairs if not math.isfinite(value))
+            raise InvalidInput(f"{what} must be finite; not so: {bad}")
+        return vector
+
+    def _degrees_text(self, row: int, value: float) -> str:
+        is_angle = self.units[row] == "rad" and abs(value) > math.tau
+        if is_angle and self.lower[row] <= math.radians(value) <= self.upper[row]:
+            return "; this looks like degrees: convert with math.radians"
+        return ""
+
+
+def check_joint_names(names: Sequence[str]) -> tuple[str, ...]:
+    """``names`` as a tuple. Raises InvalidInput if there are none, or one is repeated."""
+    if isinstance(names, str) or not names:
+        raise InvalidInput(f"joint names are a sequence of names, at least one; got {names!r}")
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise InvalidInput(f"joints given twice: {', '.join(map(repr, repeated))}")
+    return tuple(names)
+
+
+def _driven_joints(model: RobotModel, names: Sequence[str] | None) -> tuple[Joint, ...]:
+    """The joints of ``names`` in that order, or all, if they have one position each."""
+    single = {joint.name: joint for joint in model.driven_joints if POSITION_COUNTS[joint.type] == 1}
+    chosen = check_joint_names(tuple(single) if names is None else names)
+    problems = [_not_single_text(model, name, tuple(single)) for name in chosen if name not in single]
+    if problems:
+        raise InvalidInput(f"limits of {model.name!r}: {'; '.join(problems)}")
+    return tuple(single[name] for name in chosen)
+
+
+def _not_single_text(model: RobotModel, name: str, single: Sequence[str]) -> str:
+    joint = next((joint for joint in model.joints if joint.name == name), None)
+    if joint is None:
+        return f"unknown joint {name!r}{suggestion_text(near_joint(name, single))}"
+    if joint.mimic is not None:
+        return f"{name!r} follows {model.mimic_of(joint).joint!r} and is not driven itself"
+    return f"{name!r} is {joint.type}; only joints with one position have limits"
+
+
+def _rates(
+    given: float | Mapping[str, float] | None, names: tuple[str, ...], stated: Floats, kind: str
+) -> Floats:
+    """A number for each joint: those ``given``, else those ``stated``."""
+    if given is None:
+        return stated
+    if not isinstance(given, Mapping):
+        return np.full(len(names), _rate(given, f"{kind} limit"))
+    unknown = [f"{name!r}{suggestion_text(near_joint(name, names))}" for name in given if name not in names]
+    if unknown:
+        raise InvalidInput(f"{kind} limits of unknown joints: {', '.join(unknown)}")
+    numbers = {name: _rate(value, f"{kind} limit of {name!r}") for name, value in given.items()}
+    return np.array([numbers.get(name, limit) for name, limit in zip(names, stated.tolist(), strict=True)])
+
+
+def _rate(value: float, what: str) -> float:
+    number = real_numbers(value, what)
+    if number.shape != () or not number > 0.0:
+        raise InvalidInput(f"the {what} is {value!r}; it must be a number above zero")
+    return float(number)
