@@ -124,7 +124,7 @@ class Calibration:
         return np.asarray(rates, dtype=np.float64) * self._scale
 
     def to_counts(self, positions: ArrayLike) -> NDArray[np.int64]:
-        """The nearest counts at ``positions`` [rad] or [m]: (n,). Raises InvalidInput unless all are finite."""
+        """The nearest counts at ``positions`` [rad] or [m]: (n,). Raises InvalidInput unless finite."""
         counts = np.asarray(positions, dtype=np.float64) / self._scale + self._zero
         if not np.isfinite(counts).all():
             raise InvalidInput(f"positions to convert to counts must be finite, not {positions!r}")

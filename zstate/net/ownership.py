@@ -24,8 +24,8 @@ import zenoh
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InsertRefused, InvalidInput, MessageError, SecondWriter, format_duration
-from zstate.net.presence import ANSWER_WITHIN_S, announce, confirmed_tokens
 from zstate.net.latched import cached_values
+from zstate.net.presence import ANSWER_WITHIN_S, announce, confirmed_tokens
 from zstate.net.queryable import query
 from zstate.net.session import Session
 from zstate.net.streams import Ring, to_serialized

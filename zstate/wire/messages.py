@@ -235,11 +235,11 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
 
     ``state`` is "off" before and after the control loop; "ready" if it reads and writes nothing; "active"
     while setpoints are valid; "holding" after their end; "stopped" until all ``stops`` are released; "fault"
-    after too many failures in a row. ``reason`` is why. ``commander`` is the program of the newest setpoints, whose
-    age since their arrival is ``command_age`` [ns], None without any; ``ttl`` [ns] is the longest that is
-    granted. ``limited`` are the joints that moved slower than commanded at the last tick. ``faults`` counts
-    failed calls of the driver, ``refused`` commands by reason, the newest described by ``last_refusal``.
-    ``stamp`` [ns] is of the driver's system clock.
+    after too many failures in a row. ``reason`` is why. ``commander`` is the program of the newest setpoints,
+    whose age since their arrival is ``command_age`` [ns], None without any; ``ttl`` [ns] is the longest that
+    is granted. ``limited`` are the joints that moved slower than commanded at the last tick. ``faults``
+    counts failed calls of the driver, ``refused`` commands by reason, the newest described by
+    ``last_refusal``. ``stamp`` [ns] is of the driver's system clock.
     """
 
     stamp: Stamp

@@ -35,7 +35,9 @@ from zstate.wire import keys
 from zstate.wire.messages import LaserScan, OccupancyGrid, TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
-FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",), commanders=("teleop",))
+FLEET = AclRoles(
+    ("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",), commanders=("teleop",)
+)
 USERS = (*FLEET.identities, "stranger")
 
 

@@ -41,9 +41,10 @@ def _role_options(command: Any) -> Any:
 def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, ...]) -> None:
     """Print the access control of a fleet as a router's configuration (JSON5).
 
-    Everything that is not allowed there is denied. Every NAME may stop the driver of a robot. NAME is the common name of a certificate (`zstate certs`)
+    Everything that is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`)
     or a user; for a robot or a placer it is also the name in the keys. One NAME may have several roles: a
-    robot that reads other robots is also a viewer.
+    robot that reads other robots is also a viewer. Every NAME may stop the driver of a robot; only a
+    commander or an operator may command it, and release the stop.
 
     The router checks keys, listeners check frames: r1 writes only under zstate/r1/, and listeners accept
     frames r1/... only from those keys. The exception is the root of r1, which other writers may place in
