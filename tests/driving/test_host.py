@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -9,16 +11,17 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, wait_for_reader
 
 from zstate import JointReading, StatePublisher
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
+from zstate.driving.stops import wait_for_state
 from zstate.errors import DriverFault, InvalidInput, SecondWriter
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
-from zstate.wire.messages import JointCommand, order_digest, to_block
+from zstate.wire.messages import DriverState, JointCommand, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
 LIMITS = Limits.of(RRBOT, velocity=2.0)
@@ -113,6 +116,12 @@ def test_a_commanded_joint_reaches_its_position_in_steps_within_the_velocity_lim
     assert driver.calls[-1][0] == "stop"
 
 
+def state_of(session: Session) -> DriverState:
+    found = wait_for_state(session, "arm", lambda state: state.state == "holding", DEADLINE_S)
+    assert found is not None
+    return found
+
+
 COMMANDER = """
     import sys, time
     from zstate import connect
@@ -126,20 +135,22 @@ COMMANDER = """
 """
 
 
-def test_a_killed_commander_leaves_the_joints_held_within_ttl_and_one_tick(sessions, spawn):
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_dead_or_frozen_commander_leaves_the_joints_held_within_ttl_and_one_tick(
+    sessions, spawn, end: signal.Signals
+):
     driver = RecordingDriver()
     with running(sessions[0], driver) as host:
         killed = spawn(COMMANDER)
         killed.line()
         until(lambda: len(driver.written()) > 20)
-        killed.kill()
+        killed.process.send_signal(end)
         dead_at = time.monotonic_ns()
         until(lambda: host.state == "holding")
         until(lambda: len(driver.written()) and (driver.written()[-5:] == driver.written()[-1]).all())
         report = host.report()
-        with Commander(sessions[1], "arm") as arm:
-            until(lambda: arm.driver is not None and "nothing from teleop@" in arm.driver.reason)
-            assert f"pid {killed.process.pid}" in arm.wait_for_driver().reason
+        program = f"pid {killed.process.pid}"
+        assert f"nothing from teleop@{socket.gethostname()} {program} for" in state_of(sessions[1]).reason
     writes = [(at, value) for name, at, value in driver.calls if name == "write"]
     moved = [at for (at, one), (_, before) in zip(writes[1:], writes, strict=False) if (one != before).any()]
     # Counted from arrival, which is not after the death; the last motion is in the tick of the expiry.
@@ -413,6 +424,20 @@ def test_one_robot_has_one_host(sessions):
         pytest.raises(SecondWriter),
     ):
         DriverHost(sessions[1], RecordingDriver(), RRBOT, "arm", limits=LIMITS)
+
+
+def test_two_hosts_do_not_share_a_robot_by_its_joints(sessions):
+    def part(joint: str) -> RecordingDriver:
+        driver = RecordingDriver()
+        driver.joint_names = (joint,)
+        return driver
+
+    limits = Limits.of(RRBOT, ["elbow"])
+    with (
+        DriverHost(sessions[0], part("elbow"), RRBOT, "arm", limits=limits, program="left"),
+        pytest.raises(SecondWriter, match=r"'left@.*' already drives elbow of 'arm'"),
+    ):
+        DriverHost(sessions[1], part("shoulder"), RRBOT, "arm")
 
 
 def test_unusable_arguments_are_refused_together(sessions):

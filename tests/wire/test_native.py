@@ -133,10 +133,11 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     ),
     "driver state": (
         DriverState(
-            *(5, 7, "active", "", NAMES, 100, "teleop", 6, ("j2",), 0.5, 4, 3, 2, {"old": 1}, "late"),
+            *(5, 7, "host", "active", "", NAMES, 100, "teleop", 6, ("j2",), 0.5, 4, 3, 2, {"old": 1}, "late"),
             *(((8, 9),),),
         ),
-        b"\xdc\x00\x10\x05\x07"
+        b"\xdc\x00\x11\x05\x07"
+        + fixstr("host")
         + fixstr("active")
         + fixstr("")
         + b"\x92"

@@ -65,10 +65,7 @@ class CommandReceiver(Closeable):
 
     def drain(self) -> list[Command]:
         """The commands since the last call, oldest first."""
-        found: list[Command] = []
-        while self._arrived:
-            found.append(self._arrived.popleft())
-        return found
+        return [self._arrived.popleft() for _ in range(len(self._arrived))]
 
     def close(self) -> None:
         self._subscriber.close()

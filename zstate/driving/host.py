@@ -11,12 +11,13 @@ import logging
 import secrets
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate._util.refusals import Refusals
@@ -32,9 +33,12 @@ from zstate.errors import (
     DriverFault,
     InvalidInput,
     MessageError,
+    SecondWriter,
     format_duration,
 )
 from zstate.model.robot import RobotModel
+from zstate.net.latched import cached_values
+from zstate.net.ownership import wait_for_discovery
 from zstate.net.presence import WriterWatch, local_writer
 from zstate.net.queryable import check_timeout
 from zstate.net.session import Session
@@ -42,11 +46,14 @@ from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.rate import Rate, check_rate
 from zstate.sources import JointReading
-from zstate.wire.identity import Announcement
-from zstate.wire.keys import check_robot
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.keys import check_robot, driver_key
 from zstate.wire.messages import DriverState
+from zstate.wire.native import decode
 
 _LOG = logging.getLogger("zstate")
+
+_CACHES_WITHIN_S = 0.5
 
 StateName = Literal["off", "ready", "active", "holding", "stopped", "fault"]
 
@@ -71,8 +78,9 @@ class DriverHost(Closeable):
     like those of ``zstate.driving.stop``, is latched: a restarted host stays stopped until a commander
     releases it, see ``zstate.driving.stops``.
 
-    Raises InvalidInput for unusable arguments, SecondWriter if another program publishes these joints, and
-    what ``driver.open`` raises. A context manager. Not a safety-rated channel.
+    A robot has one host. Raises InvalidInput for unusable arguments, SecondWriter if another program hosts a
+    driver of the robot or publishes these joints, and what ``driver.open`` raises. A context manager. Not a
+    safety-rated channel: a stop waits for the calls of the driver, and is lost with the network.
     """
 
     def __init__(
@@ -104,7 +112,7 @@ class DriverHost(Closeable):
         self._writer = local_writer(secrets.randbits(32), program)
         self._refusals = Refusals(f"command for {self.robot!r}")
         self._targets = Targets(len(names))
-        self._programs: dict[int, str] = {}
+        self._programs: BoundedDict[int, str] = BoundedDict()
         """Announced commanders by session."""
         self._state = _State("off", "the loop does not run yet")
         self._measured: NDArray[np.float64] | None = None
@@ -122,6 +130,7 @@ class DriverHost(Closeable):
         self._running = fork_safe_lock()
         self._runner: threading.Thread | None = None
         with ExitStack() as opening:
+            _check_only_host(session, self.robot)
             self._publisher, self._order = self._open_publisher(session, model, opening)
             self._stops = opening.enter_context(StopLatch(session, self.robot, self._refusals))
             self._commands = opening.enter_context(
@@ -308,7 +317,7 @@ class DriverHost(Closeable):
                 return None
             self._change("holding", reason)
         elif is_live and self._state.name == "holding":
-            self._targets.start(now, self._setpoint.positions)
+            self._targets.start(now, self._resting())
             self._change("active", "")
         return self._move(now)
 
@@ -407,6 +416,7 @@ class DriverHost(Closeable):
         return DriverState(
             time.time_ns(),
             self._writer.session,
+            str(self._writer),
             state.name,
             state.reason,
             self._names,
@@ -432,6 +442,22 @@ class DriverHost(Closeable):
     def _on_writer(self, announced: Announcement, alive: bool) -> None:
         if alive and announced.stream == "joint_commands":
             self._programs[announced.writer.session] = str(announced.writer)
+
+
+def _check_only_host(session: Session, robot: str) -> None:
+    """Raise SecondWriter if a driver of ``robot`` is hosted already."""
+    wait_for_discovery(session)
+    for value in cached_values(session, driver_key(robot), _CACHES_WITHIN_S):
+        with suppress(MessageError):
+            other = decode(value.payload, value.encoding, DriverState)
+            first = WriterId(other.program, "", 0, 0, other.session)
+            raise SecondWriter(
+                f"{other.program!r} already drives {', '.join(other.joint_names)} of {robot!r}; a robot has "
+                "one driver host: stop the first, or give one driver all joints",
+                robot=robot,
+                stream="driver",
+                first=first,
+            )
 
 
 def _check_arguments(

@@ -204,7 +204,8 @@ class _CachedValues(Receiver[zenoh.Sample]):
         """The values of the publishers with these ``tokens``, and of those announced while waiting."""
         waiting: RoundRobinQueue[_Request] = RoundRobinQueue()
         in_flight: deque[_Request] = deque()
-        with suppress(Closed, zenoh.ZError):  # undeclared, or the session was closed
+        # Undeclared, also at this moment by another thread (RuntimeError), or the session was closed.
+        with suppress(Closed, zenoh.ZError, RuntimeError):
             while not self._closed:
                 for token in tokens:
                     if token.kind == zenoh.SampleKind.PUT:

@@ -233,17 +233,19 @@ class Release(StampedMessage, frozen=True, array_like=True, gc=False):
 class DriverState(Message, frozen=True, array_like=True, gc=False):
     """The state of the driver of a robot's ``joint_names``. Not a safety-rated channel.
 
-    ``state`` is "off" before and after the control loop; "ready" if it reads and writes nothing; "active"
-    while setpoints are valid; "holding" after their end; "stopped" until all ``stops`` are released; "fault"
-    after too many failures in a row. ``reason`` is why. ``commander`` is the program of the newest setpoints,
-    whose age since their arrival is ``command_age`` [ns], None without any; ``ttl`` [ns] is the longest that
-    is granted. ``limited`` are the joints that moved slower than commanded at the last tick. ``faults``
-    counts failed calls of the driver, ``refused`` commands by reason, the newest described by
-    ``last_refusal``. ``stamp`` [ns] is of the driver's system clock.
+    ``program`` is the host of the driver. ``state`` is "off" before and after the control loop; "ready" if
+    it reads and writes nothing; "active" while setpoints are valid; "holding" after their end; "stopped"
+    until all ``stops`` are released; "fault" after too many failures in a row. ``reason`` is why.
+    ``commander`` is the program of the newest setpoints, whose age since their arrival is ``command_age``
+    [ns], None without any; ``ttl`` [ns] is the longest that is granted. ``limited`` are the joints that
+    moved slower than commanded at the last tick. ``faults`` counts failed calls of the driver, ``refused``
+    commands by reason, the newest described by ``last_refusal``. ``stamp`` [ns] is of the driver's system
+    clock.
     """
 
     stamp: Stamp
     session: Count
+    program: str
     state: Literal["off", "ready", "active", "holding", "stopped", "fault"]
     reason: str
     joint_names: tuple[str, ...]
