@@ -373,7 +373,8 @@ def test_zenoh_parses_the_text_to_the_same_rules():
 
 def test_rules_without_a_role_are_omitted():
     rules = [rule["id"] for rule in access_control(AclRoles(viewers=("desk", "desk")))["rules"]]
-    assert rules == ["viewers read", "viewers are given", "readers are known", "everyone stops"]
+    stops = ["everyone stops", "everyone is asked for stops"]
+    assert rules == ["viewers read", "viewers are given", "readers are known", *stops]
 
 
 @pytest.mark.parametrize("name", ["", "*", "a/b", "two words", "@r1", "r1:x", "x" * 65, "röbi"])

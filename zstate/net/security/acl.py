@@ -142,8 +142,11 @@ def _native_rules(roles: AclRoles) -> Grants:
     commands = tuple(f"{root}/*/{stream}" for stream in streams)
     commanders = (*roles.operators, *roles.commanders)
     yield commanders, _ingress("commanders command", ("put", "liveliness_token"), commands)
+    # A publisher sends nothing before its session knows of a subscriber.
+    yield commanders, _egress("commanders are asked", SUBSCRIBE, commands)
     stops = (f"{root}/*/stop/*", f"{root}/*/stop/*/@adv/**")
     yield roles.identities, _ingress("everyone stops", PUBLISH, stops)
+    yield roles.identities, _egress("everyone is asked for stops", SUBSCRIBE, stops)
     yield roles.timekeepers, _ingress("timekeepers write", ("put",), (clock,))
 
 
