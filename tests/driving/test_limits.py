@@ -152,7 +152,7 @@ def test_positions_outside_the_limits_are_refused_with_values_and_limits(positio
 
 
 def test_limits_containing_positions_extend_to_those_outside_only():
-    limits = Limits.of(ARM).containing([2.1, 7.0, 0.1])
+    limits = Limits.of(ARM).containing([2.1, 7.0, -0.1])
     assert limits.upper.tolist() == [2.1, math.inf, 0.5]
-    assert limits.lower.tolist() == [-1.0, -math.inf, 0.0]
+    assert limits.lower.tolist() == [-1.0, -math.inf, -0.1]
     assert limits.units == ("rad", "rad", "m")

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from zstate.driving.limits import Limits
 from zstate.driving.setpoint_limiter import SetpointLimiter
+from zstate.driving.trajectory import Trajectory
 from zstate.errors import InvalidInput
 
 DT = 0.002
@@ -123,6 +124,28 @@ def test_a_moving_target_within_the_limits_is_followed_without_a_lag():
         limited = limiter.step([target], DT, velocities=[0.5 * rate * math.sin(rate * time)])
         assert limited.positions[0] == pytest.approx(target, abs=1e-12)
         assert limited.limited == ()
+
+
+def test_an_accepted_trajectory_is_followed_without_a_lag_and_its_replacement_within_the_limits():
+    limits = limits_of_elbow(velocity=1.0, acceleration=4.0)
+    first = Trajectory(("elbow",), [[0.0], [1.5], [-1.0]], [0.0, 1.0, 2.0]).stretched(limits)
+    limiter = started()
+    for number in range(1, round(first.duration_s / DT)):
+        positions, velocities, _ = first.sample(number * DT)
+        limited = limiter.step(positions, DT, velocities)
+        assert limited.positions == pytest.approx(positions, abs=1e-12)
+        if abs(velocities[0]) > 0.9:
+            break  # replaced at full speed, by one that rests where the joint is
+    assert abs(limited.velocities[0]) > 0.85
+    second = Trajectory(("elbow",), [limited.positions, [0.5]], [0.0, 2.0])
+    assert second.findings(limits) == ()
+    for number in range(1, 1_500):
+        positions, velocities, _ = second.sample(number * DT)
+        following = limiter.step(positions, DT, velocities)
+        assert abs(following.positions - limited.positions) <= 1.0 * DT + 1e-12
+        assert abs(following.velocities - limited.velocities) <= 4.0 * DT + 1e-12
+        limited = following
+    assert limited.positions == pytest.approx(0.5, abs=1e-9)
 
 
 def test_a_moving_target_far_ahead_is_caught_up_with_and_then_followed():

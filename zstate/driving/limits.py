@@ -127,14 +127,14 @@ class Limits:
         """A text for each joint that is outside its limits at ``positions``, (n,)."""
         outside = (positions < self.lower - ROUNDING) | (positions > self.upper + ROUNDING)
         return tuple(
-            f"{self.joint_names[row]!r} at {positions[row]:.6g} {self.units[row]} is outside "
+            f"{self.joint_names[row]!r} at {positions[row]:.9g} {self.units[row]} is outside "
             f"{self.range_text(row)}{self._degrees_text(row, float(positions[row]))}"
             for row in np.flatnonzero(outside).tolist()
         )
 
     def range_text(self, row: int) -> str:
         """The position limits of the joint ``joint_names[row]``: "-2 to 2"."""
-        return f"{self.lower[row]:.6g} to {self.upper[row]:.6g}"
+        return f"{self.lower[row]:.9g} to {self.upper[row]:.9g}"
 
     def containing(self, positions: ArrayLike) -> Limits:
         """The same limits, as far extended as ``positions``, (n,), are outside.
