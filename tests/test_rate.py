@@ -94,3 +94,17 @@ def test_stop_ends_a_wait_at_the_systems_clock_at_once():
     next(ticks)
     threading.Timer(0.05, stop.set).start()
     assert next(ticks, None) is None
+
+
+def test_without_catching_up_no_two_ticks_follow_at_once():
+    # The tick of 20 ms comes at 55 ms: those of 20 to 40 ms are given up, that of 50 ms is due now.
+    clock = SteppingClock(0, lateness={2: 35_000_000})
+    rate = Rate(100.0, clock, threading.Event(), 0.08, catch_up=False)
+    latenesses = []
+    stamps = []
+    for stamp in rate:
+        stamps.append(stamp // 1_000_000)
+        latenesses.append(rate.lateness_ns // 1_000_000)
+    assert stamps == [0, 10, 55, 60, 70]
+    assert latenesses == [0, 0, 5, 0, 0]
+    assert (rate.report().ticks, rate.report().skipped) == (5, 3)

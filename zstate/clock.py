@@ -26,6 +26,9 @@ SYSTEM = "system"
 SIMULATED = "sim"
 """The domain of the time of a simulation or a playback."""
 
+MONOTONIC = "monotonic"
+"""The domain of the time since an arbitrary instant, which nothing sets; its stamps never leave a process."""
+
 SET_BACK_NS = 100_000_000
 """Samples older than their predecessors by more than this mean that the writer's clock was set back."""
 
@@ -70,6 +73,19 @@ class SystemClock:
 
     def wait_until(self, stamp: int, stop: threading.Event) -> bool:
         remaining_s = (stamp - time.time_ns()) * 1e-9
+        return not (wait_interruptible(stop, remaining_s) if remaining_s > 0.0 else stop.is_set())
+
+
+class MonotonicClock:
+    """The monotonic clock of this machine, for the deadlines of control loops."""
+
+    domain = MONOTONIC
+
+    def now(self) -> int:
+        return time.monotonic_ns()
+
+    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
+        remaining_s = (stamp - time.monotonic_ns()) * 1e-9
         return not (wait_interruptible(stop, remaining_s) if remaining_s > 0.0 else stop.is_set())
 
 

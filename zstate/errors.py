@@ -10,6 +10,7 @@ ZStateError
 ├── LibraryMissing (ImportError)       a library to install first
 ├── MessageError (ValueError)          a payload that cannot be decoded           .reason
 ├── SecondWriter                       another writer is active already           .first .robot .stream .edge
+├── DriverFault                        a driver that failed too often, and stopped    .robot
 ├── RecordingError                     a file that cannot be read or written      .path
 ├── NetworkError                       Zenoh reports a failure
 │   ├── Unreachable (TimeoutError)     no answer from the endpoints               .endpoints
@@ -247,6 +248,14 @@ class SecondWriter(ZStateError):
     ) -> None:
         super().__init__(message)
         self.robot, self.stream, self.first, self.edge = robot, stream, first, edge
+
+
+class DriverFault(ZStateError):
+    """The driver of ``robot`` failed too often in a row; it was stopped, and stays so until a release."""
+
+    def __init__(self, message: str, *, robot: str) -> None:
+        super().__init__(message)
+        self.robot = robot
 
 
 class RecordingError(ZStateError):

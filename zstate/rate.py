@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from zstate.clock import SYSTEM, Clock
+from zstate.clock import MONOTONIC, SYSTEM, Clock
 from zstate.errors import InvalidInput
 
 
@@ -42,10 +42,19 @@ class Rate:
     in the past are skipped and counted. Simulated time advances in steps: there a tick's stamp is its
     deadline, and only more than 1 s counts as a long delay. If the clock is set back, the deadlines move
     with it. Ends when ``stop`` is set, or after ``seconds``.
+
+    With ``catch_up=False`` deadlines are skipped once the next one has passed: two ticks never follow each
+    other at once, as is needed for what moves hardware.
     """
 
     def __init__(
-        self, rate_hz: float, clock: Clock, stop: threading.Event, seconds: float | None = None
+        self,
+        rate_hz: float,
+        clock: Clock,
+        stop: threading.Event,
+        seconds: float | None = None,
+        *,
+        catch_up: bool = True,
     ) -> None:
         self.rate_hz = check_rate(rate_hz)
         self._period_ns = 1e9 / rate_hz
@@ -53,14 +62,18 @@ class Rate:
             raise InvalidInput(f"seconds is a positive number, or None for ever; got {seconds!r}")
         self._max_ticks = math.inf if seconds is None else max(1, round(seconds * rate_hz))
         self._clock = clock
-        self._is_stepping = clock.domain != SYSTEM
+        self._is_stepping = clock.domain not in (SYSTEM, MONOTONIC)
         self._longest_delay_ns = _LONGEST_STEP_NS if self._is_stepping else _LONGEST_DELAY_NS
+        if not catch_up:
+            self._longest_delay_ns = int(self._period_ns)
         self._stop = stop
         self._ticks = 0
         self._skipped = 0
         self._late = 0
         self._first: int | None = None
         self._last = 0
+        self.lateness_ns = 0
+        """How long after its deadline the current tick began [ns]."""
 
     def __iter__(self) -> Iterator[int]:
         start = self._clock.now()
@@ -85,6 +98,7 @@ class Rate:
             self._first = now if self._first is None else self._first
             self._last = now
             self._ticks += 1
+            self.lateness_ns = now - deadline
             yield now
             tick += 1
 

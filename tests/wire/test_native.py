@@ -14,15 +14,18 @@ from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     LATCHED_BYTES,
     ClockMessage,
+    DriverState,
     HistoryPage,
     JointCommand,
     JointState,
     LaserScan,
     Message,
     OccupancyGrid,
+    Release,
     RobotDescription,
     StaticTransforms,
     Status,
+    Stop,
     TransformSample,
     WriterTransforms,
     order_digest,
@@ -109,8 +112,48 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + struct.pack("<42d", *[0.5] * 42),
     ),
     "command": (
-        JointCommand(STAMP, 300, 2**63 + 5, ORDER, velocities=to_block([0.25])),
-        header(7) + NIL + bin8(struct.pack("<d", 0.25)) + NIL,
+        JointCommand(
+            *(STAMP, 300, 2**63 + 5, order_digest(("j1",))), to_block([0.25]), names=("j1",), ttl=100
+        ),
+        header(9)[:-8]
+        + order_digest(("j1",))
+        + bin8(struct.pack("<d", 0.25))
+        + NIL * 2
+        + b"\x91"
+        + fixstr("j1")
+        + b"\x64",
+    ),
+    "stop": (
+        Stop(STAMP, 300, 2**63 + 5, "hold", "door open"),
+        header(5)[: -len(bin8(ORDER))] + fixstr("hold") + fixstr("door open"),
+    ),
+    "release": (
+        Release(STAMP, 300, 2**63 + 5, ((1, 2), (3, 4))),
+        header(4)[: -len(bin8(ORDER))] + b"\x92\x92\x01\x02\x92\x03\x04",
+    ),
+    "driver state": (
+        DriverState(
+            *(5, 7, "host", "active", "", NAMES, 100, "teleop", 6, ("j2",), 0.5, 4, 3, 2, {"old": 1}, "late"),
+            *(((8, 9),),),
+        ),
+        b"\xdc\x00\x11\x05\x07"
+        + fixstr("host")
+        + fixstr("active")
+        + fixstr("")
+        + b"\x92"
+        + fixstr("j1")
+        + fixstr("j2")
+        + b"\x64"
+        + fixstr("teleop")
+        + b"\x06\x91"
+        + fixstr("j2")
+        + b"\xcb"
+        + struct.pack(">d", 0.5)
+        + b"\x04\x03\x02\x81"
+        + fixstr("old")
+        + b"\x01"
+        + fixstr("late")
+        + b"\x91\x92\x08\x09",
     ),
     "statics": (
         StaticTransforms(7, (("b", "c"),), to_block([0, 0, 1, 0, 0, 0, 1])),

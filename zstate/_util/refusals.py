@@ -21,6 +21,8 @@ class Refusals:
         self.counts: Counter[str] = Counter()
         self.first: dict[str, str] = {}
         """The text of the first refusal of each reason."""
+        self.newest: object = ""
+        """The explanation of the newest refusal."""
         self._prefix = f"{subject} " if subject else ""
         self._parent = parent
         self._lock = fork_safe_lock()
@@ -29,6 +31,7 @@ class Refusals:
         """Count one refusal for ``reason``; ``text`` explains it."""
         with self._lock:
             self.counts[reason] += 1
+            self.newest = text
             is_known = reason in self.first
         if not is_known and self._is_first(reason, str(text)):
             facts = {"event": "refused", "reason": reason}

@@ -42,10 +42,10 @@ class LatchedPublisher(Closeable):
     """Publisher of one value on one key for current and later subscribers, while this publisher lives.
 
     Once it closes or dies, late joiners do not receive the value. Subscribers that have it keep it, unless it
-    was withdrawn.
+    was withdrawn. An ``urgent`` value overtakes all samples that wait for the network.
     """
 
-    def __init__(self, session: Session, key: str, encoding: str) -> None:
+    def __init__(self, session: Session, key: str, encoding: str, *, urgent: bool = False) -> None:
         self._session = session
         self._key = key
         misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S)
@@ -54,6 +54,8 @@ class LatchedPublisher(Closeable):
             key,
             encoding=encoding or None,
             congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA,
+            express=urgent,
             cache=zenoh.ext.CacheConfig(1),
             sample_miss_detection=misses,
             publisher_detection=True,
@@ -79,6 +81,14 @@ class LatchedPublisher(Closeable):
     def close(self) -> None:
         """Stop publishing the value. A second call does nothing."""
         self._session.release(self._publisher)
+
+
+def cached_values(session: Session, keyexpr: str, timeout_s: float) -> Iterator[SerializedSample]:
+    """The values that latched publishers on ``keyexpr`` cache for late joiners now."""
+    cached = f"{keyexpr}/@adv/**"
+    for reply in query(session.zenoh, cached, timeout_s, accept_replies=zenoh.ReplyKeyExpr.ANY):
+        if reply.ok is not None:
+            yield to_serialized(reply.ok)
 
 
 @dataclass(frozen=True)
@@ -194,7 +204,8 @@ class _CachedValues(Receiver[zenoh.Sample]):
         """The values of the publishers with these ``tokens``, and of those announced while waiting."""
         waiting: RoundRobinQueue[_Request] = RoundRobinQueue()
         in_flight: deque[_Request] = deque()
-        with suppress(Closed, zenoh.ZError):  # undeclared, or the session was closed
+        # Undeclared, also at this moment by another thread (RuntimeError), or the session was closed.
+        with suppress(Closed, zenoh.ZError, RuntimeError):
             while not self._closed:
                 for token in tokens:
                     if token.kind == zenoh.SampleKind.PUT:

@@ -24,6 +24,7 @@ import zenoh
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InsertRefused, InvalidInput, MessageError, SecondWriter, format_duration
+from zstate.net.latched import cached_values
 from zstate.net.presence import ANSWER_WITHIN_S, announce, confirmed_tokens
 from zstate.net.queryable import query
 from zstate.net.session import Session
@@ -46,7 +47,6 @@ from zstate.wire.keys import (
 )
 from zstate.wire.messages import Edges, OccupancyGrid, RobotDescription, StampedMessage, StaticTransforms
 from zstate.wire.native import NativeWire
-from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 1024
 TOKEN_EXPIRY_S = 0.5
@@ -259,6 +259,8 @@ class WriterClaim(Closeable):
             advice = "stop it first, for it and this writer would publish the same joints"
         elif first.stream in ("transforms", "partial_joint_states"):
             advice = "stop it first, or give this writer another name"
+        elif first.stream == "joint_commands":
+            advice = "a robot has one commander at a time: close the first"
         else:
             advice = (
                 "stop it first, or publish as well with takeover=True (--takeover): "
@@ -462,7 +464,7 @@ def _current_descriptions(session: Session, robot: str) -> Iterator[RobotDescrip
         key = _WIRE.expression(robot, "robot_description")
     except InvalidInput:  # not a robot's name
         return
-    for value in _latched_values(session, key):
+    for value in cached_values(session, key, ANSWER_WITHIN_S):
         if value.key == key:
             with suppress(MessageError):
                 (description,) = _WIRE.decode("robot_description", value, robot)
@@ -472,21 +474,13 @@ def _current_descriptions(session: Session, robot: str) -> Iterator[RobotDescrip
 
 def _current_statics(session: Session) -> Iterator[tuple[str, str, StaticTransforms]]:
     """Robot, writer name and edges of each static writer."""
-    for value in _latched_values(session, _WIRE.expression(ANY, "tf_static")):
+    for value in cached_values(session, _WIRE.expression(ANY, "tf_static"), ANSWER_WITHIN_S):
         with suppress(MessageError, InvalidInput):  # withdrawn, or not of zstate
             robot, name = _WIRE.robot_from_key(value.key), _WIRE.edge_writer_name(value.key)
             if value.key == stream_key(robot, "tf_static", name):
                 (statics,) = _WIRE.decode("tf_static", value, robot)
                 assert isinstance(statics, StaticTransforms)
                 yield robot, name, statics
-
-
-def _latched_values(session: Session, expression: str) -> Iterator[SerializedSample]:
-    """The values that latched publishers on these keys cache for late joiners."""
-    cached = f"{expression}/@adv/**"
-    for reply in query(session.zenoh, cached, ANSWER_WITHIN_S, accept_replies=zenoh.ReplyKeyExpr.ANY):
-        if reply.ok is not None:
-            yield to_serialized(reply.ok)
 
 
 def named_edges(robot: str, edges: Edges) -> Iterator[Edge]:

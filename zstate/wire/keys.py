@@ -10,6 +10,9 @@
 ``zstate/<robot>/scan/<sensor>``                  LaserScan, each scan; the sensor is the writer's name
 ``zstate/<robot>/map/<writer>``                   OccupancyGrid, latched
 ``zstate/<robot>/joint_commands``                 JointCommand, to a driver
+``zstate/<robot>/driver``                         DriverState, latched
+``zstate/<robot>/stop/<id>``                      Stop, latched: of one program that stops the driver
+``zstate/<robot>/release/<id>``                   Release, of a commander
 ``zstate/<robot>/lookup``                         a queryable
 ``zstate/<robot>/status/<id>``                    Status of one writer, once a second while read
 ``zstate/<robot>/@writer/<streams>/<id>``         liveliness token of one writer, with all its streams
@@ -167,6 +170,37 @@ def parse_status_key(key: str) -> tuple[str, str]:
     """Robot and identity in a ``status_key``."""
     robot, identity = _parse(key, "zstate/<robot>/status/<identity>")
     return check_robot(robot), identity
+
+
+def driver_key(robot: str) -> str:
+    """The key on which the driver of a robot publishes its DriverState."""
+    return f"zstate/{check_robot(robot)}/driver"
+
+
+def stop_key(robot: str, identity: str) -> str:
+    """The key on which one program stops the driver of a robot."""
+    return f"zstate/{check_robot(robot)}/stop/{identity}"
+
+
+def stop_expression(robot: str) -> str:
+    """The key expression of every Stop of ``robot``."""
+    return f"zstate/{_check_robot_or_any(robot)}/stop/*"
+
+
+def parse_stop_key(key: str) -> tuple[str, str]:
+    """Robot and identity in a ``stop_key``."""
+    robot, identity = _parse(key, "zstate/<robot>/stop/<identity>")
+    return check_robot(robot), identity
+
+
+def release_key(robot: str, identity: str) -> str:
+    """The key on which a commander releases stops. Access control separates it from that of stops."""
+    return f"zstate/{check_robot(robot)}/release/{identity}"
+
+
+def release_expression(robot: str) -> str:
+    """The key expression of every Release of ``robot``."""
+    return f"zstate/{_check_robot_or_any(robot)}/release/*"
 
 
 def writer_key(robot: str, streams: Stream | Collection[Stream], identity: str) -> str:

@@ -120,9 +120,7 @@ class JointState(Sample, frozen=True, array_like=True, gc=False):
         if len(self.positions) % 8 or self.velocities is not None or self.efforts is not None:
             _check_numbers(self.positions, self.velocities, self.efforts)
         if self.names is not None:
-            for block in (self.positions, self.velocities, self.efforts):
-                if block is not None and len(block) != 8 * len(self.names):
-                    raise InvalidInput(f"{len(self.names)} names need as many numbers, not {len(block) // 8}")
+            _check_named(self.names, self.positions, self.velocities, self.efforts)
             _check_order(self.order, self.names)
 
 
@@ -180,15 +178,88 @@ def select_edges(sample: TransformSample, edges: Edges, rows: Sequence[int]) -> 
     return WriterTransforms(*head, to_block(poses[rows]), chosen, to_block(covariances[rows]))
 
 
+MAX_REASON_LENGTH = 1000
+"""The longest reason of a Stop."""
+
+
 class JointCommand(Sample, frozen=True, array_like=True, gc=False):
-    """Setpoints for a driver; a block that is not commanded is None."""
+    """Setpoints for a driver, of the joints ``names``; a block that is not commanded is None.
+
+    They are valid for ``ttl`` [ns] after they have arrived; 0 stands for the driver's own limit. A driver
+    refuses a command without names.
+    """
 
     positions: bytes | None = None
     velocities: bytes | None = None
     efforts: bytes | None = None
+    names: tuple[str, ...] | None = None
+    ttl: Interval = 0
 
     def __post_init__(self) -> None:
-        _check_numbers(self.positions, self.velocities, self.efforts)
+        blocks = (self.positions, self.velocities, self.efforts)
+        _check_numbers(*blocks)
+        if self.names is not None:
+            _check_named(self.names, *blocks)
+            _check_order(self.order, self.names)
+
+
+class Stop(StampedMessage, frozen=True, array_like=True, gc=False):
+    """A stop of a driver, until it is released.
+
+    With ``how`` "hold" the joints stay where they are, with "relax" without torque. ``reason`` is shown to
+    users.
+    """
+
+    how: Literal["hold", "relax"]
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        if len(self.reason) > MAX_REASON_LENGTH:
+            raise InvalidInput(
+                f"the reason of a stop has at most {MAX_REASON_LENGTH} characters, not {len(self.reason)}"
+            )
+
+
+StopIds = tuple[tuple[Count, Count], ...]
+"""Stops, each by its ``session`` and its ``seq``."""
+
+
+class Release(StampedMessage, frozen=True, array_like=True, gc=False):
+    """The end of ``stops``, and of no others: a stop that arrives at the same time stays."""
+
+    stops: StopIds
+
+
+class DriverState(Message, frozen=True, array_like=True, gc=False):
+    """The state of the driver of a robot's ``joint_names``. Not a safety-rated channel.
+
+    ``program`` is the host of the driver. ``state`` is "off" before and after the control loop; "ready" if
+    it reads and writes nothing; "active" while setpoints are valid; "holding" after their end; "stopped"
+    until all ``stops`` are released; "fault" after too many failures in a row. ``reason`` is why.
+    ``commander`` is the program of the newest setpoints, whose age since their arrival is ``command_age``
+    [ns], None without any; ``ttl`` [ns] is the longest that is granted. ``limited`` are the joints that
+    moved slower than commanded at the last tick. ``faults`` counts failed calls of the driver, ``refused``
+    commands by reason, the newest described by ``last_refusal``. ``stamp`` [ns] is of the driver's system
+    clock.
+    """
+
+    stamp: Stamp
+    session: Count
+    program: str
+    state: Literal["off", "ready", "active", "holding", "stopped", "fault"]
+    reason: str
+    joint_names: tuple[str, ...]
+    ttl: Interval
+    commander: str = ""
+    command_age: Interval | None = None
+    limited: tuple[str, ...] = ()
+    rate_hz: float = 0.0
+    ticks: Count = 0
+    skipped: Count = 0
+    faults: Count = 0
+    refused: dict[str, int] = {}
+    last_refusal: str = ""
+    stops: StopIds = ()
 
 
 class StaticTransforms(Message, frozen=True, array_like=True, gc=False):
@@ -358,6 +429,12 @@ def _check_numbers(*blocks: bytes | None) -> None:
     for block in blocks:
         if block is not None and len(block) % 8:
             raise InvalidInput(f"a block of float64 has a multiple of 8 bytes, not {len(block)}")
+
+
+def _check_named(names: Sequence[str], *blocks: bytes | None) -> None:
+    for block in blocks:
+        if block is not None and len(block) != 8 * len(names):
+            raise InvalidInput(f"{len(names)} names need as many numbers, not {len(block) // 8}")
 
 
 def _check_frame(frame: str) -> None:

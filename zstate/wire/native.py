@@ -22,15 +22,18 @@ from zstate.wire.messages import (
     LATCHED_BYTES,
     SAMPLE_BYTES,
     ClockMessage,
+    DriverState,
     HistoryPage,
     JointCommand,
     JointState,
     LaserScan,
     Message,
     OccupancyGrid,
+    Release,
     RobotDescription,
     StaticTransforms,
     Status,
+    Stop,
     TransformSample,
     WriterTransforms,
     check_edges,
@@ -48,6 +51,9 @@ ENCODINGS: dict[type[Message], str] = {
     TransformSample: "zstate/TransformSample;v=1",
     WriterTransforms: "zstate/WriterTransforms;v=1",
     JointCommand: "zstate/JointCommand;v=1",
+    DriverState: "zstate/DriverState;v=1",
+    Stop: "zstate/Stop;v=1",
+    Release: "zstate/Release;v=1",
     StaticTransforms: "zstate/StaticTransforms;v=1",
     RobotDescription: "zstate/RobotDescription;v=1",
     LaserScan: "zstate/LaserScan;v=1",
@@ -73,7 +79,13 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
 _MIN_LIMIT_BYTES = 1_000
 
 # Of messages without a stream.
-_MAX_BYTES: dict[type[Message], int] = {Status: 64_000, HistoryPage: 4 * SAMPLE_BYTES}
+_MAX_BYTES: dict[type[Message], int] = {
+    Status: 64_000,
+    DriverState: 256_000,
+    Stop: 8_000,
+    Release: 64_000,
+    HistoryPage: 4 * SAMPLE_BYTES,
+}
 
 _DEFLATED_BYTES = 64_000
 _DEFLATED = b"\x78"

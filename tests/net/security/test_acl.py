@@ -35,7 +35,9 @@ from zstate.wire import keys
 from zstate.wire.messages import LaserScan, OccupancyGrid, TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
-FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",))
+FLEET = AclRoles(
+    ("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",), commanders=("teleop",)
+)
 USERS = (*FLEET.identities, "stranger")
 
 
@@ -93,6 +95,17 @@ WRITES = [
     ("desk", "zstate/r1/transforms/odometry", False),
     ("desk", "zstate/clock", False),
     ("hand", "zstate/r1/joint_commands", True),
+    ("teleop", "zstate/r1/joint_commands", True),
+    ("teleop", "zstate/r1/release/teleop", True),
+    ("teleop", "zstate/r1/stop/teleop", True),
+    ("teleop", "zstate/r1/joint_states", False),
+    ("teleop", "zstate/r1/driver", False),
+    ("desk", "zstate/r1/stop/desk", True),
+    ("desk", "zstate/r1/release/desk", False),
+    ("r2", "zstate/r1/stop/r2", True),
+    ("r2", "zstate/r1/joint_commands", False),
+    ("r2", "zstate/r1/release/r2", False),
+    ("stranger", "zstate/r1/stop/stranger", False),
     ("hand", "zstate/r1/joint_states", False),
     ("simulator", "zstate/clock", True),
     ("simulator", "zstate/r1/joint_states", False),
@@ -360,7 +373,8 @@ def test_zenoh_parses_the_text_to_the_same_rules():
 
 def test_rules_without_a_role_are_omitted():
     rules = [rule["id"] for rule in access_control(AclRoles(viewers=("desk", "desk")))["rules"]]
-    assert rules == ["viewers read", "viewers are given", "readers are known"]
+    stops = ["everyone stops", "everyone is asked for stops"]
+    assert rules == ["viewers read", "viewers are given", "readers are known", *stops]
 
 
 @pytest.mark.parametrize("name", ["", "*", "a/b", "two words", "@r1", "r1:x", "x" * 65, "röbi"])

@@ -11,9 +11,10 @@ from zstate.cli.output.console import print_result
 _ROLES = {
     "robot": "A robot: writes its own keys; reads these and the clock",
     "viewer": "Reads everything and writes nothing",
-    "operator": "A viewer that also commands joints",
+    "operator": "A commander that also calls ROS services",
     "timekeeper": "A viewer that also writes the simulated time",
     "placer": "Writes static edges as robot NAME and nothing else, for instance where robots are in a map",
+    "commander": "A viewer that also commands joints, and releases stops",
 }
 
 
@@ -42,7 +43,8 @@ def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, .
 
     Everything that is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`)
     or a user; for a robot or a placer it is also the name in the keys. One NAME may have several roles: a
-    robot that reads other robots is also a viewer.
+    robot that reads other robots is also a viewer. Every NAME may stop the driver of a robot; only a
+    commander or an operator may command it, and release the stop.
 
     The router checks keys, listeners check frames: r1 writes only under zstate/r1/, and listeners accept
     frames r1/... only from those keys. The exception is the root of r1, which other writers may place in
@@ -63,6 +65,6 @@ def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, .
     if not any(roles.values()):
         *others, last = (f"--{role} NAME" for role in _ROLES)
         raise click.UsageError(f"give at least one of {', '.join(others)} and {last}")
-    robots, viewers, operators, timekeepers, placers = (roles[role] for role in _ROLES)
-    fleet = AclRoles(robots, viewers, operators, timekeepers, namespace, wires, placers)
+    robots, viewers, operators, timekeepers, placers, commanders = (roles[role] for role in _ROLES)
+    fleet = AclRoles(robots, viewers, operators, timekeepers, namespace, wires, placers, commanders)
     print_result(access_text(fleet).rstrip("\n"))

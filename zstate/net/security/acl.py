@@ -1,4 +1,4 @@
-"""Access control of a Zenoh router, generated from roles: robots, viewers, operators, timekeepers, placers.
+"""Access control of a Zenoh router, generated from roles: robots, viewers, operators, commanders and others.
 
 Messages that no rule allows are denied. Zenoh allows a message if a rule's key expression includes that of
 the message, so a robot cannot write to other robots by a wildcard either.
@@ -46,11 +46,12 @@ class AclRoles:
 
     A robot writes and reads its own keys; of other robots it reads their names, their static edges,
     which it must not contradict, and their maps, as those of places; and it reads the simulated time. A
-    viewer reads everything and writes nothing; an operator also commands joints; a timekeeper also writes the
-    simulated time. A placer writes only static edges under its own name, and reads those of the robots: it
-    places their roots, as in ``fleet/map -> r1/odom``; readers with ``placers=`` accept such edges from these
-    only. A name may have several roles. ``namespace`` is that of the sessions behind the router, if they have
-    one. ``wires``: "native", and "ros2" with its options, see ``_Ros2Rules``.
+    viewer reads everything and writes nothing but stops of drivers, which every identity may send; a
+    commander also commands joints; an operator does, too, and calls services of ROS; a timekeeper also
+    writes the simulated time. A placer writes only static edges under its own name, and reads those of the
+    robots: it places their roots, as in ``fleet/map -> r1/odom``; readers with ``placers=`` accept such edges
+    from these only. A name may have several roles. ``namespace`` is that of the sessions behind the router,
+    if they have one. ``wires``: "native", and "ros2" with its options, see ``_Ros2Rules``.
     Raises InvalidInput for names that cannot be names of identities.
     """
 
@@ -61,6 +62,7 @@ class AclRoles:
     namespace: str = ""
     wires: tuple[str, ...] = ("native",)
     placers: tuple[str, ...] = ()
+    commanders: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in self.identities:
@@ -77,7 +79,7 @@ class AclRoles:
     @property
     def readers(self) -> tuple[str, ...]:
         """The names that may read everything."""
-        return (*self.viewers, *self.operators, *self.timekeepers)
+        return (*self.viewers, *self.operators, *self.commanders, *self.timekeepers)
 
 
 def check_namespace(namespace: str) -> str:
@@ -136,7 +138,15 @@ def _native_rules(roles: AclRoles) -> Grants:
     yield roles.readers, _ingress("viewers read", SUBSCRIBE, everything)
     yield roles.readers, _egress("viewers are given", PUBLISH, everything)
     yield roles.identities, _ingress("readers are known", ("liveliness_token",), (f"{root}/{_READER}/**",))
-    yield roles.operators, _ingress("operators command", ("put",), (f"{root}/*/joint_commands",))
+    streams = ("joint_commands", "release/*", f"{_WRITER}/joint_commands/*")
+    commands = tuple(f"{root}/*/{stream}" for stream in streams)
+    commanders = (*roles.operators, *roles.commanders)
+    yield commanders, _ingress("commanders command", ("put", "liveliness_token"), commands)
+    # A publisher sends nothing before its session knows of a subscriber.
+    yield commanders, _egress("commanders are asked", SUBSCRIBE, commands)
+    stops = (f"{root}/*/stop/*", f"{root}/*/stop/*/@adv/**")
+    yield roles.identities, _ingress("everyone stops", PUBLISH, stops)
+    yield roles.identities, _egress("everyone is asked for stops", SUBSCRIBE, stops)
     yield roles.timekeepers, _ingress("timekeepers write", ("put",), (clock,))
 
 

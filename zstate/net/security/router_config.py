@@ -195,6 +195,7 @@ def access_text(roles: AclRoles) -> str:
         "robots": roles.robots,
         "viewers": roles.viewers,
         "operators": roles.operators,
+        "commanders": roles.commanders,
         "timekeepers": roles.timekeepers,
         "placers": roles.placers,
     }

@@ -1,0 +1,458 @@
+"""A driver host and its commander: real sessions, and processes that are killed."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from helpers.processes import DEADLINE_S, until
+from helpers.robots import RRBOT, wait_for_reader
+
+from zstate import JointReading, StatePublisher
+from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
+from zstate.driving.stops import wait_for_state
+from zstate.errors import DriverFault, InvalidInput, SecondWriter
+from zstate.net.session import Session
+from zstate.net.streams import StreamPublisher
+from zstate.nodes.listener import TransformListener
+from zstate.wire.messages import DriverState, JointCommand, order_digest, to_block
+from zstate.wire.native import ENCODINGS, encode
+
+LIMITS = Limits.of(RRBOT, velocity=2.0)
+RATE_HZ = 200.0
+STEP = 2.0 / RATE_HZ
+"""The longest step of a tick at the velocity limit [rad]."""
+
+
+class RecordingDriver(SimulatedDriver):
+    """A mirror that keeps every call, with its instant on the monotonic clock."""
+
+    def __init__(self, start: list[float] | None = None) -> None:
+        super().__init__(RRBOT, "mirror", start=None if start is None else np.array(start))
+        self.calls: list[tuple[str, int, object]] = []
+        self.failures: list[Exception] = []
+
+    def _keep(self, name: str, value: object = None) -> None:
+        self.calls.append((name, time.monotonic_ns(), value))
+
+    def read(self, stamp: int) -> JointReading:
+        if self.failures:
+            raise self.failures.pop()
+        return super().read(stamp)
+
+    def write(self, setpoint) -> None:
+        self._keep("write", setpoint.positions)
+        super().write(setpoint)
+
+    def stop(self, how) -> None:
+        self._keep("stop", how)
+        super().stop(how)
+
+    def written(self) -> np.ndarray:
+        return np.array([value for name, _, value in list(self.calls) if name == "write"]).reshape(-1, 2)
+
+
+@contextmanager
+def running(session: Session, driver: SimulatedDriver, **options: object) -> Iterator[DriverHost]:
+    """A host whose loop runs in a thread; its exception is raised at the end."""
+    failure: list[BaseException] = []
+    with DriverHost(session, driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS, **options) as host:
+
+        def run() -> None:
+            try:
+                host.run()
+            except BaseException as error:
+                failure.append(error)
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            until(lambda: host.state != "off" or failure)
+            yield host
+        finally:
+            host.close()
+            thread.join()
+    if failure:
+        raise failure[0]
+
+
+def send_until(commander: Commander, positions: dict[str, float], condition) -> None:
+    def sent() -> bool:
+        commander.send(positions)
+        return bool(condition())
+
+    until(sent)
+
+
+def received(listener: TransformListener) -> list[float]:
+    """The newest joint positions that a listener has."""
+    return listener.buffer.joint_positions("arm")[0].tolist()
+
+
+def test_a_commanded_joint_reaches_its_position_in_steps_within_the_velocity_limit(sessions):
+    driver = RecordingDriver([0.5, -0.5])
+    with (
+        running(sessions[0], driver) as host,
+        Commander(sessions[1], "arm") as arm,
+        TransformListener(sessions[1], "arm") as listener,
+    ):
+        assert arm.wait_for_driver().state == "ready"
+        assert driver.written().size == 0
+        send_until(arm, {"elbow": 0.2}, lambda: driver.written().size and driver.written()[-1, 1] == 0.2)
+        assert host.state == "active"
+        until(lambda: received(listener) == [0.5, 0.2])
+        until(lambda: arm.driver is not None and arm.driver.state == "active")
+    written = driver.written()
+    # The first setpoint starts from what was measured, and the shoulder was not commanded.
+    path = np.vstack(([0.5, -0.5], written))
+    assert np.abs(np.diff(path, axis=0)).max() <= STEP * (1 + 1e-9)
+    assert (written[:, 0] == 0.5).all()
+    assert driver.calls[-1][0] == "stop"
+
+
+def state_of(session: Session) -> DriverState:
+    found = wait_for_state(session, "arm", lambda state: state.state == "holding", DEADLINE_S)
+    assert found is not None
+    return found
+
+
+COMMANDER = """
+    import sys, time
+    from zstate import connect
+    from zstate.driving import Commander
+    with connect() as session, Commander(session, "arm", program="teleop") as arm:
+        arm.wait_for_driver()
+        print("commanding", flush=True)
+        while True:
+            arm.send({"shoulder": 100.0}, ttl_s=0.2)
+            time.sleep(0.01)
+"""
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_dead_or_frozen_commander_leaves_the_joints_held_within_ttl_and_one_tick(
+    sessions, spawn, end: signal.Signals
+):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host:
+        killed = spawn(COMMANDER)
+        killed.line()
+        until(lambda: len(driver.written()) > 20)
+        killed.process.send_signal(end)
+        dead_at = time.monotonic_ns()
+        until(lambda: host.state == "holding")
+        until(lambda: len(driver.written()) and (driver.written()[-5:] == driver.written()[-1]).all())
+        report = host.report()
+        program = f"pid {killed.process.pid}"
+        assert f"nothing from teleop@{socket.gethostname()} {program} for" in state_of(sessions[1]).reason
+    writes = [(at, value) for name, at, value in driver.calls if name == "write"]
+    moved = [at for (at, one), (_, before) in zip(writes[1:], writes, strict=False) if (one != before).any()]
+    # Counted from arrival, which is not after the death; the last motion is in the tick of the expiry.
+    worst_tick_ns = report.lateness_us.max * 1e3 + 1e9 / RATE_HZ
+    assert moved[-1] - dead_at <= 0.2e9 + worst_tick_ns
+    assert writes[-1][0] > moved[-1], "the position is held by further writes"
+
+
+def test_on_silence_relax_switches_the_torque_off(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver, ttl_s=0.05, on_silence="relax"), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"elbow": 0.4}, lambda: len(driver.written()))
+        until(lambda: ("stop", "relax") in [(name, value) for name, _, value in driver.calls])
+        until(lambda: arm.wait_for_driver().state == "ready")
+
+
+def test_a_second_commander_is_refused_with_the_name_of_the_first(sessions):
+    with (
+        Commander(sessions[0], "arm", program="teleop"),
+        pytest.raises(
+            SecondWriter, match=r"'teleop@.*already writes joint_commands.*one commander at a time"
+        ),
+    ):
+        Commander(sessions[1], "arm")
+
+
+def test_commands_of_another_session_are_refused_while_the_first_are_valid(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        with raw_commands(sessions[1]) as put:
+            send_until(arm, {"elbow": 0.1}, lambda: host.state == "active")
+
+            def both() -> bool:
+                arm.send({"elbow": 0.1})
+                put(command(elbow=-1.0))
+                return host.report().refused.get("second commander", 0) > 0
+
+            until(both)
+    assert driver.written()[:, 1].min() >= 0.0
+
+
+@contextmanager
+def raw_commands(session: Session) -> Iterator:
+    key = "zstate/arm/joint_commands"
+    with StreamPublisher(session, key, ENCODINGS[JointCommand]) as publisher:
+        wait_for_reader(session, key)
+        yield publisher.put
+
+
+def command(seq: int = 0, ttl: int = 0, **positions: float) -> bytes:
+    names = tuple(positions)
+    block = to_block(list(positions.values()))
+    return encode(JointCommand(0, seq, 7, order_digest(names), block, names=names, ttl=ttl))
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (command(elbow=float("nan")), "not finite"),
+        (command(elbow=float("inf")), "not finite"),
+        (command(elbw=0.0), "unknown joint"),
+        (command(elbow=0.0, ttl=10**10), "ttl"),
+        (encode(JointCommand(0, 0, 7, order_digest(("elbow",)), to_block([0.0]))), "no names"),
+        (
+            encode(JointCommand(0, 0, 7, order_digest(("elbow",)), None, to_block([1.0]), names=("elbow",))),
+            "mode",
+        ),
+        (
+            encode(
+                JointCommand(0, 0, 7, order_digest(("elbow",) * 2), to_block([0, 1]), names=("elbow",) * 2)
+            ),
+            "repeated joint",
+        ),
+        (command(elbow=0.0)[:-3], "truncated"),
+        (b"\xff\x00garbage", "malformed"),
+    ],
+)
+def test_a_bad_command_is_refused_counted_and_moves_nothing(sessions, payload: bytes, reason: str):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+        put(payload)
+        until(lambda: host.report().refused == {reason: 1})
+        put(command(elbow=0.1))
+        until(lambda: host.state == "active")
+    assert driver.written().min() >= 0.0
+
+
+def test_positions_outside_limits_are_refused_and_counted(sessions):
+    narrow = Limits(RRBOT.joint_names, [-1.0, -0.5], [1.0, 0.5], [2.0, 2.0], [np.inf, np.inf])
+    driver = RecordingDriver()
+    with (
+        DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=narrow) as host,
+        raw_commands(sessions[1]) as put,
+    ):
+        put(command(elbow=0.6))
+        put(command(1, elbow=0.6, shoulder=0.1))
+        host.run(seconds=0.2)
+        assert host.report().refused == {"outside limits": 2}
+    assert driver.written().size == 0
+
+
+def test_an_old_command_is_refused(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+        put(command(5, elbow=0.1))
+        put(command(5, elbow=0.2))
+        put(command(4, elbow=0.2))
+        until(lambda: host.report().refused == {"old": 2} and len(driver.written()))
+    assert driver.written()[:, 1].max() <= 0.1
+
+
+def test_a_stop_is_latched_and_released_by_the_commander(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 50.0}, lambda: len(driver.written()) > 5)
+        confirmed = stop(sessions[1], "arm", "door open")
+        assert confirmed.state == "stopped"
+        assert "door open" in confirmed.reason
+        before = len(driver.written())
+        assert driver.calls[-1][0] == "stop"
+        send_until(arm, {"shoulder": 50.0}, lambda: host.report().refused.get("stopped"))
+        assert len(driver.written()) == before
+        assert arm.release().state == "ready"
+        stopped_at = driver.written()[-1]
+        send_until(arm, {"shoulder": 50.0}, lambda: len(driver.written()) > before)
+        assert np.abs(driver.written()[before] - stopped_at).max() <= STEP * (1 + 1e-9)
+
+
+def test_a_commander_that_did_not_release_the_stop_does_not_move_the_robot_by_a_release(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+        numbers = iter(range(10**6))
+
+        def send(condition) -> None:
+            def sent() -> bool:
+                put(command(next(numbers), shoulder=50.0))
+                return bool(condition())
+
+            until(sent)
+
+        send(lambda: host.state == "active")
+        stop(sessions[1], "arm")
+        send(lambda: host.report().refused.get("stopped"))
+        written = len(driver.written())
+        with Commander(sessions[1], "arm") as arm:
+            assert arm.release().state == "ready"
+        send(lambda: host.report().refused.get("not released", 0) > 3)
+        assert len(driver.written()) == written
+
+
+HOST = """
+    import sys
+    from zstate import connect, load_model
+    from zstate.driving import DriverHost, SimulatedDriver
+    model = load_model("rrbot")
+    with connect() as session, DriverHost(session, SimulatedDriver(model), model, "arm") as host:
+        print("open", flush=True)
+        host.run()
+"""
+
+STOPPER = """
+    from zstate import connect
+    from zstate.driving import stop
+    with connect() as session:
+        print(stop(session, "arm", "from a third process").state, flush=True)
+"""
+
+
+def test_a_restarted_host_obeys_a_stop_whose_program_has_ended(sessions, spawn):
+    first = spawn(HOST)
+    first.line()
+    stopper = spawn(STOPPER)
+    assert stopper.line() == "stopped"
+    stopper.wait()
+    first.kill()
+    second = spawn(HOST)
+    second.line()
+    with Commander(sessions[1], "arm") as arm:
+        until(lambda: arm.driver is not None and arm.driver.state == "stopped")
+        assert "from a third process" in arm.wait_for_driver().reason
+        until_stopped = arm.wait_for_driver().refused.get("stopped", 0)
+        send_until(
+            arm, {"elbow": 1.0}, lambda: arm.wait_for_driver().refused.get("stopped", 0) > until_stopped
+        )
+        assert arm.release().state == "ready"
+    second.kill()
+    third = spawn(HOST)
+    third.line()
+    with Commander(sessions[1], "arm") as arm:
+        until(lambda: arm.driver is not None and arm.driver.state == "ready")
+
+
+def test_a_stop_before_the_host_starts_is_obeyed_from_its_sender(sessions, tmp_path):
+    with pytest.raises(TimeoutError, match="no driver of 'arm' has confirmed"):
+        stop(sessions[1], "arm", "not yet", timeout_s=0.05)
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host:
+        until(lambda: host.state == "stopped")
+
+
+def test_a_bad_reading_is_counted_and_the_loop_goes_on(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host:
+        for count in (1, 2):
+            driver.failures.append(OSError("bad checksum"))
+            until(lambda count=count: host.report().faults == count)
+        assert host.state == "ready"
+
+
+def test_a_driver_that_keeps_failing_is_stopped_and_the_stop_outlives_the_host(sessions):
+    driver = RecordingDriver()
+    with (
+        pytest.raises(DriverFault, match=r"3 ticks in a row.*unplugged"),
+        running(sessions[0], driver) as host,
+    ):
+        driver.failures += [OSError("unplugged")] * 1000
+        until(lambda: host.state == "fault")
+        assert host.report().faults == 3
+    assert ("stop", "hold") in [(name, value) for name, _, value in driver.calls]
+    with running(sessions[0], RecordingDriver()) as host:
+        until(lambda: host.state == "stopped")
+
+
+def test_no_writes_follow_each_other_at_once_after_a_read_that_blocked(sessions):
+    class SlowOnce(RecordingDriver):
+        is_slow = False
+
+        def read(self, stamp: int) -> JointReading:
+            if self.is_slow:
+                self.is_slow = False
+                threading.Event().wait(20 / RATE_HZ)
+            return super().read(stamp)
+
+    driver = SlowOnce()
+    with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+        driver.is_slow = True
+        send_until(arm, {"shoulder": 9.0}, lambda: host.report().rate.skipped >= 18)
+        written = len(driver.written())
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > written + 20)
+    assert np.abs(np.diff(driver.written()[:, 0])).max() <= STEP * (1 + 1e-9)
+
+
+def test_a_part_of_the_robot_is_driven_beside_a_publisher_of_the_rest(sessions):
+    class Elbow(RecordingDriver):
+        def __init__(self) -> None:
+            super().__init__()
+            self.joint_names = ("elbow",)
+
+        def read(self, stamp: int) -> JointReading:
+            return JointReading(super().read(stamp).positions[1:])
+
+        def write(self, setpoint) -> None:
+            self._target = setpoint
+            self._keep("write", [0.0, setpoint.positions[0]])
+
+    limits = Limits.of(RRBOT, ["elbow"], velocity=2.0)
+    with DriverHost(sessions[0], Elbow(), RRBOT, "arm", limits=limits) as host:
+        report = host.run(seconds=0.1)
+        assert report.rate is not None
+        assert report.rate.ticks == 10
+
+
+def test_one_robot_has_one_host(sessions):
+    with (
+        StatePublisher(sessions[0], RRBOT, "arm"),
+        pytest.raises(SecondWriter),
+    ):
+        DriverHost(sessions[1], RecordingDriver(), RRBOT, "arm", limits=LIMITS)
+
+
+def test_two_hosts_do_not_share_a_robot_by_its_joints(sessions):
+    def part(joint: str) -> RecordingDriver:
+        driver = RecordingDriver()
+        driver.joint_names = (joint,)
+        return driver
+
+    limits = Limits.of(RRBOT, ["elbow"])
+    with (
+        DriverHost(sessions[0], part("elbow"), RRBOT, "arm", limits=limits, program="left"),
+        pytest.raises(SecondWriter, match=r"'left@.*' already drives elbow of 'arm'"),
+    ):
+        DriverHost(sessions[1], part("shoulder"), RRBOT, "arm")
+
+
+def test_unusable_arguments_are_refused_together(sessions):
+    with pytest.raises(InvalidInput, match=r"on_silence.*faults_allowed"):
+        DriverHost(sessions[0], RecordingDriver(), RRBOT, limits=LIMITS, on_silence="fall", faults_allowed=0)
+
+
+def test_a_commander_checks_what_it_sends(sessions):
+    with running(sessions[0], RecordingDriver()), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        with pytest.raises(InvalidInput, match="no joint 'elbw'; it has shoulder, elbow"):
+            arm.send({"elbw": 0.0})
+        with pytest.raises(InvalidInput, match="must be finite; not so: 'elbow'"):
+            arm.send({"elbow": float("nan")})
+        with pytest.raises(InvalidInput, match="at least one joint"):
+            arm.send({})
+        with pytest.raises(InvalidInput, match=r"a ttl of 1\.0 s is longer than 250\.0 ms"):
+            arm.send({"elbow": 0.0}, ttl_s=1.0)

@@ -1,0 +1,188 @@
+"""Commands as they arrive at a driver: checks, and the targets of its joints until they expire."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate._util.closeable import Closeable
+from zstate._util.format import suggestion_text
+from zstate._util.refusals import Refusals
+from zstate.errors import InvalidInput, MessageError, format_duration, printable
+from zstate.model.robot import near_joint
+from zstate.net.session import Session
+from zstate.net.streams import StreamSubscriber
+from zstate.wire.keys import shortened, stream_key
+from zstate.wire.messages import JointCommand, check_size, from_block
+from zstate.wire.native import decode
+from zstate.wire.protocol import SerializedSample
+
+Floats = NDArray[np.float64]
+
+_WAITING = 1024
+"""Commands that wait for a control loop; beyond it the oldest are lost, which newer ones replace anyway."""
+
+NO_DEADLINE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Positions (k,) [rad] or [m] for the joints at ``columns`` (k,), valid until ``deadline``.
+
+    ``arrived`` and ``deadline`` are on the monotonic clock [ns].
+    """
+
+    session: int
+    seq: int
+    columns: NDArray[np.intp]
+    positions: Floats
+    arrived: int
+    deadline: int
+
+
+class CommandReceiver(Closeable):
+    """Receives the commands of ``robot`` for ``joint_names``; ``drain`` returns those that can be used.
+
+    A command counts from its arrival, for its own ttl or for ``ttl_ns``, which is also the longest that is
+    granted. ``refusals`` counts the others by reason.
+    """
+
+    def __init__(
+        self, session: Session, robot: str, joint_names: Sequence[str], ttl_ns: int, refusals: Refusals
+    ) -> None:
+        self._columns = {name: column for column, name in enumerate(joint_names)}
+        self._ttl_ns = ttl_ns
+        self._refusals = refusals
+        self._arrived: deque[Command] = deque(maxlen=_WAITING)
+        key = stream_key(robot, "joint_commands")
+        self._subscriber = StreamSubscriber(session, key, self._on_samples)
+
+    def drain(self) -> list[Command]:
+        """The commands since the last call, oldest first."""
+        return [self._arrived.popleft() for _ in range(len(self._arrived))]
+
+    def close(self) -> None:
+        self._subscriber.close()
+
+    def _on_samples(self, samples: list[SerializedSample]) -> None:
+        now = time.monotonic_ns()
+        for sample in samples:
+            self._on_sample(sample, now)
+
+    def _on_sample(self, sample: SerializedSample, now: int) -> None:
+        try:
+            self._arrived.append(self._read(sample, now))
+        except MessageError as error:
+            self._refusals.count(error.reason, error)
+
+    def _read(self, sample: SerializedSample, now: int) -> Command:
+        """The command in ``sample``. Raises MessageError with the reason why it is refused."""
+        check_size("joint_commands", sample.size or len(sample.payload))
+        message = decode(sample.payload, sample.encoding, JointCommand)
+        if not message.names:
+            raise MessageError("a command has the names of its joints; this one has none", reason="no names")
+        if message.positions is None or message.velocities is not None or message.efforts is not None:
+            text = "a command has positions and nothing else; velocities and efforts are not supported"
+            raise MessageError(text, reason="mode")
+        positions = from_block(message.positions)
+        if message.ttl > self._ttl_ns:
+            text = f"a ttl of {format_duration(message.ttl)} is longer than {format_duration(self._ttl_ns)}"
+            raise MessageError(f"{text}, which this driver grants at most", reason="ttl")
+        deadline = now + (message.ttl or self._ttl_ns)
+        columns = self._columns_of(message.names)
+        for name, value in zip(message.names, positions.tolist(), strict=True):
+            if not math.isfinite(value):
+                raise MessageError(f"the position of {name!r} is {value}", reason="not finite")
+        return Command(message.session, message.seq, columns, positions, now, deadline)
+
+    def _columns_of(self, names: Sequence[str]) -> NDArray[np.intp]:
+        for name in names:
+            if name not in self._columns:
+                near = near_joint(name, list(self._columns))
+                text = f"this driver has no joint {printable(shortened(name))!r}{suggestion_text(near)}"
+                raise MessageError(text, reason="unknown joint")
+        if len(set(names)) < len(names):
+            raise MessageError("a joint is named twice in one command", reason="repeated joint")
+        return np.array([self._columns[name] for name in names], dtype=np.intp)
+
+
+class Targets:
+    """The positions to which the joints move, each until its command expires. For one thread.
+
+    Joints without a command stay where they were at ``start``, or came to rest after their last one. While
+    commands of one session are valid, those of others are refused, and so is an older one of that session.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._positions = np.zeros(count)
+        self._deadlines = np.full(count, NO_DEADLINE, dtype=np.int64)
+        self._last_seqs: dict[int, int] = {}
+        self.session = 0
+        """The session of the newest command; 0 before the first."""
+        self.arrived = 0
+        """When the newest command arrived [ns, monotonic]."""
+        self.ttl_ns = 0
+        """For how long the newest command is valid."""
+
+    def start(self, now: int, positions: Floats) -> None:
+        """Joints without a command that is valid at ``now`` stay at ``positions``."""
+        resting = self._deadlines <= now
+        self._positions[resting] = positions[resting]
+        self._deadlines[resting] = NO_DEADLINE
+
+    def check_sender(self, command: Command, now: int) -> None:
+        """Raise MessageError for a command of another session than the active one, or for an old one."""
+        if command.session != self.session and self.is_live(now):
+            text = f"a command of session {command.session:016x} while that of another session is valid"
+            raise MessageError(text, reason="second commander")
+        if command.seq <= self._last_seqs.get(command.session, -1):
+            raise MessageError(f"the command {command.seq} comes after a newer one", reason="old")
+
+    def merged(self, command: Command, present: Floats) -> Floats:
+        """The positions of ``command``; ``present`` ones for all other joints."""
+        positions = present.copy()
+        positions[command.columns] = command.positions
+        return positions
+
+    def accept(self, command: Command) -> None:
+        """Move the joints of ``command`` to its positions until its deadline."""
+        if command.session != self.session:
+            self.clear()
+        self._last_seqs[command.session] = command.seq
+        while len(self._last_seqs) > _WAITING:
+            del self._last_seqs[next(iter(self._last_seqs))]
+        self.session, self.arrived = command.session, command.arrived
+        self.ttl_ns = command.deadline - command.arrived
+        self._positions[command.columns] = command.positions
+        self._deadlines[command.columns] = command.deadline
+
+    def is_live(self, now: int) -> bool:
+        """Whether any joint has a command that is valid at ``now``."""
+        return bool((self._deadlines > now).any())
+
+    def current(self, now: int, resting: Floats) -> Floats:
+        """The target of each joint at ``now``: (n,); one whose command expires now stays at ``resting``."""
+        expired = (self._deadlines <= now) & (self._deadlines != NO_DEADLINE)
+        if expired.any():
+            self._positions[expired] = resting[expired]
+            self._deadlines[expired] = NO_DEADLINE
+        return self._positions
+
+    def clear(self) -> None:
+        """Forget all commands."""
+        self._deadlines[:] = NO_DEADLINE
+
+
+def check_named_positions(positions: dict[str, float]) -> None:
+    """Raise InvalidInput unless ``positions`` are finite numbers of at least one joint."""
+    if not positions:
+        raise InvalidInput("a command has the position of at least one joint: {'elbow': 0.4}")
+    bad = [f"{name!r} ({value})" for name, value in positions.items() if not math.isfinite(value)]
+    if bad:
+        raise InvalidInput(f"commanded positions must be finite; not so: {', '.join(bad)}")

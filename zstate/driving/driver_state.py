@@ -1,0 +1,107 @@
+"""What a driver host reports: its state on the network, and the figures of its control loop."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe
+from zstate.errors import Closed
+from zstate.net.latched import LatchedPublisher
+from zstate.net.session import Session
+from zstate.rate import RateReport
+from zstate.wire.keys import driver_key
+from zstate.wire.messages import DriverState
+from zstate.wire.native import ENCODINGS, encode
+
+PERIOD_S = 0.1
+JOIN_WITHIN_S = 0.5
+
+_MOST_DURATIONS = 60_000
+
+
+class Spread(NamedTuple):
+    """Median, 99th percentile and maximum of durations [us]; zero without any."""
+
+    p50: float
+    p99: float
+    max: float
+
+
+class Durations:
+    """The last minute, at 1 kHz, of a kind of duration; the maximum of all. For one thread."""
+
+    def __init__(self) -> None:
+        self._newest: deque[int] = deque(maxlen=_MOST_DURATIONS)
+        self._max = 0
+
+    def add(self, duration_ns: int) -> None:
+        self._newest.append(duration_ns)
+        self._max = max(self._max, duration_ns)
+
+    def spread(self) -> Spread:
+        if not self._newest:
+            return Spread(0.0, 0.0, 0.0)
+        p50, p99 = np.percentile(np.array(self._newest), (50, 99)) / 1e3
+        return Spread(float(p50), float(p99), self._max / 1e3)
+
+
+@dataclass(frozen=True, slots=True)
+class DriverReport:
+    """The figures of a driver host since it opened; ``rate`` and ``lateness_us`` of its last ``run``.
+
+    ``lateness_us`` is how long ticks began after their deadlines; ``read_us`` and ``write_us`` are what the
+    driver's own calls took. ``faults`` counts those that raised. ``refused`` counts commands by reason.
+    """
+
+    rate: RateReport | None
+    lateness_us: Spread
+    read_us: Spread
+    write_us: Spread
+    written: int
+    faults: int
+    refused: Mapping[str, int]
+
+
+class DriverStatePublisher(Closeable):
+    """Publishes what ``build()`` returns, latched: after each ``notify`` and ten times a second.
+
+    It has a thread of its own, because a latched value waits for the network and a control loop must not.
+    """
+
+    def __init__(self, session: Session, robot: str, build: Callable[[], DriverState]) -> None:
+        self._build = build
+        self._latched = LatchedPublisher(session, driver_key(robot), ENCODINGS[DriverState])
+        self._has_changed = fork_safe(threading.Event())
+        self._closed = False
+        self._latched.set(encode(build()))
+        self._thread = threading.Thread(target=self._run, name="zstate driver state", daemon=True)
+        self._thread.start()
+
+    def notify(self) -> None:
+        """Publish the state now. Does not wait."""
+        self._has_changed.set()
+
+    def close(self) -> None:
+        self._closed = True
+        self._has_changed.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(JOIN_WITHIN_S)
+        self._latched.close()
+
+    def _run(self) -> None:
+        with suppress(Closed):
+            while True:
+                self._has_changed.wait(PERIOD_S)
+                self._has_changed.clear()
+                # The last state is published, too: "off", or "fault".
+                self._latched.set(encode(self._build()))
+                if self._closed:
+                    return

@@ -1,0 +1,477 @@
+"""The control loop of the program that owns a robot's hardware.
+
+States: "off" before and after ``run``; "ready" reads and publishes, and writes nothing; "active" while
+commands are valid; "holding" after they have expired; "stopped" until all stops are released; "fault" after
+too many failures in a row, which ends the loop. Not a safety-rated channel.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from contextlib import ExitStack, suppress
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate._util.bounded import BoundedDict
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe, fork_safe_lock
+from zstate._util.refusals import Refusals
+from zstate.clock import MonotonicClock
+from zstate.driving.commands import Command, CommandReceiver, Targets
+from zstate.driving.driver import Driver, Setpoint, StopMode
+from zstate.driving.driver_state import DriverReport, DriverStatePublisher, Durations
+from zstate.driving.limits import Limits
+from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
+from zstate.driving.stops import ActiveStop, StopLatch
+from zstate.errors import (
+    Closed,
+    DriverFault,
+    InvalidInput,
+    MessageError,
+    SecondWriter,
+    format_duration,
+)
+from zstate.model.robot import RobotModel
+from zstate.net.latched import cached_values
+from zstate.net.ownership import wait_for_discovery
+from zstate.net.presence import WriterWatch, local_writer
+from zstate.net.queryable import check_timeout
+from zstate.net.session import Session
+from zstate.nodes.partial_publisher import PartialStatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.rate import Rate, check_rate
+from zstate.sources import JointReading
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.keys import check_robot, driver_key
+from zstate.wire.messages import DriverState
+from zstate.wire.native import decode
+
+_LOG = logging.getLogger("zstate")
+
+_CACHES_WITHIN_S = 0.5
+
+StateName = Literal["off", "ready", "active", "holding", "stopped", "fault"]
+
+
+class _State(NamedTuple):
+    name: StateName
+    reason: str = ""
+
+
+class DriverHost(Closeable):
+    """Owns ``driver``, publishes its joints as the state of ``robot``, and writes what a ``Commander`` sends.
+
+    ``rate_hz`` is that of the loop. A command is valid for its own ttl or for ``ttl_s`` [s], which is also
+    the longest that is granted, counted from its arrival on the monotonic clock. When the last one has
+    expired, ``on_silence`` "hold" brakes the joints and keeps writing that position, "relax" switches their
+    torque off. ``limits`` are those of the model by default: positions outside them are refused, and faster
+    motion is slowed. The first setpoint after any change of state is at the measured joints, or at the last
+    setpoint where one was written, so that no step is longer than a tick's motion at the velocity limits.
+
+    A call of the driver that raises is counted, and the loop continues. After ``faults_allowed`` ticks in a
+    row with such a failure the driver is stopped as after silence, and ``run`` raises DriverFault. That stop,
+    like those of ``zstate.driving.stop``, is latched: a restarted host stays stopped until a commander
+    releases it, see ``zstate.driving.stops``.
+
+    A robot has one host. Raises InvalidInput for unusable arguments, SecondWriter if another program hosts a
+    driver of the robot or publishes these joints, and what ``driver.open`` raises. A context manager. Not a
+    safety-rated channel: a stop waits for the calls of the driver, and is lost with the network.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        driver: Driver,
+        model: RobotModel,
+        robot: str | None = None,
+        *,
+        rate_hz: float = 100.0,
+        ttl_s: float = 0.25,
+        limits: Limits | None = None,
+        on_silence: StopMode = "hold",
+        faults_allowed: int = 3,
+        program: str = "",
+    ) -> None:
+        self.robot = check_robot(robot or model.name)
+        self._driver = driver
+        self._rate_hz = check_rate(rate_hz)
+        self._ttl_ns = round(check_timeout(ttl_s) * 1e9)
+        names = model.part(driver.joint_names).joint_names
+        limits = limits or Limits.of(model, names)
+        _check_arguments(driver, limits, names, on_silence, faults_allowed)
+        self._names = names
+        self._limits = limits
+        self._limiter = SetpointLimiter(limits)
+        self._on_silence: StopMode = on_silence
+        self._faults_allowed = faults_allowed
+        self._writer = local_writer(secrets.randbits(32), program)
+        self._refusals = Refusals(f"command for {self.robot!r}")
+        self._targets = Targets(len(names))
+        self._programs: BoundedDict[int, str] = BoundedDict()
+        """Announced commanders by session."""
+        self._state = _State("off", "the loop does not run yet")
+        self._measured: NDArray[np.float64] | None = None
+        self._measured_at = 0
+        self._setpoint: Limited | None = None
+        """The last one that was written since the joints were enabled; None otherwise."""
+        self._is_enabled = False
+        self._obeyed: tuple[ActiveStop, ...] = ()
+        self._barred: set[int] = set()
+        """Sessions that have commanded a stopped robot: a release by another does not move it for them."""
+        self._written = self._faults = self._faults_in_row = 0
+        self._lateness, self._reading, self._writing = Durations(), Durations(), Durations()
+        self._rate: Rate | None = None
+        self._stop = fork_safe(threading.Event())
+        self._running = fork_safe_lock()
+        self._runner: threading.Thread | None = None
+        with ExitStack() as opening:
+            _check_only_host(session, self.robot)
+            self._publisher, self._order = self._open_publisher(session, model, opening)
+            self._stops = opening.enter_context(StopLatch(session, self.robot, self._refusals))
+            self._commands = opening.enter_context(
+                CommandReceiver(session, self.robot, names, self._ttl_ns, self._refusals)
+            )
+            opening.enter_context(WriterWatch(session, self.robot, self._on_writer))
+            opening.callback(driver.close)
+            driver.open()
+            self._states = opening.enter_context(
+                DriverStatePublisher(session, self.robot, self._driver_state)
+            )
+            self._opened = opening.pop_all()
+
+    def __repr__(self) -> str:
+        return f"<DriverHost of {self.robot!r}: {self._state.name}, {self._written} setpoints>"
+
+    def _open_publisher(
+        self, session: Session, model: RobotModel, opening: ExitStack
+    ) -> tuple[StatePublisher | PartialStatePublisher, NDArray[np.intp]]:
+        """The publisher of the driver's joints, and their columns in its order."""
+        program = self._writer.program
+        if set(self._names) == set(model.joint_names):
+            order = [self._names.index(name) for name in model.joint_names]
+            publisher = StatePublisher(session, model, self.robot, program=program)
+        else:
+            order = list(range(len(self._names)))
+            publisher = PartialStatePublisher(session, model, self._names, self.robot, program=program)
+        return opening.enter_context(publisher), np.array(order, dtype=np.intp)
+
+    @property
+    def state(self) -> StateName:
+        """The present state."""
+        return self._state.name
+
+    def report(self) -> DriverReport:
+        """The figures until now."""
+        return DriverReport(
+            None if self._rate is None else self._rate.report(),
+            self._lateness.spread(),
+            self._reading.spread(),
+            self._writing.spread(),
+            self._written,
+            self._faults,
+            dict(self._refusals.counts),
+        )
+
+    def run(self, *, seconds: float | None = None) -> DriverReport:
+        """Run the loop for ``seconds``, or until ``close()``. Ticks that are missed are not made up for.
+
+        If it ends while the joints are commanded or held, the driver is stopped as after silence. Raises
+        DriverFault, SecondWriter and Closed.
+        """
+        with self._running:
+            self._rate = rate = Rate(self._rate_hz, MonotonicClock(), self._stop, seconds, catch_up=False)
+            self._runner = threading.current_thread()
+            self._change("ready", "")
+            try:
+                for _ in rate:
+                    self._lateness.add(rate.lateness_ns)
+                    self._tick()
+            except Closed:
+                if not self._stop.is_set():
+                    raise
+            finally:
+                self._end()
+                self._runner = None
+        return self.report()
+
+    def close(self) -> None:
+        """End the loop, stop the driver, and disconnect it. A second call does nothing.
+
+        From inside the loop, such as in a handler of a signal, only the loop ends: close again after ``run``.
+        """
+        self._stop.set()
+        if self._runner is threading.current_thread():
+            return
+        with self._running:
+            self._opened.close()
+
+    # One tick, in the thread of run()
+
+    def _tick(self) -> None:
+        fault = self._read()
+        self._obey_stops()
+        now = time.monotonic_ns()
+        for command in self._commands.drain():
+            self._accept(command, now)
+        if self._state.name != "stopped":
+            fault = self._advance(now, is_fresh=fault is None) or fault
+        self._count_fault(fault)
+
+    def _read(self) -> Exception | None:
+        """Read the joints and publish them. Returns what failed; the last state stays then."""
+        stamp, start = time.time_ns(), time.monotonic_ns()
+        try:
+            reading = self._driver.read(stamp)
+        except Exception as error:
+            return error
+        finally:
+            self._reading.add(time.monotonic_ns() - start)
+        if reading is None:
+            return None
+        try:
+            self._publish(reading, stamp)
+            self._measured = self._limits.vector(reading.positions, "measured positions")
+            self._measured_at = time.monotonic_ns()
+        except InvalidInput as error:
+            return error
+        return None
+
+    def _publish(self, reading: JointReading, stamp: int) -> None:
+        order = self._order
+        self._publisher.publish(
+            np.asarray(reading.positions)[order],
+            None if reading.velocities is None else np.asarray(reading.velocities)[order],
+            None if reading.efforts is None else np.asarray(reading.efforts)[order],
+            stamp if reading.stamp is None else reading.stamp,
+        )
+
+    def _obey_stops(self) -> None:
+        """Stop if there is a new stop; become ready when the last one is released."""
+        latched = self._stops.latched
+        if latched is self._obeyed:
+            return
+        before, self._obeyed = set(self._obeyed), latched
+        if set(latched) - before:
+            hows = {one.how for one in latched}
+            self._stop_driver("relax" if "relax" in hows else "hold")
+            self._barred.add(self._targets.session)
+            self._targets.clear()
+        if latched:
+            self._change("stopped", "; ".join(map(str, latched)))
+        elif self._state.name == "stopped":
+            self._barred.discard(self._stops.releaser)
+            self._change("ready", f"released by {self._name_of(self._stops.releaser)}")
+
+    def _accept(self, command: Command, now: int) -> None:
+        """Take the targets of ``command``, or count the reason against it."""
+        try:
+            self._check_released(command)
+            self._targets.check_sender(command, now)
+            self._check_limits(command)
+        except MessageError as error:
+            self._refusals.count(error.reason, error)
+        else:
+            self._targets.accept(command)
+
+    def _check_released(self, command: Command) -> None:
+        """Raise MessageError while stopped, and for a commander that has not released the stop itself."""
+        if self._state.name == "stopped":
+            self._barred.add(command.session)
+            raise MessageError(self._state.reason, reason="stopped")
+        if command.session in self._barred:
+            text = (
+                "it came from a commander that did not release the last stop; release with it, or reopen it"
+            )
+            raise MessageError(text, reason="not released")
+
+    def _check_limits(self, command: Command) -> None:
+        """Raise MessageError unless the limiter accepts the positions of ``command``."""
+        inside = np.clip(np.zeros(len(self._names)), self._limits.lower, self._limits.upper)
+        if self._setpoint is None and self._measured is not None:
+            self._limiter.start(self._measured)
+        try:
+            self._limiter.check(self._targets.merged(command, inside))
+        except InvalidInput as error:
+            raise MessageError(str(error), reason="outside limits") from None
+
+    def _advance(self, now: int, *, is_fresh: bool) -> Exception | None:
+        """Enable the joints, or write the next setpoint. Returns what failed."""
+        is_live = self._targets.is_live(now)
+        if self._setpoint is None:
+            if not is_live and self._is_enabled:
+                self._stop_driver(self._on_silence)
+            is_known = self._measured is not None and now - self._measured_at < self._ttl_ns
+            if not is_live or not is_fresh or not is_known:
+                return None
+            return self._start(now) if self._is_enabled else self._enable()
+        if not is_live and self._state.name == "active":
+            reason = f"nothing from {self._name_of(self._targets.session)} for {self._silence(now)}"
+            if self._on_silence == "relax":
+                self._stop_driver("relax")
+                self._change("ready", reason)
+                return None
+            self._change("holding", reason)
+        elif is_live and self._state.name == "holding":
+            self._targets.start(now, self._resting())
+            self._change("active", "")
+        return self._move(now)
+
+    def _enable(self) -> Exception | None:
+        """Switch on power and brakes.
+
+        Joints may sag by that, so the first setpoint waits for the next reading.
+        """
+        try:
+            self._driver.enable(True)
+        except Exception as error:
+            return error
+        self._is_enabled = True
+        self._measured = None
+        return None
+
+    def _start(self, now: int) -> Exception | None:
+        assert self._measured is not None
+        self._limiter.start(self._measured)
+        self._targets.start(now, self._measured)
+        self._change("active", "")
+        return self._move(now)
+
+    def _move(self, now: int) -> Exception | None:
+        """Write the next setpoint on the way to the targets, or to rest."""
+        dt_s = 1.0 / self._rate_hz  # also after a tick that was missed: slower, never further
+        if self._state.name == "holding":
+            limited = self._limiter.brake(dt_s)
+        else:
+            limited = self._limiter.step(self._targets.current(now, self._resting()), dt_s)
+        self._setpoint = limited
+        start = time.monotonic_ns()
+        try:
+            self._driver.write(Setpoint(time.time_ns(), limited.positions, limited.velocities))
+        except Exception as error:
+            return error
+        finally:
+            self._writing.add(time.monotonic_ns() - start)
+        self._written += 1
+        return None
+
+    def _resting(self) -> NDArray[np.float64]:
+        """Where the joints come to rest if they brake from the last setpoint."""
+        if self._setpoint is None:
+            assert self._measured is not None
+            return self._measured
+        positions, velocities, _ = self._setpoint
+        return positions + velocities * np.abs(velocities) / (2.0 * self._limits.acceleration)
+
+    def _count_fault(self, fault: Exception | None) -> None:
+        if fault is None:
+            self._faults_in_row = 0
+            return
+        self._faults += 1
+        self._faults_in_row += 1
+        if self._faults == 1:
+            _LOG.warning("the driver of %r failed: %r; further failures are counted", self.robot, fault)
+        if self._faults_in_row < self._faults_allowed:
+            return
+        reason = f"the driver failed in {self._faults_in_row} ticks in a row; the last one: {fault!r}"
+        self._stop_driver(self._on_silence)
+        self._stops.latch(reason, self._writer)
+        self._change("fault", reason)
+        raise DriverFault(
+            f"{self.robot!r} is stopped: {reason}; mend it, restart, then release the stop with a Commander",
+            robot=self.robot,
+        ) from fault
+
+    def _stop_driver(self, how: StopMode) -> None:
+        """Stop the hardware. The next setpoint starts from the measured joints."""
+        self._setpoint = None
+        self._is_enabled = False
+        try:
+            self._driver.stop(how)
+        except Exception as error:
+            self._faults += 1
+            _LOG.error("stop(%r) of the driver of %r failed: %r", how, self.robot, error)
+
+    def _end(self) -> None:
+        if self._setpoint is not None or self._is_enabled:
+            self._stop_driver(self._on_silence)
+        self._targets.clear()
+        if self._state.name != "fault":
+            self._change("off", "the loop has ended")
+
+    # The state for others, in the thread of the state publisher
+
+    def _change(self, name: StateName, reason: str) -> None:
+        self._state = _State(name, reason)
+        self._states.notify()
+
+    def _driver_state(self) -> DriverState:
+        state, targets, setpoint = self._state, self._targets, self._setpoint
+        rate = None if self._rate is None else self._rate.report()
+        obeyed = self._stops.latched if state.name in ("off", "fault") else self._obeyed
+        return DriverState(
+            time.time_ns(),
+            self._writer.session,
+            str(self._writer),
+            state.name,
+            state.reason,
+            self._names,
+            self._ttl_ns,
+            self._name_of(targets.session) if targets.session else "",
+            max(0, time.monotonic_ns() - targets.arrived) if targets.session else None,
+            setpoint.limited if setpoint is not None else (),
+            0.0 if rate is None else rate.rate_hz,
+            0 if rate is None else rate.ticks,
+            0 if rate is None else rate.skipped,
+            self._faults,
+            dict(self._refusals.counts),
+            str(self._refusals.newest),
+            tuple((one.session, one.seq) for one in obeyed),
+        )
+
+    def _silence(self, now: int) -> str:
+        return format_duration(now - self._targets.arrived)
+
+    def _name_of(self, session: int) -> str:
+        return self._programs.get(session) or f"session {session:x}"
+
+    def _on_writer(self, announced: Announcement, alive: bool) -> None:
+        if alive and announced.stream == "joint_commands":
+            self._programs[announced.writer.session] = str(announced.writer)
+
+
+def _check_only_host(session: Session, robot: str) -> None:
+    """Raise SecondWriter if a driver of ``robot`` is hosted already."""
+    wait_for_discovery(session)
+    for value in cached_values(session, driver_key(robot), _CACHES_WITHIN_S):
+        with suppress(MessageError):
+            other = decode(value.payload, value.encoding, DriverState)
+            first = WriterId(other.program, "", 0, 0, other.session)
+            raise SecondWriter(
+                f"{other.program!r} already drives {', '.join(other.joint_names)} of {robot!r}; a robot has "
+                "one driver host: stop the first, or give one driver all joints",
+                robot=robot,
+                stream="driver",
+                first=first,
+            )
+
+
+def _check_arguments(
+    driver: Driver, limits: Limits, names: tuple[str, ...], on_silence: str, faults_allowed: int
+) -> None:
+    """Raise InvalidInput with all problems."""
+    problems: list[str] = []
+    if "position" not in driver.modes:
+        problems.append(f"the driver takes setpoints of {', '.join(sorted(driver.modes))}, not of positions")
+    if limits.joint_names != names:
+        problems.append(f"the limits are of {limits.joint_names}, the driver's joints are {names}")
+    if on_silence not in ("hold", "relax"):
+        problems.append(f"on_silence is 'hold' or 'relax', not {on_silence!r}")
+    if faults_allowed < 1:
+        problems.append(f"faults_allowed is at least 1, not {faults_allowed}")
+    if problems:
+        raise InvalidInput("; ".join(problems))

@@ -1,0 +1,274 @@
+"""Stops of a driver: sent by any program that may, obeyed until they are released, also after a restart.
+
+A stop travels by a key of its own, reliably and before all samples. It is no safety-rated channel: an
+emergency stop is wired to the power of the hardware.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import secrets
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
+from zstate._util.refusals import Refusals
+from zstate.driving.driver import StopMode
+from zstate.errors import ConfigError, InvalidInput, MessageError, Unreachable, printable
+from zstate.net.latched import LatchedPublisher, LatchedSubscriber, cached_values
+from zstate.net.ownership import wait_for_discovery
+from zstate.net.presence import local_writer
+from zstate.net.queryable import check_timeout
+from zstate.net.session import Session
+from zstate.net.streams import StreamSubscriber, call_for_each
+from zstate.wire.identity import WriterId
+from zstate.wire.keys import (
+    check_robot,
+    driver_key,
+    parse_stop_key,
+    release_expression,
+    stop_expression,
+    stop_key,
+)
+from zstate.wire.messages import DriverState, Release, Stop
+from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.protocol import SerializedSample
+
+_LOG = logging.getLogger("zstate")
+
+_CACHES_WITHIN_S = 0.5
+_MOST_STOPS = 256
+
+_STOPPERS: weakref.WeakKeyDictionary[Session, dict[str, _Stopper]] = weakref.WeakKeyDictionary()
+_STOPPERS_LOCK = fork_safe_lock()
+
+
+def stop(
+    session: Session, robot: str, reason: str = "", *, how: StopMode = "hold", timeout_s: float = 1.0
+) -> DriverState:
+    """Stop the driver of ``robot``, and return its state once it has stopped.
+
+    The driver stays stopped, also if it or this program restarts, until ``Commander.release``. "hold" leaves
+    the joints where they are, "relax" without torque. ``reason`` is shown to users. No claim is needed. Not a
+    safety-rated channel.
+
+    Raises Unreachable if no driver has confirmed the stop within ``timeout_s`` [s]. The stop stays latched in
+    ``session`` then: a driver that can be reached later obeys it.
+    """
+    check_timeout(timeout_s)
+    with _STOPPERS_LOCK:
+        stoppers = _STOPPERS.setdefault(session, {})
+        stopper = stoppers.get(robot)
+        if stopper is None:
+            stopper = stoppers[robot] = _Stopper(session, check_robot(robot))
+    return stopper.stop(how, reason, timeout_s)
+
+
+class _Stopper:
+    """The stops of one robot that one session has sent; latched while the session is open."""
+
+    def __init__(self, session: Session, robot: str) -> None:
+        self._robot = robot
+        # Not the session itself: the stoppers of a session must not keep it alive.
+        self._session = weakref.ref(session)
+        self._writer = local_writer(secrets.randbits(32))
+        self._seq = 0
+        self._lock = fork_safe_lock()
+        key = stop_key(robot, self._writer.identity)
+        self._latched = LatchedPublisher(session, key, ENCODINGS[Stop], urgent=True)
+
+    def stop(self, how: StopMode, reason: str, timeout_s: float) -> DriverState:
+        with self._lock:
+            number, self._seq = self._seq, self._seq + 1
+            message = Stop(time.time_ns(), number, self._writer.session, how, reason)
+            self._latched.set(encode(message))  # before anything that takes time
+        session = self._session()
+        assert session is not None, "the caller has it"
+        confirmed = wait_for_state(
+            session, self._robot, lambda state: (self._writer.session, number) in state.stops, timeout_s
+        )
+        if confirmed is None:
+            raise Unreachable(
+                f"no driver of {self._robot!r} has confirmed the stop within {timeout_s:g} s. Is it running, "
+                "and may this program stop it (`zstate acl`)? The stop stays latched while this session is "
+                "open",
+                endpoints=(),
+            )
+        return confirmed
+
+
+def wait_for_state(
+    session: Session, robot: str, condition: Callable[[DriverState], bool], timeout_s: float
+) -> DriverState | None:
+    """The first state of the driver of ``robot`` with ``condition``, else None after ``timeout_s``."""
+    found: list[DriverState] = []
+    has_found = threading.Event()
+
+    def on_value(sample: SerializedSample) -> None:
+        with suppress(MessageError):
+            state = decode(sample.payload, sample.encoding, DriverState)
+            if not found and condition(state):
+                found.append(state)
+                has_found.set()
+
+    with LatchedSubscriber(session, driver_key(robot), on_value):
+        has_found.wait(timeout_s)
+    return found[0] if found else None
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveStop:
+    """A stop that is not released: of ``who``, with the ``seq`` of that program's ``session``."""
+
+    session: int
+    seq: int
+    how: StopMode
+    reason: str
+    who: str
+
+    def __str__(self) -> str:
+        return f"stopped by {self.who}" + (f": {self.reason}" if self.reason else "")
+
+
+def stops_file(robot: str) -> Path:
+    """The file with the stops of ``robot``: below $XDG_STATE_HOME, or ~/.local/state."""
+    folder = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(folder).expanduser() / "zstate" / "stops" / f"{robot}.json"
+
+
+class StopLatch(Closeable):
+    """The stops of the driver of ``robot`` that are not released.
+
+    They are kept in ``stops_file``, which a restarted host reads, and are read from the caches of programs
+    that have sent them. A file that cannot be read counts as a stop; one that cannot be written raises
+    ConfigError here, and is logged later. ``refusals`` counts invalid messages.
+    """
+
+    def __init__(self, session: Session, robot: str, refusals: Refusals) -> None:
+        self._robot = robot
+        self._path = stops_file(robot)
+        self._refusals = refusals
+        self._lock = fork_safe_lock()
+        self._by_session: dict[int, ActiveStop] = {}
+        self._released: dict[int, int] = {}
+        """The last released stop of each session, which its program may still cache."""
+        self.latched: tuple[ActiveStop, ...] = ()
+        """A new tuple after each change; may be read from any thread."""
+        self.releaser = 0
+        """The session of the commander that released the last stop."""
+        self._read_file()
+        self._write_file(is_opening=True)
+        with ExitStack() as opening:
+            wait_for_discovery(session)
+            call_for_each(cached_values(session, stop_expression(robot), _CACHES_WITHIN_S), self._on_stop)
+            opening.enter_context(LatchedSubscriber(session, stop_expression(robot), self._on_stop))
+            releases = StreamSubscriber(session, release_expression(robot), self._on_releases)
+            opening.enter_context(releases)
+            self._opened = opening.pop_all()
+
+    def latch(self, reason: str, writer: WriterId) -> None:
+        """Latch a stop of this host itself."""
+        with self._lock:
+            self._by_session[writer.session] = ActiveStop(writer.session, 0, "hold", reason, str(writer))
+            self._publish()
+
+    def close(self) -> None:
+        """Follow no further stops. Those that are latched stay in the file."""
+        self._opened.close()
+
+    def _on_stop(self, sample: SerializedSample) -> None:
+        if not sample.payload:
+            return  # the program has ended; its stop has not
+        try:
+            _, identity = parse_stop_key(sample.key)
+            writer = WriterId.parse(identity)
+            message = decode(sample.payload, sample.encoding, Stop)
+        except (MessageError, InvalidInput) as error:
+            self._refusals.count(getattr(error, "reason", "foreign"), error)
+            return
+        if message.session != writer.session:
+            self._refusals.count("foreign", f"the Stop of another program on {sample.key!r}")
+            return
+        one = ActiveStop(message.session, message.seq, message.how, printable(message.reason), str(writer))
+        with self._lock:
+            known = self._by_session.get(one.session)
+            is_old = known is not None and known.seq >= one.seq
+            if is_old or self._released.get(one.session, -1) >= one.seq:
+                return
+            self._by_session.pop(one.session, None)
+            self._by_session[one.session] = one
+            if len(self._by_session) > _MOST_STOPS:  # the others still stop the driver
+                del self._by_session[next(iter(self._by_session))]
+            self._publish()
+
+    def _on_releases(self, samples: list[SerializedSample]) -> None:
+        for sample in samples:
+            try:
+                release = decode(sample.payload, sample.encoding, Release)
+            except MessageError as error:
+                self._refusals.count(error.reason, error)
+                continue
+            with self._lock:
+                self._release(release)
+
+    def _release(self, release: Release) -> None:
+        ended = [
+            session
+            for session, seq in release.stops
+            if session in self._by_session and self._by_session[session].seq <= seq
+        ]
+        for session in ended:
+            # Newest last, so that the oldest is forgotten first.
+            self._released.pop(session, None)
+            self._released[session] = self._by_session.pop(session).seq
+        while len(self._released) > _MOST_STOPS:
+            del self._released[next(iter(self._released))]
+        if ended:
+            self.releaser = release.session
+            self._publish()
+
+    def _publish(self) -> None:
+        self.latched = tuple(self._by_session.values())
+        self._write_file()
+
+    def _read_file(self) -> None:
+        try:
+            document = json.loads(self._path.read_text())
+            stops = [ActiveStop(**fields) for fields in document["stops"]]
+            self._released = dict(map(tuple, document["released"]))
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            stops = [ActiveStop(0, 0, "hold", f"{self._path} cannot be read: {error}", "this host")]
+        self._by_session = {one.session: one for one in stops}
+        self.latched = tuple(stops)
+
+    def _write_file(self, *, is_opening: bool = False) -> None:
+        document = {
+            "stops": [asdict(one) for one in self.latched],
+            "released": [list(pair) for pair in self._released.items()],
+        }
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            draft = self._path.with_suffix(f".{os.getpid()}")
+            with draft.open("w") as file:
+                json.dump(document, file)
+                file.flush()
+                os.fsync(file.fileno())
+            draft.replace(self._path)
+        except OSError as error:
+            text = (
+                f"stops of {self._robot!r} cannot be kept in {self._path}: {error}; a restarted host would "
+                "not obey them: set XDG_STATE_HOME to a folder that can be written"
+            )
+            if is_opening:
+                raise ConfigError(text, path=str(self._path)) from None
+            _LOG.error("%s", text)
