@@ -197,6 +197,18 @@ def test_values_of_many_publishers_are_requested_a_few_at_a_time(free_port: int)
         assert len(tokens) == robots
 
 
+def test_value_that_does_not_arrive_is_logged(caplog: pytest.LogCaptureFixture):
+    with connect() as writer, connect() as reader:
+        token = f"{key('a')}/@adv/pub/{writer.zid}/7/_"
+        requests: zenoh.Queryable = writer.zenoh.declare_queryable(token, zenoh.handlers.FifoChannel(8))
+        announced = writer.zenoh.liveliness().declare_token(token)
+        values = Values(reader)
+        until(lambda: key("a") in caplog.text)
+        assert not values.received
+        assert "3 requests" in caplog.text
+        del requests, announced
+
+
 def test_large_values_reach_advanced_subscribers_of_zenoh_once_as_those_of_ros_nodes():
     received: list[tuple[int, bytes]] = []
     history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)

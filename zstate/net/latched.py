@@ -8,6 +8,7 @@ queried here, a few at a time.
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 from collections import deque
@@ -31,6 +32,8 @@ from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 4096
 HEARTBEAT_S = 0.5
+
+_LOG = logging.getLogger("zstate")
 
 _TOKENS = 16_384
 """Waiting announcements of publishers; more arrive together only if so many publishers exist."""
@@ -236,7 +239,7 @@ class _CachedValues(Receiver[zenoh.Sample]):
     """Requests the cached value of each publisher on ``keyexprs`` once it is announced, now or later.
 
     At most eight requests are in flight. Keys take turns, so that many silent publishers of one key do not
-    delay the others. A request that times out is repeated twice.
+    delay the others. A request that times out is repeated twice; the third timeout is logged as a warning.
     """
 
     def __init__(
@@ -270,6 +273,8 @@ class _CachedValues(Receiver[zenoh.Sample]):
                         yield reply.ok
                     elif request.attempts < _MAX_ATTEMPTS:  # Zenoh's own reply at the timeout
                         self._add(waiting, request)
+                    else:
+                        _log_silent_publisher(request.token)
                 tokens = list(iter(self._subscribed.handler.try_recv, None))
 
     @staticmethod
@@ -285,3 +290,13 @@ class _CachedValues(Receiver[zenoh.Sample]):
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
         )
+
+
+def _log_silent_publisher(token: str) -> None:
+    key = token.partition("/@adv/")[0]
+    facts = {"event": "no latched value", "key": key}
+    text = (
+        "the publisher of %r is announced, but its current value did not arrive in %d requests of %g s each; "
+        "it is received when it changes. Its process is suspended, or the link is too slow for its size"
+    )
+    _LOG.warning(text, key, _MAX_ATTEMPTS, _ANSWER_WITHIN_S, extra=facts)
