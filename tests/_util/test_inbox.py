@@ -54,6 +54,16 @@ def test_cancelled_wait_leaves_nothing_behind():
     assert not inbox._waiting_tasks
 
 
+def test_items_beyond_the_limit_of_bytes_are_lost_and_counted():
+    inbox: Inbox[bytes] = Inbox(9, lambda: None, max_bytes=10, size_of=len)
+    assert inbox.add([b"1234", b"5678"]) == 0
+    assert inbox.add([b"9"]) == 0
+    assert inbox.add([b"abc", b"d"]) == 1  # 4 + 4 + 1 + 3 bytes are 2 too many
+    assert inbox.add([b"more than 10 bytes"]) == 5
+    assert inbox.add([b"e"]) == 0
+    assert inbox.take_newest() == b"e"
+
+
 def test_items_lost_for_newer_ones_are_counted():
     inbox: Inbox[int] = Inbox(3, lambda: None)
     assert inbox.add([1, 2]) == 0

@@ -45,8 +45,9 @@ class Values:
         self.received.append((arrival.key, arrival.payload, arrival.encoding))
 
 
-def test_late_joiner_receives_the_current_value_once():
-    with connect() as writer, LatchedPublisher(writer, key("a"), ENCODING) as value:
+@pytest.mark.parametrize("is_large", [False, True])
+def test_late_joiner_receives_the_current_value_once(is_large: bool):
+    with connect() as writer, LatchedPublisher(writer, key("a"), ENCODING, is_large=is_large) as value:
         value.set(b"old")
         value.set(b"new")
         with connect() as reader:
@@ -55,10 +56,11 @@ def test_late_joiner_receives_the_current_value_once():
             assert values.received == [(key("a"), b"new", ENCODING)]
 
 
-def test_change_reaches_all_subscribers():
+@pytest.mark.parametrize("is_large", [False, True])
+def test_change_reaches_all_subscribers(is_large: bool):
     with connect() as writer, connect() as reader, connect() as other:
         early = Values(reader)
-        with LatchedPublisher(writer, key("a"), ENCODING) as value:
+        with LatchedPublisher(writer, key("a"), ENCODING, is_large=is_large) as value:
             value.set(b"1")
             until(lambda: early.values == {key("a"): b"1"})
             late = Values(other)
@@ -104,12 +106,13 @@ def test_late_joiner_receives_the_value_of_every_matching_writer():
         until(lambda: sorted(values.values.values()) == [b"%d" % number for number in range(10)])
 
 
-def test_withdrawn_value_is_removed_and_not_sent_to_late_joiners():
+@pytest.mark.parametrize("is_large", [False, True])
+def test_withdrawn_value_is_removed_and_not_sent_to_late_joiners(is_large: bool):
     with (
         connect() as writer,
         connect() as reader,
         connect() as other,
-        LatchedPublisher(writer, key("a"), ENCODING) as value,
+        LatchedPublisher(writer, key("a"), ENCODING, is_large=is_large) as value,
         LatchedPublisher(writer, key("b"), ENCODING) as witness,
     ):
         early = Values(reader)
@@ -194,9 +197,54 @@ def test_values_of_many_publishers_are_requested_a_few_at_a_time(free_port: int)
         assert len(tokens) == robots
 
 
-def test_set_after_close_raises_closed():
+def test_value_that_does_not_arrive_is_logged(caplog: pytest.LogCaptureFixture):
+    with connect() as writer, connect() as reader:
+        token = f"{key('a')}/@adv/pub/{writer.zid}/7/_"
+        requests: zenoh.Queryable = writer.zenoh.declare_queryable(token, zenoh.handlers.FifoChannel(8))
+        announced = writer.zenoh.liveliness().declare_token(token)
+        values = Values(reader)
+        until(lambda: key("a") in caplog.text)
+        assert not values.received
+        assert "3 requests" in caplog.text
+        del requests, announced
+
+
+def test_large_values_reach_advanced_subscribers_of_zenoh_once_as_those_of_ros_nodes():
+    received: list[tuple[int, bytes]] = []
+    history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+    recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+    with connect() as writer, connect() as reader:
+
+        def subscriber(number: int) -> object:
+            handler = zenoh.handlers.Callback(
+                lambda sample: received.append((number, sample.payload.to_bytes())), indirect=False
+            )
+            return zenoh.ext.declare_advanced_subscriber(
+                reader.zenoh, key("*"), handler, history=history, recovery=recovery
+            )
+
+        subscribers = [subscriber(1)]
+        with (
+            LatchedPublisher(writer, key("a"), ENCODING, is_large=True) as first,
+            LatchedPublisher(writer, key("b"), ENCODING, is_large=True) as second,
+        ):
+            first.set(b"a1")
+            second.set(b"b")
+            first.set(b"a2")
+            until(lambda: len(received) == 3)
+            subscribers.append(subscriber(2))
+            until(lambda: len(received) == 5)
+            first.set(b"a3")
+            until(lambda: len(received) == 7)
+        assert [payload for number, payload in received if number == 1] == [b"a1", b"b", b"a2", b"a3"]
+        assert sorted(payload for number, payload in received if number == 2) == [b"a2", b"a3", b"b"]
+        del subscribers
+
+
+@pytest.mark.parametrize("is_large", [False, True])
+def test_set_after_close_raises_closed(is_large: bool):
     with connect() as session:
-        value = LatchedPublisher(session, key("a"), ENCODING)
+        value = LatchedPublisher(session, key("a"), ENCODING, is_large=is_large)
         value.close()
         value.close()
         for use in (lambda: value.set(b"1"), value.withdraw):

@@ -426,6 +426,20 @@ def test_a_withdrawn_map_ends_with_a_grid_without_cells_and_keeps_edges_of_its_n
     assert len(case.read("/tf_static")) == 2
 
 
+def test_maps_beyond_128_mib_are_in_one_file_only_and_counted(case: EncoderCase):
+    side = 4096
+    floor = OccupancyGrid(1, NOW, "map", 0.5, side, side, to_block([0, 0, 0, 0, 0, 0, 1]), bytes(side * side))
+    for number in range(8):  # of 16 MiB and a header each
+        case.encoder.write_message("hall", floor, NOW, f"floor_{number}")
+    assert case.refused == {"map not repeated": 1}
+    case.encoder.withdraw("hall", "map", "floor_0", NOW)
+    case.encoder.write_message("hall", floor, NOW, "floor_8")
+    assert case.refused == {"map not repeated": 1}
+    assert case.encoder.messages["hall", "map"] == 8 + 1 + 1
+    assert {topic for topic, *_ in repeated(case)} == {f"/hall/floor_{n}" for n in (1, 2, 3, 4, 5, 6, 8)}
+    assert [len(message.data) for message in case.read("/hall/floor_7")] == [side * side]
+
+
 def test_a_scan_without_a_stamp_is_refused(case: EncoderCase):
     case.encoder.write_message(
         "cart", LaserScan(0, 0, 1, "laser", 0.0, 0.1, 0, 0, 0.0, 1.0, b""), NOW, "front"

@@ -13,9 +13,12 @@ from helpers.processes import until
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
+from zstate.net.subscription import Received, subscribe
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.scans import PlacedScan, Scan, ScanListener, ScanPublisher
 from zstate.transform import Transform
+from zstate.wire.messages import SCAN_RAYS
+from zstate.wire.registry import get_wire
 
 MS = 1_000_000
 GEOMETRY = {"angle_min": 0.0, "angle_increment": math.pi / 2, "range_min": 0.1, "range_max": 10.0}
@@ -117,6 +120,27 @@ def test_scans_lost_for_newer_ones_are_counted(sessions, stamp: int):
     with ScanListener(reader, "r1", "odom", buffer=buffer_until(3 * MS), timeout_s=60.0) as scans:
         with ScanPublisher(writer, "r1", "laser", **GEOMETRY) as publisher:
             until(lambda: [publisher.publish([1.0], stamp) for _ in range(50)] and scans.dropped)
+        assert set(scans.dropped) == {"Overflow"}
+
+
+@pytest.mark.parametrize(
+    ("stamp", "limit"), [(2 * MS, 64 * 2**20), (5 * MS, 16 * 2**20)], ids=["unread", "waiting"]
+)
+def test_fewer_large_scans_are_kept_for_their_bytes(sessions, stamp: int, limit: int):
+    writer, reader = sessions
+    geometry = {**GEOMETRY, "angle_increment": math.tau / SCAN_RAYS}
+    ranges = np.ones(SCAN_RAYS, dtype=np.float32)
+    # As they wait, each ray has a range; unread ones have a point and a flag as well.
+    kept = limit // (SCAN_RAYS * (4 if stamp > 3 * MS else 4 + 3 * 4 + 1))
+    arrived: list[Received] = []
+    with (
+        subscribe(reader, get_wire("native"), "r1", "scan", arrived.extend),
+        ScanListener(reader, "r1", "odom", buffer=buffer_until(3 * MS), timeout_s=60.0) as scans,
+        ScanPublisher(writer, "r1", "laser", **geometry) as publisher,
+    ):
+        until(lambda: publisher.publish(ranges, stamp) or scans.dropped)
+        until(lambda: len(arrived) > kept)
+        assert len(arrived) < 200
         assert set(scans.dropped) == {"Overflow"}
 
 

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.processes import until
+from helpers.processes import Child, until
 
+from zstate import connect
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net.subscription import Received, subscribe
@@ -20,6 +21,27 @@ from zstate.wire.registry import get_wire
 
 GEOMETRY = {"angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.1, "range_max": 10.0}
 ROOM = Grid([[0, 100], [-1, 50]], 0.5, (1.0, 2.0, 0.3))
+
+# Deflated it takes 13.5 MB, in CDR 16 MB: sockets and Zenoh's queues hold about 4.
+LARGE_CELLS = np.random.default_rng(1).integers(-1, 101, (4000, 4000), dtype=np.int8)
+
+PUBLISH_LARGE_MAP = """
+    import sys
+    import numpy as np
+    from zstate import connect
+    from zstate.scans import Grid, MapPublisher
+    cells = np.random.default_rng(1).integers(-1, 101, (4000, 4000), dtype=np.int8)
+    with connect(**eval(sys.argv[2])) as session:
+        with MapPublisher(session, "hall", Grid(cells, 0.05, (0, 0, 0)), sys.argv[1]):
+            sys.stdin.readline()
+"""
+ROUTE = """
+    import sys
+    from zstate import connect
+    with connect(mode="router", listen=sys.argv[1]):
+        print("ready")
+        sys.stdin.readline()
+"""
 
 
 class Scans(list[Scan]):
@@ -46,6 +68,11 @@ class Maps(dict[str, Grid]):
         for robot, key, message in received:
             assert isinstance(message, OccupancyGrid)
             self[key] = grid_from_message(message, robot)
+
+    def receive_large_one(self) -> None:
+        until(lambda: self)
+        (grid,) = self.values()
+        assert np.array_equal(grid.cells, LARGE_CELLS)
 
 
 def publish_until_received(publisher: ScanPublisher, scans: Scans, ranges, **options) -> Scan:
@@ -229,6 +256,46 @@ def test_map_of_4096_x_4096_cells_arrives(sessions):
         until(lambda: maps)
         (grid,) = maps.values()
         assert np.array_equal(grid.cells, cells)
+
+
+def receive_late(wire: str, **options: Any) -> None:
+    """Several times: a link that is stalled goes on if another one receives anything."""
+    for _ in range(4):
+        with connect(**options) as session:
+            Maps(session, wire).receive_large_one()
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_large_map_reaches_early_and_late_readers_in_its_process(sessions, wire: str):
+    writer, reader = sessions
+    early = Maps(reader, wire)
+    with MapPublisher(writer, "hall", Grid(LARGE_CELLS, 0.05, (0, 0, 0)), wire):
+        early.receive_large_one()
+        receive_late(wire)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_large_map_reaches_early_and_late_readers_in_another_process(spawn, wire: str):
+    with connect() as reader:
+        early = Maps(reader, wire)
+        spawn(PUBLISH_LARGE_MAP, wire, "{}")
+        early.receive_large_one()
+        receive_late(wire)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_large_map_reaches_early_and_late_readers_through_a_router(spawn, free_port: int, wire: str):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    options = {"mode": "client", "endpoints": endpoint}
+    router: Child = spawn(ROUTE, endpoint)
+    assert router.line() == "ready"
+    with connect(**options) as reader:
+        early = Maps(reader, wire)
+        spawn(PUBLISH_LARGE_MAP, wire, repr(options))
+        early.receive_large_one()
+        receive_late(wire, **options)
 
 
 def test_second_writer_of_a_map_is_refused(sessions):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Generic, TypeVar
 
+from zstate._util.bounded import BoundedQueue
 from zstate._util.fork_safe import fork_safe
 
 T = TypeVar("T")
@@ -19,14 +19,23 @@ _LONGEST_WAIT_S = 0.5
 class Inbox(Generic[T]):
     """The last ``capacity`` items that were added and not taken. Any thread may add.
 
+    With ``size_of``, which returns the bytes of an item, also no more than ``max_bytes``.
+
     Iterations return each item once, in the order of arrival, and end with ``close()``, after the last item.
     ``check_reception()`` is called before a wait and every 0.5 s of it; it raises if nothing can arrive, as
     in a forked process.
     """
 
-    def __init__(self, capacity: int, check_reception: Callable[[], object]) -> None:
-        self._capacity = capacity
-        self._items: deque[T] = deque(maxlen=capacity)
+    def __init__(
+        self,
+        capacity: int,
+        check_reception: Callable[[], object],
+        *,
+        max_bytes: int = 0,
+        size_of: Callable[[T], int] = lambda _: 0,
+    ) -> None:
+        self._items: BoundedQueue[T] = BoundedQueue(capacity, max_bytes)
+        self._size_of = size_of
         self._check_reception = check_reception
         self._changed = fork_safe(threading.Condition())
         self._waiting_tasks: list[Callable[[], object]] = []
@@ -38,14 +47,13 @@ class Inbox(Generic[T]):
     def add(self, items: Iterable[T]) -> int:
         """Add items, oldest first; after ``close()`` none.
 
-        Of more than ``capacity`` the oldest are lost; returns how many.
+        Beyond a limit the oldest are lost; returns how many.
         """
-        added = list(items)
+        added = [(item, self._size_of(item)) for item in items]
         with self._changed:
             if self._closed:
                 return 0
-            lost = max(len(self._items) + len(added) - self._capacity, 0)
-            self._items.extend(added)
+            lost = sum(self._items.append(item, size) for item, size in added)
             self._wake()
         return lost
 

@@ -8,19 +8,23 @@ queried here, a few at a time.
 
 from __future__ import annotations
 
+import logging
+import secrets
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
 from functools import partial
 
 import zenoh
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import Closed, InvalidInput
-from zstate.net.queryable import query
+from zstate.net.queryable import Queryable, Reply, query
 from zstate.net.sample_history import RoundRobinQueue
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, SharedSubscription, call_for_each, subscribe_to_all, to_serialized
@@ -28,6 +32,8 @@ from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 4096
 HEARTBEAT_S = 0.5
+
+_LOG = logging.getLogger("zstate")
 
 _TOKENS = 16_384
 """Waiting announcements of publishers; more arrive together only if so many publishers exist."""
@@ -42,12 +48,18 @@ class LatchedPublisher(Closeable):
     """Publisher of one value on one key for current and later subscribers, while this publisher lives.
 
     Once it closes or dies, late joiners do not receive the value. Subscribers that have it keep it, unless it
-    was withdrawn. An ``urgent`` value overtakes all samples that wait for the network.
+    was withdrawn. An ``urgent`` value overtakes all samples that wait for the network. ``is_large`` is for
+    values above 1 MB; it takes a thread.
     """
 
-    def __init__(self, session: Session, key: str, encoding: str, *, urgent: bool = False) -> None:
+    def __init__(
+        self, session: Session, key: str, encoding: str, *, urgent: bool = False, is_large: bool = False
+    ) -> None:
         self._session = session
         self._key = key
+        if is_large:
+            self._publisher = _LargeValuePublisher(session, key, encoding)
+            return
         misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S)
         self._publisher = zenoh.ext.declare_advanced_publisher(
             session.zenoh,
@@ -89,6 +101,60 @@ def cached_values(session: Session, keyexpr: str, timeout_s: float) -> Iterator[
     for reply in query(session.zenoh, cached, timeout_s, accept_replies=zenoh.ReplyKeyExpr.ANY):
         if reply.ok is not None:
             yield to_serialized(reply.ok)
+
+
+class _LargeValuePublisher:
+    """Zenoh's advanced publisher, with a cache that replies from a thread of its own.
+
+    Zenoh's cache replies inside the task that receives the query. That task waits while the sending queue is
+    full, beyond 1 MB and the buffers of the socket; no thread then polls the sockets (``zstate.net.open``),
+    and after 5 s Zenoh closes the link.
+
+    Replies of Python have no sequence numbers. So samples have timestamps, which advanced subscribers use as
+    well: increasing, and with an identifier of this publisher, as they compare those of one identifier.
+    """
+
+    def __init__(self, session: Session, key: str, encoding: str) -> None:
+        self._session = session
+        self._key = key
+        self._encoding = encoding
+        self._id = secrets.token_bytes(16)
+        self._stamp = datetime.fromtimestamp(0, timezone.utc)
+        self._lock = fork_safe_lock()
+        self._value: Reply | None = None
+        self._publisher = session.zenoh.declare_publisher(
+            key, encoding=encoding or None, congestion_control=zenoh.CongestionControl.BLOCK
+        )
+        # The form of the tokens of advanced publishers with timestamps.
+        token = f"{key}/@adv/pub/{session.zid}/uhlc/{session.next_number()}"
+        self._cache = Queryable(session, token, self._cached)
+        self._token = session.zenoh.liveliness().declare_token(token)
+
+    def _cached(self, _: Mapping[str, str]) -> Reply | None:
+        return self._value
+
+    def put(self, payload: bytes, *, attachment: bytes | None = None) -> None:
+        with self._lock:
+            timestamp = self._next_timestamp(payload, attachment)
+            self._publisher.put(payload, attachment=attachment, timestamp=timestamp)
+
+    def delete(self) -> None:
+        with self._lock:
+            self._publisher.delete(timestamp=self._next_timestamp(b"", None))
+
+    def _next_timestamp(self, payload: bytes, attachment: bytes | None) -> zenoh.Timestamp:
+        """The timestamp of a new value, which is cached before it is sent: late joiners then miss none."""
+        self._stamp = max(datetime.now(timezone.utc), self._stamp + timedelta(microseconds=1))
+        timestamp = zenoh.Timestamp(self._stamp, self._id)
+        self._value = Reply(
+            payload, self._encoding, key=self._key, attachment=attachment, timestamp=timestamp
+        )
+        return timestamp
+
+    def undeclare(self) -> None:
+        self._session.release(self._token)
+        self._cache.close()
+        self._publisher.undeclare()
 
 
 @dataclass(frozen=True)
@@ -186,7 +252,7 @@ class _CachedValues(Receiver[zenoh.Sample]):
     """Requests the cached value of each publisher on ``keyexprs`` once it is announced, now or later.
 
     At most eight requests are in flight. Keys take turns, so that many silent publishers of one key do not
-    delay the others. A request that times out is repeated twice.
+    delay the others. A request that times out is repeated twice; the third timeout is logged as a warning.
     """
 
     def __init__(
@@ -221,6 +287,8 @@ class _CachedValues(Receiver[zenoh.Sample]):
                         yield reply.ok
                     elif request.attempts < _MAX_ATTEMPTS:  # Zenoh's own reply at the timeout
                         self._add(waiting, request)
+                    else:
+                        _log_silent_publisher(request.token)
                 tokens = list(iter(self._subscribed.handler.try_recv, None))
 
     @staticmethod
@@ -236,3 +304,13 @@ class _CachedValues(Receiver[zenoh.Sample]):
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
         )
+
+
+def _log_silent_publisher(token: str) -> None:
+    key = token.partition("/@adv/")[0]
+    facts = {"event": "no latched value", "key": key}
+    text = (
+        "the publisher of %r is announced, but its current value did not arrive in %d requests of %g s each; "
+        "it is received when it changes. Its process is suspended, or the link is too slow for its size"
+    )
+    _LOG.warning(text, key, _MAX_ATTEMPTS, _ANSWER_WITHIN_S, extra=facts)

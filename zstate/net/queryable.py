@@ -112,11 +112,17 @@ def _bounded(replies: Iterable[zenoh.Reply], selector: str) -> Iterator[zenoh.Re
 
 
 class Reply(NamedTuple):
-    """A payload and its Zenoh encoding; an error is sent as Zenoh's own error reply."""
+    """A payload and its Zenoh encoding; an error is sent as Zenoh's own error reply.
+
+    ``key`` is that of the queryable by default. Attachment and timestamp are those of a cached sample.
+    """
 
     payload: bytes
     encoding: str
     is_error: bool = False
+    key: str = ""
+    attachment: bytes | None = None
+    timestamp: zenoh.Timestamp | None = None
 
 
 class _WaitingQueries:
@@ -207,7 +213,13 @@ class Queryable(Receiver[zenoh.Query]):
                 if reply.is_error:
                     received.reply_err(reply.payload, encoding=reply.encoding)
                 else:
-                    received.reply(self._key, reply.payload, encoding=reply.encoding)
+                    received.reply(
+                        reply.key or self._key,
+                        reply.payload,
+                        encoding=reply.encoding,
+                        attachment=reply.attachment,
+                        timestamp=reply.timestamp,
+                    )
                 self.answered += 1
 
 

@@ -65,8 +65,8 @@ class SampleWriter(StreamPublisher):
 class LatchedWriter(LatchedPublisher):
     """Publishes one latched value of one writer; for encoding and sending see ``SampleWriter``."""
 
-    def __init__(self, session: Session, encoder: StreamEncoder) -> None:
-        super().__init__(session, encoder.key, encoder.encoding)
+    def __init__(self, session: Session, encoder: StreamEncoder, *, is_large: bool = False) -> None:
+        super().__init__(session, encoder.key, encoder.encoding, is_large=is_large)
         self.encoder = encoder
 
     def write(self, payload: bytes) -> None:
@@ -123,7 +123,8 @@ class WireWriter(Closeable):
 
     def open_latched(self, stream: Stream, name: str = "") -> LatchedWriter:
         """Open and announce ``stream`` for a latched value; static edges under ``name``."""
-        return self._announced(LatchedWriter(self._session, self._encoder(stream, name)))
+        encoder = self._encoder(stream, name)
+        return self._announced(LatchedWriter(self._session, encoder, is_large=stream == "map"))
 
     def _encoder(self, stream: Stream, name: str = "") -> StreamEncoder:
         return self._wire.stream_encoder(self._node, stream, self._session.next_number(), name)

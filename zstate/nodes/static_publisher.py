@@ -7,20 +7,17 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from urllib.parse import quote
 
-from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import check_names
-from zstate.errors import Closed, InvalidInput, SecondWriter
-from zstate.net.ownership import WriterClaim, check_readers, claim_edges
+from zstate.errors import InvalidInput, SecondWriter
+from zstate.net.ownership import check_readers, claim_edges
 from zstate.net.presence import local_writer
 from zstate.net.session import Session
-from zstate.net.writer import WireWriter, write_all
+from zstate.nodes.value_publisher import ValuePublisher
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
 from zstate.wire.messages import StaticTransforms, to_block
-from zstate.wire.registry import as_wire_names, get_wire
 
 
 def edge_writer_name(writer: str | None, identity: WriterId) -> str:
@@ -33,7 +30,7 @@ def edge_writer_name(writer: str | None, identity: WriterId) -> str:
     return writer
 
 
-class StaticPublisher(Closeable):
+class StaticPublisher(ValuePublisher):
     """Publishes static edges under one writer's name; a robot may have several such writers.
 
     Bare frame names are the robot's own; other frames have full names, ``robot/frame``. All edges of a
@@ -48,6 +45,8 @@ class StaticPublisher(Closeable):
     ``takeover``.
     """
 
+    _KIND = "static publisher"
+
     def __init__(
         self,
         session: Session,
@@ -59,29 +58,13 @@ class StaticPublisher(Closeable):
         takeover: bool = False,
     ) -> None:
         identity = local_writer(secrets.randbits(32), program)
-        self.robot = check_robot(robot)
-        self.writer = edge_writer_name(writer, identity)
-        self._session_id = identity.session
+        name = edge_writer_name(writer, identity)
+        self._session = session
         self._edges: dict[str, Transform] = {}
         # Raises here, where the mistake is made, what every listener would refuse.
         self._check = TransformBuffer()
-        self._lock = fork_safe_lock()
-        self._closed = False
-        self._session = session
-        self._announced = Announcement(self.robot, "tf_static", identity, self.writer)
-        self._claim: WriterClaim | None = None
-        with ExitStack() as opening:
-            if "native" in as_wire_names(wires) and not takeover:  # in ROS any node may write them
-                self._claim = opening.enter_context(WriterClaim(session, [self._announced]))
-            self._latched = [
-                opening.enter_context(WireWriter(session, get_wire(wire), robot, identity)).open_latched(
-                    "tf_static", self.writer
-                )
-                for wire in as_wire_names(wires)
-            ]
-            if self._claim is not None:
-                self._claim.confirm()
-            self._opened = opening.pop_all()
+        announced = Announcement(check_robot(robot), "tf_static", identity, name)
+        super().__init__(session, announced, wires, owns=not takeover)
 
     def __repr__(self) -> str:
         closed = ", closed" if self._closed else ""
@@ -113,7 +96,7 @@ class StaticPublisher(Closeable):
                 Transform(parent, child, transform.translation, transform.rotation), writer=self.writer
             )
             self._edges[child] = transform
-            self._send()
+            self._send_edges()
 
     def withdraw(self, child: str) -> None:
         """Withdraw the edge that places ``child``. Raises InvalidInput if this writer has none."""
@@ -128,23 +111,9 @@ class StaticPublisher(Closeable):
                 )
             self._check.withdraw(name)
             del self._edges[name]
-            self._send()
+            self._send_edges()
 
-    def _check_open(self) -> None:
-        if self._closed:
-            raise Closed(f"the static publisher {self.writer!r} is closed")
-
-    def _send(self) -> None:
+    def _send_edges(self) -> None:
         edges = tuple((edge.target, edge.source) for edge in self._edges.values())
         poses = to_block([edge.pose7 for edge in self._edges.values()])
-        write_all(self._latched, StaticTransforms(self._session_id, edges, poses))
-
-    def close(self) -> None:
-        """Withdraw the edges. A second call does nothing."""
-        with self._lock:
-            if self._closed:
-                return
-            self._closed = True
-            for latched in self._latched:
-                latched.withdraw()
-            self._opened.close()
+        self._send(StaticTransforms(self._announced.writer.session, edges, poses))

@@ -50,6 +50,9 @@ from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 MAX_LATCHED = 256
 """Latched messages of one robot: its description, the edges of each static writer, and its maps."""
 
+MAX_MAP_BYTES = 1 << 27
+"""Maps of all robots that are repeated in the files that follow: seven of the largest ones."""
+
 MAX_PENDING = 1024
 """Samples of one robot that wait for the description that names their numbers."""
 MAX_PENDING_BYTES = 1 << 22
@@ -97,8 +100,10 @@ class RecordingEncoder:
     names, where every ROS tool finds them; any other robot has a namespace and a frame prefix of its own.
     ``refuse(reason, text)`` is called for each message that cannot be written: CDR cannot represent it ("no
     stamp", "stamp outside 1901 to 2038", "not sayable"), its model is unusable ("unusable model"), or its
-    robot has opened too many channels ("too many writers", see ``OpenChannels``). ``programs`` maps sessions
-    to program names, as far as known when the first message of a session is written.
+    robot has opened too many channels ("too many writers", see ``OpenChannels``). It is also called for each
+    map that is in one file only, since 128 MiB of maps are repeated in the files that follow ("map not
+    repeated"). ``programs`` maps sessions to program names, as far as known when the first message of a
+    session is written.
     """
 
     def __init__(
@@ -117,6 +122,8 @@ class RecordingEncoder:
         self._lock = fork_safe_lock()
         self._channels: defaultdict[str, OpenChannels] = defaultdict(OpenChannels)
         self._latched: dict[str, dict[str, ChannelEncoder]] = {}
+        self._map_bytes: dict[str, int] = {}
+        """Of the maps that are repeated, by the keys of ``_latched_key``."""
         self._statics: dict[tuple[str, int], StaticAccumulator] = {}
         self._orders: dict[str, OrderRegistry] = {}
         self._pending = PendingSamples()
@@ -178,6 +185,7 @@ class RecordingEncoder:
         with self._lock:
             key = _latched_key(robot, stream, name)
             channel = self._latched.get(robot, {}).pop(key, None)
+            self._map_bytes.pop(key, None)
             if channel is not None:
                 empty = NO_MAP if stream == "map" else StaticTransforms(0, (), b"")
                 self._writer.latch(channel.number, key, channel.encode(empty), log_time, log_time)
@@ -247,12 +255,32 @@ class RecordingEncoder:
             # The maps of a fleet, with 16 MB each, would be most of a recording if they were repeated.
             once = stream == "map"
             number = channel.number
-            is_new = self._writer.latch(number, key, payload, log_time, log_time, once_per_file=once)
             before = latched.get(key, channel)
-            if before is not channel:
+            if once and not self._may_repeat(key, len(payload)):
+                self._writer.write(number, payload, log_time, log_time)
                 self._writer.unlatch(before.number, key)
+                is_new = True
+            else:
+                is_new = self._writer.latch(number, key, payload, log_time, log_time, once_per_file=once)
+                if before is not channel:
+                    self._writer.unlatch(before.number, key)
             latched[key] = channel
             self._counts[robot, stream] += is_new
+
+    def _may_repeat(self, key: str, size: int) -> bool:
+        """Whether there is room to repeat the map of ``key`` in the files that follow; counts it if not."""
+        self._map_bytes.pop(key, None)
+        repeated = sum(self._map_bytes.values())
+        if repeated + size > MAX_MAP_BYTES:
+            text = (
+                f"the map {key!r} of {size} bytes is in one file only: {len(self._map_bytes)} maps with "
+                f"{repeated} bytes are repeated in the files that follow, and the limit is {MAX_MAP_BYTES}; "
+                "record it by itself, or without splitting the file"
+            )
+            self._refuse("map not repeated", text)
+            return False
+        self._map_bytes[key] = size
+        return True
 
     def _orders_of(self, robot: str) -> OrderRegistry:
         # Atomic: descriptions are added from another thread, without the lock.

@@ -32,6 +32,9 @@ from zstate.wire.registry import get_wire
 
 _CAPACITY = 256
 """Scans kept for a slow reader, and scans of one sensor that wait for their poses."""
+_UNREAD_BYTES = 64 * 2**20
+_WAITING_BYTES = 16 * 2**20
+"""Limits of their bytes, if these are reached first: 30 and 20 of the largest scans."""
 _OVERFLOW = "Overflow"
 _MAX_SENSORS = 64
 _LONGEST_WAIT_S = 0.5
@@ -68,13 +71,24 @@ class PlacedScan:
         return f"<PlacedScan of {self.sensor!r} in {self.target!r}: {self.valid.sum()} points{rigid}>"
 
 
+def _size(scan: Scan) -> int:
+    """The bytes of the numbers of ``scan``."""
+    return scan.ranges.nbytes + (0 if scan.intensities is None else scan.intensities.nbytes)
+
+
+def _placed_size(placed: PlacedScan) -> int:
+    return _size(placed.scan) + placed.points.nbytes + placed.valid.nbytes
+
+
 class _SensorScans(Closeable):
     """The scans of one sensor, which wait for their poses in a thread of their own."""
 
     def __init__(self, place: Callable[[Scan, float], object], sensor: str) -> None:
         self._place = place
         # The thread ends with the listener, not with its session.
-        self._waiting: Inbox[tuple[Scan, float]] = Inbox(_CAPACITY, lambda: None)
+        self._waiting: Inbox[tuple[Scan, float]] = Inbox(
+            _CAPACITY, lambda: None, max_bytes=_WAITING_BYTES, size_of=lambda waiting: _size(waiting[0])
+        )
         threading.Thread(target=self._run, name=f"zstate scans of {sensor}", daemon=True).start()
 
     def add(self, scan: Scan, deadline: float) -> int:
@@ -99,8 +113,8 @@ class ScanListener(Closeable):
     ``for placed in scans`` and ``async for placed in scans`` return a PlacedScan for each scan, in the order
     in which they became placeable, and end with ``close()``. A scan waits for the pose of its *last* ray, at
     most ``timeout_s`` from its arrival: then it is counted in ``dropped`` by the name of the error, and
-    ``last_reason`` names the edge that was too late. Of more than 256 scans that are unread, or of one
-    sensor that wait, the oldest are lost; ``dropped["Overflow"]`` counts them.
+    ``last_reason`` names the edge that was too late. Of more than 256 scans or 64 MiB that are unread, or
+    256 scans or 16 MiB of one sensor that wait, the oldest are lost; ``dropped["Overflow"]`` counts them.
     ``refused`` counts messages that are no scan, by reason; the first of each reason is also logged.
 
     ``sensor`` selects one scanner of the robot, on the native wire; "*": all of them. Frames come from
@@ -131,7 +145,9 @@ class ScanListener(Closeable):
         self._refusals = Refusals("scan")
         self.refused: dict[str, int] = self._refusals.counts
         self._timeout_s = timeout_s
-        self._unread: Inbox[PlacedScan] = Inbox(_CAPACITY, session.check)
+        self._unread: Inbox[PlacedScan] = Inbox(
+            _CAPACITY, session.check, max_bytes=_UNREAD_BYTES, size_of=_placed_size
+        )
         self._sensors: dict[str, _SensorScans] = {}
         self._wire = get_wire(wire)
         self._closed = False

@@ -10,8 +10,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe_lock
 from zstate.clock import Clock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net.ownership import WriterClaim
@@ -21,12 +19,13 @@ from zstate.net.status import StatusPublisher
 from zstate.net.writer import WireWriter, write_all
 from zstate.nodes.publisher_status import StatusReporter
 from zstate.nodes.sample_publisher import SamplePublisher
+from zstate.nodes.value_publisher import ValuePublisher
 from zstate.rate import RateReport
 from zstate.scans.grid import Grid, grid_to_message
 from zstate.scans.scan import Scan, scan_to_message
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import check_robot, check_writer, full_name
-from zstate.wire.registry import as_wire_names, get_wire
+from zstate.wire.registry import get_wire
 
 
 class RangeSource(Protocol):
@@ -183,7 +182,7 @@ def _geometry(scan: Scan, robot: str) -> dict[str, object]:
     }
 
 
-class MapPublisher(Closeable):
+class MapPublisher(ValuePublisher):
     """Publishes the map of a place, latched: listeners that join later receive it as well.
 
     A place is a robot, whose name is that of the place ("hall"), or a map that a robot has made. The frame of
@@ -191,6 +190,8 @@ class MapPublisher(Closeable):
     ``close()`` withdraws the map; the ROS wires cannot express that. On the native wire SecondWriter, which
     names the first writer, is raised if another active writer publishes this map. A context manager.
     """
+
+    _KIND = "map publisher"
 
     def __init__(
         self,
@@ -204,27 +205,14 @@ class MapPublisher(Closeable):
         program: str = "",
     ) -> None:
         identity = local_writer(secrets.randbits(32), program)
-        self.robot = check_robot(robot)
-        self.writer = check_writer(writer)
-        self._session_id = identity.session
         self._frame = frame
-        self._closed = False
-        self._lock = fork_safe_lock()
-        self._claim: WriterClaim | None = None
-        with ExitStack() as opening:
-            if "native" in as_wire_names(wires):
-                announced = Announcement(self.robot, "map", identity, self.writer)
-                self._claim = opening.enter_context(WriterClaim(session, [announced]))
-            self._latched = [
-                opening.enter_context(WireWriter(session, get_wire(wire), robot, identity)).open_latched(
-                    "map", self.writer
-                )
-                for wire in as_wire_names(wires)
-            ]
-            if self._claim is not None:
-                self._claim.confirm()
+        announced = Announcement(check_robot(robot), "map", identity, check_writer(writer))
+        super().__init__(session, announced, wires)
+        try:
             self.set(grid)
-            self._opened = opening.pop_all()
+        except BaseException:
+            self._opened.close()
+            raise
 
     def __repr__(self) -> str:
         closed = ", closed" if self._closed else ""
@@ -233,19 +221,8 @@ class MapPublisher(Closeable):
     def set(self, grid: Grid) -> None:
         """Replace the map. Raises InvalidInput if it is larger than a message may be, and Closed."""
         with self._lock:
-            if self._closed:
-                raise Closed(f"the map publisher {self.writer!r} is closed")
+            self._check_open()
             if self._frame not in (None, grid.frame):
                 grid = Grid(grid.cells, grid.resolution, grid.origin.pose7, self._frame, grid.stamp)
-            write_all(self._latched, grid_to_message(grid, self._session_id))
+            self._send(grid_to_message(grid, self._announced.writer.session))
             self.grid = grid
-
-    def close(self) -> None:
-        """Withdraw the map. A second call does nothing."""
-        with self._lock:
-            if self._closed:
-                return
-            self._closed = True
-            for latched in self._latched:
-                latched.withdraw()
-            self._opened.close()
