@@ -146,6 +146,22 @@ def test_many_points_between_two_samples_of_any_motion_are_placed_as_looked_up(
     assert assert_placed_as_looked_up(buffer, points, stamps, "root", "second").all()
 
 
+def test_turns_that_cancel_between_two_samples_are_placed_as_looked_up() -> None:
+    # Forwards and back, about axes that are 1e-11 rad apart: what remains is tiny, and not smooth.
+    model = load_model("""<robot name="linkage"><link name="base"/><link name="lever"/><link name="hand"/>
+      <joint name="turn" type="continuous"><parent link="base"/><child link="lever"/>
+        <axis xyz="0 0 1"/></joint>
+      <joint name="back" type="continuous"><parent link="lever"/><child link="hand"/><axis xyz="0 0 1"/>
+        <origin rpy="1e-11 0 0"/><mimic joint="turn" multiplier="-1"/></joint></robot>""")
+    buffer = TransformBuffer()
+    track = buffer.add_robot(model)
+    for n in range(2):
+        buffer.insert_joints(track, NOW + n * S, [40.0 * n])
+    stamps = NOW + np.arange(0, S, 200_000)
+    points = np.tile([0.0, 0.0, 1.0], (len(stamps), 1))
+    assert_placed_as_looked_up(buffer, points, stamps, "hand", "base")
+
+
 def test_wall_seen_while_turning_is_straight() -> None:
     """Rays of a laser that turns at 1.5 rad/s measure the wall x = 5; in the map their ends are on it."""
     buffer = filled(*(moving("map", "laser", NOW + n * 10 * MS, yaw=0.015 * n) for n in range(20)))

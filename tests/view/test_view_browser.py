@@ -182,3 +182,12 @@ def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):
         assert bare[occupied[1], occupied[0]].min() > 180
         for x, y in (unknown, free):
             assert full[y, x].min() > 180
+
+
+def test_map_without_any_frame_is_drawn_in_its_own(open_tab, show_view, sessions):
+    grid = Grid(np.full((4, 4), 100), 0.5, (30.0, 20.0, 0.0), "map")
+    with MapPublisher(sessions[0], "room", grid):
+        shown = show_view(sessions[1])
+        view_tab = open_tab(shown.page.url)
+        until(lambda: shown.view.scene.world.version == 1, PATIENCE_S)
+        until(lambda: np.count_nonzero(picture(view_tab).max(axis=2) < 60) > 5000, PATIENCE_S)

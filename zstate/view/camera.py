@@ -68,15 +68,18 @@ def fit_camera(
     corners: NDArray[np.float64] = _NO_POINTS,
     maps: NDArray[np.float64] = _NO_POINTS,
 ) -> CameraPose | None:
-    """The camera that shows all robots of a snapshot; None if none has a pose in the fixed frame.
+    """The camera that shows all robots of a snapshot, or all maps if there is no frame at all.
 
-    ``poses`` are its frames in the fixed frame, ``corners`` (N, 3) those of the robots' meshes; ``aspect`` is
-    width by height of the picture. Frames without a robot count only if there is no robot: a map may begin
-    far away. Of ``maps``, whose corners are (N, 3), the part around the robots is in the picture.
+    None if none has a pose in the fixed frame. ``poses`` are its frames in the fixed frame, ``corners``
+    (N, 3) those of the robots' meshes; ``aspect`` is width by height of the picture. Frames without a robot
+    count only if there is no robot: a map may begin far away. Of ``maps``, whose corners are (N, 3), the part
+    around the robots is in the picture.
     """
     of_robots = np.array(["/" in name for name in snapshot.tree.names], dtype=np.bool_)
     points = poses[of_robots if of_robots.any() else slice(None), :3]
     points = points[np.isfinite(points).all(axis=1)]
+    if not snapshot.tree.names:
+        points = maps
     if not len(points):
         return None
     points = np.concatenate((points, corners))

@@ -41,6 +41,7 @@ _LOG = logging.getLogger("zstate")
 # Numbers that change faster cannot be read, and cost more than the picture.
 _PANELS_PERIOD_S = 0.2
 _IDLE_S = 0.5
+_NO_POSES: Poses = np.empty((0, 7))
 
 
 class View(Closeable):
@@ -144,13 +145,15 @@ class View(Closeable):
             snapshot = self._source.snapshot(self.layout.stamp)
             if self._hold_requested:
                 self._held, self._fitted_to = snapshot, None
-        fixed = self.layout.fixed.resolve(snapshot.tree)
+        at = self.layout.stamp if self._held is None else snapshot.stamp
+        # Maps without any frame are drawn in their own.
+        own = next((grid.frame for grid in self._source.world.maps_at(at).values()), "")
+        fixed = self.layout.fixed.resolve(snapshot.tree) or own
         with self._page.server.atomic():
             try:
                 if fixed:
-                    poses = self.scene.show(snapshot, fixed)
+                    poses = self.scene.show(snapshot, fixed) if snapshot.tree.names else _NO_POSES
                     place = Place(snapshot.tree, poses, fixed)
-                    at = self.layout.stamp if self._held is None else snapshot.stamp
                     self.scene.world.show(self._source.world, self._source.buffer, place, at)
                     self._fit_camera(snapshot, fixed, poses)
                     if self._held is not None:

@@ -10,9 +10,10 @@
 
 #define TERMS 8
 
-/* Turns above about 0.15 rad exceed this limit, and have to be halved. Below it the terms that a
- * curve does not have are less than 1e-15: term n + 2 is about a^2 / 1000 of term n. */
-#define LAST_TERMS 1e-11
+/* Turns above about 0.08 rad exceed this limit, and have to be halved. Below it the terms that a
+ * curve does not have are less than 1e-16: term n + 2 is about a^2 / 1000 of term n. Turns that
+ * cancel can be larger; what remains of them is then at most about twice the limit. */
+#define LAST_TERMS 2e-13
 
 typedef struct {
     double factors[7][TERMS]; /* of 1, x, ..., x^7 in each number of the pose */
@@ -97,7 +98,7 @@ curve_fit(double polynomials[TERMS][TERMS], const double values[TERMS], double f
 }
 
 /* The curve from `begin` to `end`, which are between the samples in `nows`. Returns the size of its
- * last terms, of positions relative to the reach of the path; NaN if a sample is not finite. */
+ * last terms, of positions relative to the reach of the path; NaN if a number is not finite. */
 static double
 curve_of(Curve *curve, const Path *path, Bracket *nows, const Interval *intervals,
          Py_ssize_t tracks, int64_t begin, int64_t end)
@@ -117,7 +118,8 @@ curve_of(Curve *curve, const Path *path, Bracket *nows, const Interval *interval
     chebyshev_at_nodes(polynomials);
     for (int k = 0; k < 3; k++)
         last += curve_fit(polynomials, values[k], curve->factors[k]);
-    last /= path_reach(path, nows);
+    double reach = path_reach(path, nows);
+    last = isfinite(reach) ? last / reach : Py_NAN;
     for (int k = 3; k < 7; k++)
         last += curve_fit(polynomials, values[k], curve->factors[k]);
     curve->begin = begin;
