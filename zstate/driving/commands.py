@@ -115,8 +115,9 @@ class CommandReceiver(Closeable):
 class Targets:
     """The positions to which the joints move, each until its command expires. For one thread.
 
-    Joints without a command stay where they were at ``start``, or came to rest after their last one. While
-    commands of one session are valid, those of others are refused, and so is an older one of that session.
+    Joints without a command stay where they were at ``start``, or came to rest after their last one, also
+    after a change of the session. While commands of one session are valid, those of others are refused, and
+    so is an older one of that session.
     """
 
     def __init__(self, count: int) -> None:
@@ -152,8 +153,6 @@ class Targets:
 
     def accept(self, command: Command) -> None:
         """Move the joints of ``command`` to its positions until its deadline."""
-        if command.session != self.session:
-            self.clear()
         self._last_seqs[command.session] = command.seq
         while len(self._last_seqs) > _WAITING:
             del self._last_seqs[next(iter(self._last_seqs))]
