@@ -14,8 +14,9 @@ import pytest
 from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, wait_for_reader
 
-from zstate import JointReading, StatePublisher
+from zstate import JointReading, StatePublisher, load_model
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
+from zstate.driving.driver import StopMode
 from zstate.driving.stops import wait_for_state
 from zstate.errors import DriverFault, InvalidInput, SecondWriter
 from zstate.net.session import Session
@@ -37,6 +38,9 @@ class RecordingDriver(SimulatedDriver):
         super().__init__(RRBOT, "mirror", start=None if start is None else np.array(start))
         self.calls: list[tuple[str, int, object]] = []
         self.failures: list[Exception] = []
+        """Of the next calls of ``read``."""
+        self.write_failures: list[Exception] = []
+        self.stop_failures: list[BaseException] = []
 
     def _keep(self, name: str, value: object = None) -> None:
         self.calls.append((name, time.monotonic_ns(), value))
@@ -47,12 +51,23 @@ class RecordingDriver(SimulatedDriver):
         return super().read(stamp)
 
     def write(self, setpoint) -> None:
+        if self.write_failures:
+            raise self.write_failures.pop()
         self._keep("write", setpoint.positions)
         super().write(setpoint)
 
     def stop(self, how) -> None:
         self._keep("stop", how)
+        if self.stop_failures:
+            raise self.stop_failures.pop()
         super().stop(how)
+
+    @property
+    def has_torque(self) -> bool:
+        return self._target is not None
+
+    def stops(self) -> list[object]:
+        return [value for name, _, value in list(self.calls) if name == "stop"]
 
     def written(self) -> np.ndarray:
         return np.array([value for name, _, value in list(self.calls) if name == "write"]).reshape(-1, 2)
@@ -415,7 +430,7 @@ def test_a_part_of_the_robot_is_driven_beside_a_publisher_of_the_rest(sessions):
     with DriverHost(sessions[0], Elbow(), RRBOT, "arm", limits=limits) as host:
         report = host.run(seconds=0.1)
         assert report.rate is not None
-        assert report.rate.ticks == 10
+        assert report.rate.ticks + report.rate.skipped == 10
 
 
 def test_one_robot_has_one_host(sessions):
@@ -456,3 +471,213 @@ def test_a_commander_checks_what_it_sends(sessions):
             arm.send({})
         with pytest.raises(InvalidInput, match=r"a ttl of 1\.0 s is longer than 250\.0 ms"):
             arm.send({"elbow": 0.0}, ttl_s=1.0)
+
+
+# Stops that a driver, a second run or a new commander could have undone
+
+
+def test_a_second_run_obeys_a_stop_that_is_still_latched(sessions):
+    driver = RecordingDriver()
+    with (
+        DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS) as host,
+        raw_commands(sessions[1]) as put,
+    ):
+        with pytest.raises(TimeoutError):
+            stop(sessions[1], "arm", "door open", timeout_s=0.05)
+        host.run(seconds=0.1)
+        put(command(elbow=1.0))
+        host.run(seconds=0.1)
+        assert host.report().refused == {"stopped": 1}
+    assert driver.written().size == 0
+
+
+def test_joints_of_an_expired_commander_come_to_rest_when_another_one_takes_over(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+        put(command(shoulder=3.0, ttl=50_000_000))
+        until(lambda: host.state == "active")
+        other = iter(range(10**6))
+
+        def taken_over() -> bool:
+            # Sent all the time, so that it takes over in the tick in which the first command expires.
+            names, block = ("elbow",), to_block([0.1])
+            number = next(other)
+            put(encode(JointCommand(0, number, 8, order_digest(names), block, names=names)))
+            return bool(driver.written()[-1, 1] == 0.1)
+
+        until(taken_over)
+        resting = driver.written()[-1, 0]
+        count = len(driver.written())
+        until(lambda: taken_over() and len(driver.written()) > count + 20)
+    assert driver.written()[-1, 0] == resting < 3.0
+
+
+@pytest.mark.parametrize("faults", [2, 40])
+def test_setpoints_that_could_not_be_written_do_not_add_up_to_a_longer_step(sessions, faults: int):
+    driver = RecordingDriver([0.0, 0.0])
+    with running(sessions[0], driver, faults_allowed=50) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+        driver.write_failures += [OSError("bus off")] * faults
+        send_until(arm, {"shoulder": 9.0}, lambda: host.report().faults == faults)
+        written = len(driver.written())
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > written + 3)
+    assert np.abs(np.diff(driver.written(), axis=0)).max() <= STEP * (1 + 1e-9)
+
+
+def test_a_first_setpoint_that_could_not_be_written_starts_again_from_the_measured_joints(sessions):
+    driver = RecordingDriver([0.5, -0.5])
+    driver.write_failures += [OSError("bus off")] * 20
+    with running(sessions[0], driver, faults_allowed=50), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+    assert np.abs(driver.written()[0] - [0.5, -0.5]).max() <= STEP * (1 + 1e-9)
+
+
+def test_joints_without_a_velocity_limit_are_refused_by_name(sessions, tmp_path):
+    path = tmp_path / "one.urdf"
+    path.write_text(
+        '<robot name="one"><link name="a"/><link name="b"/><joint name="wheel" type="continuous">'
+        '<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    model = load_model(path)
+    with pytest.raises(InvalidInput, match=r"the velocity of 'wheel' has no limit.*velocity=\.\.\."):
+        DriverHost(sessions[0], SimulatedDriver(model), model)
+
+
+def test_relaxed_joints_stay_without_torque_while_stopped(sessions):
+    driver = RecordingDriver()
+    with pytest.raises(DriverFault), running(sessions[0], driver) as host:
+        stop(sessions[1], "arm", "hand inside", how="relax")
+        assert not driver.has_torque
+        stop(sessions[0], "arm", "again", how="hold")
+        assert not driver.has_torque
+        driver.failures += [OSError("unplugged")] * 3
+        until(lambda: host.state == "fault")
+        assert not driver.has_torque
+
+
+def test_joints_relaxed_on_silence_get_no_torque_by_a_stop_or_after_a_restart(sessions):
+    driver = RecordingDriver()
+    options = {"ttl_s": 0.05, "on_silence": "relax"}
+    with pytest.raises(DriverFault), running(sessions[0], driver, **options) as host:
+        with Commander(sessions[1], "arm") as arm:
+            arm.wait_for_driver()
+            send_until(arm, {"elbow": 0.4}, lambda: len(driver.written()))
+        until(lambda: not driver.has_torque)
+        driver.failures += [OSError("unplugged")] * 3
+        until(lambda: host.state == "fault")
+    again = RecordingDriver()
+    with running(sessions[0], again, **options) as host:
+        until(lambda: host.state == "stopped")
+        assert again.stops() == ["relax"]
+
+
+def test_a_stop_that_the_driver_failed_to_carry_out_is_repeated_before_it_is_confirmed(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver, faults_allowed=50) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+        driver.stop_failures += [OSError("servo 6 did not answer")] * 5
+        assert stop(sessions[1], "arm", how="relax").state == "stopped"
+        assert not driver.has_torque
+        assert driver.stops()[1:] == ["relax"] * 6, "after the one of enable"
+        assert host.report().faults == 5
+
+
+def test_a_stop_is_confirmed_when_the_driver_has_stopped(sessions):
+    class Slow(RecordingDriver):
+        has_stopped = False
+
+        def stop(self, how: StopMode) -> None:
+            threading.Event().wait(0.3)
+            super().stop(how)
+            self.has_stopped = True
+
+    driver = Slow()
+    with running(sessions[0], driver):
+        assert stop(sessions[1], "arm").state == "stopped"
+        assert driver.has_stopped
+
+
+def test_an_enable_that_failed_half_way_is_followed_by_a_stop_after_silence(sessions):
+    class Half(RecordingDriver):
+        def enable(self, on: bool) -> None:
+            super().enable(on)
+            self.calls.clear()
+            if on:
+                threading.Event().wait(0.06)
+                raise OSError("servo 6 did not answer")
+
+    driver = Half()
+    with (
+        running(sessions[0], driver, on_silence="relax", ttl_s=0.05) as host,
+        raw_commands(sessions[1]) as put,
+    ):
+        put(command(elbow=0.1))
+        until(lambda: driver.stops() == ["relax"])
+        assert host.state == "ready"
+        assert not driver.has_torque
+
+
+def test_an_interrupted_stop_is_repeated_when_the_loop_ends(sessions):
+    driver = RecordingDriver()
+    with (
+        DriverHost(
+            sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS, on_silence="relax"
+        ) as host,
+        raw_commands(sessions[1]) as put,
+    ):
+        enable = driver.enable
+
+        def enable_once(on: bool) -> None:
+            enable(on)
+            driver.stop_failures.append(KeyboardInterrupt())
+
+        driver.enable = enable_once
+        put(command(elbow=0.1, ttl=50_000_000))
+        with pytest.raises(KeyboardInterrupt):
+            host.run()
+        driver.enable = enable
+        assert not driver.has_torque
+
+
+@pytest.mark.parametrize(
+    "reading",
+    [
+        JointReading(np.array([0.1])),
+        JointReading(np.array([0.1, 0.2, 0.3])),
+        JointReading(np.array([0.1, 0.2]), np.zeros(3)),
+        JointReading(0.1),
+        JointReading(["a", "b"]),
+        [0.1, 0.2],
+    ],
+)
+def test_a_reading_that_no_joints_have_is_counted_and_not_published(sessions, reading: JointReading):
+    class Wrong(RecordingDriver):
+        def read(self, stamp: int) -> JointReading:
+            return reading
+
+    with (
+        running(sessions[0], Wrong(), faults_allowed=10**6) as host,
+        TransformListener(sessions[1], "arm") as listener,
+    ):
+        until(lambda: host.report().faults > 10)
+        assert host.state == "ready"
+        assert listener.stats.received == 0
+
+
+def test_power_and_brakes_are_switched_off_before_the_driver_is_closed(sessions):
+    calls: list[object] = []
+
+    class Closing(RecordingDriver):
+        def enable(self, on: bool) -> None:
+            calls.append(on)
+            raise OSError("unplugged")
+
+        def close(self) -> None:
+            calls.append("close")
+
+    with running(sessions[0], Closing()):
+        pass
+    assert calls == [False, "close"]

@@ -28,6 +28,7 @@ from zstate.driving.driver_state import DriverReport, DriverStatePublisher, Dura
 from zstate.driving.limits import Limits
 from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
 from zstate.driving.stops import ActiveStop, StopLatch
+from zstate.driving.supervised_driver import SupervisedDriver
 from zstate.errors import (
     Closed,
     DriverFault,
@@ -98,7 +99,7 @@ class DriverHost(Closeable):
         program: str = "",
     ) -> None:
         self.robot = check_robot(robot or model.name)
-        self._driver = driver
+        self._driver = SupervisedDriver(driver, self.robot)
         self._rate_hz = check_rate(rate_hz)
         self._ttl_ns = round(check_timeout(ttl_s) * 1e9)
         names = model.part(driver.joint_names).joint_names
@@ -119,12 +120,11 @@ class DriverHost(Closeable):
         self._measured_at = 0
         self._setpoint: Limited | None = None
         """The last one that was written since the joints were enabled; None otherwise."""
-        self._is_enabled = False
         self._obeyed: tuple[ActiveStop, ...] = ()
         self._barred: set[int] = set()
         """Sessions that have commanded a stopped robot: a release by another does not move it for them."""
-        self._written = self._faults = self._faults_in_row = 0
-        self._lateness, self._reading, self._writing = Durations(), Durations(), Durations()
+        self._faults = self._faults_in_row = 0
+        self._lateness = Durations()
         self._rate: Rate | None = None
         self._stop = fork_safe(threading.Event())
         self._running = fork_safe_lock()
@@ -139,13 +139,14 @@ class DriverHost(Closeable):
             opening.enter_context(WriterWatch(session, self.robot, self._on_writer))
             opening.callback(driver.close)
             driver.open()
+            opening.callback(self._driver.disable)
             self._states = opening.enter_context(
                 DriverStatePublisher(session, self.robot, self._driver_state)
             )
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:
-        return f"<DriverHost of {self.robot!r}: {self._state.name}, {self._written} setpoints>"
+        return f"<DriverHost of {self.robot!r}: {self._state.name}, {self._driver.written} setpoints>"
 
     def _open_publisher(
         self, session: Session, model: RobotModel, opening: ExitStack
@@ -170,9 +171,9 @@ class DriverHost(Closeable):
         return DriverReport(
             None if self._rate is None else self._rate.report(),
             self._lateness.spread(),
-            self._reading.spread(),
-            self._writing.spread(),
-            self._written,
+            self._driver.reading.spread(),
+            self._driver.writing.spread(),
+            self._driver.written,
             self._faults,
             dict(self._refusals.counts),
         )
@@ -186,6 +187,7 @@ class DriverHost(Closeable):
         with self._running:
             self._rate = rate = Rate(self._rate_hz, MonotonicClock(), self._stop, seconds, catch_up=False)
             self._runner = threading.current_thread()
+            self._obeyed = ()  # stops that are still latched are obeyed once more
             self._change("ready", "")
             try:
                 for _ in rate:
@@ -214,58 +216,66 @@ class DriverHost(Closeable):
 
     def _tick(self) -> None:
         fault = self._read()
-        self._obey_stops()
         now = time.monotonic_ns()
-        for command in self._commands.drain():
-            self._accept(command, now)
-        if self._state.name != "stopped":
+        fault = self._obey_stops(now) or fault
+        self._accept_commands(now)
+        has_new_stop = self._stops.latched is not self._obeyed  # obeyed in the next tick
+        if self._state.name != "stopped" and not has_new_stop:
             fault = self._advance(now, is_fresh=fault is None) or fault
         self._count_fault(fault)
 
     def _read(self) -> Exception | None:
         """Read the joints and publish them. Returns what failed; the last state stays then."""
-        stamp, start = time.time_ns(), time.monotonic_ns()
-        try:
-            reading = self._driver.read(stamp)
-        except Exception as error:
-            return error
-        finally:
-            self._reading.add(time.monotonic_ns() - start)
-        if reading is None:
-            return None
+        stamp = time.time_ns()
+        reading = self._driver.read(stamp)
+        if reading is None or isinstance(reading, Exception):
+            return reading
         try:
             self._publish(reading, stamp)
-            self._measured = self._limits.vector(reading.positions, "measured positions")
-            self._measured_at = time.monotonic_ns()
-        except InvalidInput as error:
+        except (Closed, SecondWriter):
+            raise
+        except Exception as error:  # what a driver returns may be anything
             return error
         return None
 
     def _publish(self, reading: JointReading, stamp: int) -> None:
-        order = self._order
-        self._publisher.publish(
-            np.asarray(reading.positions)[order],
-            None if reading.velocities is None else np.asarray(reading.velocities)[order],
-            None if reading.efforts is None else np.asarray(reading.efforts)[order],
-            stamp if reading.stamp is None else reading.stamp,
+        positions = self._limits.vector(reading.positions, "measured positions")
+        velocities, efforts = (
+            None if values is None else self._limits.vector(values, f"measured {kind}")[self._order]
+            for kind, values in (("velocities", reading.velocities), ("efforts", reading.efforts))
         )
+        instant = stamp if reading.stamp is None else reading.stamp
+        self._publisher.publish(positions[self._order], velocities, efforts, instant)
+        self._measured, self._measured_at = positions, time.monotonic_ns()
 
-    def _obey_stops(self) -> None:
-        """Stop if there is a new stop; become ready when the last one is released."""
+    def _obey_stops(self, now: int) -> Exception | None:
+        """Stop if there is a new stop; become ready when the last one is released. Returns what failed.
+
+        A stop is confirmed, by its number in the state, once the driver has stopped.
+        """
         latched = self._stops.latched
         if latched is self._obeyed:
-            return
-        before, self._obeyed = set(self._obeyed), latched
-        if set(latched) - before:
-            hows = {one.how for one in latched}
-            self._stop_driver("relax" if "relax" in hows else "hold")
+            return None
+        reason = "; ".join(map(str, latched))
+        if set(latched) - set(self._obeyed):
             self._barred.add(self._targets.session)
             self._targets.clear()
+            failure = self._stop_driver("relax" if "relax" in {one.how for one in latched} else "hold")
+            if failure is not None:
+                self._change("stopped", f"the driver has not stopped yet: {failure!r}; {reason}")
+                return failure
         if latched:
-            self._change("stopped", "; ".join(map(str, latched)))
+            self._change("stopped", reason)
         elif self._state.name == "stopped":
+            self._accept_commands(now)  # those from before the release are refused
             self._barred.discard(self._stops.releaser)
             self._change("ready", f"released by {self._name_of(self._stops.releaser)}")
+        self._obeyed = latched
+        return None
+
+    def _accept_commands(self, now: int) -> None:
+        for command in self._commands.drain():
+            self._accept(command, now)
 
     def _accept(self, command: Command, now: int) -> None:
         """Take the targets of ``command``, or count the reason against it."""
@@ -303,18 +313,18 @@ class DriverHost(Closeable):
         """Enable the joints, or write the next setpoint. Returns what failed."""
         is_live = self._targets.is_live(now)
         if self._setpoint is None:
-            if not is_live and self._is_enabled:
-                self._stop_driver(self._on_silence)
+            if self._driver.is_stopping or (self._driver.needs_stop and not is_live):
+                return self._stop_driver(self._on_silence)
             is_known = self._measured is not None and now - self._measured_at < self._ttl_ns
             if not is_live or not is_fresh or not is_known:
                 return None
-            return self._start(now) if self._is_enabled else self._enable()
+            return self._start(now) if self._driver.is_enabled else self._enable()
         if not is_live and self._state.name == "active":
             reason = f"nothing from {self._name_of(self._targets.session)} for {self._silence(now)}"
             if self._on_silence == "relax":
-                self._stop_driver("relax")
+                failure = self._stop_driver("relax")
                 self._change("ready", reason)
-                return None
+                return failure
             self._change("holding", reason)
         elif is_live and self._state.name == "holding":
             self._targets.start(now, self._resting())
@@ -326,38 +336,33 @@ class DriverHost(Closeable):
 
         Joints may sag by that, so the first setpoint waits for the next reading.
         """
-        try:
-            self._driver.enable(True)
-        except Exception as error:
-            return error
-        self._is_enabled = True
         self._measured = None
-        return None
+        return self._driver.enable()
 
     def _start(self, now: int) -> Exception | None:
+        """Write the first setpoint after a change of state."""
         assert self._measured is not None
         self._limiter.start(self._measured)
         self._targets.start(now, self._measured)
-        self._change("active", "")
-        return self._move(now)
+        failure = self._move(now)
+        if failure is None:
+            self._change("active", "")
+        return failure
 
     def _move(self, now: int) -> Exception | None:
-        """Write the next setpoint on the way to the targets, or to rest."""
+        """Write the next setpoint on the way to the targets, or to rest. Where that fails, nothing moves."""
         dt_s = 1.0 / self._rate_hz  # also after a tick that was missed: slower, never further
         if self._state.name == "holding":
             limited = self._limiter.brake(dt_s)
         else:
             limited = self._limiter.step(self._targets.current(now, self._resting()), dt_s)
-        self._setpoint = limited
-        start = time.monotonic_ns()
-        try:
-            self._driver.write(Setpoint(time.time_ns(), limited.positions, limited.velocities))
-        except Exception as error:
-            return error
-        finally:
-            self._writing.add(time.monotonic_ns() - start)
-        self._written += 1
-        return None
+        setpoint = Setpoint(time.time_ns(), limited.positions, limited.velocities)
+        failure = self._driver.write(setpoint)
+        if failure is None:
+            self._setpoint = limited
+        elif self._setpoint is not None:
+            self._limiter.start(self._setpoint.positions, self._setpoint.velocities)
+        return failure
 
     def _resting(self) -> NDArray[np.float64]:
         """Where the joints come to rest if they brake from the last setpoint."""
@@ -378,27 +383,27 @@ class DriverHost(Closeable):
         if self._faults_in_row < self._faults_allowed:
             return
         reason = f"the driver failed in {self._faults_in_row} ticks in a row; the last one: {fault!r}"
-        self._stop_driver(self._on_silence)
-        self._stops.latch(reason, self._writer)
+        self._stop_and_latch(reason)
         self._change("fault", reason)
         raise DriverFault(
             f"{self.robot!r} is stopped: {reason}; mend it, restart, then release the stop with a Commander",
             robot=self.robot,
         ) from fault
 
-    def _stop_driver(self, how: StopMode) -> None:
-        """Stop the hardware. The next setpoint starts from the measured joints."""
+    def _stop_and_latch(self, reason: str) -> None:
+        """Stop as after silence, until a commander releases that."""
+        self._stop_driver(self._on_silence)
+        self._stops.latch(reason, self._writer, how=self._on_silence)
+
+    def _stop_driver(self, how: StopMode) -> Exception | None:
+        """Stop the hardware. The next setpoint starts from the measured joints. Returns what failed."""
         self._setpoint = None
-        self._is_enabled = False
-        try:
-            self._driver.stop(how)
-        except Exception as error:
-            self._faults += 1
-            _LOG.error("stop(%r) of the driver of %r failed: %r", how, self.robot, error)
+        return self._driver.stop(how)
 
     def _end(self) -> None:
-        if self._setpoint is not None or self._is_enabled:
+        if self._driver.needs_stop:
             self._stop_driver(self._on_silence)
+        self._driver.repeat_stop()
         self._targets.clear()
         if self._state.name != "fault":
             self._change("off", "the loop has ended")
@@ -471,6 +476,11 @@ def _check_arguments(
         problems.append(f"the limits are of {limits.joint_names}, the driver's joints are {names}")
     if on_silence not in ("hold", "relax"):
         problems.append(f"on_silence is 'hold' or 'relax', not {on_silence!r}")
+    if unbounded := [name for name, at_most in zip(names, limits.velocity, strict=True) if at_most == np.inf]:
+        problems.append(
+            f"the velocity of {', '.join(map(repr, unbounded))} has no limit, so that one setpoint could be "
+            "the whole way: pass limits=Limits.of(model, velocity=...)"
+        )
     if faults_allowed < 1:
         problems.append(f"faults_allowed is at least 1, not {faults_allowed}")
     if problems:
