@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from helpers.processes import DEADLINE_S, until
+from helpers.processes import DEADLINE_S, repeated, until
 from helpers.robots import RRBOT, wait_for_reader
 
 from zstate import JointReading, StatePublisher, load_model
@@ -681,3 +681,86 @@ def test_power_and_brakes_are_switched_off_before_the_driver_is_closed(sessions)
     with running(sessions[0], Closing()):
         pass
     assert calls == [False, "close"]
+
+
+# Ends of the program
+
+REPORTING_HOST = """
+    import os, signal, sys, threading
+    from zstate import connect, load_model
+    from zstate.driving import DriverHost, Limits, SimulatedDriver
+
+    class Reporting(SimulatedDriver):
+        def write(self, setpoint):
+            super().write(setpoint)
+            if not self.is_moving:
+                self.is_moving = True
+                print("moving", flush=True)
+
+        def stop(self, how):
+            super().stop(how)
+            if self.is_moving:
+                print("stop", how, flush=True)
+
+        def close(self):
+            on_close()
+            print("close", os.getpid() == first, flush=True)
+
+    Reporting.is_moving = False
+    first = os.getpid()
+    on_close = lambda: None
+    model = load_model("rrbot")
+    session = connect()
+    host = DriverHost(session, Reporting(model), model, "arm", limits=Limits.of(model, velocity=2.0))
+    print("open", flush=True)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_that_ends_the_program_stops_and_closes_the_driver_first(
+    sessions, spawn, number: signal.Signals
+):
+    child = spawn(REPORTING_HOST + "    host.run()\n")
+    assert child.line() == "open"
+    with Commander(sessions[1], "arm") as arm, repeated(lambda: arm.send({"shoulder": 9.0})):
+        assert child.line() == "moving"
+        child.process.send_signal(number)
+        assert child.line() == "stop hold"
+        lines = [child.line(), child.line()]
+    assert lines == ["stop relax", "close True"]  # relax is the one of enable(False)
+    assert child.process.wait(DEADLINE_S) == -number
+
+
+def test_close_in_a_handler_of_a_signal_during_close_does_not_wait_for_itself(spawn):
+    child = spawn(
+        REPORTING_HOST
+        + """
+    signal.signal(signal.SIGTERM, lambda *_: host.close())
+    on_close = lambda: signal.raise_signal(signal.SIGTERM)
+    host.run(seconds=0.1)
+    host.close()
+    print("closed", flush=True)
+"""
+    )
+    assert [child.line() for _ in range(3)] == ["open", "close True", "closed"]
+
+
+def test_a_forked_child_leaves_the_driver_alone(spawn):
+    child = spawn(
+        REPORTING_HOST
+        + """
+    with host:
+        if os.fork() == 0:
+            try:
+                host.run()
+            except Exception as error:
+                print(error, flush=True)
+            host.close()
+            os._exit(0)
+        os.wait()
+    print("closed", flush=True)
+"""
+    )
+    assert child.line() == "open"
+    assert "belongs to process" in child.line()
+    assert [child.line(), child.line()] == ["close True", "closed"]

@@ -8,6 +8,7 @@ too many failures in a row, which ends the loop. Not a safety-rated channel.
 from __future__ import annotations
 
 import logging
+import os
 import secrets
 import threading
 import time
@@ -19,8 +20,9 @@ from numpy.typing import NDArray
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe, fork_safe_lock
+from zstate._util.fork_safe import fork_safe
 from zstate._util.refusals import Refusals
+from zstate._util.signals import held_back_signals
 from zstate.clock import MonotonicClock
 from zstate.driving.commands import Command, CommandReceiver, Targets
 from zstate.driving.driver import Driver, Setpoint, StopMode
@@ -38,6 +40,7 @@ from zstate.errors import (
     format_duration,
 )
 from zstate.model.robot import RobotModel
+from zstate.net.at_exit import forked_text
 from zstate.net.latched import cached_values
 from zstate.net.ownership import wait_for_discovery
 from zstate.net.presence import WriterWatch, local_writer
@@ -127,8 +130,12 @@ class DriverHost(Closeable):
         self._lateness = Durations()
         self._rate: Rate | None = None
         self._stop = fork_safe(threading.Event())
-        self._running = fork_safe_lock()
+        self._is_ending = False
+        self._running = fork_safe(threading.RLock())
+        """Held by ``run`` and ``close``; a handler of a signal may call ``close`` inside both."""
         self._runner: threading.Thread | None = None
+        """The thread inside ``run`` or ``close``."""
+        self._pid = os.getpid()
         with ExitStack() as opening:
             _check_only_host(session, self.robot)
             self._publisher, self._order = self._open_publisher(session, model, opening)
@@ -181,21 +188,16 @@ class DriverHost(Closeable):
     def run(self, *, seconds: float | None = None) -> DriverReport:
         """Run the loop for ``seconds``, or until ``close()``. Ticks that are missed are not made up for.
 
-        If it ends while the joints are commanded or held, the driver is stopped as after silence. Raises
-        DriverFault, SecondWriter and Closed.
+        If it ends while the joints are commanded or held, the driver is stopped as after silence. In the main
+        thread of a program that does not handle SIGTERM and SIGHUP, they end the loop and close this host
+        before they end the process. Raises DriverFault, SecondWriter and Closed.
         """
-        with self._running:
-            self._rate = rate = Rate(self._rate_hz, MonotonicClock(), self._stop, seconds, catch_up=False)
+        if os.getpid() != self._pid:
+            raise Closed(forked_text(f"this driver host belongs to process {self._pid}"))
+        with self._running, held_back_signals(self.close) as arrived:
             self._runner = threading.current_thread()
-            self._obeyed = ()  # stops that are still latched are obeyed once more
-            self._change("ready", "")
             try:
-                for _ in rate:
-                    self._lateness.add(rate.lateness_ns)
-                    self._tick()
-            except Closed:
-                if not self._stop.is_set():
-                    raise
+                self._loop(seconds, arrived)
             finally:
                 self._end()
                 self._runner = None
@@ -205,12 +207,34 @@ class DriverHost(Closeable):
         """End the loop, stop the driver, and disconnect it. A second call does nothing.
 
         From inside the loop, such as in a handler of a signal, only the loop ends: close again after ``run``.
+        Does nothing in a forked process.
         """
-        self._stop.set()
+        if os.getpid() != self._pid:
+            return
+        self._is_ending = True
         if self._runner is threading.current_thread():
             return
+        self._stop.set()
         with self._running:
-            self._opened.close()
+            self._runner = threading.current_thread()
+            try:
+                self._opened.close()
+            finally:
+                self._runner = None
+
+    def _loop(self, seconds: float | None, signals: list[int]) -> None:
+        self._rate = rate = Rate(self._rate_hz, MonotonicClock(), self._stop, seconds, catch_up=False)
+        self._obeyed = ()  # stops that are still latched are obeyed once more
+        self._change("ready", "")
+        try:
+            for _ in rate:
+                if self._is_ending or signals:
+                    return
+                self._lateness.add(rate.lateness_ns)
+                self._tick()
+        except Closed:
+            if not self._stop.is_set():
+                raise
 
     # One tick, in the thread of run()
 
