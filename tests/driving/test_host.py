@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import socket
 import threading
@@ -17,7 +18,7 @@ from helpers.robots import RRBOT, wait_for_reader
 from zstate import JointReading, StatePublisher, load_model
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
-from zstate.driving.stops import wait_for_state
+from zstate.driving.stops import stops_file, wait_for_state
 from zstate.errors import DriverFault, InvalidInput, SecondWriter
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
@@ -764,3 +765,48 @@ def test_a_forked_child_leaves_the_driver_alone(spawn):
     assert child.line() == "open"
     assert "belongs to process" in child.line()
     assert [child.line(), child.line()] == ["close True", "closed"]
+
+
+# Floods, and commands from before a release
+
+
+def test_a_tick_looks_at_a_bounded_number_of_commands_and_the_others_are_counted(sessions):
+    narrow = Limits(RRBOT.joint_names, [-1.0, -0.5], [1.0, 0.5], [2.0, 2.0], [np.inf, np.inf])
+    with (
+        DriverHost(sessions[0], RecordingDriver(), RRBOT, "arm", rate_hz=RATE_HZ, limits=narrow) as host,
+        raw_commands(sessions[1]) as put,
+    ):
+        for number in range(100):
+            put(command(number, elbow=0.6))
+        until(lambda: host.report().refused == {"overrun": 68})
+        host.run(seconds=2 / RATE_HZ)
+        assert host.report().refused == {"overrun": 68, "outside limits": 32}
+
+
+def test_commands_from_before_a_release_do_not_move_the_robot_after_it(sessions):
+    may_read = threading.Event()
+    may_read.set()
+
+    class Slow(RecordingDriver):
+        def read(self, stamp: int) -> JointReading:
+            assert may_read.wait(DEADLINE_S)
+            return super().read(stamp)
+
+    driver = Slow()
+    with running(sessions[0], driver, ttl_s=10.0) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        stop(sessions[1], "arm")
+        until(lambda: arm.wait_for_driver().state == "stopped")
+        may_read.clear()
+        # More than wait for a tick: those that are left have arrived, and no tick has seen them.
+        send_until(arm, {"shoulder": 9.0}, lambda: host.report().refused.get("overrun"))
+        releasing = threading.Thread(target=arm.release, args=(DEADLINE_S,))
+        releasing.start()
+        until(lambda: not json.loads(stops_file("arm").read_text())["stops"])
+        may_read.set()
+        releasing.join()
+        until(lambda: host.state == "ready")
+        ticks = host.report().rate.ticks
+        until(lambda: host.report().rate.ticks > ticks + 5)
+        assert host.report().refused["stopped"] >= 32
+    assert driver.written().size == 0
