@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import socket
 import threading
@@ -765,6 +766,53 @@ def test_a_forked_child_leaves_the_driver_alone(spawn):
     assert child.line() == "open"
     assert "belongs to process" in child.line()
     assert [child.line(), child.line()] == ["close True", "closed"]
+
+
+class Cut(RecordingDriver):
+    """Joints that do not move by what is written while ``is_cut``, as without power, or are not read."""
+
+    is_cut = False
+    is_silent = False
+
+    def read(self, stamp: int) -> JointReading | None:
+        reading = super().read(stamp)
+        return None if self.is_silent else reading
+
+    def write(self, setpoint) -> None:
+        before = self._target
+        super().write(setpoint)
+        if self.is_cut:
+            self._target = before
+
+
+def test_joints_that_do_not_follow_are_stopped_and_start_from_where_they_are(sessions):
+    driver = Cut([0.0, 0.0])
+    with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+        driver.is_cut = True
+        send_until(arm, {"shoulder": 9.0}, lambda: host.state == "stopped")
+        until(lambda: arm.wait_for_driver().state == "stopped")
+        reason = r"'shoulder' is 0\.\d+ rad from its setpoint, more than following_error=0\.2"
+        assert re.search(reason, arm.wait_for_driver().reason)
+        measured = driver.read(time.time_ns()).positions
+        # The setpoint was one step ahead when the joint was first found to be too far.
+        assert np.abs(driver.written()[-1] - measured).max() <= 0.2 + 2 * STEP
+        driver.is_cut = False
+        arm.release()
+        written = len(driver.written())
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > written)
+        assert np.abs(driver.written()[written] - measured).max() <= STEP * (1 + 1e-9)
+
+
+def test_joints_without_new_readings_are_stopped(sessions):
+    driver = Cut()
+    with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"elbow": 0.1}, lambda: len(driver.written()) > 3)
+        driver.is_silent = True
+        send_until(arm, {"elbow": 0.1}, lambda: host.state == "stopped")
+        until(lambda: "no new reading of the joints for" in arm.wait_for_driver().reason)
 
 
 # Floods, and commands from before a release

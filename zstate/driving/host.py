@@ -27,6 +27,7 @@ from zstate.clock import MonotonicClock
 from zstate.driving.commands import Command, CommandReceiver, Targets
 from zstate.driving.driver import Driver, Setpoint, StopMode
 from zstate.driving.driver_state import DriverReport, DriverStatePublisher, Durations
+from zstate.driving.following import FollowingCheck
 from zstate.driving.limits import Limits
 from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
 from zstate.driving.stops import ActiveStop, StopLatch
@@ -78,9 +79,11 @@ class DriverHost(Closeable):
     setpoint where one was written, so that no step is longer than a tick's motion at the velocity limits.
 
     A call of the driver that raises is counted, and the loop continues. After ``faults_allowed`` ticks in a
-    row with such a failure the driver is stopped as after silence, and ``run`` raises DriverFault. That stop,
-    like those of ``zstate.driving.stop``, is latched: a restarted host stays stopped until a commander
-    releases it, see ``zstate.driving.stops``.
+    row with such a failure the driver is stopped as after silence, and ``run`` raises DriverFault. It is
+    stopped, too, when a joint is further than ``following_error`` [rad] or [m] from its setpoint, such as
+    without power, or when there is no new reading for ``ttl_s``. These stops, like those of
+    ``zstate.driving.stop``, are latched: a restarted host stays stopped until a commander releases them, see
+    ``zstate.driving.stops``.
 
     A robot has one host. Raises InvalidInput for unusable arguments, SecondWriter if another program hosts a
     driver of the robot or publishes these joints, and what ``driver.open`` raises. A context manager. Not a
@@ -99,6 +102,7 @@ class DriverHost(Closeable):
         limits: Limits | None = None,
         on_silence: StopMode = "hold",
         faults_allowed: int = 3,
+        following_error: float = 0.2,
         program: str = "",
     ) -> None:
         self.robot = check_robot(robot or model.name)
@@ -113,6 +117,8 @@ class DriverHost(Closeable):
         self._limiter = SetpointLimiter(limits)
         self._on_silence: StopMode = on_silence
         self._faults_allowed = faults_allowed
+        oldest_ns = max(self._ttl_ns, round(faults_allowed * 1e9 / self._rate_hz))
+        self._following = FollowingCheck(limits, following_error, oldest_ns)
         self._writer = local_writer(secrets.randbits(32), program)
         self._refusals = Refusals(f"command for {self.robot!r}")
         self._targets = Targets(len(names))
@@ -241,6 +247,10 @@ class DriverHost(Closeable):
     def _tick(self) -> None:
         fault = self._read()
         now = time.monotonic_ns()
+        if self._measured is not None:
+            reason = self._following.deviation(self._measured, self._measured_at, now)
+            if reason:
+                self._stop_and_latch(reason)
         fault = self._obey_stops(now) or fault
         self._accept_commands(now)
         has_new_stop = self._stops.latched is not self._obeyed  # obeyed in the next tick
@@ -384,6 +394,7 @@ class DriverHost(Closeable):
         failure = self._driver.write(setpoint)
         if failure is None:
             self._setpoint = limited
+            self._following.written(limited.positions, time.monotonic_ns())
         elif self._setpoint is not None:
             self._limiter.start(self._setpoint.positions, self._setpoint.velocities)
         return failure
@@ -422,6 +433,7 @@ class DriverHost(Closeable):
     def _stop_driver(self, how: StopMode) -> Exception | None:
         """Stop the hardware. The next setpoint starts from the measured joints. Returns what failed."""
         self._setpoint = None
+        self._following.stopped()
         return self._driver.stop(how)
 
     def _end(self) -> None:
