@@ -12,26 +12,25 @@ import os
 import secrets
 import threading
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.bounded import BoundedDict
-from zstate._util.closeable import Closeable
+from zstate._util.closeable import Closeable, held_back_signals
 from zstate._util.fork_safe import fork_safe
 from zstate._util.refusals import Refusals
-from zstate._util.signals import held_back_signals
 from zstate.clock import MonotonicClock
 from zstate.driving.commands import Command, CommandReceiver, Targets
 from zstate.driving.driver import Driver, Setpoint, StopMode
 from zstate.driving.driver_state import DriverReport, DriverStatePublisher, Durations
-from zstate.driving.following import FollowingCheck
+from zstate.driving.host_checks import check_arguments, check_only_host
 from zstate.driving.limits import Limits
 from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
 from zstate.driving.stops import ActiveStop, StopLatch
-from zstate.driving.supervised_driver import SupervisedDriver
+from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
 from zstate.errors import (
     Closed,
     DriverFault,
@@ -42,8 +41,6 @@ from zstate.errors import (
 )
 from zstate.model.robot import RobotModel
 from zstate.net.at_exit import forked_text
-from zstate.net.latched import cached_values
-from zstate.net.ownership import wait_for_discovery
 from zstate.net.presence import WriterWatch, local_writer
 from zstate.net.queryable import check_timeout
 from zstate.net.session import Session
@@ -51,14 +48,11 @@ from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.rate import Rate, check_rate
 from zstate.sources import JointReading
-from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import check_robot, driver_key
+from zstate.wire.identity import Announcement
+from zstate.wire.keys import check_robot
 from zstate.wire.messages import DriverState
-from zstate.wire.native import decode
 
 _LOG = logging.getLogger("zstate")
-
-_CACHES_WITHIN_S = 0.5
 
 StateName = Literal["off", "ready", "active", "holding", "stopped", "fault"]
 
@@ -111,7 +105,7 @@ class DriverHost(Closeable):
         self._ttl_ns = round(check_timeout(ttl_s) * 1e9)
         names = model.part(driver.joint_names).joint_names
         limits = limits or Limits.of(model, names)
-        _check_arguments(driver, limits, names, on_silence, faults_allowed)
+        check_arguments(driver, limits, names, on_silence, faults_allowed)
         self._names = names
         self._limits = limits
         self._limiter = SetpointLimiter(limits)
@@ -143,7 +137,7 @@ class DriverHost(Closeable):
         """The thread inside ``run`` or ``close``."""
         self._pid = os.getpid()
         with ExitStack() as opening:
-            _check_only_host(session, self.robot)
+            check_only_host(session, self.robot)
             self._publisher, self._order = self._open_publisher(session, model, opening)
             self._stops = opening.enter_context(StopLatch(session, self.robot, self._refusals))
             self._commands = opening.enter_context(
@@ -483,41 +477,3 @@ class DriverHost(Closeable):
     def _on_writer(self, announced: Announcement, alive: bool) -> None:
         if alive and announced.stream == "joint_commands":
             self._programs[announced.writer.session] = str(announced.writer)
-
-
-def _check_only_host(session: Session, robot: str) -> None:
-    """Raise SecondWriter if a driver of ``robot`` is hosted already."""
-    wait_for_discovery(session)
-    for value in cached_values(session, driver_key(robot), _CACHES_WITHIN_S):
-        with suppress(MessageError):
-            other = decode(value.payload, value.encoding, DriverState)
-            first = WriterId(other.program, "", 0, 0, other.session)
-            raise SecondWriter(
-                f"{other.program!r} already drives {', '.join(other.joint_names)} of {robot!r}; a robot has "
-                "one driver host: stop the first, or give one driver all joints",
-                robot=robot,
-                stream="driver",
-                first=first,
-            )
-
-
-def _check_arguments(
-    driver: Driver, limits: Limits, names: tuple[str, ...], on_silence: str, faults_allowed: int
-) -> None:
-    """Raise InvalidInput with all problems."""
-    problems: list[str] = []
-    if "position" not in driver.modes:
-        problems.append(f"the driver takes setpoints of {', '.join(sorted(driver.modes))}, not of positions")
-    if limits.joint_names != names:
-        problems.append(f"the limits are of {limits.joint_names}, the driver's joints are {names}")
-    if on_silence not in ("hold", "relax"):
-        problems.append(f"on_silence is 'hold' or 'relax', not {on_silence!r}")
-    if unbounded := [name for name, at_most in zip(names, limits.velocity, strict=True) if at_most == np.inf]:
-        problems.append(
-            f"the velocity of {', '.join(map(repr, unbounded))} has no limit, so that one setpoint could be "
-            "the whole way: pass limits=Limits.of(model, velocity=...)"
-        )
-    if faults_allowed < 1:
-        problems.append(f"faults_allowed is at least 1, not {faults_allowed}")
-    if problems:
-        raise InvalidInput("; ".join(problems))
