@@ -106,5 +106,13 @@ def test_without_catching_up_no_two_ticks_follow_at_once():
         stamps.append(stamp // 1_000_000)
         latenesses.append(rate.lateness_ns // 1_000_000)
     assert stamps == [0, 10, 55, 60, 70]
-    assert latenesses == [0, 0, 5, 0, 0]
+    assert latenesses == [0, 0, 35, 0, 0]
     assert (rate.report().ticks, rate.report().skipped) == (5, 3)
+
+
+def test_without_catching_up_ticks_are_half_a_period_apart_at_least():
+    # The tick of 20 ms comes at 29.9 ms, 0.1 ms before the next deadline, which is given up.
+    clock = SteppingClock(0, lateness={2: 9_900_000})
+    rate = Rate(100.0, clock, threading.Event(), 0.06, catch_up=False)
+    assert [stamp / 1_000_000 for stamp in rate] == [0, 10, 29.9, 40, 50]
+    assert (rate.report().ticks, rate.report().skipped) == (5, 1)

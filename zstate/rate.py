@@ -43,8 +43,8 @@ class Rate:
     deadline, and only more than 1 s counts as a long delay. If the clock is set back, the deadlines move
     with it. Ends when ``stop`` is set, or after ``seconds``.
 
-    With ``catch_up=False`` deadlines are skipped once the next one has passed: two ticks never follow each
-    other at once, as is needed for what moves hardware.
+    With ``catch_up=False`` deadlines are skipped once the next one has passed, and so is one less than half a
+    period after a late tick: two ticks never follow each other at once, as is needed for what moves hardware.
     """
 
     def __init__(
@@ -64,8 +64,10 @@ class Rate:
         self._clock = clock
         self._is_stepping = clock.domain not in (SYSTEM, MONOTONIC)
         self._longest_delay_ns = _LONGEST_STEP_NS if self._is_stepping else _LONGEST_DELAY_NS
+        self._shortest_gap_ns = -math.inf
         if not catch_up:
             self._longest_delay_ns = int(self._period_ns)
+            self._shortest_gap_ns = self._period_ns / 2
         self._stop = stop
         self._ticks = 0
         self._skipped = 0
@@ -73,7 +75,7 @@ class Rate:
         self._first: int | None = None
         self._last = 0
         self.lateness_ns = 0
-        """How long after its deadline the current tick began [ns]."""
+        """How long after its deadline, or the first one that was skipped, the current tick began [ns]."""
 
     def __iter__(self) -> Iterator[int]:
         start = self._clock.now()
@@ -88,6 +90,7 @@ class Rate:
                 return
             now = self._clock.now()
             self._late += now - deadline > self._period_ns
+            self.lateness_ns = 0 if self._is_stepping else now - deadline
             if now - deadline > self._longest_delay_ns:
                 due = int(min((now - start) * self.rate_hz / 1e9, self._max_ticks - 1))
                 self._skipped += due - tick
@@ -98,9 +101,12 @@ class Rate:
             self._first = now if self._first is None else self._first
             self._last = now
             self._ticks += 1
-            self.lateness_ns = now - deadline
             yield now
             tick += 1
+            following = start + round(tick * 1e9 / self.rate_hz)
+            if following - now < self._shortest_gap_ns and tick < self._max_ticks:
+                tick += 1
+                self._skipped += 1
 
     def report(self) -> RateReport:
         """Statistics so far."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import signal
 import socket
 import threading
@@ -11,12 +13,13 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from helpers.processes import DEADLINE_S, until
+from helpers.processes import DEADLINE_S, repeated, until
 from helpers.robots import RRBOT, wait_for_reader
 
-from zstate import JointReading, StatePublisher
+from zstate import JointReading, StatePublisher, load_model
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
-from zstate.driving.stops import wait_for_state
+from zstate.driving.driver import StopMode
+from zstate.driving.stops import stops_file, wait_for_state
 from zstate.errors import DriverFault, InvalidInput, SecondWriter
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
@@ -37,6 +40,9 @@ class RecordingDriver(SimulatedDriver):
         super().__init__(RRBOT, "mirror", start=None if start is None else np.array(start))
         self.calls: list[tuple[str, int, object]] = []
         self.failures: list[Exception] = []
+        """Of the next calls of ``read``."""
+        self.write_failures: list[Exception] = []
+        self.stop_failures: list[BaseException] = []
 
     def _keep(self, name: str, value: object = None) -> None:
         self.calls.append((name, time.monotonic_ns(), value))
@@ -47,12 +53,23 @@ class RecordingDriver(SimulatedDriver):
         return super().read(stamp)
 
     def write(self, setpoint) -> None:
+        if self.write_failures:
+            raise self.write_failures.pop()
         self._keep("write", setpoint.positions)
         super().write(setpoint)
 
     def stop(self, how) -> None:
         self._keep("stop", how)
+        if self.stop_failures:
+            raise self.stop_failures.pop()
         super().stop(how)
+
+    @property
+    def has_torque(self) -> bool:
+        return self._target is not None
+
+    def stops(self) -> list[object]:
+        return [value for name, _, value in list(self.calls) if name == "stop"]
 
     def written(self) -> np.ndarray:
         return np.array([value for name, _, value in list(self.calls) if name == "write"]).reshape(-1, 2)
@@ -415,7 +432,7 @@ def test_a_part_of_the_robot_is_driven_beside_a_publisher_of_the_rest(sessions):
     with DriverHost(sessions[0], Elbow(), RRBOT, "arm", limits=limits) as host:
         report = host.run(seconds=0.1)
         assert report.rate is not None
-        assert report.rate.ticks == 10
+        assert report.rate.ticks + report.rate.skipped == 10
 
 
 def test_one_robot_has_one_host(sessions):
@@ -456,3 +473,388 @@ def test_a_commander_checks_what_it_sends(sessions):
             arm.send({})
         with pytest.raises(InvalidInput, match=r"a ttl of 1\.0 s is longer than 250\.0 ms"):
             arm.send({"elbow": 0.0}, ttl_s=1.0)
+
+
+# Stops that a driver, a second run or a new commander could have undone
+
+
+def test_a_second_run_obeys_a_stop_that_is_still_latched(sessions):
+    driver = RecordingDriver()
+    with (
+        DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS) as host,
+        raw_commands(sessions[1]) as put,
+    ):
+        with pytest.raises(TimeoutError):
+            stop(sessions[1], "arm", "door open", timeout_s=0.05)
+        host.run(seconds=0.1)
+        put(command(elbow=1.0))
+        host.run(seconds=0.1)
+        assert host.report().refused == {"stopped": 1}
+    assert driver.written().size == 0
+
+
+def test_joints_of_an_expired_commander_come_to_rest_when_another_one_takes_over(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+        put(command(shoulder=3.0, ttl=50_000_000))
+        until(lambda: host.state == "active")
+        other = iter(range(10**6))
+
+        def taken_over() -> bool:
+            # Sent all the time, so that it takes over in the tick in which the first command expires.
+            names, block = ("elbow",), to_block([0.1])
+            number = next(other)
+            put(encode(JointCommand(0, number, 8, order_digest(names), block, names=names)))
+            return bool(driver.written()[-1, 1] == 0.1)
+
+        until(taken_over)
+        resting = driver.written()[-1, 0]
+        count = len(driver.written())
+        until(lambda: taken_over() and len(driver.written()) > count + 20)
+    assert driver.written()[-1, 0] == resting < 3.0
+
+
+@pytest.mark.parametrize("faults", [2, 40])
+def test_setpoints_that_could_not_be_written_do_not_add_up_to_a_longer_step(sessions, faults: int):
+    driver = RecordingDriver([0.0, 0.0])
+    with running(sessions[0], driver, faults_allowed=50) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+        driver.write_failures += [OSError("bus off")] * faults
+        send_until(arm, {"shoulder": 9.0}, lambda: host.report().faults == faults)
+        written = len(driver.written())
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > written + 3)
+    assert np.abs(np.diff(driver.written(), axis=0)).max() <= STEP * (1 + 1e-9)
+
+
+def test_a_first_setpoint_that_could_not_be_written_starts_again_from_the_measured_joints(sessions):
+    driver = RecordingDriver([0.5, -0.5])
+    driver.write_failures += [OSError("bus off")] * 20
+    with running(sessions[0], driver, faults_allowed=50), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+    assert np.abs(driver.written()[0] - [0.5, -0.5]).max() <= STEP * (1 + 1e-9)
+
+
+def test_joints_without_a_velocity_limit_are_refused_by_name(sessions, tmp_path):
+    path = tmp_path / "one.urdf"
+    path.write_text(
+        '<robot name="one"><link name="a"/><link name="b"/><joint name="wheel" type="continuous">'
+        '<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    model = load_model(path)
+    with pytest.raises(InvalidInput, match=r"the velocity of 'wheel' has no limit.*velocity=\.\.\."):
+        DriverHost(sessions[0], SimulatedDriver(model), model)
+
+
+def test_relaxed_joints_stay_without_torque_while_stopped(sessions):
+    driver = RecordingDriver()
+    with pytest.raises(DriverFault), running(sessions[0], driver) as host:
+        stop(sessions[1], "arm", "hand inside", how="relax")
+        assert not driver.has_torque
+        stop(sessions[0], "arm", "again", how="hold")
+        assert not driver.has_torque
+        driver.failures += [OSError("unplugged")] * 3
+        until(lambda: host.state == "fault")
+        assert not driver.has_torque
+
+
+def test_joints_relaxed_on_silence_get_no_torque_by_a_stop_or_after_a_restart(sessions):
+    driver = RecordingDriver()
+    options = {"ttl_s": 0.05, "on_silence": "relax"}
+    with pytest.raises(DriverFault), running(sessions[0], driver, **options) as host:
+        with Commander(sessions[1], "arm") as arm:
+            arm.wait_for_driver()
+            send_until(arm, {"elbow": 0.4}, lambda: len(driver.written()))
+        until(lambda: not driver.has_torque)
+        driver.failures += [OSError("unplugged")] * 3
+        until(lambda: host.state == "fault")
+    again = RecordingDriver()
+    with running(sessions[0], again, **options) as host:
+        until(lambda: host.state == "stopped")
+        assert again.stops() == ["relax"]
+
+
+def test_a_stop_that_the_driver_failed_to_carry_out_is_repeated_before_it_is_confirmed(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver, faults_allowed=50) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+        driver.stop_failures += [OSError("servo 6 did not answer")] * 5
+        assert stop(sessions[1], "arm", how="relax").state == "stopped"
+        assert not driver.has_torque
+        assert driver.stops()[1:] == ["relax"] * 6, "after the one of enable"
+        assert host.report().faults == 5
+
+
+def test_a_stop_is_confirmed_when_the_driver_has_stopped(sessions):
+    class Slow(RecordingDriver):
+        has_stopped = False
+
+        def stop(self, how: StopMode) -> None:
+            threading.Event().wait(0.3)
+            super().stop(how)
+            self.has_stopped = True
+
+    driver = Slow()
+    with running(sessions[0], driver):
+        assert stop(sessions[1], "arm").state == "stopped"
+        assert driver.has_stopped
+
+
+def test_an_enable_that_failed_half_way_is_followed_by_a_stop_after_silence(sessions):
+    class Half(RecordingDriver):
+        def enable(self, on: bool) -> None:
+            super().enable(on)
+            self.calls.clear()
+            if on:
+                threading.Event().wait(0.06)
+                raise OSError("servo 6 did not answer")
+
+    driver = Half()
+    with (
+        running(sessions[0], driver, on_silence="relax", ttl_s=0.05) as host,
+        raw_commands(sessions[1]) as put,
+    ):
+        put(command(elbow=0.1))
+        until(lambda: driver.stops() == ["relax"])
+        assert host.state == "ready"
+        assert not driver.has_torque
+
+
+def test_an_interrupted_stop_is_repeated_when_the_loop_ends(sessions):
+    driver = RecordingDriver()
+    with (
+        DriverHost(
+            sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS, on_silence="relax"
+        ) as host,
+        raw_commands(sessions[1]) as put,
+    ):
+        enable = driver.enable
+
+        def enable_once(on: bool) -> None:
+            enable(on)
+            driver.stop_failures.append(KeyboardInterrupt())
+
+        driver.enable = enable_once
+        put(command(elbow=0.1, ttl=50_000_000))
+        with pytest.raises(KeyboardInterrupt):
+            host.run()
+        driver.enable = enable
+        assert not driver.has_torque
+
+
+@pytest.mark.parametrize(
+    "reading",
+    [
+        JointReading(np.array([0.1])),
+        JointReading(np.array([0.1, 0.2, 0.3])),
+        JointReading(np.array([0.1, 0.2]), np.zeros(3)),
+        JointReading(0.1),
+        JointReading(["a", "b"]),
+        [0.1, 0.2],
+    ],
+)
+def test_a_reading_that_no_joints_have_is_counted_and_not_published(sessions, reading: JointReading):
+    class Wrong(RecordingDriver):
+        def read(self, stamp: int) -> JointReading:
+            return reading
+
+    with (
+        running(sessions[0], Wrong(), faults_allowed=10**6) as host,
+        TransformListener(sessions[1], "arm") as listener,
+    ):
+        until(lambda: host.report().faults > 10)
+        assert host.state == "ready"
+        assert listener.stats.received == 0
+
+
+def test_power_and_brakes_are_switched_off_before_the_driver_is_closed(sessions):
+    calls: list[object] = []
+
+    class Closing(RecordingDriver):
+        def enable(self, on: bool) -> None:
+            calls.append(on)
+            raise OSError("unplugged")
+
+        def close(self) -> None:
+            calls.append("close")
+
+    with running(sessions[0], Closing()):
+        pass
+    assert calls == [False, "close"]
+
+
+# Ends of the program
+
+REPORTING_HOST = """
+    import os, signal, sys, threading
+    from zstate import connect, load_model
+    from zstate.driving import DriverHost, Limits, SimulatedDriver
+
+    class Reporting(SimulatedDriver):
+        def write(self, setpoint):
+            super().write(setpoint)
+            if not self.is_moving:
+                self.is_moving = True
+                print("moving", flush=True)
+
+        def stop(self, how):
+            super().stop(how)
+            if self.is_moving:
+                print("stop", how, flush=True)
+
+        def close(self):
+            on_close()
+            print("close", os.getpid() == first, flush=True)
+
+    Reporting.is_moving = False
+    first = os.getpid()
+    on_close = lambda: None
+    model = load_model("rrbot")
+    session = connect()
+    host = DriverHost(session, Reporting(model), model, "arm", limits=Limits.of(model, velocity=2.0))
+    print("open", flush=True)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_that_ends_the_program_stops_and_closes_the_driver_first(
+    sessions, spawn, number: signal.Signals
+):
+    child = spawn(REPORTING_HOST + "    host.run()\n")
+    assert child.line() == "open"
+    with Commander(sessions[1], "arm") as arm, repeated(lambda: arm.send({"shoulder": 9.0})):
+        assert child.line() == "moving"
+        child.process.send_signal(number)
+        assert child.line() == "stop hold"
+        lines = [child.line(), child.line()]
+    assert lines == ["stop relax", "close True"]  # relax is the one of enable(False)
+    assert child.process.wait(DEADLINE_S) == -number
+
+
+def test_close_in_a_handler_of_a_signal_during_close_does_not_wait_for_itself(spawn):
+    child = spawn(
+        REPORTING_HOST
+        + """
+    signal.signal(signal.SIGTERM, lambda *_: host.close())
+    on_close = lambda: signal.raise_signal(signal.SIGTERM)
+    host.run(seconds=0.1)
+    host.close()
+    print("closed", flush=True)
+"""
+    )
+    assert [child.line() for _ in range(3)] == ["open", "close True", "closed"]
+
+
+def test_a_forked_child_leaves_the_driver_alone(spawn):
+    child = spawn(
+        REPORTING_HOST
+        + """
+    with host:
+        if os.fork() == 0:
+            try:
+                host.run()
+            except Exception as error:
+                print(error, flush=True)
+            host.close()
+            os._exit(0)
+        os.wait()
+    print("closed", flush=True)
+"""
+    )
+    assert child.line() == "open"
+    assert "belongs to process" in child.line()
+    assert [child.line(), child.line()] == ["close True", "closed"]
+
+
+class Cut(RecordingDriver):
+    """Joints that do not move by what is written while ``is_cut``, as without power, or are not read."""
+
+    is_cut = False
+    is_silent = False
+
+    def read(self, stamp: int) -> JointReading | None:
+        reading = super().read(stamp)
+        return None if self.is_silent else reading
+
+    def write(self, setpoint) -> None:
+        before = self._target
+        super().write(setpoint)
+        if self.is_cut:
+            self._target = before
+
+
+def test_joints_that_do_not_follow_are_stopped_and_start_from_where_they_are(sessions):
+    driver = Cut([0.0, 0.0])
+    with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+        driver.is_cut = True
+        send_until(arm, {"shoulder": 9.0}, lambda: host.state == "stopped")
+        until(lambda: arm.wait_for_driver().state == "stopped")
+        reason = r"'shoulder' is 0\.\d+ rad from its setpoint, more than following_error=0\.2"
+        assert re.search(reason, arm.wait_for_driver().reason)
+        measured = driver.read(time.time_ns()).positions
+        # The setpoint was one step ahead when the joint was first found to be too far.
+        assert np.abs(driver.written()[-1] - measured).max() <= 0.2 + 2 * STEP
+        driver.is_cut = False
+        arm.release()
+        written = len(driver.written())
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > written)
+        assert np.abs(driver.written()[written] - measured).max() <= STEP * (1 + 1e-9)
+
+
+def test_joints_without_new_readings_are_stopped(sessions):
+    driver = Cut()
+    with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        send_until(arm, {"elbow": 0.1}, lambda: len(driver.written()) > 3)
+        driver.is_silent = True
+        send_until(arm, {"elbow": 0.1}, lambda: host.state == "stopped")
+        until(lambda: "no new reading of the joints for" in arm.wait_for_driver().reason)
+
+
+# Floods, and commands from before a release
+
+
+def test_a_tick_looks_at_a_bounded_number_of_commands_and_the_others_are_counted(sessions):
+    narrow = Limits(RRBOT.joint_names, [-1.0, -0.5], [1.0, 0.5], [2.0, 2.0], [np.inf, np.inf])
+    with (
+        DriverHost(sessions[0], RecordingDriver(), RRBOT, "arm", rate_hz=RATE_HZ, limits=narrow) as host,
+        raw_commands(sessions[1]) as put,
+    ):
+        for number in range(100):
+            put(command(number, elbow=0.6))
+        until(lambda: host.report().refused == {"overrun": 68})
+        host.run(seconds=2 / RATE_HZ)
+        assert host.report().refused == {"overrun": 68, "outside limits": 32}
+
+
+def test_commands_from_before_a_release_do_not_move_the_robot_after_it(sessions):
+    may_read = threading.Event()
+    may_read.set()
+
+    class Slow(RecordingDriver):
+        def read(self, stamp: int) -> JointReading:
+            assert may_read.wait(DEADLINE_S)
+            return super().read(stamp)
+
+    driver = Slow()
+    with running(sessions[0], driver, ttl_s=10.0) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        stop(sessions[1], "arm")
+        until(lambda: arm.wait_for_driver().state == "stopped")
+        may_read.clear()
+        # More than wait for a tick: those that are left have arrived, and no tick has seen them.
+        send_until(arm, {"shoulder": 9.0}, lambda: host.report().refused.get("overrun"))
+        releasing = threading.Thread(target=arm.release, args=(DEADLINE_S,))
+        releasing.start()
+        until(lambda: not json.loads(stops_file("arm").read_text())["stops"])
+        may_read.set()
+        releasing.join()
+        until(lambda: host.state == "ready")
+        ticks = host.report().rate.ticks
+        until(lambda: host.report().rate.ticks > ticks + 5)
+        assert host.report().refused["stopped"] >= 32
+    assert driver.written().size == 0

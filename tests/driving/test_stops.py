@@ -9,19 +9,38 @@ from contextlib import ExitStack, contextmanager
 import pytest
 from helpers.access_routers import router_with_users
 from helpers.processes import repeated, until
-from helpers.robots import RRBOT
+from helpers.robots import RRBOT, wait_for_reader
 
+from zstate._util.refusals import Refusals
 from zstate.driving import Commander, DriverHost, SimulatedDriver, stop
-from zstate.driving.stops import stops_file
+from zstate.driving.driver import StopMode
+from zstate.driving.stops import StopLatch, stops_file
 from zstate.errors import AccessDenied, ConfigError
+from zstate.net.presence import local_writer
 from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session, connect
+from zstate.net.streams import StreamPublisher
+from zstate.wire.keys import release_key
+from zstate.wire.messages import Release
+from zstate.wire.native import ENCODINGS, encode
+
+
+class StoppedDriver(SimulatedDriver):
+    """A simulated driver that keeps how it was stopped."""
+
+    def __init__(self) -> None:
+        super().__init__(RRBOT)
+        self.hows: list[StopMode] = []
+
+    def stop(self, how: StopMode) -> None:
+        super().stop(how)
+        self.hows.append(how)
 
 
 @contextmanager
-def hosted(session: Session) -> Iterator[DriverHost]:
+def hosted(session: Session, driver: SimulatedDriver | None = None) -> Iterator[DriverHost]:
     """A host of robot "arm" whose loop runs."""
-    with DriverHost(session, SimulatedDriver(RRBOT), RRBOT, "arm") as host:
+    with DriverHost(session, driver or SimulatedDriver(RRBOT), RRBOT, "arm") as host:
         thread = threading.Thread(target=host.run)
         thread.start()
         try:
@@ -85,3 +104,44 @@ def test_a_second_stop_keeps_the_robot_stopped_when_the_first_is_released(sessio
         assert arm.release().state == "ready"
         again = stop(sessions[0], "arm", "again")
         assert len(again.stops) == 1
+
+
+def test_joints_without_torque_stay_so_when_the_same_session_stops_them_again(sessions):
+    driver = StoppedDriver()
+    with hosted(sessions[0], driver):
+        stop(sessions[1], "arm", "hand inside", how="relax")
+        stop(sessions[1], "arm", "again", how="hold")
+        assert set(driver.hows) == {"relax"}
+    restarted = StoppedDriver()
+    with hosted(sessions[0], restarted) as host:
+        until(lambda: host.state == "stopped")
+        assert set(restarted.hows) == {"relax"}
+
+
+def test_a_latch_keeps_how_its_host_stopped_for_the_next_one(sessions):
+    with StopLatch(sessions[0], "arm", Refusals()) as latch:
+        latch.latch("the driver failed", local_writer(7), "relax")
+    with StopLatch(sessions[0], "arm", Refusals()) as latch:
+        assert [(one.reason, one.how) for one in latch.latched] == [("the driver failed", "relax")]
+
+
+def test_a_late_release_of_a_hosts_first_stop_does_not_end_its_second(sessions):
+    writer, commander = local_writer(7), local_writer(8)
+    key = release_key("arm", commander.identity)
+    with (
+        StopLatch(sessions[0], "arm", Refusals()) as latch,
+        StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
+    ):
+        wait_for_reader(sessions[1], key)
+        latch.latch("first", writer)
+        other = latch.latched[0]
+        first = encode(Release(0, 0, commander.session, ((other.session, other.seq),)))
+        releases.put(first)
+        until(lambda: not latch.latched)
+        latch.latch("second", writer)
+        latch.latch("of another session", local_writer(9))
+        releases.put(first)
+        # Releases of one commander arrive in order: this one proves that the late one has been handled.
+        releases.put(encode(Release(0, 1, commander.session, ((9, 0),))))
+        until(lambda: len(latch.latched) == 1)
+        assert latch.latched[0].reason == "second"

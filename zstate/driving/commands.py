@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.format import suggestion_text
 from zstate._util.refusals import Refusals
@@ -25,8 +26,8 @@ from zstate.wire.protocol import SerializedSample
 
 Floats = NDArray[np.float64]
 
-_WAITING = 1024
-"""Commands that wait for a control loop; beyond it the oldest are lost, which newer ones replace anyway."""
+_WAITING = 32
+"""Commands that wait for a tick, of which each takes time to check; of more, the oldest are refused."""
 
 NO_DEADLINE = -1
 
@@ -64,7 +65,7 @@ class CommandReceiver(Closeable):
         self._subscriber = StreamSubscriber(session, key, self._on_samples)
 
     def drain(self) -> list[Command]:
-        """The commands since the last call, oldest first."""
+        """The newest commands since the last call, oldest first."""
         return [self._arrived.popleft() for _ in range(len(self._arrived))]
 
     def close(self) -> None:
@@ -77,9 +78,14 @@ class CommandReceiver(Closeable):
 
     def _on_sample(self, sample: SerializedSample, now: int) -> None:
         try:
-            self._arrived.append(self._read(sample, now))
+            command = self._read(sample, now)
         except MessageError as error:
             self._refusals.count(error.reason, error)
+            return
+        if len(self._arrived) == _WAITING:
+            text = f"more than {_WAITING} commands arrived within one tick; the newest are used"
+            self._refusals.count("overrun", text)
+        self._arrived.append(command)
 
     def _read(self, sample: SerializedSample, now: int) -> Command:
         """The command in ``sample``. Raises MessageError with the reason why it is refused."""
@@ -115,14 +121,15 @@ class CommandReceiver(Closeable):
 class Targets:
     """The positions to which the joints move, each until its command expires. For one thread.
 
-    Joints without a command stay where they were at ``start``, or came to rest after their last one. While
-    commands of one session are valid, those of others are refused, and so is an older one of that session.
+    Joints without a command stay where they were at ``start``, or came to rest after their last one, also
+    after a change of the session. While commands of one session are valid, those of others are refused, and
+    so is an older one of that session.
     """
 
     def __init__(self, count: int) -> None:
         self._positions = np.zeros(count)
         self._deadlines = np.full(count, NO_DEADLINE, dtype=np.int64)
-        self._last_seqs: dict[int, int] = {}
+        self._last_seqs: BoundedDict[int, int] = BoundedDict()
         self.session = 0
         """The session of the newest command; 0 before the first."""
         self.arrived = 0
@@ -152,11 +159,7 @@ class Targets:
 
     def accept(self, command: Command) -> None:
         """Move the joints of ``command`` to its positions until its deadline."""
-        if command.session != self.session:
-            self.clear()
         self._last_seqs[command.session] = command.seq
-        while len(self._last_seqs) > _WAITING:
-            del self._last_seqs[next(iter(self._last_seqs))]
         self.session, self.arrived = command.session, command.arrived
         self.ttl_ns = command.deadline - command.arrived
         self._positions[command.columns] = command.positions

@@ -8,26 +8,29 @@ too many failures in a row, which ends the loop. Not a safety-rated channel.
 from __future__ import annotations
 
 import logging
+import os
 import secrets
 import threading
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.bounded import BoundedDict
-from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe, fork_safe_lock
+from zstate._util.closeable import Closeable, held_back_signals
+from zstate._util.fork_safe import fork_safe
 from zstate._util.refusals import Refusals
 from zstate.clock import MonotonicClock
 from zstate.driving.commands import Command, CommandReceiver, Targets
 from zstate.driving.driver import Driver, Setpoint, StopMode
 from zstate.driving.driver_state import DriverReport, DriverStatePublisher, Durations
+from zstate.driving.host_checks import check_arguments, check_only_host
 from zstate.driving.limits import Limits
 from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
 from zstate.driving.stops import ActiveStop, StopLatch
+from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
 from zstate.errors import (
     Closed,
     DriverFault,
@@ -37,8 +40,7 @@ from zstate.errors import (
     format_duration,
 )
 from zstate.model.robot import RobotModel
-from zstate.net.latched import cached_values
-from zstate.net.ownership import wait_for_discovery
+from zstate.net.at_exit import forked_text
 from zstate.net.presence import WriterWatch, local_writer
 from zstate.net.queryable import check_timeout
 from zstate.net.session import Session
@@ -46,14 +48,11 @@ from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.rate import Rate, check_rate
 from zstate.sources import JointReading
-from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import check_robot, driver_key
+from zstate.wire.identity import Announcement
+from zstate.wire.keys import check_robot
 from zstate.wire.messages import DriverState
-from zstate.wire.native import decode
 
 _LOG = logging.getLogger("zstate")
-
-_CACHES_WITHIN_S = 0.5
 
 StateName = Literal["off", "ready", "active", "holding", "stopped", "fault"]
 
@@ -74,9 +73,11 @@ class DriverHost(Closeable):
     setpoint where one was written, so that no step is longer than a tick's motion at the velocity limits.
 
     A call of the driver that raises is counted, and the loop continues. After ``faults_allowed`` ticks in a
-    row with such a failure the driver is stopped as after silence, and ``run`` raises DriverFault. That stop,
-    like those of ``zstate.driving.stop``, is latched: a restarted host stays stopped until a commander
-    releases it, see ``zstate.driving.stops``.
+    row with such a failure the driver is stopped as after silence, and ``run`` raises DriverFault. It is
+    stopped, too, when a joint is further than ``following_error`` [rad] or [m] from its setpoint, such as
+    without power, or when there is no new reading for ``ttl_s``. These stops, like those of
+    ``zstate.driving.stop``, are latched: a restarted host stays stopped until a commander releases them, see
+    ``zstate.driving.stops``.
 
     A robot has one host. Raises InvalidInput for unusable arguments, SecondWriter if another program hosts a
     driver of the robot or publishes these joints, and what ``driver.open`` raises. A context manager. Not a
@@ -95,20 +96,23 @@ class DriverHost(Closeable):
         limits: Limits | None = None,
         on_silence: StopMode = "hold",
         faults_allowed: int = 3,
+        following_error: float = 0.2,
         program: str = "",
     ) -> None:
         self.robot = check_robot(robot or model.name)
-        self._driver = driver
+        self._driver = SupervisedDriver(driver, self.robot)
         self._rate_hz = check_rate(rate_hz)
         self._ttl_ns = round(check_timeout(ttl_s) * 1e9)
         names = model.part(driver.joint_names).joint_names
         limits = limits or Limits.of(model, names)
-        _check_arguments(driver, limits, names, on_silence, faults_allowed)
+        check_arguments(driver, limits, names, on_silence, faults_allowed)
         self._names = names
         self._limits = limits
         self._limiter = SetpointLimiter(limits)
         self._on_silence: StopMode = on_silence
         self._faults_allowed = faults_allowed
+        oldest_ns = max(self._ttl_ns, round(faults_allowed * 1e9 / self._rate_hz))
+        self._following = FollowingCheck(limits, following_error, oldest_ns)
         self._writer = local_writer(secrets.randbits(32), program)
         self._refusals = Refusals(f"command for {self.robot!r}")
         self._targets = Targets(len(names))
@@ -119,18 +123,21 @@ class DriverHost(Closeable):
         self._measured_at = 0
         self._setpoint: Limited | None = None
         """The last one that was written since the joints were enabled; None otherwise."""
-        self._is_enabled = False
         self._obeyed: tuple[ActiveStop, ...] = ()
         self._barred: set[int] = set()
         """Sessions that have commanded a stopped robot: a release by another does not move it for them."""
-        self._written = self._faults = self._faults_in_row = 0
-        self._lateness, self._reading, self._writing = Durations(), Durations(), Durations()
+        self._faults = self._faults_in_row = 0
+        self._lateness = Durations()
         self._rate: Rate | None = None
         self._stop = fork_safe(threading.Event())
-        self._running = fork_safe_lock()
+        self._is_ending = False
+        self._running = fork_safe(threading.RLock())
+        """Held by ``run`` and ``close``; a handler of a signal may call ``close`` inside both."""
         self._runner: threading.Thread | None = None
+        """The thread inside ``run`` or ``close``."""
+        self._pid = os.getpid()
         with ExitStack() as opening:
-            _check_only_host(session, self.robot)
+            check_only_host(session, self.robot)
             self._publisher, self._order = self._open_publisher(session, model, opening)
             self._stops = opening.enter_context(StopLatch(session, self.robot, self._refusals))
             self._commands = opening.enter_context(
@@ -139,13 +146,14 @@ class DriverHost(Closeable):
             opening.enter_context(WriterWatch(session, self.robot, self._on_writer))
             opening.callback(driver.close)
             driver.open()
+            opening.callback(self._driver.disable)
             self._states = opening.enter_context(
                 DriverStatePublisher(session, self.robot, self._driver_state)
             )
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:
-        return f"<DriverHost of {self.robot!r}: {self._state.name}, {self._written} setpoints>"
+        return f"<DriverHost of {self.robot!r}: {self._state.name}, {self._driver.written} setpoints>"
 
     def _open_publisher(
         self, session: Session, model: RobotModel, opening: ExitStack
@@ -170,9 +178,9 @@ class DriverHost(Closeable):
         return DriverReport(
             None if self._rate is None else self._rate.report(),
             self._lateness.spread(),
-            self._reading.spread(),
-            self._writing.spread(),
-            self._written,
+            self._driver.reading.spread(),
+            self._driver.writing.spread(),
+            self._driver.written,
             self._faults,
             dict(self._refusals.counts),
         )
@@ -180,20 +188,16 @@ class DriverHost(Closeable):
     def run(self, *, seconds: float | None = None) -> DriverReport:
         """Run the loop for ``seconds``, or until ``close()``. Ticks that are missed are not made up for.
 
-        If it ends while the joints are commanded or held, the driver is stopped as after silence. Raises
-        DriverFault, SecondWriter and Closed.
+        If it ends while the joints are commanded or held, the driver is stopped as after silence. In the main
+        thread of a program that does not handle SIGTERM and SIGHUP, they end the loop and close this host
+        before they end the process. Raises DriverFault, SecondWriter and Closed.
         """
-        with self._running:
-            self._rate = rate = Rate(self._rate_hz, MonotonicClock(), self._stop, seconds, catch_up=False)
+        if os.getpid() != self._pid:
+            raise Closed(forked_text(f"this driver host belongs to process {self._pid}"))
+        with self._running, held_back_signals(self.close) as arrived:
             self._runner = threading.current_thread()
-            self._change("ready", "")
             try:
-                for _ in rate:
-                    self._lateness.add(rate.lateness_ns)
-                    self._tick()
-            except Closed:
-                if not self._stop.is_set():
-                    raise
+                self._loop(seconds, arrived)
             finally:
                 self._end()
                 self._runner = None
@@ -203,69 +207,103 @@ class DriverHost(Closeable):
         """End the loop, stop the driver, and disconnect it. A second call does nothing.
 
         From inside the loop, such as in a handler of a signal, only the loop ends: close again after ``run``.
+        Does nothing in a forked process.
         """
-        self._stop.set()
+        if os.getpid() != self._pid:
+            return
+        self._is_ending = True
         if self._runner is threading.current_thread():
             return
+        self._stop.set()
         with self._running:
-            self._opened.close()
+            self._runner = threading.current_thread()
+            try:
+                self._opened.close()
+            finally:
+                self._runner = None
+
+    def _loop(self, seconds: float | None, signals: list[int]) -> None:
+        self._rate = rate = Rate(self._rate_hz, MonotonicClock(), self._stop, seconds, catch_up=False)
+        self._obeyed = ()  # stops that are still latched are obeyed once more
+        self._change("ready", "")
+        try:
+            for _ in rate:
+                if self._is_ending or signals:
+                    return
+                self._lateness.add(rate.lateness_ns)
+                self._tick()
+        except Closed:
+            if not self._stop.is_set():
+                raise
 
     # One tick, in the thread of run()
 
     def _tick(self) -> None:
         fault = self._read()
-        self._obey_stops()
         now = time.monotonic_ns()
-        for command in self._commands.drain():
-            self._accept(command, now)
-        if self._state.name != "stopped":
+        if self._measured is not None:
+            reason = self._following.deviation(self._measured, self._measured_at, now)
+            if reason:
+                self._stop_and_latch(reason)
+        fault = self._obey_stops(now) or fault
+        self._accept_commands(now)
+        has_new_stop = self._stops.latched is not self._obeyed  # obeyed in the next tick
+        if self._state.name != "stopped" and not has_new_stop:
             fault = self._advance(now, is_fresh=fault is None) or fault
         self._count_fault(fault)
 
     def _read(self) -> Exception | None:
         """Read the joints and publish them. Returns what failed; the last state stays then."""
-        stamp, start = time.time_ns(), time.monotonic_ns()
-        try:
-            reading = self._driver.read(stamp)
-        except Exception as error:
-            return error
-        finally:
-            self._reading.add(time.monotonic_ns() - start)
-        if reading is None:
-            return None
+        stamp = time.time_ns()
+        reading = self._driver.read(stamp)
+        if reading is None or isinstance(reading, Exception):
+            return reading
         try:
             self._publish(reading, stamp)
-            self._measured = self._limits.vector(reading.positions, "measured positions")
-            self._measured_at = time.monotonic_ns()
-        except InvalidInput as error:
+        except (Closed, SecondWriter):
+            raise
+        except Exception as error:  # what a driver returns may be anything
             return error
         return None
 
     def _publish(self, reading: JointReading, stamp: int) -> None:
-        order = self._order
-        self._publisher.publish(
-            np.asarray(reading.positions)[order],
-            None if reading.velocities is None else np.asarray(reading.velocities)[order],
-            None if reading.efforts is None else np.asarray(reading.efforts)[order],
-            stamp if reading.stamp is None else reading.stamp,
+        positions = self._limits.vector(reading.positions, "measured positions")
+        velocities, efforts = (
+            None if values is None else self._limits.vector(values, f"measured {kind}")[self._order]
+            for kind, values in (("velocities", reading.velocities), ("efforts", reading.efforts))
         )
+        instant = stamp if reading.stamp is None else reading.stamp
+        self._publisher.publish(positions[self._order], velocities, efforts, instant)
+        self._measured, self._measured_at = positions, time.monotonic_ns()
 
-    def _obey_stops(self) -> None:
-        """Stop if there is a new stop; become ready when the last one is released."""
+    def _obey_stops(self, now: int) -> Exception | None:
+        """Stop if there is a new stop; become ready when the last one is released. Returns what failed.
+
+        A stop is confirmed, by its number in the state, once the driver has stopped.
+        """
         latched = self._stops.latched
         if latched is self._obeyed:
-            return
-        before, self._obeyed = set(self._obeyed), latched
-        if set(latched) - before:
-            hows = {one.how for one in latched}
-            self._stop_driver("relax" if "relax" in hows else "hold")
+            return None
+        reason = "; ".join(map(str, latched))
+        if set(latched) - set(self._obeyed):
             self._barred.add(self._targets.session)
             self._targets.clear()
+            failure = self._stop_driver("relax" if "relax" in {one.how for one in latched} else "hold")
+            if failure is not None:
+                self._change("stopped", f"the driver has not stopped yet: {failure!r}; {reason}")
+                return failure
         if latched:
-            self._change("stopped", "; ".join(map(str, latched)))
+            self._change("stopped", reason)
         elif self._state.name == "stopped":
+            self._accept_commands(now)  # those from before the release are refused
             self._barred.discard(self._stops.releaser)
             self._change("ready", f"released by {self._name_of(self._stops.releaser)}")
+        self._obeyed = latched
+        return None
+
+    def _accept_commands(self, now: int) -> None:
+        for command in self._commands.drain():
+            self._accept(command, now)
 
     def _accept(self, command: Command, now: int) -> None:
         """Take the targets of ``command``, or count the reason against it."""
@@ -303,18 +341,18 @@ class DriverHost(Closeable):
         """Enable the joints, or write the next setpoint. Returns what failed."""
         is_live = self._targets.is_live(now)
         if self._setpoint is None:
-            if not is_live and self._is_enabled:
-                self._stop_driver(self._on_silence)
+            if self._driver.is_stopping or (self._driver.needs_stop and not is_live):
+                return self._stop_driver(self._on_silence)
             is_known = self._measured is not None and now - self._measured_at < self._ttl_ns
             if not is_live or not is_fresh or not is_known:
                 return None
-            return self._start(now) if self._is_enabled else self._enable()
+            return self._start(now) if self._driver.is_enabled else self._enable()
         if not is_live and self._state.name == "active":
             reason = f"nothing from {self._name_of(self._targets.session)} for {self._silence(now)}"
             if self._on_silence == "relax":
-                self._stop_driver("relax")
+                failure = self._stop_driver("relax")
                 self._change("ready", reason)
-                return None
+                return failure
             self._change("holding", reason)
         elif is_live and self._state.name == "holding":
             self._targets.start(now, self._resting())
@@ -326,38 +364,34 @@ class DriverHost(Closeable):
 
         Joints may sag by that, so the first setpoint waits for the next reading.
         """
-        try:
-            self._driver.enable(True)
-        except Exception as error:
-            return error
-        self._is_enabled = True
         self._measured = None
-        return None
+        return self._driver.enable()
 
     def _start(self, now: int) -> Exception | None:
+        """Write the first setpoint after a change of state."""
         assert self._measured is not None
         self._limiter.start(self._measured)
         self._targets.start(now, self._measured)
-        self._change("active", "")
-        return self._move(now)
+        failure = self._move(now)
+        if failure is None:
+            self._change("active", "")
+        return failure
 
     def _move(self, now: int) -> Exception | None:
-        """Write the next setpoint on the way to the targets, or to rest."""
+        """Write the next setpoint on the way to the targets, or to rest. Where that fails, nothing moves."""
         dt_s = 1.0 / self._rate_hz  # also after a tick that was missed: slower, never further
         if self._state.name == "holding":
             limited = self._limiter.brake(dt_s)
         else:
             limited = self._limiter.step(self._targets.current(now, self._resting()), dt_s)
-        self._setpoint = limited
-        start = time.monotonic_ns()
-        try:
-            self._driver.write(Setpoint(time.time_ns(), limited.positions, limited.velocities))
-        except Exception as error:
-            return error
-        finally:
-            self._writing.add(time.monotonic_ns() - start)
-        self._written += 1
-        return None
+        setpoint = Setpoint(time.time_ns(), limited.positions, limited.velocities)
+        failure = self._driver.write(setpoint)
+        if failure is None:
+            self._setpoint = limited
+            self._following.written(limited.positions, time.monotonic_ns())
+        elif self._setpoint is not None:
+            self._limiter.start(self._setpoint.positions, self._setpoint.velocities)
+        return failure
 
     def _resting(self) -> NDArray[np.float64]:
         """Where the joints come to rest if they brake from the last setpoint."""
@@ -378,27 +412,28 @@ class DriverHost(Closeable):
         if self._faults_in_row < self._faults_allowed:
             return
         reason = f"the driver failed in {self._faults_in_row} ticks in a row; the last one: {fault!r}"
-        self._stop_driver(self._on_silence)
-        self._stops.latch(reason, self._writer)
+        self._stop_and_latch(reason)
         self._change("fault", reason)
         raise DriverFault(
             f"{self.robot!r} is stopped: {reason}; mend it, restart, then release the stop with a Commander",
             robot=self.robot,
         ) from fault
 
-    def _stop_driver(self, how: StopMode) -> None:
-        """Stop the hardware. The next setpoint starts from the measured joints."""
+    def _stop_and_latch(self, reason: str) -> None:
+        """Stop as after silence, until a commander releases that."""
+        self._stop_driver(self._on_silence)
+        self._stops.latch(reason, self._writer, how=self._on_silence)
+
+    def _stop_driver(self, how: StopMode) -> Exception | None:
+        """Stop the hardware. The next setpoint starts from the measured joints. Returns what failed."""
         self._setpoint = None
-        self._is_enabled = False
-        try:
-            self._driver.stop(how)
-        except Exception as error:
-            self._faults += 1
-            _LOG.error("stop(%r) of the driver of %r failed: %r", how, self.robot, error)
+        self._following.stopped()
+        return self._driver.stop(how)
 
     def _end(self) -> None:
-        if self._setpoint is not None or self._is_enabled:
+        if self._driver.needs_stop:
             self._stop_driver(self._on_silence)
+        self._driver.repeat_stop()
         self._targets.clear()
         if self._state.name != "fault":
             self._change("off", "the loop has ended")
@@ -442,36 +477,3 @@ class DriverHost(Closeable):
     def _on_writer(self, announced: Announcement, alive: bool) -> None:
         if alive and announced.stream == "joint_commands":
             self._programs[announced.writer.session] = str(announced.writer)
-
-
-def _check_only_host(session: Session, robot: str) -> None:
-    """Raise SecondWriter if a driver of ``robot`` is hosted already."""
-    wait_for_discovery(session)
-    for value in cached_values(session, driver_key(robot), _CACHES_WITHIN_S):
-        with suppress(MessageError):
-            other = decode(value.payload, value.encoding, DriverState)
-            first = WriterId(other.program, "", 0, 0, other.session)
-            raise SecondWriter(
-                f"{other.program!r} already drives {', '.join(other.joint_names)} of {robot!r}; a robot has "
-                "one driver host: stop the first, or give one driver all joints",
-                robot=robot,
-                stream="driver",
-                first=first,
-            )
-
-
-def _check_arguments(
-    driver: Driver, limits: Limits, names: tuple[str, ...], on_silence: str, faults_allowed: int
-) -> None:
-    """Raise InvalidInput with all problems."""
-    problems: list[str] = []
-    if "position" not in driver.modes:
-        problems.append(f"the driver takes setpoints of {', '.join(sorted(driver.modes))}, not of positions")
-    if limits.joint_names != names:
-        problems.append(f"the limits are of {limits.joint_names}, the driver's joints are {names}")
-    if on_silence not in ("hold", "relax"):
-        problems.append(f"on_silence is 'hold' or 'relax', not {on_silence!r}")
-    if faults_allowed < 1:
-        problems.append(f"faults_allowed is at least 1, not {faults_allowed}")
-    if problems:
-        raise InvalidInput("; ".join(problems))

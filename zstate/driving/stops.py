@@ -15,7 +15,7 @@ import time
 import weakref
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from zstate._util.closeable import Closeable
@@ -174,11 +174,13 @@ class StopLatch(Closeable):
             opening.enter_context(releases)
             self._opened = opening.pop_all()
 
-    def latch(self, reason: str, writer: WriterId) -> None:
-        """Latch a stop of this host itself."""
+    def latch(self, reason: str, writer: WriterId, how: StopMode = "hold") -> None:
+        """Latch a stop of this host itself, after those that it has latched before."""
         with self._lock:
-            self._by_session[writer.session] = ActiveStop(writer.session, 0, "hold", reason, str(writer))
-            self._publish()
+            session = writer.session
+            known = self._by_session.get(session)
+            seq = 1 + (self._released.get(session, -1) if known is None else known.seq)
+            self._add(ActiveStop(session, seq, how, reason, str(writer)))
 
     def close(self) -> None:
         """Follow no further stops. Those that are latched stay in the file."""
@@ -203,11 +205,20 @@ class StopLatch(Closeable):
             is_old = known is not None and known.seq >= one.seq
             if is_old or self._released.get(one.session, -1) >= one.seq:
                 return
-            self._by_session.pop(one.session, None)
-            self._by_session[one.session] = one
-            if len(self._by_session) > _MOST_STOPS:  # the others still stop the driver
-                del self._by_session[next(iter(self._by_session))]
-            self._publish()
+            self._add(one)
+
+    def _add(self, one: ActiveStop) -> None:
+        """Latch ``one`` in place of the last stop of its session, or of the oldest one of too many.
+
+        If that has switched the torque off, it stays off.
+        """
+        replaced = [self._by_session.pop(one.session, None)]
+        if len(self._by_session) == _MOST_STOPS:
+            replaced.append(self._by_session.pop(next(iter(self._by_session))))
+        if any(old is not None and old.how == "relax" for old in replaced):
+            one = replace(one, how="relax")
+        self._by_session[one.session] = one
+        self._publish()
 
     def _on_releases(self, samples: list[SerializedSample]) -> None:
         for sample in samples:
