@@ -8,21 +8,24 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 from helpers.access_routers import router_with_users
-from helpers.processes import repeated, until
+from helpers.processes import DEADLINE_S, SOON_S, repeated, until
 from helpers.robots import RRBOT, wait_for_reader
 
+from zstate import JointReading
 from zstate._util.refusals import Refusals
 from zstate.driving import Commander, DriverHost, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
 from zstate.driving.stops import StopLatch, stops_file
-from zstate.errors import AccessDenied, ConfigError
+from zstate.errors import AccessDenied, ConfigError, Unreachable
+from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import local_writer
 from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
-from zstate.wire.keys import release_key
-from zstate.wire.messages import Release
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.keys import release_key, stop_expression
+from zstate.wire.messages import Release, Stop
+from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.protocol import SerializedSample
 
 
 class StoppedDriver(SimulatedDriver):
@@ -145,3 +148,51 @@ def test_a_late_release_of_a_hosts_first_stop_does_not_end_its_second(sessions):
         releases.put(encode(Release(0, 1, commander.session, ((9, 0),))))
         until(lambda: len(latch.latched) == 1)
         assert latch.latched[0].reason == "second"
+
+
+def test_a_stop_is_not_confirmed_before_the_driver_has_stopped(sessions):
+    may_stop = threading.Event()
+
+    class Slow(SimulatedDriver):
+        def stop(self, how: StopMode) -> None:
+            assert may_stop.wait(DEADLINE_S)
+            super().stop(how)
+
+    with hosted(sessions[0], Slow(RRBOT)), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        with pytest.raises(Unreachable):  # the host publishes its state several times within that
+            stop(sessions[1], "arm", timeout_s=0.5)
+        may_stop.set()
+        assert stop(sessions[1], "arm").state == "stopped"
+
+
+def test_parallel_stops_of_one_session_are_all_confirmed(sessions):
+    may_read = threading.Event()
+    may_read.set()
+
+    class Slow(SimulatedDriver):
+        def read(self, stamp: int) -> JointReading:
+            assert may_read.wait(DEADLINE_S)
+            return super().read(stamp)
+
+    sent: list[int] = []
+    states: list[str] = []
+
+    def on_stop(sample: SerializedSample) -> None:
+        sent.append(decode(sample.payload, sample.encoding, Stop).seq)
+
+    def stop_it() -> None:
+        states.append(stop(sessions[1], "arm", timeout_s=SOON_S).state)
+
+    with hosted(sessions[0], Slow(RRBOT)), Commander(sessions[1], "arm") as arm, ExitStack() as joined:
+        arm.wait_for_driver()
+        joined.enter_context(LatchedSubscriber(sessions[0], stop_expression("arm"), on_stop))
+        may_read.clear()
+        # No tick while both are sent: the driver obeys the second one in place of the first.
+        for number in (0, 1):
+            thread = threading.Thread(target=stop_it)
+            thread.start()
+            joined.callback(thread.join)
+            until(lambda number=number: number in sent)
+        may_read.set()
+    assert states == ["stopped", "stopped"]

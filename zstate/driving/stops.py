@@ -47,6 +47,9 @@ _LOG = logging.getLogger("zstate")
 _CACHES_WITHIN_S = 0.5
 _MOST_STOPS = 256
 
+_STANDING = ("stopped", "off", "fault")
+"""States in which a driver writes nothing, and has been stopped."""
+
 _STOPPERS: weakref.WeakKeyDictionary[Session, dict[str, _Stopper]] = weakref.WeakKeyDictionary()
 _STOPPERS_LOCK = fork_safe_lock()
 
@@ -93,7 +96,7 @@ class _Stopper:
         session = self._session()
         assert session is not None, "the caller has it"
         confirmed = wait_for_state(
-            session, self._robot, lambda state: (self._writer.session, number) in state.stops, timeout_s
+            session, self._robot, lambda state: self._is_obeyed(state, number), timeout_s
         )
         if confirmed is None:
             raise Unreachable(
@@ -103,6 +106,13 @@ class _Stopper:
                 endpoints=(),
             )
         return confirmed
+
+    def _is_obeyed(self, state: DriverState, number: int) -> bool:
+        """Whether the driver has stopped for the stop ``number`` or a later one, which replaces it."""
+        mine = self._writer.session
+        return state.state in _STANDING and any(
+            session == mine and seq >= number for session, seq in state.stops
+        )
 
 
 def wait_for_state(
