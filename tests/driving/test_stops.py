@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,8 +17,9 @@ from zstate import JointReading
 from zstate._util.refusals import Refusals
 from zstate.driving import Commander, DriverHost, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
-from zstate.driving.stops import StopLatch, stops_file
-from zstate.errors import AccessDenied, ConfigError, Unreachable
+from zstate.driving.stops import StopLatch
+from zstate.driving.stops_file import stops_file
+from zstate.errors import AccessDenied, ConfigError, SecondWriter, Unreachable
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import local_writer
 from zstate.net.security.acl import AclRoles
@@ -102,6 +105,7 @@ def test_a_second_stop_keeps_the_robot_stopped_when_the_first_is_released(sessio
         first = stop(sessions[0], "arm", "first")
         second = stop(sessions[1], "arm", "second")
         assert set(first.stops) < set(second.stops)
+        until(lambda: arm.wait_for_driver().stops == second.stops)
         assert "first" in second.reason
         assert "second" in second.reason
         assert arm.release().state == "ready"
@@ -196,3 +200,22 @@ def test_parallel_stops_of_one_session_are_all_confirmed(sessions):
             until(lambda number=number: number in sent)
         may_read.set()
     assert states == ["stopped", "stopped"]
+
+
+def test_hosts_on_two_networks_do_not_share_the_file_of_stops(sessions):
+    with StopLatch(sessions[0], "arm", Refusals()) as first:
+        with pytest.raises(SecondWriter, match=rf"pid {os.getpid()}' already hosts a driver of 'arm'"):
+            StopLatch(sessions[1], "arm", Refusals())
+        first.latch("door open", local_writer(7))
+    with StopLatch(sessions[1], "arm", Refusals()) as second:
+        assert [one.reason for one in second.latched] == ["door open"]
+
+
+def test_a_file_with_fields_of_wrong_types_is_a_stop(sessions):
+    path = stops_file("arm")
+    path.parent.mkdir(parents=True)
+    damaged = {"session": 1, "seq": "0", "how": "hold", "reason": "", "who": ""}
+    path.write_text(json.dumps({"stops": [damaged], "released": []}))
+    with hosted(sessions[0]), Commander(sessions[1], "arm") as arm:
+        assert "cannot be read: '0' is not a number" in arm.wait_for_driver().reason
+        assert arm.release().state == "ready"
