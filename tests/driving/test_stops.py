@@ -18,7 +18,7 @@ from zstate._util.refusals import Refusals
 from zstate.driving import Commander, DriverHost, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
 from zstate.driving.stops import StopLatch
-from zstate.driving.stops_file import stops_file
+from zstate.driving.stops_file import ActiveStop, stops_file, write_stops
 from zstate.errors import AccessDenied, ConfigError, SecondWriter, Unreachable
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import local_writer
@@ -218,4 +218,18 @@ def test_a_file_with_fields_of_wrong_types_is_a_stop(sessions):
     path.write_text(json.dumps({"stops": [damaged], "released": []}))
     with hosted(sessions[0]), Commander(sessions[1], "arm") as arm:
         assert "cannot be read: '0' is not a number" in arm.wait_for_driver().reason
+        assert arm.release().state == "ready"
+
+
+def test_a_robot_with_many_long_stops_can_be_released(sessions):
+    path = stops_file("arm")
+    write_stops(path, [ActiveStop(1 + n, 0, "hold", "x" * 1000, "desk") for n in range(256)], {})
+    with hosted(sessions[0]), Commander(sessions[1], "arm") as arm:
+        state = arm.wait_for_driver()
+        assert state.state == "stopped"
+        assert len(state.stops) == 256
+        assert "more characters" in state.reason
+        with repeated(lambda: arm.send({"elbow": 0.1})):
+            until(lambda: arm.wait_for_driver().refused.get("stopped"))
+        assert "more characters" in arm.wait_for_driver().last_refusal
         assert arm.release().state == "ready"

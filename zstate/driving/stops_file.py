@@ -126,8 +126,8 @@ def _second_host(robot: str, path: Path, identity: str) -> SecondWriter:
     with suppress(InvalidInput):  # it has the lock, and has not written its name yet
         first = WriterId.parse(identity)
     return SecondWriter(
-        f"{str(first)!r} already hosts a driver of {robot!r} for this user, maybe on another network, and has "
-        f"locked {path}; stop it, or give the second robot another name: they would share their stops",
+        f"{str(first)!r} already hosts a driver of {robot!r} for this user, maybe on another network; stop "
+        f"it, or give the second robot another name: they would share their stops (it has locked {path})",
         robot=robot,
         stream="driver",
         first=first,
