@@ -233,3 +233,13 @@ def test_a_robot_with_many_long_stops_can_be_released(sessions):
             until(lambda: arm.wait_for_driver().refused.get("stopped"))
         assert "more characters" in arm.wait_for_driver().last_refusal
         assert arm.release().state == "ready"
+
+
+def test_a_stop_that_displaces_the_oldest_of_too_many_keeps_the_torque_off(sessions):
+    relaxed = ActiveStop(1, 0, "relax", "hand inside", "desk")
+    others = [ActiveStop(2 + n, 0, "hold", "", "desk") for n in range(255)]
+    write_stops(stops_file("arm"), [relaxed, *others], {})
+    with StopLatch(sessions[0], "arm", Refusals()) as latch:
+        latch.latch("one more", local_writer(1000))
+        assert len(latch.latched) == 256
+        assert [one.reason for one in latch.latched if one.how == "relax"] == ["one more"]
