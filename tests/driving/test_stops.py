@@ -20,13 +20,13 @@ from zstate.driving.driver import StopMode
 from zstate.driving.stops import StopLatch
 from zstate.driving.stops_file import ActiveStop, stops_file, write_stops
 from zstate.errors import AccessDenied, ConfigError, SecondWriter, Unreachable
-from zstate.net.latched import LatchedSubscriber
+from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.presence import local_writer
 from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session, connect
-from zstate.net.streams import StreamPublisher
-from zstate.wire.keys import release_key, stop_expression
-from zstate.wire.messages import Release, Stop
+from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.wire.keys import driver_key, release_expression, release_key, stop_expression
+from zstate.wire.messages import DriverState, Release, Stop
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
 
@@ -243,3 +243,27 @@ def test_a_stop_that_displaces_the_oldest_of_too_many_keeps_the_torque_off(sessi
         latch.latch("one more", local_writer(1000))
         assert len(latch.latched) == 256
         assert [one.reason for one in latch.latched if one.how == "relax"] == ["one more"]
+
+
+def test_a_release_returns_once_the_driver_is_no_longer_stopped(sessions):
+    stopped = DriverState(0, 5, "host", "stopped", "", ("elbow",), 10**8, stops=((7, 0),))
+    without_stops = DriverState(0, 5, "host", "stopped", "", ("elbow",), 10**8)
+    ready = DriverState(0, 5, "host", "ready", "", ("elbow",), 10**8)
+    present = [stopped]
+    states: list[str] = []
+    with (
+        LatchedPublisher(sessions[0], driver_key("arm"), ENCODINGS[DriverState]) as values,
+        repeated(lambda: values.set(encode(present[-1]))),
+        Commander(sessions[1], "arm") as arm,
+    ):
+        until(lambda: arm.wait_for_driver().stops)
+        releasing = threading.Thread(target=lambda: states.append(arm.release(DEADLINE_S).state))
+        on_release = StreamSubscriber(
+            sessions[0], release_expression("arm"), lambda _: present.append(without_stops)
+        )
+        with on_release:
+            releasing.start()
+            until(lambda: not arm.wait_for_driver().stops)
+        present.append(ready)
+        releasing.join()
+    assert states == ["ready"]
