@@ -123,9 +123,10 @@ class Commander(Closeable):
         deadline = time.monotonic() + check_timeout(timeout_s)
         known = self.wait_for_driver(timeout_s)
         while True:
-            left = set(known.stops).intersection(self.wait_for_driver(timeout_s).stops)
-            if not left:
-                return self.wait_for_driver(timeout_s)
+            state = self.wait_for_driver(timeout_s)
+            left = set(known.stops).intersection(state.stops)
+            if not left and (state.stops or state.state != "stopped"):  # not between the two
+                return state
             if time.monotonic() > deadline:
                 raise Unreachable(
                     f"the driver of {self.robot!r} has not confirmed the release within {timeout_s:g} s; may "

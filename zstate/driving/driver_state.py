@@ -18,7 +18,7 @@ from zstate.net.latched import LatchedPublisher
 from zstate.net.session import Session
 from zstate.rate import RateReport
 from zstate.wire.keys import driver_key
-from zstate.wire.messages import DriverState
+from zstate.wire.messages import DriverState, with_short_texts
 from zstate.wire.native import ENCODINGS, encode
 
 PERIOD_S = 0.1
@@ -73,7 +73,8 @@ class DriverReport:
 class DriverStatePublisher(Closeable):
     """Publishes what ``build()`` returns, latched: after each ``notify`` and ten times a second.
 
-    It has a thread of its own, because a latched value waits for the network and a control loop must not.
+    Long texts are cut. It has a thread of its own, because a latched value waits for the network and a
+    control loop must not.
     """
 
     def __init__(self, session: Session, robot: str, build: Callable[[], DriverState]) -> None:
@@ -81,7 +82,7 @@ class DriverStatePublisher(Closeable):
         self._latched = LatchedPublisher(session, driver_key(robot), ENCODINGS[DriverState])
         self._has_changed = fork_safe(threading.Event())
         self._closed = False
-        self._latched.set(encode(build()))
+        self._latched.set(encode(with_short_texts(build())))
         self._thread = threading.Thread(target=self._run, name="zstate driver state", daemon=True)
         self._thread.start()
 
@@ -102,6 +103,6 @@ class DriverStatePublisher(Closeable):
                 self._has_changed.wait(PERIOD_S)
                 self._has_changed.clear()
                 # The last state is published, too: "off", or "fault".
-                self._latched.set(encode(self._build()))
+                self._latched.set(encode(with_short_texts(self._build())))
                 if self._closed:
                     return

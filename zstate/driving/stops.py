@@ -6,22 +6,20 @@ emergency stop is wired to the power of the hardware.
 
 from __future__ import annotations
 
-import json
 import logging
-import os
 import secrets
 import threading
 import time
 import weakref
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.driving.driver import StopMode
+from zstate.driving.stops_file import ActiveStop, HostLock, read_stops, stops_file, write_stops
 from zstate.errors import ConfigError, InvalidInput, MessageError, Unreachable, printable
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber, cached_values
 from zstate.net.ownership import wait_for_discovery
@@ -46,6 +44,9 @@ _LOG = logging.getLogger("zstate")
 
 _CACHES_WITHIN_S = 0.5
 _MOST_STOPS = 256
+
+_STANDING = ("stopped", "off", "fault")
+"""States in which a driver writes nothing, and has been stopped."""
 
 _STOPPERS: weakref.WeakKeyDictionary[Session, dict[str, _Stopper]] = weakref.WeakKeyDictionary()
 _STOPPERS_LOCK = fork_safe_lock()
@@ -93,7 +94,7 @@ class _Stopper:
         session = self._session()
         assert session is not None, "the caller has it"
         confirmed = wait_for_state(
-            session, self._robot, lambda state: (self._writer.session, number) in state.stops, timeout_s
+            session, self._robot, lambda state: self._is_obeyed(state, number), timeout_s
         )
         if confirmed is None:
             raise Unreachable(
@@ -103,6 +104,13 @@ class _Stopper:
                 endpoints=(),
             )
         return confirmed
+
+    def _is_obeyed(self, state: DriverState, number: int) -> bool:
+        """Whether the driver has stopped for the stop ``number`` or a later one, which replaces it."""
+        mine = self._writer.session
+        return state.state in _STANDING and any(
+            session == mine and seq >= number for session, seq in state.stops
+        )
 
 
 def wait_for_state(
@@ -124,32 +132,13 @@ def wait_for_state(
     return found[0] if found else None
 
 
-@dataclass(frozen=True, slots=True)
-class ActiveStop:
-    """A stop that is not released: of ``who``, with the ``seq`` of that program's ``session``."""
-
-    session: int
-    seq: int
-    how: StopMode
-    reason: str
-    who: str
-
-    def __str__(self) -> str:
-        return f"stopped by {self.who}" + (f": {self.reason}" if self.reason else "")
-
-
-def stops_file(robot: str) -> Path:
-    """The file with the stops of ``robot``: below $XDG_STATE_HOME, or ~/.local/state."""
-    folder = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
-    return Path(folder).expanduser() / "zstate" / "stops" / f"{robot}.json"
-
-
 class StopLatch(Closeable):
     """The stops of the driver of ``robot`` that are not released.
 
     They are kept in ``stops_file``, which a restarted host reads, and are read from the caches of programs
     that have sent them. A file that cannot be read counts as a stop; one that cannot be written raises
-    ConfigError here, and is logged later. ``refusals`` counts invalid messages.
+    ConfigError here, and is logged later. While it is open, it has the ``HostLock`` of the robot; raises
+    SecondWriter if another host has that. ``refusals`` counts invalid messages.
     """
 
     def __init__(self, session: Session, robot: str, refusals: Refusals) -> None:
@@ -164,9 +153,10 @@ class StopLatch(Closeable):
         """A new tuple after each change; may be read from any thread."""
         self.releaser = 0
         """The session of the commander that released the last stop."""
-        self._read_file()
-        self._write_file(is_opening=True)
         with ExitStack() as opening:
+            opening.enter_context(HostLock(robot))
+            self._read_file()
+            self._write_file(is_opening=True)
             wait_for_discovery(session)
             call_for_each(cached_values(session, stop_expression(robot), _CACHES_WITHIN_S), self._on_stop)
             opening.enter_context(LatchedSubscriber(session, stop_expression(robot), self._on_stop))
@@ -252,29 +242,15 @@ class StopLatch(Closeable):
 
     def _read_file(self) -> None:
         try:
-            document = json.loads(self._path.read_text())
-            stops = [ActiveStop(**fields) for fields in document["stops"]]
-            self._released = dict(map(tuple, document["released"]))
-        except FileNotFoundError:
-            return
-        except (OSError, ValueError, TypeError, KeyError) as error:
+            stops, self._released = read_stops(self._path)
+        except (OSError, ValueError) as error:
             stops = [ActiveStop(0, 0, "hold", f"{self._path} cannot be read: {error}", "this host")]
         self._by_session = {one.session: one for one in stops}
         self.latched = tuple(stops)
 
     def _write_file(self, *, is_opening: bool = False) -> None:
-        document = {
-            "stops": [asdict(one) for one in self.latched],
-            "released": [list(pair) for pair in self._released.items()],
-        }
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            draft = self._path.with_suffix(f".{os.getpid()}")
-            with draft.open("w") as file:
-                json.dump(document, file)
-                file.flush()
-                os.fsync(file.fileno())
-            draft.replace(self._path)
+            write_stops(self._path, self.latched, self._released)
         except OSError as error:
             text = (
                 f"stops of {self._robot!r} cannot be kept in {self._path}: {error}; a restarted host would "

@@ -179,6 +179,7 @@ def select_edges(sample: TransformSample, edges: Edges, rows: Sequence[int]) -> 
 
 
 MAX_REASON_LENGTH = 1000
+MAX_STATE_TEXT_LENGTH = 2000
 """The longest reason of a Stop."""
 
 
@@ -260,6 +261,17 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     refused: dict[str, int] = {}
     last_refusal: str = ""
     stops: StopIds = ()
+
+
+def with_short_texts(state: DriverState) -> DriverState:
+    """``state`` with at most ``MAX_STATE_TEXT_LENGTH`` characters of each text: readers refuse large ones."""
+    reason, last_refusal = _cut(state.reason), _cut(state.last_refusal)
+    return msgspec.structs.replace(state, reason=reason, last_refusal=last_refusal)
+
+
+def _cut(text: str) -> str:
+    more = len(text) - MAX_STATE_TEXT_LENGTH
+    return text if more <= 0 else f"{text[:MAX_STATE_TEXT_LENGTH]}... and {more} more characters"
 
 
 class StaticTransforms(Message, frozen=True, array_like=True, gc=False):
