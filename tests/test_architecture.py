@@ -402,7 +402,7 @@ RATCHETS = (
     Ratchet("modules in largest folder", modules_in_largest_folder, 18, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
     Ratchet("modules", lambda: len(modules()), 270, 270),
-    Ratchet("lines", lines, 54_100, 36_000),  # 40,026 before moving frames, drivers, scans, driving
+    Ratchet("lines", lines, 54_400, 36_000),  # 40,026 before moving frames, drivers, scans, driving
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
 

@@ -685,6 +685,23 @@ def test_power_and_brakes_are_switched_off_before_the_driver_is_closed(sessions)
     assert calls == [False, "close"]
 
 
+def test_a_release_while_the_loop_is_off_lets_its_commander_move_the_robot(sessions):
+    driver = RecordingDriver()
+    with (
+        DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS) as host,
+        Commander(sessions[1], "arm") as arm,
+    ):
+        arm.wait_for_driver()
+        stop(sessions[1], "arm")
+        with repeated(lambda: arm.send({"elbow": 0.1})):
+            host.run(seconds=0.3)
+            assert host.report().refused.get("stopped")
+        arm.release()
+        with repeated(lambda: arm.send({"elbow": 0.1})):
+            host.run(seconds=0.3)
+        assert driver.written().size
+
+
 # Ends of the program
 
 REPORTING_HOST = """

@@ -13,16 +13,19 @@ import numpy as np
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
-from zstate.errors import Closed
-from zstate.net.latched import LatchedPublisher
+from zstate.errors import Closed, MessageError, SecondWriter
+from zstate.net.latched import LatchedPublisher, cached_values
+from zstate.net.ownership import wait_for_discovery
 from zstate.net.session import Session
 from zstate.rate import RateReport
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import driver_key
 from zstate.wire.messages import DriverState, with_short_texts
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import ENCODINGS, decode, encode
 
 PERIOD_S = 0.1
 JOIN_WITHIN_S = 0.5
+_CACHES_WITHIN_S = 0.5
 
 _MOST_DURATIONS = 60_000
 
@@ -106,3 +109,19 @@ class DriverStatePublisher(Closeable):
                 self._latched.set(encode(with_short_texts(self._build())))
                 if self._closed:
                     return
+
+
+def check_only_host(session: Session, robot: str) -> None:
+    """Raise SecondWriter if a driver of ``robot`` is hosted already."""
+    wait_for_discovery(session)
+    for value in cached_values(session, driver_key(robot), _CACHES_WITHIN_S):
+        with suppress(MessageError):
+            other = decode(value.payload, value.encoding, DriverState)
+            first = WriterId(other.program, "", 0, 0, other.session)
+            raise SecondWriter(
+                f"{other.program!r} already drives {', '.join(other.joint_names)} of {robot!r}; a robot has "
+                "one driver host: stop the first, or give one driver all joints",
+                robot=robot,
+                stream="driver",
+                first=first,
+            )

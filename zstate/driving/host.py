@@ -25,12 +25,12 @@ from zstate._util.refusals import Refusals
 from zstate.clock import MonotonicClock
 from zstate.driving.commands import Command, CommandReceiver, Targets
 from zstate.driving.driver import Driver, Setpoint, StopMode
-from zstate.driving.driver_state import DriverReport, DriverStatePublisher, Durations
-from zstate.driving.host_checks import check_arguments, check_only_host
+from zstate.driving.driver_state import DriverReport, DriverStatePublisher, Durations, check_only_host
 from zstate.driving.limits import Limits
 from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
-from zstate.driving.stops import ActiveStop, StopLatch
-from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
+from zstate.driving.stops import StopLatch
+from zstate.driving.stops_file import ActiveStop
+from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver, check_arguments
 from zstate.errors import (
     Closed,
     DriverFault,
@@ -124,7 +124,7 @@ class DriverHost(Closeable):
         self._setpoint: Limited | None = None
         """The last one that was written since the joints were enabled; None otherwise."""
         self._obeyed: tuple[ActiveStop, ...] = ()
-        self._barred: set[int] = set()
+        self._barred: BoundedDict[int, None] = BoundedDict()
         """Sessions that have commanded a stopped robot: a release by another does not move it for them."""
         self._faults = self._faults_in_row = 0
         self._lateness = Durations()
@@ -225,6 +225,8 @@ class DriverHost(Closeable):
     def _loop(self, seconds: float | None, signals: list[int]) -> None:
         self._rate = rate = Rate(self._rate_hz, MonotonicClock(), self._stop, seconds, catch_up=False)
         self._obeyed = ()  # stops that are still latched are obeyed once more
+        if not self._stops.latched:  # the last one may have been released since the last loop
+            self._barred.pop(self._stops.releaser, None)
         self._change("ready", "")
         try:
             for _ in rate:
@@ -286,7 +288,7 @@ class DriverHost(Closeable):
             return None
         reason = "; ".join(map(str, latched))
         if set(latched) - set(self._obeyed):
-            self._barred.add(self._targets.session)
+            self._barred[self._targets.session] = None
             self._targets.clear()
             failure = self._stop_driver("relax" if "relax" in {one.how for one in latched} else "hold")
             if failure is not None:
@@ -296,7 +298,7 @@ class DriverHost(Closeable):
             self._change("stopped", reason)
         elif self._state.name == "stopped":
             self._accept_commands(now)  # those from before the release are refused
-            self._barred.discard(self._stops.releaser)
+            self._barred.pop(self._stops.releaser, None)
             self._change("ready", f"released by {self._name_of(self._stops.releaser)}")
         self._obeyed = latched
         return None
@@ -319,7 +321,7 @@ class DriverHost(Closeable):
     def _check_released(self, command: Command) -> None:
         """Raise MessageError while stopped, and for a commander that has not released the stop itself."""
         if self._state.name == "stopped":
-            self._barred.add(command.session)
+            self._barred[command.session] = None
             raise MessageError(self._state.reason, reason="stopped")
         if command.session in self._barred:
             text = (

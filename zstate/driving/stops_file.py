@@ -87,8 +87,8 @@ def write_stops(path: Path, stops: Sequence[ActiveStop], released: Mapping[int, 
 class HostLock(Closeable):
     """The lock of the one host of ``robot`` among the processes of this user, on all networks.
 
-    It is a file beside ``stops_file``, which names its process, and is free once that has ended. Raises
-    SecondWriter if another host has it, and ConfigError if it cannot be written.
+    It is a file in the folder of ``stops_file``, which names its process, and is free once that has ended.
+    Raises SecondWriter if another host has it, and ConfigError if it cannot be written.
     """
 
     def __init__(self, robot: str) -> None:

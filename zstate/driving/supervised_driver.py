@@ -144,3 +144,25 @@ class FollowingCheck:
             f"{name!r} is {errors[row]:.3g} {unit} from its setpoint, more than "
             f"following_error={self._most:g}; has it power, and is it free to move?"
         )
+
+
+def check_arguments(
+    driver: Driver, limits: Limits, names: tuple[str, ...], on_silence: str, faults_allowed: int
+) -> None:
+    """Raise InvalidInput with all problems."""
+    problems: list[str] = []
+    if "position" not in driver.modes:
+        problems.append(f"the driver takes setpoints of {', '.join(sorted(driver.modes))}, not of positions")
+    if limits.joint_names != names:
+        problems.append(f"the limits are of {limits.joint_names}, the driver's joints are {names}")
+    if on_silence not in ("hold", "relax"):
+        problems.append(f"on_silence is 'hold' or 'relax', not {on_silence!r}")
+    if unbounded := [name for name, at_most in zip(names, limits.velocity, strict=True) if at_most == np.inf]:
+        problems.append(
+            f"the velocity of {', '.join(map(repr, unbounded))} has no limit, so that one setpoint could be "
+            "the whole way: pass limits=Limits.of(model, velocity=...)"
+        )
+    if faults_allowed < 1:
+        problems.append(f"faults_allowed is at least 1, not {faults_allowed}")
+    if problems:
+        raise InvalidInput("; ".join(problems))
