@@ -3,6 +3,7 @@ import threading
 import pytest
 import zenoh
 from helpers.processes import Child, until
+from helpers.robots import wait_for_reader
 
 from zstate.errors import Closed, InvalidInput
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
@@ -224,6 +225,7 @@ def test_large_values_reach_advanced_subscribers_of_zenoh_once_as_those_of_ros_n
             )
 
         subscribers = [subscriber(1)]
+        wait_for_reader(writer, key("a"))
         with (
             LatchedPublisher(writer, key("a"), ENCODING, is_large=True) as first,
             LatchedPublisher(writer, key("b"), ENCODING, is_large=True) as second,
