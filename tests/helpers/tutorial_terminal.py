@@ -72,7 +72,11 @@ def masked(lines: list[str]) -> list[str]:
         for pattern, name in _MASKS.items():
             line = re.sub(pattern, name, line)  # noqa: PLW2901 - one mask after the other
         found.append(line.rstrip())
-    return [line for line in found if line and not line.startswith(("waiting: ", "receiving "))]
+    return [
+        line
+        for line in found
+        if line and not line.startswith(("waiting: ", "receiving ", "received zstate/"))
+    ]
 
 
 class Terminal:

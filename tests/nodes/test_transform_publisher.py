@@ -157,11 +157,10 @@ def test_static_edge_is_not_moved_by_another_writer(sessions):
 
 def test_two_writers_of_one_name_are_refused(sessions):
     first_session, second_session = sessions
-    with (
-        TransformPublisher(first_session, "r1", "odometry"),
-        pytest.raises(SecondWriter, match=r"transforms of 'r1' under the name 'odometry'.*another name"),
-    ):
-        TransformPublisher(second_session, "r1", "odometry")
+    with TransformPublisher(first_session, "r1", "odometry"):
+        until(lambda: current_tokens(second_session, "zstate/r1/@writer/**", 1.0))
+        with pytest.raises(SecondWriter, match=r"transforms of 'r1' under the name 'odometry'.*another name"):
+            TransformPublisher(second_session, "r1", "odometry")
 
 
 def test_of_two_writers_that_start_an_edge_at_once_one_is_refused(sessions):
