@@ -42,13 +42,10 @@ def test_lines_of_json_are_published_with_their_stamps_until_ctrl_c(spawn: Spawn
         child.send_line(line("map", "ball", 3.0, stamp=2_000))
         between = listener.buffer.wait("map", "ball", 1_500, timeout_s=2 * SOON_S)
         assert between.translation[0] == 2.0
-        child.send_line(line("map", "ball", 3.0, stamp=3_000))
-        listener.buffer.wait("map", "ball", 3_000, timeout_s=2 * SOON_S)
         child.process.send_signal(signal.SIGINT)
         assert child.wait() == 130
     assert "publishing the transforms of standard input on zstate/r1/transforms/" in child.line()
-    # The signal may arrive before the last one is counted.
-    assert child.line() in ("2 transforms published", "3 transforms published")
+    assert child.line() == "2 transforms published"
 
 
 def test_bad_line_is_reported_with_its_number_and_the_next_ones_go_on():

@@ -192,10 +192,11 @@ class _Lines:
         """Publish ``first`` and the transforms after it; report and count those that are refused."""
         edge: Transform | None = first
         while edge is not None:
+            self.published += 1  # before: a signal may arrive right after it is published
             try:
                 publisher.publish([edge])
-                self.published += 1
             except InvalidInput as error:
+                self.published -= 1
                 self._refuse(error)
             edge = next(self, None)
 
