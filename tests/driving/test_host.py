@@ -452,9 +452,10 @@ def test_two_hosts_do_not_share_a_robot_by_its_joints(sessions):
     limits = Limits.of(RRBOT, ["elbow"])
     with (
         DriverHost(sessions[0], part("elbow"), RRBOT, "arm", limits=limits, program="left"),
-        pytest.raises(SecondWriter, match=r"'left@.*' already drives elbow of 'arm'"),
     ):
-        DriverHost(sessions[1], part("shoulder"), RRBOT, "arm")
+        assert wait_for_state(sessions[1], "arm", lambda state: state.joint_names == ("elbow",), 10)
+        with pytest.raises(SecondWriter, match=r"'left@.*' already drives elbow of 'arm'"):
+            DriverHost(sessions[1], part("shoulder"), RRBOT, "arm")
 
 
 def test_unusable_arguments_are_refused_together(sessions):
