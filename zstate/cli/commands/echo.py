@@ -87,11 +87,12 @@ def echo_command(
         ChangeFilter,
         CsvFormatter,
         DescribedJointStates,
+        map_document,
+        scan_document,
         select_field,
         transforms_document,
         yaml_text,
     )
-    from zstate.cli.output.scan_text import map_document, scan_document
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
     from zstate.wire.protocol import carrier
