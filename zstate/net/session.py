@@ -33,9 +33,8 @@ from zstate.net.config import (
     settings_from_environment,
     user_config,
 )
-from zstate.net.open import ProbeSession, connect_timeout, open_with_retry
+from zstate.net.open import ConnectionMonitor, ProbeSession, connect_timeout, open_with_retry
 from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_addresses
-from zstate.net.security.connection_monitor import ConnectionMonitor
 from zstate.net.security.credentials import Credentials
 
 CLOSE_TIMEOUT_S = 0.8
