@@ -19,7 +19,7 @@ from zstate.net.status import StatusPublisher
 from zstate.net.writer import WireWriter, write_all
 from zstate.nodes.publisher_status import StatusReporter
 from zstate.nodes.sample_publisher import SamplePublisher
-from zstate.nodes.value_publisher import ValuePublisher
+from zstate.nodes.static_publisher import ValuePublisher
 from zstate.rate import RateReport
 from zstate.scans.grid import Grid, grid_to_message
 from zstate.scans.scan import Scan, scan_to_message
