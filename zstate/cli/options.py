@@ -163,7 +163,7 @@ def build_credentials(params: Mapping[str, Any]) -> Credentials | None:
 def _password(user: str, file: str | None) -> str:
     # Never from the command line, which every user of the machine can read.
     if file is not None:
-        from zstate.net.security.credential_files import password_in
+        from zstate.net.security.credentials import password_in
 
         return password_in(file)
     password = os.environ.get(PASSWORD_VARIABLE)

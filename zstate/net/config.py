@@ -17,7 +17,7 @@ import zenoh
 
 from zstate._util.endpoint import parse_endpoint, parse_host_port
 from zstate.errors import ConfigError, InvalidInput, NetworkError, PortBusy
-from zstate.net.security.credentials import Credentials
+from zstate.net.security.credentials import Credentials, password_in
 
 Mode = Literal["peer", "loopback", "lan", "client", "router"]
 ConfigSource: TypeAlias = "str | os.PathLike[str] | Mapping[str, object] | zenoh.Config"
@@ -321,8 +321,6 @@ def _credentials_in_environment() -> Credentials | None:
         raise ConfigError(f"{has} is set but {lacks} is not; set both or neither", path=has)
     password = os.environ.get(PASSWORD) if user else None
     if user and (file := os.environ.get(PASSWORD_FILE)):
-        from zstate.net.security.credential_files import password_in  # noqa: PLC0415  # loads ssl, which few need
-
         password = password_in(file)
     elif user and not password:
         raise ConfigError(

@@ -35,7 +35,7 @@ from zstate.net.config import (
 )
 from zstate.net.open import ConnectionMonitor, ProbeSession, connect_timeout, open_with_retry
 from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_addresses
-from zstate.net.security.credentials import Credentials
+from zstate.net.security.credentials import Credentials, check_files
 
 CLOSE_TIMEOUT_S = 0.8
 _UNDECLARE_TIMEOUT_S = 0.5
@@ -108,8 +108,6 @@ def connect(
     if checked == "loopback":
         check_loopback_only((*endpoints, *listen))
     if credentials is not None:
-        from zstate.net.security.credential_files import check_files  # noqa: PLC0415  # loads ssl, which few need
-
         credentials.check_endpoints(endpoints, listen)
         check_files(credentials)
     source = config if config is not None else os.environ.get(CONFIG_VARIABLE) or None

@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 from zstate._util.endpoint import parse_endpoint
 from zstate.errors import AccessDenied, NetworkError, Unreachable
-from zstate.net.security.credential_files import client_context
-from zstate.net.security.credentials import Credentials
+from zstate.net.security.credentials import Credentials, client_context
 
 _CONNECT_TIMEOUT_S = 2.0
 _DENIAL_TIMEOUT_S = 1.0  # a router checks our certificate after our part of the handshake
