@@ -281,7 +281,7 @@ def _announced_names(ctx: click.Context, incomplete: str) -> Iterator[str]:
 
 def _settings(ctx: click.Context, incomplete: str) -> Iterator[str]:
     """KEY=VALUE with the parameters of the file of `zstate up` and their current values."""
-    from zstate.cli.up.toml_file import TomlFile
+    from zstate.cli.up.template import TomlFile
 
     with suppress(ZStateError):
         parameters = TomlFile(Path(str(ctx.params.get("file")))).tables.get("parameters", {})

@@ -16,7 +16,7 @@ import tomli_w
 from zstate.cli.output.console import count_text, fail, print_result, print_status
 from zstate.cli.processes import BackgroundCall
 from zstate.cli.session import SessionOptions
-from zstate.cli.up.toml_file import TomlFile
+from zstate.cli.up.template import TomlFile
 from zstate.clock import SystemClock
 from zstate.errors import ConfigError, InvalidInput
 from zstate.model.robot import RobotModel
