@@ -17,9 +17,8 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from zstate.errors import RecordingError
-from zstate.recording.mcap.index import DataRange, Summary, read_header
+from zstate.recording.mcap.index import DataRange, Scan, Summary, read_header
 from zstate.recording.mcap.records import MAGIC, MESSAGE, BoundedFile, CorruptData, iter_records, parse_record
-from zstate.recording.mcap.scan import Scan
 from zstate.recording.storage import Channel, Format, ReadFilter, Record, SortedPart
 
 IDENTITY = "zstate.recording"

@@ -12,9 +12,8 @@ from mcap.opcode import Opcode
 
 from zstate.errors import RecordingError
 from zstate.recording.mcap.file import explain_unreadable, open_errors
-from zstate.recording.mcap.index import DataLoss
+from zstate.recording.mcap.index import DataLoss, Scan
 from zstate.recording.mcap.records import MESSAGE, BoundedFile, iter_records
-from zstate.recording.mcap.scan import Scan
 from zstate.recording.mcap.writer import LIBRARY, McapOutput
 
 
