@@ -22,7 +22,7 @@ from zstate.net.session import connect
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.messages import JointState, order_digest
 from zstate.wire.native import encode
-from zstate.wire.ros2.attachment import unpack
+from zstate.wire.ros2.graph import unpack_attachment
 
 JOINTS, TF = "zstate/r1/joint_states", "zstate/r1/tf"
 POSITIONS, RATES = np.array([0.1 + 0.2, -1.0 / 3.0]), np.array([5e-324, 1.5])
@@ -102,8 +102,8 @@ def test_ros_payloads_and_attachments_are_those_of_the_slow_way(sessions, wire: 
         assert payloads_until(tap, expected[-1]) == expected
         attachments = [arrival.attachment for arrival in tap.arrivals[-3:]]
         if wire == "ros2":
-            assert [unpack(one).seq for one in attachments] == [2, 3, 4]
-            assert {unpack(one).gid for one in attachments} == {encoder._gid}
+            assert [unpack_attachment(one).seq for one in attachments] == [2, 3, 4]
+            assert {unpack_attachment(one).gid for one in attachments} == {encoder._gid}
         else:
             assert attachments == [None] * 3
         with pytest.raises(InvalidInput, match="the stamp is 0"):

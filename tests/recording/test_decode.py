@@ -40,9 +40,9 @@ from zstate.wire.messages import (
     to_float32_block,
 )
 from zstate.wire.ros2.encoder import RosStreamEncoder
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
+from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import JOINT_STATE, LASER_SCAN, OCCUPANCY_GRID
 
 STORAGES = (StoragePlugin.SQLITE3, StoragePlugin.MCAP)

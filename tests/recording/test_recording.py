@@ -28,8 +28,8 @@ from zstate.transform import Transform
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
 from zstate.wire.ros2.encoder import RosStreamEncoder
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
 
 

@@ -28,9 +28,8 @@ from zstate.wire.messages import (
     TransformSample,
 )
 from zstate.wire.ros2.decoder import RosDecoder
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.topics import SHARED, robot_from_topic, ros_type
+from zstate.wire.ros2.topics import SHARED, FrameNames, robot_from_topic, ros_type
 
 _TOPICS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
 STREAMS: tuple[Stream, ...] = (*_TOPICS, *TOPICS)

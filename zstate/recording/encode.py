@@ -41,10 +41,9 @@ from zstate.wire.messages import (
 )
 from zstate.wire.ros2.cdr import to_time
 from zstate.wire.ros2.encoder import RosStreamEncoder
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
-from zstate.wire.ros2.topics import SHARED, RmwKeys, ros_type
+from zstate.wire.ros2.topics import SHARED, FrameNames, RmwKeys, ros_type
 from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 
 MAX_LATCHED = 256

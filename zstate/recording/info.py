@@ -19,9 +19,8 @@ from zstate.wire.keys import LATCHED_STREAMS, Stream
 from zstate.wire.messages import LaserScan, from_float32_block
 from zstate.wire.ros2.cdr import decode_string
 from zstate.wire.ros2.decoder import RosDecoder
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.topics import SHARED
+from zstate.wire.ros2.topics import SHARED, FrameNames
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.ros2.encoder import RosStreamEncoder
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import FrameNames
 
 STAMP = 1_700_000_000_123_456_789
 DIGEST = b"8 bytes."

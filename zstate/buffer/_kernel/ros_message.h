@@ -2,7 +2,7 @@
  *
  * CDR as in zstate/wire/ros2/cdr.py: a header of 4 bytes, the stamp, frame_id, names, and
  * positions, velocities and efforts, each value aligned to its size, counted from the fifth byte.
- * The attachment (zstate/wire/ros2/attachment.py) is the sequence number, a time, 16 and the 16
+ * The attachment (zstate/wire/ros2/graph.py) is the sequence number, a time, 16 and the 16
  * bytes of the gid.
  */
 

@@ -1,22 +1,26 @@
-"""Decoder of ROS 2 topics into zstate's messages, and of JointState and TFMessage among them."""
+"""Decoder of ROS 2 topics into zstate's messages: JointState, TFMessage, LaserScan and OccupancyGrid."""
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from collections.abc import Sequence
 from hashlib import blake2b
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.errors import MessageError
+from zstate.errors import InvalidInput, MessageError
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     ClockMessage,
     Edges,
     JointState,
+    LaserScan,
     Message,
+    OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     TransformSample,
@@ -33,10 +37,15 @@ from zstate.wire.ros2.cdr import (
     decode_string,
     unpack_stamps,
 )
-from zstate.wire.ros2.frame_names import FrameNames
-from zstate.wire.ros2.scans import decode_grid, decode_scan
-from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
+from zstate.wire.ros2.topics import FrameNames
+from zstate.wire.ros2.types import JOINT_STATE, LASER_SCAN, OCCUPANCY_GRID, TF_MESSAGE
 
+FLOAT_BYTES = 4
+"""Of a float32, in which ROS has ranges."""
+CELL_BYTES = 1
+"""Of a cell of a grid."""
+
+_SCAN_FLOATS = 7
 _POSE_NUMBERS = 7
 _STAMP_WORDS = STAMP_BYTES // 4
 
@@ -279,3 +288,37 @@ def read_tf_message(reader: CdrReader) -> RosTransforms:
         poses.append(reader.numbers(_POSE_NUMBERS))
     shared = stamps[0] if len(set(stamps)) == 1 else None
     return RosTransforms(shared, tuple(stamps), tuple(edges), b"".join(poses))
+
+
+def decode_scan(payload: bytes, session: int, seq: int, names: FrameNames) -> LaserScan:
+    """The scan in ``payload``; its ``angle_max`` is ignored. Raises MessageError with the reason "truncated" or "malformed"."""
+    reader = CdrReader(payload, LASER_SCAN.name)
+    stamp, frame = reader.stamp(), names.to_zstate(reader.text())
+    angle_min, _, angle_increment, ray_s, scan_s, range_min, range_max = _floats(reader, _SCAN_FLOATS)
+    ranges, intensities = reader.sequence(FLOAT_BYTES), reader.sequence(FLOAT_BYTES)
+    if not (isfinite(ray_s) and isfinite(scan_s)):
+        raise reader.malformed(f"its time_increment is {ray_s}, and its scan_time {scan_s} [s]")
+    times = round(ray_s * 1e9), round(scan_s * 1e9)
+    geometry = angle_min, angle_increment, *times, range_min, range_max
+    try:
+        return LaserScan(stamp, seq, session, frame, *geometry, ranges, intensities or None)
+    except InvalidInput as error:
+        raise reader.malformed(str(error)) from None
+
+
+def decode_grid(payload: bytes, session: int, names: FrameNames) -> OccupancyGrid:
+    """The grid in ``payload``; its ``map_load_time`` is ignored. Raises MessageError with the reason "truncated" or "malformed"."""
+    reader = CdrReader(payload, OCCUPANCY_GRID.name)
+    stamp, frame = reader.stamp(), names.to_zstate(reader.text())
+    reader.stamp()
+    (resolution,) = _floats(reader, 1)
+    width, height, origin = reader.count(), reader.count(), reader.numbers(_POSE_NUMBERS)
+    cells = reader.sequence(CELL_BYTES)
+    try:
+        return OccupancyGrid(session, stamp, frame, resolution, width, height, origin, cells)
+    except InvalidInput as error:
+        raise reader.malformed(str(error)) from None
+
+
+def _floats(reader: CdrReader, count: int) -> tuple[float, ...]:
+    return struct.unpack(f"<{count}f", reader.numbers(count, FLOAT_BYTES))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import product
@@ -26,11 +27,16 @@ from zstate.wire.messages import (
     from_block,
     to_block,
 )
-from zstate.wire.ros2.attachment import pack
 from zstate.wire.ros2.cdr import CdrReader, CdrTemplate, CdrWriter, encode_clock, encode_string, pack_stamp
-from zstate.wire.ros2.decoder import duplicate_text, read_joint_state, read_tf_message
-from zstate.wire.ros2.frame_names import FrameNames
-from zstate.wire.ros2.scans import encode_grid, encode_scan
+from zstate.wire.ros2.decoder import (
+    CELL_BYTES,
+    FLOAT_BYTES,
+    duplicate_text,
+    read_joint_state,
+    read_tf_message,
+)
+from zstate.wire.ros2.graph import pack_attachment
+from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
 if TYPE_CHECKING or kernel == "c":
@@ -82,7 +88,7 @@ class RosStreamEncoder:
         if self._compiled is not None:
             return self._compiled.attachment(now)
         self._seq += 1
-        return pack(self._seq, now, self._gid)
+        return pack_attachment(self._seq, now, self._gid)
 
     def encode(self, message: Message) -> bytes:
         """``message`` as CDR.
@@ -237,3 +243,50 @@ class TfMessageEncoder:
                 f"not {len(poses)}"
             )
         return self._template.join(self._fixed, pack_stamp(stamp) * count + poses)
+
+
+def encode_scan(scan: LaserScan, names: FrameNames) -> bytes:
+    """The payload of ``scan``.
+
+    ROS has float32 where it has float64 (angles, range limits), and seconds in float32 where it has
+    nanoseconds: ``time_increment`` is ``ray_ns``, ``scan_time`` is ``scan_ns``. ``angle_max`` is the angle of
+    the last ray. Raises InvalidInput for a number that float32 cannot represent, and for a stamp outside 1901
+    to 2038.
+    """
+    last_ray = max(0, len(scan.ranges) // FLOAT_BYTES - 1)
+    angle_max = scan.angle_min + last_ray * scan.angle_increment
+    angles = scan.angle_min, angle_max, scan.angle_increment
+    times_s = scan.ray_ns * 1e-9, scan.scan_ns * 1e-9
+    writer = CdrWriter()
+    writer.stamp(scan.stamp)
+    writer.text(names.to_ros(scan.frame))
+    writer.numbers(_float32(*angles, *times_s, scan.range_min, scan.range_max), FLOAT_BYTES)
+    writer.sequence(scan.ranges, FLOAT_BYTES)
+    writer.sequence(scan.intensities or b"", FLOAT_BYTES)
+    return writer.payload()
+
+
+def encode_grid(grid: OccupancyGrid, names: FrameNames) -> bytes:
+    """The payload of ``grid``, with a resolution of float32; its stamp is also ``map_load_time``.
+
+    Raises InvalidInput as ``encode_scan`` does.
+    """
+    writer = CdrWriter()
+    writer.stamp(grid.stamp)
+    writer.text(names.to_ros(grid.frame))
+    writer.stamp(grid.stamp)
+    writer.numbers(_float32(grid.resolution), FLOAT_BYTES)
+    writer.count(grid.width)
+    writer.count(grid.height)
+    writer.numbers(grid.origin)
+    writer.sequence(grid.cells, CELL_BYTES)
+    return writer.payload()
+
+
+def _float32(*numbers: float) -> bytes:
+    try:
+        return struct.pack(f"<{len(numbers)}f", *numbers)
+    except OverflowError:
+        raise InvalidInput(
+            f"ROS 2 has float32 for {', '.join(map(str, numbers))}, and one of them is too large for it"
+        ) from None

@@ -14,11 +14,10 @@ from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, Stream
 from zstate.wire.messages import Message, check_edges, check_size
 from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
-from zstate.wire.ros2.attachment import ATTACHMENT_BYTES, session_from_gid, unpack
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.graph import (
+    ATTACHMENT_BYTES,
     DDS_GRAPH_EXPRESSION,
     DdsToken,
     EndpointToken,
@@ -27,6 +26,8 @@ from zstate.wire.ros2.graph import (
     graph_expression,
     parse_dds_token,
     parse_token,
+    session_from_gid,
+    unpack_attachment,
 )
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
@@ -34,6 +35,7 @@ from zstate.wire.ros2.topics import (
     NAMED_TOPICS,
     SHARED,
     DdsKeys,
+    FrameNames,
     RmwKeys,
     robot_from_topic,
     ros_type,
@@ -127,7 +129,7 @@ class Ros2Wire:
 
     def _origin(self, arrival: SerializedSample) -> tuple[int, int]:
         """The writer's session and the sequence number."""
-        attachment = unpack(arrival.attachment)
+        attachment = unpack_attachment(arrival.attachment)
         return session_from_gid(attachment.gid), attachment.seq
 
     def writers_expression(self, robot: str) -> str:

@@ -33,8 +33,8 @@ from zstate.wire.ros2 import types
 from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string
 from zstate.wire.ros2.decoder import JointStateDecoder, RosDecoder, TfMessageDecoder
 from zstate.wire.ros2.encoder import JointStateEncoder, RosStreamEncoder, TfMessageEncoder
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import FrameNames
 
 pytestmark = [pytest.mark.heavy, pytest.mark.processes]
 

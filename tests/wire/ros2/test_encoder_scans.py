@@ -25,8 +25,8 @@ from zstate.wire.messages import (
 )
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
 
 STAMP = 1_700_000_000_123_456_789

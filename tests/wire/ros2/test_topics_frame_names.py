@@ -4,8 +4,8 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput
 from zstate.wire.keys import full_name
-from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import FrameNames
 
 ROBOT = "r1"
 PREFIXES = st.sampled_from(["", "r1/", "*/", "left_", "fleet/r1/", "*_"])
