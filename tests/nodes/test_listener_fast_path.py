@@ -40,8 +40,8 @@ from zstate.wire.messages import (
 from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
-from zstate.wire.ros2.graph import pack_attachment
 from zstate.wire.ros2.encoder import JointStateEncoder
+from zstate.wire.ros2.graph import pack_attachment
 
 pytestmark = pytest.mark.skipif(kernel == "reference", reason="only the extension has a fast path")
 
@@ -245,7 +245,9 @@ class RosWriter(Writer):
         encoder = JointStateEncoder(sample.names or RRBOT.joint_names, frame_id="base")
         payload = encoder.encode(sample.stamp, sample.positions, sample.velocities, sample.efforts)
         gid = sample.session.to_bytes(8, "little") + bytes(8)
-        return SerializedSample(self.key, payload, "", pack_attachment(sample.seq, self.random.randrange(2**60), gid))
+        return SerializedSample(
+            self.key, payload, "", pack_attachment(sample.seq, self.random.randrange(2**60), gid)
+        )
 
     def not_finite(self, payload: bytes) -> bytes:
         return payload[:-8] + struct.pack("<d", self.random.choice((np.nan, np.inf)))

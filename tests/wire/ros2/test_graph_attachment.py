@@ -41,7 +41,15 @@ def test_the_labels_of_an_old_rmw_zenoh_are_recognised():
 
 
 @pytest.mark.parametrize(
-    "wrong", [b"", b"\0" * 32, b"\0" * 34, b"\0" * 33, pack_attachment(1, 2, GID) + b"\0", pack_attachment(-1, 2, GID)]
+    "wrong",
+    [
+        b"",
+        b"\0" * 32,
+        b"\0" * 34,
+        b"\0" * 33,
+        pack_attachment(1, 2, GID) + b"\0",
+        pack_attachment(-1, 2, GID),
+    ],
 )
 def test_bytes_of_another_shape_are_foreign(wrong: bytes):
     with pytest.raises(MessageError, match=f"an attachment of {len(wrong)} bytes") as caught:

@@ -291,7 +291,10 @@ def read_tf_message(reader: CdrReader) -> RosTransforms:
 
 
 def decode_scan(payload: bytes, session: int, seq: int, names: FrameNames) -> LaserScan:
-    """The scan in ``payload``; its ``angle_max`` is ignored. Raises MessageError with the reason "truncated" or "malformed"."""
+    """The scan in ``payload``; its ``angle_max`` is ignored.
+
+    Raises MessageError with the reason "truncated" or "malformed".
+    """
     reader = CdrReader(payload, LASER_SCAN.name)
     stamp, frame = reader.stamp(), names.to_zstate(reader.text())
     angle_min, _, angle_increment, ray_s, scan_s, range_min, range_max = _floats(reader, _SCAN_FLOATS)
@@ -307,7 +310,7 @@ def decode_scan(payload: bytes, session: int, seq: int, names: FrameNames) -> La
 
 
 def decode_grid(payload: bytes, session: int, names: FrameNames) -> OccupancyGrid:
-    """The grid in ``payload``; its ``map_load_time`` is ignored. Raises MessageError with the reason "truncated" or "malformed"."""
+    """The grid in ``payload``; its ``map_load_time`` is ignored. Raises as ``decode_scan`` does."""
     reader = CdrReader(payload, OCCUPANCY_GRID.name)
     stamp, frame = reader.stamp(), names.to_zstate(reader.text())
     reader.stamp()

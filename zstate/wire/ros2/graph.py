@@ -219,7 +219,7 @@ def unpack_attachment(data: bytes | None) -> Attachment:
             "or a bridge that drops it",
             reason="no attachment",
         )
-    if len(data) == _ATTACHMENT.size and data[16] == _GID_BYTES:
+    if len(data) == ATTACHMENT_BYTES and data[16] == _GID_BYTES:
         seq, source_time, _length, gid = _ATTACHMENT.unpack(data)
         if seq >= 0:
             return Attachment(seq, source_time, gid)
@@ -230,7 +230,8 @@ def unpack_attachment(data: bytes | None) -> Attachment:
             reason="foreign",
         )
     raise MessageError(
-        f"an attachment of {len(data)} bytes that is not rmw_zenoh_cpp's, which has {_ATTACHMENT.size} bytes, "
-        f"a sequence number from 0 on, and a {_GID_BYTES} before the gid; another program writes on this key",
+        f"an attachment of {len(data)} bytes that is not rmw_zenoh_cpp's, which has {ATTACHMENT_BYTES} "
+        f"bytes, a sequence number from 0 on, and a {_GID_BYTES} before the gid; another program writes on "
+        "this key",
         reason="foreign",
     )
