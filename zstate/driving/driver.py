@@ -67,7 +67,10 @@ class Driver(Protocol):
         ...
 
     def stop(self, how: StopMode) -> None:
-        """Stop now. May be called at any time after ``open``, and more than once; never raises."""
+        """Stop now. May be called at any time after ``open``, and more than once.
+
+        Raises any exception if the joints may still move: the host calls it again until it succeeds.
+        """
         ...
 
     def close(self) -> None:

@@ -1,0 +1,54 @@
+"""Dynamixel servos of the X series on a serial bus, by Robotis' SDK: pip install dynamixel-sdk."""
+
+import dynamixel_sdk as dxl
+import numpy as np
+
+from zstate import JointReading
+from zstate.driving import Calibration
+
+TORQUE, GOAL, POSITION = 64, 116, 132  # addresses in the control table
+
+
+class SerialServos:
+    """The servos ``ids`` move the joints. Nothing is retried: the next tick of the host reads again."""
+
+    modes = frozenset({"position"})
+
+    def __init__(self, port, joint_names, ids, *, latency_ms=16, zero=2048, sign=1, ratio=1):
+        self.joint_names, self._ids, self._encoders = joint_names, ids, Calibration(4096, zero, sign, ratio)
+        self._port, self._bus = dxl.PortHandler(port), dxl.PacketHandler(2.0)
+        dxl.port_handler.LATENCY_TIMER = latency_ms  # of the USB adapter: replies may take twice as long
+
+    def open(self):
+        self._port.openPort()
+
+    def enable(self, on):
+        if on:
+            self.stop("hold")  # the goals may be old
+        for reply in [self._bus.write1ByteTxRx(self._port, one, TORQUE, on) for one in self._ids]:
+            self._check(*reply)
+
+    def read(self, stamp):
+        group = dxl.GroupSyncRead(self._port, self._bus, POSITION, 4)
+        for one in self._ids:
+            group.addParam(one)
+        self._check(group.txRxPacket())
+        counts = np.array([group.getData(one, POSITION, 4) for one in self._ids], np.uint32)
+        return JointReading(self._encoders.to_positions(counts.view(np.int32)))
+
+    def write(self, setpoint):
+        group = dxl.GroupSyncWrite(self._port, self._bus, GOAL, 4)
+        for one, count in zip(self._ids, self._encoders.to_counts(setpoint.positions), strict=True):
+            group.addParam(one, int(count).to_bytes(4, "little", signed=True))
+        self._check(group.txPacket())
+
+    def stop(self, how):
+        self.write(self.read(0)) if how == "hold" else self.enable(False)
+
+    def close(self):
+        if self._port.is_open:
+            self._port.closePort()
+
+    def _check(self, result, error=0):
+        if result != dxl.COMM_SUCCESS or error:
+            raise ConnectionError(self._bus.getTxRxResult(result) + self._bus.getRxPacketError(error))
