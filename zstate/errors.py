@@ -11,6 +11,8 @@ ZStateError
 ├── MessageError (ValueError)          a payload that cannot be decoded           .reason
 ├── SecondWriter                       another writer is active already           .first .robot .stream .edge
 ├── DriverFault                        a driver that failed too often, and stopped    .robot
+├── MotionRefused                      a motion that a driver must not make       .findings
+├── MotionTimeout (TimeoutError)       a motion that is still under way           .progress
 ├── RecordingError                     a file that cannot be read or written      .path
 ├── NetworkError                       Zenoh reports a failure
 │   ├── Unreachable (TimeoutError)     no answer from the endpoints               .endpoints
@@ -256,6 +258,25 @@ class DriverFault(ZStateError):
     def __init__(self, message: str, *, robot: str) -> None:
         super().__init__(message)
         self.robot = robot
+
+
+class MotionRefused(ZStateError):
+    """A driver has refused a motion; nothing moves by it. ``findings`` are all reasons."""
+
+    def __init__(self, robot: str, findings: Sequence[str]) -> None:
+        self.findings = tuple(findings)
+        count = f"{len(self.findings)} finding{'s' if len(self.findings) != 1 else ''}"
+        super().__init__(
+            "\n  ".join((f"the driver of {robot!r} refuses the motion ({count})", *self.findings))
+        )
+
+
+class MotionTimeout(ZStateError, TimeoutError):
+    """A motion is still under way after the time to wait; ``progress`` is 0 to 1."""
+
+    def __init__(self, message: str, *, progress: float) -> None:
+        super().__init__(message)
+        self.progress = progress
 
 
 class RecordingError(ZStateError):

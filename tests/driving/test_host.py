@@ -21,10 +21,12 @@ from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
 from zstate.driving.stops import stops_file, wait_for_state
 from zstate.errors import DriverFault, InvalidInput, SecondWriter
+from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
-from zstate.wire.messages import DriverState, JointCommand, order_digest, to_block
+from zstate.wire.keys import release_key
+from zstate.wire.messages import DriverState, JointCommand, Release, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
 LIMITS = Limits.of(RRBOT, velocity=2.0)
@@ -876,3 +878,43 @@ def test_commands_from_before_a_release_do_not_move_the_robot_after_it(sessions)
         until(lambda: host.report().rate.ticks > ticks + 5)
         assert host.report().refused["stopped"] >= 32
     assert driver.written().size == 0
+
+
+def test_a_stop_that_is_released_before_the_next_tick_is_obeyed(sessions):
+    may_read = threading.Event()
+    may_read.set()
+
+    class Slow(RecordingDriver):
+        def read(self, stamp: int) -> JointReading:
+            assert may_read.wait(DEADLINE_S)
+            return super().read(stamp)
+
+    def stops_in_file() -> list[dict[str, int]]:
+        return json.loads(stops_file("arm").read_text())["stops"]
+
+    driver = Slow()
+    releaser = local_writer(8)
+    key = release_key("arm", releaser.identity)
+    with (
+        running(sessions[0], driver, ttl_s=10.0) as host,
+        Commander(sessions[1], "arm") as arm,
+        StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
+    ):
+        arm.wait_for_driver()
+        wait_for_reader(sessions[1], key)
+        send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
+        may_read.clear()
+        with pytest.raises(TimeoutError):
+            stop(sessions[1], "arm", "door open", timeout_s=0.05)
+        until(stops_in_file)
+        (stopped,) = stops_in_file()
+        ended = ((stopped["session"], stopped["seq"]),)
+        releases.put(encode(Release(0, 0, releaser.session, ended)))
+        until(lambda: not stops_in_file())
+        before = len(driver.stops())
+        may_read.set()
+        until(lambda: driver.stops()[before:] == ["hold"])
+        until(lambda: host.state == "ready")
+        written = len(driver.written())
+        send_until(arm, {"shoulder": 9.0}, lambda: host.report().refused.get("not released", 0) > 3)
+        assert len(driver.written()) == written

@@ -58,6 +58,16 @@ def test_limits_of_some_joints_have_their_order():
     assert limits.acceleration.tolist() == [math.inf, math.inf]
 
 
+def test_a_part_of_limits_has_the_order_of_its_joints():
+    whole = Limits(("a", "b", "c"), [1, 2, 3], [4, 5, 6], [7, 8, 9], [10, 11, 12], ("m", "rad", "rad"))
+    part = whole.part(["c", "a"])
+    assert (part.joint_names, part.units) == (("c", "a"), ("rad", "m"))
+    bounds = np.array([part.lower, part.upper, part.velocity, part.acceleration])
+    assert bounds.tolist() == [[3, 1], [6, 4], [9, 7], [12, 10]]
+    with pytest.raises(InvalidInput, match="no limits of 'd'"):
+        whole.part(["a", "d"])
+
+
 def test_velocities_are_lowered_and_accelerations_given_by_joint():
     limits = Limits.of(ARM, velocity={"shoulder": 1.0, "wheel": 20.0}, acceleration={"lift": 0.5})
     assert limits.velocity.tolist() == [1.0, 20.0, 0.2]

@@ -97,6 +97,23 @@ def test_a_spline_equals_the_solution_of_the_whole_linear_system():
     assert velocities == pytest.approx(np.linalg.solve(matrix, right), abs=1e-12)
 
 
+def test_positions_alone_may_start_with_a_velocity():
+    one = Trajectory(("elbow",), [[0.0], [1.0]], [0.0, 2.0], start_velocities=[0.5])
+    # h v s + (3 d - 2 h v) s^2 + (h v - 2 d) s^3 at s = 1/2 is d / 2 + h v / 8, with d = 1, h = 2, v = 0.5.
+    positions, velocities, _ = one.sample([0.0, 1.0, 2.0])
+    np.testing.assert_allclose(positions[:, 0], [0.0, 0.625, 1.0], atol=1e-15)
+    np.testing.assert_allclose(velocities[[0, 2], 0], [0.5, 0.0], atol=1e-15)
+    two = Trajectory(("elbow",), [[0.0], [1.0], [0.0]], [0.0, 2.0, 3.0], start_velocities=[0.5])
+    before, after = two.sample([2.0 - 1e-9, 2.0 + 1e-9])[2]
+    np.testing.assert_allclose(before, after, atol=1e-6)
+    slower = one.stretched(of_elbow(velocity=0.4))
+    assert slower.sample(0.0)[1].tolist() == pytest.approx([0.5 * 2.0 / slower.duration_s])
+    with pytest.raises(InvalidInput, match="pass one of the two"):
+        Trajectory(("elbow",), [[0.0], [1.0]], [0.0, 2.0], [[0.5], [0.0]], start_velocities=[0.5])
+    with pytest.raises(InvalidInput, match="a finite number for each joint"):
+        Trajectory(("elbow",), [[0.0], [1.0]], [0.0, 2.0], start_velocities=[np.nan])
+
+
 def test_velocities_and_accelerations_at_the_points_are_kept():
     generator = np.random.default_rng(6)
     times = np.array([0.0, 0.7, 1.1, 3.0])

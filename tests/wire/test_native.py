@@ -18,8 +18,12 @@ from zstate.wire.messages import (
     HistoryPage,
     JointCommand,
     JointState,
+    JointTrajectory,
     LaserScan,
     Message,
+    MotionCancel,
+    MotionOutcome,
+    MotionReply,
     OccupancyGrid,
     Release,
     RobotDescription,
@@ -115,13 +119,14 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         JointCommand(
             *(STAMP, 300, 2**63 + 5, order_digest(("j1",))), to_block([0.25]), names=("j1",), ttl=100
         ),
-        header(9)[:-8]
+        header(10)[:-8]
         + order_digest(("j1",))
         + bin8(struct.pack("<d", 0.25))
         + NIL * 2
         + b"\x91"
         + fixstr("j1")
-        + b"\x64",
+        + b"\x64"
+        + NIL,
     ),
     "stop": (
         Stop(STAMP, 300, 2**63 + 5, "hold", "door open"),
@@ -134,9 +139,9 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     "driver state": (
         DriverState(
             *(5, 7, "host", "active", "", NAMES, 100, "teleop", 6, ("j2",), 0.5, 4, 3, 2, {"old": 1}, "late"),
-            *(((8, 9),),),
+            *(((8, 9),), (7, 3), 0.25, (MotionOutcome(7, 2, "reached", "in time"),)),
         ),
-        b"\xdc\x00\x11\x05\x07"
+        b"\xdc\x00\x14\x05\x07"
         + fixstr("host")
         + fixstr("active")
         + fixstr("")
@@ -153,7 +158,12 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + fixstr("old")
         + b"\x01"
         + fixstr("late")
-        + b"\x91\x92\x08\x09",
+        + b"\x91\x92\x08\x09"
+        + b"\x92\x07\x03\xcb"
+        + struct.pack(">d", 0.25)
+        + b"\x91\x94\x07\x02"
+        + fixstr("reached")
+        + fixstr("in time"),
     ),
     "statics": (
         StaticTransforms(7, (("b", "c"),), to_block([0, 0, 1, 0, 0, 0, 1])),
@@ -211,6 +221,25 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     "past": (
         HistoryPage("e", (b"ab", b""), 5),
         b"\x93" + fixstr("e") + b"\x92" + b"\xc4\x02ab" + b"\xc4\x00" + b"\x05",
+    ),
+    "trajectory": (
+        JointTrajectory(
+            *(STAMP, 300, 2**63 + 5, ("j1",), to_block([0.5, 1.0]), to_block([0.25, 0.75])),
+            *(None, None, 5, True, 0.2, 0.1, 3.0),
+        ),
+        header(13)[:-10]
+        + b"\x91"
+        + fixstr("j1")
+        + bin8(struct.pack("<2d", 0.5, 1.0))
+        + bin8(struct.pack("<2d", 0.25, 0.75))
+        + NIL * 2
+        + b"\x05\xc3"
+        + b"".join(b"\xcb" + struct.pack(">d", number) for number in (0.2, 0.1, 3.0)),
+    ),
+    "cancel": (MotionCancel(STAMP, 300, 2**63 + 5, 7), header(4)[:-10] + b"\x07"),
+    "motion reply": (
+        MotionReply(7, 100, ("too fast",)),
+        b"\x93\x07\x64\x91" + fixstr("too fast"),
     ),
 }
 MESSAGES = [message for message, _ in GOLDEN.values()]

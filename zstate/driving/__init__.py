@@ -5,6 +5,7 @@ from zstate.driving.driver import Calibration, Driver, Setpoint
 from zstate.driving.driver_state import DriverReport
 from zstate.driving.host import DriverHost
 from zstate.driving.limits import Limits
+from zstate.driving.motion import Motion, Outcome
 from zstate.driving.setpoint_limiter import SetpointLimiter
 from zstate.driving.simulated_driver import SimulatedDriver
 from zstate.driving.stops import stop
@@ -16,6 +17,8 @@ __all__ = [
     "DriverHost",
     "DriverReport",
     "Limits",
+    "Motion",
+    "Outcome",
     "Setpoint",
     "SetpointLimiter",
     "SimulatedDriver",

@@ -1,27 +1,51 @@
-"""The one program that commands a robot's driver."""
+"""The one program that commands a robot's driver: by setpoints, and by motions through timed points."""
 
 from __future__ import annotations
 
 import secrets
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
+
+from numpy.typing import ArrayLike
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
+from zstate.checks import real_numbers
 from zstate.driving.commands import check_named_positions
-from zstate.errors import Closed, InvalidInput, MessageError, Unreachable, format_duration
+from zstate.driving.motion import Motion, Points, rows_block
+from zstate.errors import (
+    Closed,
+    InvalidInput,
+    MessageError,
+    MotionRefused,
+    Unreachable,
+    ZStateError,
+    format_duration,
+)
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.ownership import WriterClaim
 from zstate.net.presence import local_writer
-from zstate.net.queryable import check_timeout
+from zstate.net.queryable import check_timeout, query
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.net.writer import WireWriter
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import check_robot, driver_key, release_key
-from zstate.wire.messages import DriverState, JointCommand, Release, order_digest, to_block
+from zstate.wire.keys import check_robot, driver_key, motion_key, release_key
+from zstate.wire.messages import (
+    GOAL_TIME_S,
+    GOAL_TOLERANCE,
+    PATH_TOLERANCE,
+    DriverState,
+    JointCommand,
+    JointTrajectory,
+    MotionCancel,
+    MotionReply,
+    Release,
+    order_digest,
+    to_block,
+)
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
@@ -31,9 +55,13 @@ _SILENT_S = 0.5
 
 _RELEASE_PERIOD_S = 0.1
 
+_REPLY_WITHIN_S = 5.0
+_REQUEST_PERIOD_S = 0.05
+"""A session that has just connected has not discovered the queryable of the driver yet."""
+
 
 class Commander(Closeable):
-    """Sends setpoints to the driver of ``robot``; a robot has one commander at a time.
+    """Sends setpoints and motions to the driver of ``robot``; a robot has one commander at a time.
 
     SecondWriter, which names the first, is raised if another commander is active, and by ``send`` if both
     opened at once. ``program`` is this commander's name for others; default: the script's name. A context
@@ -44,8 +72,12 @@ class Commander(Closeable):
         self.robot = check_robot(robot)
         identity = local_writer(secrets.randbits(32), program)
         self._session_id = identity.session
+        self._session = session
         self._seq = 0
         self._closed = False
+        self._motions: list[Motion] = []
+        """Those that have not ended."""
+        self._is_closing = fork_safe(threading.Event())
         self._lock = fork_safe_lock()
         self._state: tuple[DriverState, float] | None = None
         self._has_changed = fork_safe(threading.Condition())
@@ -106,12 +138,54 @@ class Commander(Closeable):
         names = tuple(numbers)
         block = to_block(list(numbers.values()))
         with self._lock:
-            if self._closed:
-                raise Closed(f"the commander of {self.robot!r} is closed")
-            self._claim.check()
-            head = (time.time_ns(), self._seq, self._session_id, order_digest(names))
+            head = (*self._next_head(), order_digest(names))
             self._writer.write(encode(JointCommand(*head, block, names=names, ttl=ttl)))
-            self._seq += 1
+
+    def move(
+        self,
+        points: Points,
+        times_s: Sequence[float] | ArrayLike,
+        *,
+        velocities: Points | None = None,
+        accelerations: Points | None = None,
+        start: int | None = None,
+        stretch: bool = False,
+        path_tolerance: float = PATH_TOLERANCE,
+        goal_tolerance: float = GOAL_TOLERANCE,
+        goal_time_s: float = GOAL_TIME_S,
+    ) -> Motion:
+        """Move joints through ``points``, positions [rad] or [m] by joint, at ``times_s`` [s], (T,).
+
+        The motion starts at the present joints, at once or at the stamp ``start`` [ns]. Other joints rest,
+        or follow ``send``.
+        See ``Trajectory`` for ``velocities`` and ``accelerations``, by joint as well. The driver checks the
+        whole motion against its limits before it accepts it; with ``stretch`` it slows it to fit instead.
+
+        The motion ends as "aborted" if a joint is more than ``path_tolerance`` [rad] or [m] from the path, or
+        more than ``goal_tolerance`` from the last point ``goal_time_s`` [s] after its time. This commander
+        renews it in a thread, until its end: then, and if that falls silent, the driver does what it does
+        after commands. A robot has one motion at a time; a new one, or a ``send`` for one of its joints,
+        replaces it.
+
+        Raises MotionRefused with all ``findings``, InvalidInput for unusable numbers, Unreachable if no
+        driver has replied within 5 s, SecondWriter, and Closed.
+        """
+        times = real_numbers(times_s, "times_s")
+        names = tuple(points)
+        rates, changes = (
+            None if rows is None else rows_block(rows, names, times, what)
+            for rows, what in ((velocities, "velocities"), (accelerations, "accelerations"))
+        )
+        blocks = (to_block(times), rows_block(points, names, times, "points"), rates, changes)
+        tolerances = (float(path_tolerance), float(goal_tolerance), float(goal_time_s))
+        self._check_against_driver(dict.fromkeys(names, 0.0), 0)
+        with self._lock:
+            head = self._next_head()
+        request = JointTrajectory(*head, names, *blocks, start, stretch, *tolerances)
+        reply = self._request(request)
+        if reply.findings:
+            raise MotionRefused(self.robot, reply.findings)
+        return self._started(request.seq, reply)
 
     def release(self, timeout_s: float = 2.0) -> DriverState:
         """Release the stops of the driver that are known here, and return its state after that.
@@ -134,19 +208,73 @@ class Commander(Closeable):
                     endpoints=(),
                 )
             with self._lock:
-                if self._closed:
-                    raise Closed(f"the commander of {self.robot!r} is closed")
-                self._claim.check()
-                message = Release(time.time_ns(), self._seq, self._session_id, tuple(left))
-                self._releases.put(encode(message))
+                self._releases.put(encode(Release(*self._next_head(), tuple(left))))
             with self._has_changed:
                 self._has_changed.wait(_RELEASE_PERIOD_S)
 
     def close(self) -> None:
-        """Send no more; the driver holds once the last command has expired. A second call does nothing."""
+        """Send no more; the driver holds once the last command has expired, also during a motion.
+
+        A second call does nothing.
+        """
         with self._lock:
             self._closed = True
+        self._is_closing.set()
         self._opened.close()
+
+    def _next_head(self) -> tuple[int, int, int]:
+        """Stamp, number and session of the next message; with the lock. Raises SecondWriter and Closed."""
+        if self._closed:
+            raise Closed(f"the commander of {self.robot!r} is closed")
+        self._claim.check()
+        self._seq += 1
+        return time.time_ns(), self._seq - 1, self._session_id
+
+    def _request(self, message: JointTrajectory | MotionCancel) -> MotionReply:
+        """The reply of the driver. A request that has not reached it is repeated."""
+        key, deadline = motion_key(self.robot), time.monotonic() + _REPLY_WITHIN_S
+        payload, encoding = encode(message), ENCODINGS[type(message)]
+        while (left_s := deadline - time.monotonic()) > 0.0:
+            for reply in query(self._session.zenoh, key, left_s, payload=payload, encoding=encoding):
+                if reply.ok is not None:
+                    with suppress(MessageError):
+                        return decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), MotionReply)
+            if self._is_closing.wait(_REQUEST_PERIOD_S):
+                raise Closed(f"the commander of {self.robot!r} is closed")
+        raise Unreachable(
+            f"no driver of {self.robot!r} has replied within {_REPLY_WITHIN_S:g} s; is it running, and may "
+            "this program command it (`zstate acl --commander`)?",
+            endpoints=(),
+        )
+
+    def _started(self, number: int, reply: MotionReply) -> Motion:
+        """The motion with that number, which a thread renews until it has ended."""
+        motion = Motion(self.robot, (self._session_id, number), reply.session, lambda: self._cancel(number))
+        with self._has_changed:
+            self._motions.append(motion)
+            if self._state is not None and self._state[0].session == reply.session:
+                motion.update(self._state[0])
+        thread = threading.Thread(
+            target=self._renew,
+            args=(motion, number, reply.ttl),
+            name="zstate motion renewal",
+            daemon=True,
+        )
+        thread.start()
+        return motion
+
+    def _renew(self, motion: Motion, number: int, ttl: int) -> None:
+        with suppress(ZStateError):  # without renewals the motion ends
+            while motion.outcome is None:
+                with self._lock:
+                    head = (*self._next_head(), order_digest(()))
+                    self._writer.write(encode(JointCommand(*head, names=(), motion=number)))
+                self._is_closing.wait(ttl / 3e9)
+
+    def _cancel(self, number: int) -> None:
+        with self._lock:
+            head = self._next_head()
+        self._request(MotionCancel(*head, number))
 
     def _check_against_driver(self, positions: Mapping[str, float], ttl: int) -> None:
         state = self.driver
@@ -169,4 +297,7 @@ class Commander(Closeable):
             state = decode(sample.payload, sample.encoding, DriverState)
             with self._has_changed:
                 self._state = (state, time.monotonic())
+                for motion in self._motions:
+                    motion.update(state)
+                self._motions = [motion for motion in self._motions if motion.outcome is None]
                 self._has_changed.notify_all()

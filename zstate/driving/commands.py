@@ -30,13 +30,16 @@ _WAITING = 32
 """Commands that wait for a tick, of which each takes time to check; of more, the oldest are refused."""
 
 NO_DEADLINE = -1
+_NO_COLUMNS = np.array([], dtype=np.intp)
+_NO_POSITIONS = np.array([], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
     """Positions (k,) [rad] or [m] for the joints at ``columns`` (k,), valid until ``deadline``.
 
-    ``arrived`` and ``deadline`` are on the monotonic clock [ns].
+    ``arrived`` and ``deadline`` are on the monotonic clock [ns]. With a ``motion`` it has no positions: the
+    motion of that number stays valid.
     """
 
     session: int
@@ -45,6 +48,7 @@ class Command:
     positions: Floats
     arrived: int
     deadline: int
+    motion: int | None = None
 
 
 class CommandReceiver(Closeable):
@@ -91,16 +95,19 @@ class CommandReceiver(Closeable):
         """The command in ``sample``. Raises MessageError with the reason why it is refused."""
         check_size("joint_commands", sample.size or len(sample.payload))
         message = decode(sample.payload, sample.encoding, JointCommand)
+        if message.ttl > self._ttl_ns:
+            text = f"a ttl of {format_duration(message.ttl)} is longer than {format_duration(self._ttl_ns)}"
+            raise MessageError(f"{text}, which this driver grants at most", reason="ttl")
+        deadline = now + (message.ttl or self._ttl_ns)
+        if message.motion is not None:
+            head = (message.session, message.seq, _NO_COLUMNS, _NO_POSITIONS)
+            return Command(*head, now, deadline, message.motion)
         if not message.names:
             raise MessageError("a command has the names of its joints; this one has none", reason="no names")
         if message.positions is None or message.velocities is not None or message.efforts is not None:
             text = "a command has positions and nothing else; velocities and efforts are not supported"
             raise MessageError(text, reason="mode")
         positions = from_block(message.positions)
-        if message.ttl > self._ttl_ns:
-            text = f"a ttl of {format_duration(message.ttl)} is longer than {format_duration(self._ttl_ns)}"
-            raise MessageError(f"{text}, which this driver grants at most", reason="ttl")
-        deadline = now + (message.ttl or self._ttl_ns)
         columns = self._columns_of(message.names)
         for name, value in zip(message.names, positions.tolist(), strict=True):
             if not math.isfinite(value):
@@ -143,13 +150,16 @@ class Targets:
         self._positions[resting] = positions[resting]
         self._deadlines[resting] = NO_DEADLINE
 
-    def check_sender(self, command: Command, now: int) -> None:
-        """Raise MessageError for a command of another session than the active one, or for an old one."""
-        if command.session != self.session and self.is_live(now):
-            text = f"a command of session {command.session:016x} while that of another session is valid"
-            raise MessageError(text, reason="second commander")
+    def check_order(self, command: Command) -> None:
+        """Raise MessageError for a command that is older than the newest one of its session."""
         if command.seq <= self._last_seqs.get(command.session, -1):
             raise MessageError(f"the command {command.seq} comes after a newer one", reason="old")
+
+    def check_session(self, session: int, now: int) -> None:
+        """Raise MessageError for another session than the active one."""
+        if session != self.session and self.is_live(now):
+            text = f"a command of session {session:016x} while that of another session is valid"
+            raise MessageError(text, reason="second commander")
 
     def merged(self, command: Command, present: Floats) -> Floats:
         """The positions of ``command``; ``present`` ones for all other joints."""
@@ -159,11 +169,20 @@ class Targets:
 
     def accept(self, command: Command) -> None:
         """Move the joints of ``command`` to its positions until its deadline."""
-        self._last_seqs[command.session] = command.seq
+        self.place(command.columns, command.positions)
+        self.renew(command, command.columns)
+
+    def renew(self, command: Command, columns: NDArray[np.intp]) -> None:
+        """Keep the targets of the joints at ``columns`` until the deadline of ``command``."""
+        last = self._last_seqs.get(command.session, -1)
+        self._last_seqs[command.session] = max(last, command.seq)
         self.session, self.arrived = command.session, command.arrived
         self.ttl_ns = command.deadline - command.arrived
-        self._positions[command.columns] = command.positions
-        self._deadlines[command.columns] = command.deadline
+        self._deadlines[columns] = command.deadline
+
+    def place(self, columns: NDArray[np.intp], positions: Floats) -> None:
+        """Move the joints at ``columns`` to ``positions`` as long as their command is valid."""
+        self._positions[columns] = positions
 
     def is_live(self, now: int) -> bool:
         """Whether any joint has a command that is valid at ``now``."""

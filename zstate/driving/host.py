@@ -27,9 +27,9 @@ from zstate.driving.commands import Command, CommandReceiver, Targets
 from zstate.driving.driver import Driver, Setpoint, StopMode
 from zstate.driving.driver_state import DriverReport, DriverStatePublisher, Durations, check_only_host
 from zstate.driving.limits import Limits
+from zstate.driving.motion_service import MotionService, Present
 from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
-from zstate.driving.stops import StopLatch
-from zstate.driving.stops_file import ActiveStop
+from zstate.driving.stops import LatchedStops, StopLatch
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver, check_arguments
 from zstate.errors import (
     Closed,
@@ -69,8 +69,9 @@ class DriverHost(Closeable):
     the longest that is granted, counted from its arrival on the monotonic clock. When the last one has
     expired, ``on_silence`` "hold" brakes the joints and keeps writing that position, "relax" switches their
     torque off. ``limits`` are those of the model by default: positions outside them are refused, and faster
-    motion is slowed. The first setpoint after any change of state is at the measured joints, or at the last
-    setpoint where one was written, so that no step is longer than a tick's motion at the velocity limits.
+    motion is slowed; a ``Commander.move`` that is too fast is refused. The first setpoint after any change of
+    state is at the measured joints, or at the last setpoint where one was written, so that no step is longer
+    than a tick's motion at the velocity limits.
 
     A call of the driver that raises is counted, and the loop continues. After ``faults_allowed`` ticks in a
     row with such a failure the driver is stopped as after silence, and ``run`` raises DriverFault. It is
@@ -123,7 +124,7 @@ class DriverHost(Closeable):
         self._measured_at = 0
         self._setpoint: Limited | None = None
         """The last one that was written since the joints were enabled; None otherwise."""
-        self._obeyed: tuple[ActiveStop, ...] = ()
+        self._obeyed = LatchedStops()
         self._barred: BoundedDict[int, None] = BoundedDict()
         """Sessions that have commanded a stopped robot: a release by another does not move it for them."""
         self._faults = self._faults_in_row = 0
@@ -143,6 +144,7 @@ class DriverHost(Closeable):
             self._commands = opening.enter_context(
                 CommandReceiver(session, self.robot, names, self._ttl_ns, self._refusals)
             )
+            self._motions = opening.enter_context(self._open_motions(session))
             opening.enter_context(WriterWatch(session, self.robot, self._on_writer))
             opening.callback(driver.close)
             driver.open()
@@ -167,6 +169,21 @@ class DriverHost(Closeable):
             order = list(range(len(self._names)))
             publisher = PartialStatePublisher(session, model, self._names, self.robot, program=program)
         return opening.enter_context(publisher), np.array(order, dtype=np.intp)
+
+    def _open_motions(self, session: Session) -> MotionService:
+        return MotionService(
+            session,
+            self.robot,
+            self._writer.session,
+            self._targets,
+            limits=self._limits,
+            ttl_ns=self._ttl_ns,
+            refusals=self._refusals,
+            present=self._present,
+            check=self._check_commander,
+            name_of=self._name_of,
+            on_change=self._notify,
+        )
 
     @property
     def state(self) -> StateName:
@@ -224,8 +241,10 @@ class DriverHost(Closeable):
 
     def _loop(self, seconds: float | None, signals: list[int]) -> None:
         self._rate = rate = Rate(self._rate_hz, MonotonicClock(), self._stop, seconds, catch_up=False)
-        self._obeyed = ()  # stops that are still latched are obeyed once more
-        if not self._stops.latched:  # the last one may have been released since the last loop
+        latched = self._stops.current
+        # Stops that are still latched are obeyed once more.
+        self._obeyed = LatchedStops((), latched.arrived - len(latched.stops))
+        if not latched.stops:  # the last one may have been released since the last loop
             self._barred.pop(self._stops.releaser, None)
         self._change("ready", "")
         try:
@@ -249,7 +268,9 @@ class DriverHost(Closeable):
                 self._stop_and_latch(reason)
         fault = self._obey_stops(now) or fault
         self._accept_commands(now)
-        has_new_stop = self._stops.latched is not self._obeyed  # obeyed in the next tick
+        if self._measured is not None:
+            self._motions.supervise(now, self._measured, self._measured_at)
+        has_new_stop = self._stops.current is not self._obeyed  # obeyed in the next tick
         if self._state.name != "stopped" and not has_new_stop:
             fault = self._advance(now, is_fresh=fault is None) or fault
         self._count_fault(fault)
@@ -283,20 +304,23 @@ class DriverHost(Closeable):
 
         A stop is confirmed, by its number in the state, once the driver has stopped.
         """
-        latched = self._stops.latched
+        latched = self._stops.current
         if latched is self._obeyed:
             return None
-        reason = "; ".join(map(str, latched))
-        if set(latched) - set(self._obeyed):
+        reason = "; ".join(map(str, latched.stops))
+        if latched.newest is not None and latched.arrived != self._obeyed.arrived:
+            reason = reason or f"{latched.newest}, and released already"
             self._barred[self._targets.session] = None
+            self._motions.finish("stopped", reason)
             self._targets.clear()
-            failure = self._stop_driver("relax" if "relax" in {one.how for one in latched} else "hold")
+            hows = {one.how for one in (*latched.stops, latched.newest)}
+            failure = self._stop_driver("relax" if "relax" in hows else "hold")
             if failure is not None:
                 self._change("stopped", f"the driver has not stopped yet: {failure!r}; {reason}")
                 return failure
-        if latched:
+        if reason:
             self._change("stopped", reason)
-        elif self._state.name == "stopped":
+        if not latched.stops and self._state.name == "stopped":
             self._accept_commands(now)  # those from before the release are refused
             self._barred.pop(self._stops.releaser, None)
             self._change("ready", f"released by {self._name_of(self._stops.releaser)}")
@@ -306,28 +330,37 @@ class DriverHost(Closeable):
     def _accept_commands(self, now: int) -> None:
         for command in self._commands.drain():
             self._accept(command, now)
+        self._motions.adopt(now)
 
     def _accept(self, command: Command, now: int) -> None:
         """Take the targets of ``command``, or count the reason against it."""
         try:
-            self._check_released(command)
-            self._targets.check_sender(command, now)
+            self._check_commander(command.session, now)
+            self._targets.check_order(command)
+            if command.motion is not None:
+                self._motions.renew(command)
+                return
             self._check_limits(command)
         except MessageError as error:
             self._refusals.count(error.reason, error)
         else:
+            self._motions.replace(command)
             self._targets.accept(command)
 
-    def _check_released(self, command: Command) -> None:
-        """Raise MessageError while stopped, and for a commander that has not released the stop itself."""
+    def _check_commander(self, session: int, now: int) -> None:
+        """Raise MessageError while stopped, and for a commander that has not released the stop itself.
+
+        And for another one than that whose targets are valid at ``now``.
+        """
         if self._state.name == "stopped":
-            self._barred[command.session] = None
+            self._barred[session] = None
             raise MessageError(self._state.reason, reason="stopped")
-        if command.session in self._barred:
+        if session in self._barred:
             text = (
                 "it came from a commander that did not release the last stop; release with it, or reopen it"
             )
             raise MessageError(text, reason="not released")
+        self._targets.check_session(session, now)
 
     def _check_limits(self, command: Command) -> None:
         """Raise MessageError unless the limiter accepts the positions of ``command``."""
@@ -366,7 +399,7 @@ class DriverHost(Closeable):
 
         Joints may sag by that, so the first setpoint waits for the next reading.
         """
-        self._measured = None
+        self._measured_at = 0
         return self._driver.enable()
 
     def _start(self, now: int) -> Exception | None:
@@ -385,23 +418,35 @@ class DriverHost(Closeable):
         if self._state.name == "holding":
             limited = self._limiter.brake(dt_s)
         else:
-            limited = self._limiter.step(self._targets.current(now, self._resting()), dt_s)
+            target, velocities = self._motions.next_target(self._targets.current(now, self._resting()), dt_s)
+            limited = self._limiter.step(target, dt_s, velocities)
         setpoint = Setpoint(time.time_ns(), limited.positions, limited.velocities)
         failure = self._driver.write(setpoint)
         if failure is None:
             self._setpoint = limited
-            self._following.written(limited.positions, time.monotonic_ns())
+            written_at = time.monotonic_ns()
+            self._following.written(limited.positions, written_at)
+            self._motions.written(written_at)
         elif self._setpoint is not None:
             self._limiter.start(self._setpoint.positions, self._setpoint.velocities)
         return failure
 
     def _resting(self) -> NDArray[np.float64]:
         """Where the joints come to rest if they brake from the last setpoint."""
-        if self._setpoint is None:
-            assert self._measured is not None
-            return self._measured
-        positions, velocities, _ = self._setpoint
-        return positions + velocities * np.abs(velocities) / (2.0 * self._limits.acceleration)
+        return self._present().resting
+
+    def _present(self) -> Present:
+        """The joints now, for any thread. Raises MessageError if they are not known, or the loop is off."""
+        setpoint, measured, stops = self._setpoint, self._measured, self._stops.current
+        if setpoint is not None:
+            positions, velocities, _ = setpoint
+            resting = positions + velocities * np.abs(velocities) / (2.0 * self._limits.acceleration)
+            return Present(positions, velocities, resting, stops)
+        if measured is None or self._state.name in ("off", "fault"):
+            reason = self._state.reason or "no reading has arrived yet"
+            text = f"the driver is {self._state.name}, and its joints are not known: {reason}"
+            raise MessageError(text, reason="not ready")
+        return Present(measured, np.zeros(len(measured)), measured, stops)
 
     def _count_fault(self, fault: Exception | None) -> None:
         if fault is None:
@@ -436,6 +481,7 @@ class DriverHost(Closeable):
         if self._driver.needs_stop:
             self._stop_driver(self._on_silence)
         self._driver.repeat_stop()
+        self._motions.finish("aborted", self._state.reason or "the driver host has ended")
         self._targets.clear()
         if self._state.name != "fault":
             self._change("off", "the loop has ended")
@@ -444,12 +490,16 @@ class DriverHost(Closeable):
 
     def _change(self, name: StateName, reason: str) -> None:
         self._state = _State(name, reason)
+        self._notify()
+
+    def _notify(self) -> None:
         self._states.notify()
 
     def _driver_state(self) -> DriverState:
         state, targets, setpoint = self._state, self._targets, self._setpoint
         rate = None if self._rate is None else self._rate.report()
-        obeyed = self._stops.latched if state.name in ("off", "fault") else self._obeyed
+        obeyed = self._stops.current if state.name in ("off", "fault") else self._obeyed
+        motion, progress = self._motions.underway
         return DriverState(
             time.time_ns(),
             self._writer.session,
@@ -467,7 +517,10 @@ class DriverHost(Closeable):
             self._faults,
             dict(self._refusals.counts),
             str(self._refusals.newest),
-            tuple((one.session, one.seq) for one in obeyed),
+            tuple((one.session, one.seq) for one in obeyed.stops),
+            motion,
+            progress,
+            self._motions.outcomes,
         )
 
     def _silence(self, now: int) -> str:

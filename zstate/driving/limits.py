@@ -112,6 +112,22 @@ class Limits:
             tuple("m" if joint.type == "prismatic" else "rad" for joint in chosen),
         )
 
+    def part(self, joint_names: Sequence[str]) -> Limits:
+        """The limits of ``joint_names``, in that order. Raises InvalidInput for unknown or repeated ones."""
+        unknown = [name for name in joint_names if name not in self.joint_names]
+        if unknown:
+            texts = (f"{name!r}{suggestion_text(near_joint(name, self.joint_names))}" for name in unknown)
+            raise InvalidInput(f"there are no limits of {', '.join(texts)}")
+        rows = [self.joint_names.index(name) for name in check_joint_names(joint_names)]
+        return Limits(
+            tuple(joint_names),
+            self.lower[rows],
+            self.upper[rows],
+            self.velocity[rows],
+            self.acceleration[rows],
+            tuple(self.units[row] for row in rows),
+        )
+
     def check_positions(self, positions: ArrayLike) -> Floats:
         """``positions`` as a vector (n,) in the order of ``joint_names``.
 

@@ -14,6 +14,7 @@ import weakref
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from typing import NamedTuple
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
@@ -132,6 +133,17 @@ def wait_for_state(
     return found[0] if found else None
 
 
+class LatchedStops(NamedTuple):
+    """The ``stops`` that are not released, and how many have ``arrived`` until now, the ``newest`` last.
+
+    A stop that is released before the next tick is known by these two.
+    """
+
+    stops: tuple[ActiveStop, ...] = ()
+    arrived: int = 0
+    newest: ActiveStop | None = None
+
+
 class StopLatch(Closeable):
     """The stops of the driver of ``robot`` that are not released.
 
@@ -149,8 +161,8 @@ class StopLatch(Closeable):
         self._by_session: dict[int, ActiveStop] = {}
         self._released: dict[int, int] = {}
         """The last released stop of each session, which its program may still cache."""
-        self.latched: tuple[ActiveStop, ...] = ()
-        """A new tuple after each change; may be read from any thread."""
+        self.current = LatchedStops()
+        """Another object after each change; may be read from any thread."""
         self.releaser = 0
         """The session of the commander that released the last stop."""
         with ExitStack() as opening:
@@ -163,6 +175,11 @@ class StopLatch(Closeable):
             releases = StreamSubscriber(session, release_expression(robot), self._on_releases)
             opening.enter_context(releases)
             self._opened = opening.pop_all()
+
+    @property
+    def latched(self) -> tuple[ActiveStop, ...]:
+        """The stops that are not released."""
+        return self.current.stops
 
     def latch(self, reason: str, writer: WriterId, how: StopMode = "hold") -> None:
         """Latch a stop of this host itself, after those that it has latched before."""
@@ -208,7 +225,8 @@ class StopLatch(Closeable):
         if any(old is not None and old.how == "relax" for old in replaced):
             one = replace(one, how="relax")
         self._by_session[one.session] = one
-        self._publish()
+        self.current = LatchedStops(tuple(self._by_session.values()), self.current.arrived + 1, one)
+        self._write_file()
 
     def _on_releases(self, samples: list[SerializedSample]) -> None:
         for sample in samples:
@@ -234,11 +252,8 @@ class StopLatch(Closeable):
             del self._released[next(iter(self._released))]
         if ended:
             self.releaser = release.session
-            self._publish()
-
-    def _publish(self) -> None:
-        self.latched = tuple(self._by_session.values())
-        self._write_file()
+            self._write_file()  # first: a release that is confirmed holds for the next host as well
+            self.current = self.current._replace(stops=tuple(self._by_session.values()))
 
     def _read_file(self) -> None:
         try:
@@ -246,11 +261,11 @@ class StopLatch(Closeable):
         except (OSError, ValueError) as error:
             stops = [ActiveStop(0, 0, "hold", f"{self._path} cannot be read: {error}", "this host")]
         self._by_session = {one.session: one for one in stops}
-        self.latched = tuple(stops)
+        self.current = LatchedStops(tuple(stops), len(stops), stops[-1] if stops else None)
 
     def _write_file(self, *, is_opening: bool = False) -> None:
         try:
-            write_stops(self._path, self.latched, self._released)
+            write_stops(self._path, tuple(self._by_session.values()), self._released)
         except OSError as error:
             text = (
                 f"stops of {self._robot!r} cannot be kept in {self._path}: {error}; a restarted host would "

@@ -11,8 +11,9 @@ and its quintic, of s^0 to s^5,
     -15 d + h (8 v + 7 w) + h^2 (3 a - 2 b) / 2,  6 d - 3 h (v + w) - h^2 (a - b) / 2
 
 (Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines and Robots, 2.1). Positions alone become
-the cubics whose velocities are zero at both ends, and whose accelerations are continuous: the velocities m at
-the points between solve, with the slopes d / h of the segments before (1) and after (2),
+the cubics whose accelerations are continuous, and whose velocities are zero at the end, and zero or given at
+the start: those at the points between, m, solve, with the slopes d / h of the segments before (1) and after
+(2),
 
     h2 m[i-1] + 2 (h1 + h2) m[i] + h1 m[i+1] = 3 (h2 d1 / h1 + h1 d2 / h2)
 
@@ -47,11 +48,12 @@ _NO_SIZE = 1e-200
 class Trajectory:
     """The motion of the joints ``joint_names`` through ``points``, (T, n), at the times ``times_s``, (T,).
 
-    Positions [rad] or [m] alone are joined by a cubic spline with continuous accelerations, at rest at both
-    ends. With ``velocities``, (T, n) per s, segments are cubics that have them at the points; with
-    ``accelerations``, (T, n) per s^2, as well, they are quintics. Times [s] count from the start of the
-    motion and ascend from zero or later. Raises InvalidInput for less than two points, other shapes, numbers
-    that are not finite, times that do not ascend, and accelerations without velocities.
+    Positions [rad] or [m] alone are joined by a cubic spline with continuous accelerations, at rest at the
+    last point, and at rest or with ``start_velocities``, (n,), at the first. With ``velocities``, (T, n) per
+    s, segments are cubics that have them at the points; with ``accelerations``, (T, n) per s^2, as well, they
+    are quintics. Times [s] count from the start of the motion and ascend from zero or later. Raises
+    InvalidInput for less than two points, other shapes, numbers that are not finite, times that do not
+    ascend, accelerations without velocities, and both kinds of velocities.
     """
 
     def __init__(
@@ -61,6 +63,8 @@ class Trajectory:
         times_s: ArrayLike,
         velocities: ArrayLike | None = None,
         accelerations: ArrayLike | None = None,
+        *,
+        start_velocities: ArrayLike | None = None,
     ) -> None:
         self.joint_names = check_joint_names(joint_names)
         self._times = _check_times(times_s)
@@ -71,6 +75,7 @@ class Trajectory:
         )
         if self._velocities is None and self._accelerations is not None:
             raise InvalidInput("accelerations at the points need velocities as well")
+        self._start_velocities = self._check_start(start_velocities)
         self._durations = np.diff(self._times)
         with np.errstate(all="ignore"):
             self._coefficients = self._position_coefficients()
@@ -144,6 +149,7 @@ class Trajectory:
             self._times * factor,
             None if self._velocities is None else self._velocities / factor,
             None if self._accelerations is None else self._accelerations / factor**2,
+            start_velocities=self._start_velocities / factor if self._velocities is None else None,
         )
 
     @cached_property
@@ -213,7 +219,7 @@ class Trajectory:
         durations = self._durations[:, None]
         velocities = self._velocities
         if velocities is None:
-            velocities = _spline_velocities(self._durations, self._points)
+            velocities = _spline_velocities(self._durations, self._points, self._start_velocities)
         start, distance = self._points[:-1], np.diff(self._points, axis=0)
         v, w = velocities[:-1] * durations, velocities[1:] * durations
         if self._accelerations is None:
@@ -232,6 +238,17 @@ class Trajectory:
             )
         speeds = _derivative(positions) / durations
         return positions, speeds, _derivative(speeds) / durations
+
+    def _check_start(self, velocities: ArrayLike | None) -> Floats:
+        """The velocities at the first point of positions alone, (n,)."""
+        if velocities is None:
+            return np.zeros(len(self.joint_names))
+        if self._velocities is not None:
+            raise InvalidInput("start_velocities are the first row of velocities; pass one of the two")
+        start = real_numbers(velocities, "start_velocities").copy()
+        if start.shape != (len(self.joint_names),) or not np.isfinite(start).all():
+            raise InvalidInput(f"start_velocities are a finite number for each joint; got {velocities!r}")
+        return start
 
     def _check_rows(self, values: ArrayLike, what: str) -> Floats:
         """``values`` as finite rows (T, n), one for each time."""
@@ -267,13 +284,14 @@ def _check_times(times_s: ArrayLike) -> Floats:
     return times
 
 
-def _spline_velocities(durations: Floats, points: Floats) -> Floats:
-    """Velocities at ``points`` of the cubic spline that is at rest at both ends, (T, n).
+def _spline_velocities(durations: Floats, points: Floats, start: Floats) -> Floats:
+    """Velocities at ``points`` of the cubic spline from the velocities ``start`` to rest, (T, n).
 
     Gaussian elimination of the tridiagonal system in the text at the top: downwards, then upwards.
     """
     slopes = np.diff(points, axis=0) / durations[:, None]
     velocities = np.zeros(points.shape)
+    velocities[0] = start
     ratios = np.zeros(len(points))
     for row in range(1, len(points) - 1):
         before, after = durations[row - 1], durations[row]

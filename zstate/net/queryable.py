@@ -60,6 +60,8 @@ def query(
     target: zenoh.QueryTarget | None = None,
     consolidation: zenoh.ConsolidationMode | None = None,
     accept_replies: zenoh.ReplyKeyExpr | None = None,
+    payload: bytes | None = None,
+    encoding: str | None = None,
 ) -> Iterator[zenoh.Reply]:
     """The replies to ``selector`` as they arrive, until all queryables have finished or ``timeout_s`` passed.
 
@@ -73,6 +75,8 @@ def query(
         target=target,
         consolidation=consolidation,
         accept_replies=accept_replies,
+        payload=payload,
+        encoding=encoding,
     )
     return _bounded(replies, selector)
 
@@ -206,7 +210,7 @@ class Queryable(Receiver[zenoh.Query]):
 
     def _on_query(self, received: zenoh.Query) -> None:
         with received:  # the end of the block ends the query for its sender
-            reply = self._answer(parse_parameters(str(received.parameters)))
+            reply = self._reply_to(received)
             if reply is None:
                 return
             with suppress(zenoh.ZError):  # the sender, or the session, is gone
@@ -221,6 +225,21 @@ class Queryable(Receiver[zenoh.Query]):
                         timestamp=reply.timestamp,
                     )
                 self.answered += 1
+
+    def _reply_to(self, received: zenoh.Query) -> Reply | None:
+        return self._answer(parse_parameters(str(received.parameters)))
+
+
+class RequestQueryable(Queryable):
+    """Replies to queries that carry a message: ``answer(payload, encoding)``, as in ``Queryable``."""
+
+    def __init__(self, session: Session, key: str, answer: Callable[[bytes, str], Reply | None]) -> None:
+        self._answer_request = answer
+        super().__init__(session, key, lambda _: None)
+
+    def _reply_to(self, received: zenoh.Query) -> Reply | None:
+        payload = b"" if received.payload is None else received.payload.to_bytes()
+        return self._answer_request(payload, str(received.encoding or ""))
 
 
 def parse_parameters(text: str) -> dict[str, str]:

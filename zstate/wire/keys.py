@@ -13,6 +13,7 @@
 ``zstate/<robot>/driver``                         DriverState, latched
 ``zstate/<robot>/stop/<id>``                      Stop, latched: of one program that stops the driver
 ``zstate/<robot>/release/<id>``                   Release, of a commander
+``zstate/<robot>/@motion``                        a queryable: JointTrajectory or MotionCancel, to a driver
 ``zstate/<robot>/lookup``                         a queryable
 ``zstate/<robot>/status/<id>``                    Status of one writer, once a second while read
 ``zstate/<robot>/@writer/<streams>/<id>``         liveliness token of one writer, with all its streams
@@ -70,6 +71,9 @@ READERS = "zstate/@reader/*/*/*"
 
 VERBATIM_CHUNKS = ("@writer", "@clock", "@edge", "@reader")
 """The chunks of tokens and clocks: ``*`` and ``**`` do not match them (Zenoh: verbatim chunks)."""
+
+MOTION_CHUNK = "@motion"
+"""The chunk of requests for motions. It is verbatim, too: access control lets viewers query ``zstate/**``."""
 
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""
@@ -201,6 +205,11 @@ def release_key(robot: str, identity: str) -> str:
 def release_expression(robot: str) -> str:
     """The key expression of every Release of ``robot``."""
     return f"zstate/{_check_robot_or_any(robot)}/release/*"
+
+
+def motion_key(robot: str) -> str:
+    """The key of the queryable of a driver that takes requests for motions."""
+    return f"zstate/{check_robot(robot)}/{MOTION_CHUNK}"
 
 
 def writer_key(robot: str, streams: Stream | Collection[Stream], identity: str) -> str:

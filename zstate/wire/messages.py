@@ -179,15 +179,16 @@ def select_edges(sample: TransformSample, edges: Edges, rows: Sequence[int]) -> 
 
 
 MAX_REASON_LENGTH = 1000
-MAX_STATE_TEXT_LENGTH = 2000
 """The longest reason of a Stop."""
+MAX_STATE_TEXT_LENGTH = 2000
 
 
 class JointCommand(Sample, frozen=True, array_like=True, gc=False):
     """Setpoints for a driver, of the joints ``names``; a block that is not commanded is None.
 
     They are valid for ``ttl`` [ns] after they have arrived; 0 stands for the driver's own limit. A driver
-    refuses a command without names.
+    refuses a command without names, unless it is for a ``motion``: the ``seq`` of a JointTrajectory of the
+    same session, which stays valid for ``ttl`` by that.
     """
 
     positions: bytes | None = None
@@ -195,6 +196,7 @@ class JointCommand(Sample, frozen=True, array_like=True, gc=False):
     efforts: bytes | None = None
     names: tuple[str, ...] | None = None
     ttl: Interval = 0
+    motion: Count | None = None
 
     def __post_init__(self) -> None:
         blocks = (self.positions, self.velocities, self.efforts)
@@ -202,6 +204,84 @@ class JointCommand(Sample, frozen=True, array_like=True, gc=False):
         if self.names is not None:
             _check_named(self.names, *blocks)
             _check_order(self.order, self.names)
+
+
+MOTION_POINTS = 10_000
+"""The most points of a motion."""
+
+PATH_TOLERANCE = 0.2
+GOAL_TOLERANCE = 0.05
+"""[rad] or [m]"""
+GOAL_TIME_S = 1.0
+
+
+class JointTrajectory(StampedMessage, frozen=True, array_like=True, gc=False):
+    """A request for a motion of the joints ``names`` through points, for the queryable of a driver.
+
+    ``times`` [s] is a block of T numbers, from ``start``, a stamp [ns], or from the arrival. ``points`` [rad]
+    or [m], ``velocities`` per s, and ``accelerations`` per s^2 are blocks of (T, n), row by row. With
+    ``stretch`` the motion is slowed to fit the limits. Joints may be ``path_tolerance`` [rad] or [m] from the
+    path, and must be within ``goal_tolerance`` of the last point ``goal_time`` [s] after it. The session and
+    ``seq`` identify the motion.
+    """
+
+    names: tuple[str, ...]
+    times: bytes
+    points: bytes
+    velocities: bytes | None = None
+    accelerations: bytes | None = None
+    start: Stamp | None = None
+    stretch: bool = False
+    path_tolerance: float = PATH_TOLERANCE
+    goal_tolerance: float = GOAL_TOLERANCE
+    goal_time: float = GOAL_TIME_S
+
+    def __post_init__(self) -> None:
+        _check_numbers(self.times)
+        count = len(self.times) // 8
+        if not 0 < count <= MOTION_POINTS:
+            raise InvalidInput(f"a motion has 1 to {MOTION_POINTS} points, not {count}")
+        numbers = count * len(self.names)
+        for block in (self.points, self.velocities, self.accelerations):
+            if block is not None and len(block) != 8 * numbers:
+                raise InvalidInput(
+                    f"{count} points of {len(self.names)} joints have {numbers} numbers, not "
+                    f"{len(block) / 8:g}"
+                )
+        if not min(self.path_tolerance, self.goal_tolerance) > 0.0:
+            tolerances = f"{self.path_tolerance} and {self.goal_tolerance}"
+            raise InvalidInput(f"path_tolerance and goal_tolerance are above zero, not {tolerances}")
+        if not 0.0 <= self.goal_time < inf:
+            raise InvalidInput(f"goal_time is finite and not negative [s], not {self.goal_time}")
+
+
+class MotionCancel(StampedMessage, frozen=True, array_like=True, gc=False):
+    """A request to end the ``motion``: the ``seq`` of a JointTrajectory of the same session."""
+
+    motion: Count
+
+
+class MotionReply(Message, frozen=True, array_like=True, gc=False):
+    """The reply of a driver to a request, which is accepted if there are no ``findings``.
+
+    ``session`` is that of the driver's DriverState. A motion is valid for ``ttl`` [ns], unless it is renewed.
+    """
+
+    session: Count
+    ttl: Interval
+    findings: tuple[str, ...] = ()
+
+
+OutcomeName = Literal["reached", "aborted", "replaced", "cancelled", "stopped"]
+
+
+class MotionOutcome(Message, frozen=True, array_like=True, gc=False):
+    """How the motion with ``seq`` of the commander's ``session`` has ended, and why."""
+
+    session: Count
+    seq: Count
+    name: OutcomeName
+    reason: str = ""
 
 
 class Stop(StampedMessage, frozen=True, array_like=True, gc=False):
@@ -240,8 +320,9 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     ``commander`` is the program of the newest setpoints, whose age since their arrival is ``command_age``
     [ns], None without any; ``ttl`` [ns] is the longest that is granted. ``limited`` are the joints that
     moved slower than commanded at the last tick. ``faults`` counts failed calls of the driver, ``refused``
-    commands by reason, the newest described by ``last_refusal``. ``stamp`` [ns] is of the driver's system
-    clock.
+    commands by reason, the newest described by ``last_refusal``. ``motion`` is under way, by session and
+    ``seq`` of its JointTrajectory, and ``progress`` is the part of its duration that has passed, 0 to 1.
+    ``outcomes`` are those of the last motions, newest last. ``stamp`` [ns] is of the driver's system clock.
     """
 
     stamp: Stamp
@@ -261,6 +342,9 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     refused: dict[str, int] = {}
     last_refusal: str = ""
     stops: StopIds = ()
+    motion: tuple[Count, Count] | None = None
+    progress: float = 0.0
+    outcomes: tuple[MotionOutcome, ...] = ()
 
 
 def with_short_texts(state: DriverState) -> DriverState:

@@ -5,7 +5,7 @@ the message, so a robot cannot write to other robots by a wildcard either.
 
 Native wire: ``**`` does not match chunks that begin with ``@``, so each needs a key expression: history
 queries of late joiners (``@adv``), liveliness tokens (``@writer``, ``@reader``), static edges (``@edge``)
-and clocks (``@clock``).
+and clocks (``@clock``). Requests for motions (``@motion``) are verbatim so that viewers cannot send them.
 
 ROS 2 (rmw_zenoh_cpp): topics and services are below ``<domain>/``, history queries under ``@adv`` below
 them, and the tokens of the ROS graph under ``@ros2_lv/<domain>/``, with node and topic names in which ``%``
@@ -24,7 +24,7 @@ from typing import Any
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import user_config
 from zstate.net.security.credentials import check_identity
-from zstate.wire.keys import CLOCK_KEY, VERBATIM_CHUNKS, check_robot
+from zstate.wire.keys import CLOCK_KEY, MOTION_CHUNK, VERBATIM_CHUNKS, check_robot
 from zstate.wire.registry import ros_options
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.types import OCCUPANCY_GRID
@@ -119,8 +119,10 @@ def _native_rules(roles: AclRoles) -> Grants:
         f"{root}/*/{stream}/*{end}" for stream in ("tf_static", "map") for end in ("", "/@adv/**")
     )
     shared = (*latched, f"{root}/*/{_EDGE}/**", f"{root}/*/{_WRITER}/**", clock)
+    motions = f"{root}/*/{MOTION_CHUNK}"
     for robot in dict.fromkeys(roles.robots):
-        keys = _below(f"{root}/{check_robot(robot)}")
+        prefix = f"{root}/{check_robot(robot)}"
+        keys = (*_below(prefix), f"{prefix}/{MOTION_CHUNK}")
         yield (robot,), _ingress(f"{robot} writes", PUBLISH, keys)
         yield (robot,), _ingress(f"{robot} reads", SUBSCRIBE, keys)
         yield (robot,), _egress(f"{robot} is given", PUBLISH, keys)
@@ -134,7 +136,7 @@ def _native_rules(roles: AclRoles) -> Grants:
     yield robots, _ingress("robots read", SUBSCRIBE, shared)
     yield robots, _egress("robots are given", PUBLISH, shared)
     # A query for all robots goes to each of them; a reply has the robot's own data only.
-    yield robots, _egress("robots are asked", SUBSCRIBE, everything)
+    yield robots, _egress("robots are asked", SUBSCRIBE, (*everything, motions))
     yield roles.readers, _ingress("viewers read", SUBSCRIBE, everything)
     yield roles.readers, _egress("viewers are given", PUBLISH, everything)
     yield roles.identities, _ingress("readers are known", ("liveliness_token",), (f"{root}/{_READER}/**",))
@@ -144,6 +146,8 @@ def _native_rules(roles: AclRoles) -> Grants:
     yield commanders, _ingress("commanders command", ("put", "liveliness_token"), commands)
     # A publisher sends nothing before its session knows of a subscriber.
     yield commanders, _egress("commanders are asked", SUBSCRIBE, commands)
+    yield commanders, _ingress("commanders move", ("query",), (motions,))
+    yield commanders, _egress("commanders are answered", PUBLISH, (motions,))
     stops = (f"{root}/*/stop/*", f"{root}/*/stop/*/@adv/**")
     yield roles.identities, _ingress("everyone stops", PUBLISH, stops)
     yield roles.identities, _egress("everyone is asked for stops", SUBSCRIBE, stops)

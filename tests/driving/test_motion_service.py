@@ -1,0 +1,333 @@
+"""Motions of a driver over the network: real sessions, and processes that are killed."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+
+import numpy as np
+import pytest
+from helpers.access_routers import router_with_users
+from helpers.processes import DEADLINE_S, until
+from helpers.robots import RRBOT
+
+from zstate.driving import Commander, DriverHost, Limits, Motion, SimulatedDriver, stop
+from zstate.driving.stops import wait_for_state
+from zstate.driving.trajectory import Trajectory
+from zstate.errors import InvalidInput, MotionRefused, MotionTimeout
+from zstate.net.queryable import query
+from zstate.net.security.acl import AclRoles
+from zstate.net.session import Session, connect
+from zstate.wire.messages import JointTrajectory, MotionCancel, MotionReply, to_block
+from zstate.wire.native import ENCODINGS, decode, encode
+
+RATE_HZ = 200.0
+LIMITS = Limits.of(RRBOT, velocity=2.0, acceleration=20.0)
+STEP = 2.0 / RATE_HZ
+"""The longest step of a tick at the velocity limit [rad]."""
+
+TTL_S = 5.0
+"""Long enough for renewals of a busy machine; a test of silence sets its own."""
+
+
+class Written(SimulatedDriver):
+    """A mirror that keeps its setpoints; a joint that is ``stuck`` does not move."""
+
+    stuck = False
+
+    def __init__(self) -> None:
+        super().__init__(RRBOT, "mirror")
+        self.setpoints: list[np.ndarray] = []
+        self.written_at: list[int] = []
+        """On the monotonic clock [ns]."""
+
+    def write(self, setpoint) -> None:
+        self.written_at.append(time.monotonic_ns())
+        self.setpoints.append(setpoint.positions)
+        if not self.stuck:
+            super().write(setpoint)
+
+    @property
+    def path(self) -> np.ndarray:
+        return np.array([np.zeros(2), *self.setpoints])
+
+    def assert_steps_within_limits(self) -> None:
+        assert np.abs(np.diff(self.path, axis=0)).max() <= STEP * (1 + 1e-9)
+
+
+@contextmanager
+def hosted(session: Session, driver: SimulatedDriver, **options: object) -> Iterator[DriverHost]:
+    """A host of robot "arm" whose loop runs in a thread."""
+    settings = {"rate_hz": RATE_HZ, "limits": LIMITS, "ttl_s": TTL_S, **options}
+    with DriverHost(session, driver, RRBOT, "arm", **settings) as host:
+        thread = threading.Thread(target=host.run)
+        thread.start()
+        try:
+            until(lambda: host.state != "off")
+            yield host
+        finally:
+            host.close()
+            thread.join()
+
+
+@contextmanager
+def arm_of(sessions, driver: Written, **options: object) -> Iterator[Commander]:
+    """A commander of a hosted ``driver``, whose steps are checked at the end."""
+    with hosted(sessions[0], driver, **options), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver(DEADLINE_S)
+        yield arm
+    driver.assert_steps_within_limits()
+
+
+def release(arm: Commander) -> None:
+    """Releases the stops of a driver, once its commander has received its state."""
+    until(lambda: arm.wait_for_driver(DEADLINE_S).state == "stopped")
+    arm.release(DEADLINE_S)
+
+
+def wait_until_under_way(motion: Motion) -> None:
+    until(lambda: 0.0 < motion.progress < 1.0)
+
+
+def test_a_motion_follows_its_trajectory_and_reaches_the_last_point(sessions):
+    driver = Written()
+    with arm_of(sessions, driver) as arm:
+        motion = arm.move({"elbow": [0.2, 0.1]}, [0.3, 0.6])
+        assert motion.wait(DEADLINE_S).name == "reached"
+        assert motion.progress == 1.0
+        assert np.abs(driver.setpoints[-1] - [0.0, 0.1]).max() < 1e-9
+    planned = Trajectory(("elbow",), [[0.0], [0.2], [0.1]], [0.0, 0.3, 0.6])
+    # One period for each setpoint, also if ticks were missed.
+    times = np.arange(1, round(0.6 * RATE_HZ) + 1) / RATE_HZ
+    written = driver.path[1 : len(times) + 1, 1]
+    assert np.abs(written - planned.sample(times)[0][:, 0]).max() < 1e-9
+
+
+def test_a_motion_that_exceeds_limits_is_refused_with_every_finding_or_stretched(sessions):
+    driver = Written()
+    narrow = Limits(RRBOT.joint_names, [-1.0, -1.0], [1.0, 1.0], [2.0, 2.0], [20.0, 20.0])
+    with arm_of(sessions, driver, limits=narrow) as arm:
+        with pytest.raises(MotionRefused, match="outside -1 to 1") as refused:
+            arm.move({"shoulder": [0.9], "elbow": [1.5]}, [0.1])
+        texts = refused.value.findings
+        assert [("shoulder" in text, "elbow" in text) for text in texts] == [
+            *((False, True), (True, False), (False, True), (True, False), (False, True))
+        ], "a position of the elbow, and velocities and accelerations of both"
+        assert not driver.setpoints
+        # From rest to rest by d in T, the greatest velocity is 1.5 d / T: that is 2 rad/s for T = 0.675 s.
+        motion = arm.move({"shoulder": [0.9]}, [0.1], stretch=True)
+        assert motion.wait(DEADLINE_S).name == "reached"
+        written = driver.path[:, 0]
+        assert len(np.flatnonzero(np.diff(written))) >= 0.67 * RATE_HZ
+
+
+def test_each_end_of_a_motion_is_an_outcome_and_no_step_is_too_long(sessions):
+    driver = Written()
+    with arm_of(sessions, driver) as arm:
+        first = arm.move({"shoulder": [2.0], "elbow": [1.0]}, [5.0])
+        wait_until_under_way(first)
+        second = arm.move({"elbow": [-1.0]}, [5.0])
+        assert first.wait(DEADLINE_S).name == "replaced"
+        wait_until_under_way(second)
+        arm.send({"shoulder": 0.0})
+        assert second.outcome is None, "a command for another joint"
+        arm.send({"elbow": 0.0})
+        outcome = second.wait(DEADLINE_S)
+        assert outcome.name == "replaced"
+        assert "by a command of" in outcome.reason
+        third = arm.move({"elbow": [1.0]}, [5.0])
+        wait_until_under_way(third)
+        third.cancel()
+        assert third.wait(DEADLINE_S).name == "cancelled"
+        count = len(driver.setpoints)
+        until(lambda: len(driver.setpoints) > count + 60)
+        assert (driver.path[-20:] == driver.path[-1]).all(), "at rest"
+        fourth = arm.move({"elbow": [1.0]}, [5.0])
+        wait_until_under_way(fourth)
+        stop(sessions[0], "arm", "door open", timeout_s=DEADLINE_S)
+        outcome = fourth.wait(DEADLINE_S)
+        assert outcome.name == "stopped"
+        assert "door open" in outcome.reason
+        with pytest.raises(MotionRefused, match="door open"):
+            arm.move({"elbow": [1.0]}, [5.0])
+        release(arm)
+        fifth = arm.move({"elbow": [1.0]}, [5.0])
+        wait_until_under_way(fifth)
+        with pytest.raises(MotionTimeout, match=r"has not ended within 0\.01 s"):
+            fifth.wait(0.01)
+
+
+def test_a_joint_that_does_not_follow_ends_the_motion(sessions):
+    driver = Written()
+    with arm_of(sessions, driver, following_error=10.0) as arm:
+        driver.stuck = True
+        outcome = arm.move({"elbow": [1.0]}, [2.0], path_tolerance=0.05).wait(DEADLINE_S)
+        assert outcome.name == "aborted"
+        assert "'elbow' is 0.05" in outcome.reason
+        assert outcome.reason.endswith("rad from its path, more than path_tolerance=0.05")
+        outcome = arm.move({"elbow": [0.1]}, [0.2], goal_tolerance=0.01, goal_time_s=0.1).wait(DEADLINE_S)
+        assert outcome.name == "aborted"
+        assert "from its goal 0.1 s after the end, more than goal_tolerance=0.01" in outcome.reason
+
+
+MOVER = """
+    from zstate import connect
+    from zstate.driving import Commander
+    with connect() as session, Commander(session, "arm", program="teleop") as arm:
+        arm.wait_for_driver(15.0)
+        motion = arm.move({"elbow": [3.0]}, [60.0])
+        print("moving", flush=True)
+        motion.wait(60.0)
+"""
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_motion_of_a_dead_or_frozen_commander_is_braked_and_held(sessions, spawn, end: signal.Signals):
+    driver = Written()
+    with hosted(sessions[0], driver, ttl_s=0.5) as host:
+        mover = spawn(MOVER)
+        assert mover.line() == "moving"
+        until(lambda: len(driver.setpoints) > RATE_HZ)  # twice as long as without renewals
+        mover.process.send_signal(end)
+        dead_at = time.monotonic_ns()
+        until(lambda: host.state == "holding")
+        until(lambda: len(driver.path) > 5 and (driver.path[-5:] == driver.path[-1]).all())
+        # At less than 0.1 rad/s the joint stops in the tick in which the last renewal expires.
+        moved = np.flatnonzero(np.diff(driver.path[:, 1]))[-1]
+        worst_tick_ns = host.report().lateness_us.max * 1e3 + 1e9 / RATE_HZ
+        assert driver.written_at[moved] - dead_at <= 0.5e9 + worst_tick_ns
+        if end == signal.SIGSTOP:
+            mover.kill()
+        with Commander(sessions[1], "arm") as late:
+            (outcome,) = late.wait_for_driver(DEADLINE_S).outcomes
+            assert outcome.name == "aborted"
+            assert "nothing from teleop@" in outcome.reason
+    driver.assert_steps_within_limits()
+
+
+def test_a_motion_starts_at_its_stamp_and_not_in_the_past(sessions):
+    driver = Written()
+    with arm_of(sessions, driver) as arm:
+        with pytest.raises(MotionRefused, match="the first point is due"):
+            arm.move({"elbow": [0.2]}, [0.3], start=time.time_ns() - 10**9)
+        with pytest.raises(MotionRefused, match="give the first point a time above zero"):
+            arm.move({"elbow": [0.2]}, [0.0])
+        motion = arm.move({"elbow": [0.1]}, [0.2], start=time.time_ns() + 10**9)
+        assert motion.wait(DEADLINE_S).name == "reached"
+    resting = int(np.flatnonzero(driver.path[:, 1])[0])
+    # Ticks that were missed delay it further; planning takes less than half a second.
+    assert resting > 0.5 * RATE_HZ
+
+
+def test_a_request_of_another_session_is_refused_while_a_motion_is_valid(sessions):
+    driver = Written()
+    with arm_of(sessions, driver) as arm:
+        motion = arm.move({"elbow": [1.0]}, [5.0])
+        request = JointTrajectory(0, 0, 7, ("elbow",), to_block([1.0]), to_block([0.0]))
+        (reply,) = replies_to(sessions[1], "zstate/arm/@motion", request)
+        assert "while that of another session is valid" in reply.findings[0]
+        cancel = MotionCancel(0, 0, 7, 0)
+        assert replies_to(sessions[1], "zstate/arm/@motion", cancel)[0].findings == ()
+        wait_until_under_way(motion)
+
+
+def test_a_repeated_request_is_the_same_motion(sessions):
+    request = JointTrajectory(0, 3, 7, ("elbow",), to_block([0.2]), to_block([0.1]))
+    driver = Written()
+    with hosted(sessions[0], driver):
+
+        def findings() -> list[tuple[str, ...]]:
+            return [reply.findings for reply in replies_to(sessions[1], "zstate/arm/@motion", request)]
+
+        until(lambda: findings() == [()])
+        reached = wait_for_state(sessions[1], "arm", lambda state: len(state.outcomes) > 0, DEADLINE_S)
+        assert reached is not None
+        assert [outcome.name for outcome in reached.outcomes] == ["reached"]
+        count = len(driver.setpoints)
+        assert findings() == [()]
+        until(lambda: len(driver.setpoints) > count + 10)
+        still = wait_for_state(sessions[1], "arm", lambda state: state.ticks > reached.ticks, DEADLINE_S)
+        assert still is not None
+        assert (still.motion, still.outcomes) == (None, reached.outcomes)
+
+
+def replies_to(session: Session, selector: str, message: JointTrajectory | MotionCancel) -> list[MotionReply]:
+    payload, encoding = encode(message), ENCODINGS[type(message)]
+    found = query(session.zenoh, selector, DEADLINE_S, payload=payload, encoding=encoding)
+    answers = [reply.ok for reply in found if reply.ok is not None]
+    kind = ENCODINGS[MotionReply]
+    return [decode(one.payload.to_bytes(), kind, MotionReply) for one in answers if str(one.encoding) == kind]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (({}, [1.0]), "at least one"),
+        (({"elbow": [0.1, 0.2]}, [1.0]), r"'elbow' has shape \(2,\)"),
+        (({"elbw": [0.1]}, [1.0]), "no joint 'elbw'"),
+    ],
+)
+def test_a_motion_is_checked_before_it_is_sent(sessions, arguments, text: str):
+    with hosted(sessions[0], Written()), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver(DEADLINE_S)
+        with pytest.raises(InvalidInput, match=text):
+            arm.move(*arguments)
+
+
+def test_only_commanders_may_request_motions(tmp_path):
+    fleet = AclRoles(("arm",), viewers=("desk",), commanders=("teleop",))
+    with router_with_users(tmp_path, fleet, fleet.identities) as endpoint, ExitStack() as opened:
+
+        def join(user: str) -> Session:
+            settings = {
+                "mode": "client",
+                "connect": {"endpoints": [endpoint], "timeout_ms": 5000},
+                "scouting": {"multicast": {"enabled": False}},
+                "transport": {"auth": {"usrpwd": {"user": user, "password": "secret"}}},
+            }
+            return opened.enter_context(connect(settings))
+
+        driver = Written()
+        opened.enter_context(hosted(join("arm"), driver))
+        arm = opened.enter_context(Commander(join("teleop"), "arm"))
+        assert arm.move({"elbow": [0.1]}, [0.2]).wait(DEADLINE_S).name == "reached"
+        request = JointTrajectory(0, 0, 7, ("elbow",), to_block([1.0]), to_block([0.0]))
+        desk = join("desk")
+        for selector in ("zstate/arm/@motion", "zstate/*/@motion", "zstate/**"):
+            assert replies_to(desk, selector, request) == []
+
+
+def test_random_motions_commands_stops_and_takeovers_make_no_step_too_long(sessions):
+    driver = Written()
+    random = np.random.default_rng(7)
+    with hosted(sessions[0], driver, ttl_s=0.3) as host, ExitStack() as opened:
+        arm = opened.enter_context(Commander(sessions[1], "arm"))
+        arm.wait_for_driver(DEADLINE_S)
+        motions: list[Motion] = []
+        for action in random.integers(0, 8, 60).tolist():
+            target = random.uniform(-2.0, 2.0, 2)
+            if action < 4:
+                names = [("elbow",), ("shoulder",), ("shoulder", "elbow")][int(random.integers(3))]
+                points = {name: [value, 0.0] for name, value in zip(names, target, strict=False)}
+                times = [random.uniform(0.2, 2.0), 3.0]
+                with suppress(MotionRefused):  # from a high speed
+                    motions.append(arm.move(points, times, stretch=True))
+            elif action == 4:
+                arm.send({"elbow": target[0]})
+            elif action == 5 and motions:
+                motions[-1].cancel()
+            elif action == 6:
+                stop(sessions[0], "arm", timeout_s=DEADLINE_S)
+                release(arm)
+            elif action == 7:
+                arm.close()
+                arm = opened.enter_context(Commander(sessions[1], "arm"))
+                until(lambda: host.state != "active")
+                arm.wait_for_driver(DEADLINE_S)
+            count = len(driver.setpoints) + int(random.integers(1, 30))
+            until(lambda count=count: len(driver.setpoints) >= count or host.state != "active")
+    assert len(motions) > 20, host.report().refused
+    driver.assert_steps_within_limits()

@@ -1,0 +1,367 @@
+"""Motions at the host of a driver: requests, their checks, and the one motion that is under way.
+
+A request is planned in the thread of a queryable: a trajectory from the present setpoint, or from the
+measured joints if none is written, which is checked against the limits in closed form. The control loop
+adopts it at its next tick, and replies by that thread.
+
+The time of a motion advances by one period at each tick that writes a setpoint. A tick that was missed delays
+the motion; no step becomes longer by it. A motion is valid for the host's ttl, unless its commander renews
+it: then the joints brake, as they do after commands.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NotDone
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
+from zstate._util.refusals import Refusals
+from zstate.driving.commands import Command, Targets
+from zstate.driving.limits import Limits
+from zstate.driving.trajectory import Trajectory
+from zstate.errors import InvalidInput, MessageError, format_duration
+from zstate.net.queryable import Reply, RequestQueryable
+from zstate.net.session import Session
+from zstate.wire.keys import motion_key
+from zstate.wire.messages import (
+    JointTrajectory,
+    MotionCancel,
+    MotionOutcome,
+    MotionReply,
+    OutcomeName,
+    from_block,
+)
+from zstate.wire.native import ENCODINGS, decode, encode
+
+Floats = NDArray[np.float64]
+
+_TICK_WITHIN_S = 1.0
+_MOST_OUTCOMES = 16
+_MAX_REASON_LENGTH = 300
+_MOST_FINDINGS = 400
+_MAX_FINDING_LENGTH = 500
+"""Readers refuse large messages; the names in a finding come from the request."""
+
+
+class Present(NamedTuple):
+    """The joints of a driver now, from which a motion starts: (n,) each.
+
+    ``resting`` is where they come to rest if they brake. ``stops`` is another object after each stop and each
+    release.
+    """
+
+    positions: Floats
+    velocities: Floats
+    resting: Floats
+    stops: object
+
+
+class Plan(NamedTuple):
+    """A motion that may be driven if it has no ``findings``.
+
+    ``time_s`` of it have passed at ``planned_at`` [ns, monotonic]; negative until its start.
+    """
+
+    request: JointTrajectory
+    columns: NDArray[np.intp]
+    trajectory: Trajectory
+    present: Present
+    time_s: float
+    planned_at: int
+    findings: tuple[str, ...]
+
+
+def plan(request: JointTrajectory, limits: Limits, present: Present, stamp: int) -> Plan:
+    """The motion of ``request`` from the ``present`` joints, at the stamp ``stamp`` [ns].
+
+    One that starts later rests until then. Raises InvalidInput for a request that is no motion at all.
+    """
+    planned_at = time.monotonic_ns()
+    part = limits.part(request.names)
+    columns = np.array([limits.joint_names.index(name) for name in request.names], dtype=np.intp)
+    wait_s = 0.0 if request.start is None else (request.start - stamp) * 1e-9
+    times = from_block(request.times) + min(wait_s, 0.0)
+    if not times[0] > 0.0:
+        raise InvalidInput(
+            f"the first point is due {-times[0]:.6g} s before the motion can start: it starts at the present "
+            "joints, so give the first point a time above zero, or a later start"
+        )
+    start = (present.resting if wait_s > 0.0 else present.positions)[columns]
+    velocities = (np.zeros(len(limits.joint_names)) if wait_s > 0.0 else present.velocities)[columns]
+    points = _after(start, request.points)
+    at = np.concatenate([[0.0], times])
+    if request.velocities is None:
+        if request.accelerations is not None:
+            raise InvalidInput("accelerations at the points need velocities as well")
+        trajectory = Trajectory(request.names, points, at, start_velocities=velocities)
+    else:
+        rates = _after(velocities, request.velocities)
+        changes = (
+            None if request.accelerations is None else _after(np.zeros(len(columns)), request.accelerations)
+        )
+        trajectory = Trajectory(request.names, points, at, rates, changes)
+    allowed = part.containing(start)
+    if request.stretch:
+        trajectory = trajectory.stretched(allowed)
+    time_s, findings = -max(wait_s, 0.0), trajectory.findings(allowed)
+    return Plan(request, columns, trajectory, present, time_s, planned_at, findings)
+
+
+def _after(first: Floats, block: bytes) -> Floats:
+    """The rows of ``block`` after the row ``first``."""
+    return np.vstack([first, from_block(block).reshape(-1, len(first))])
+
+
+@dataclass(slots=True)
+class _Underway:
+    """The motion under way. ``planned`` is what was written last, at ``written_at`` [ns, monotonic]."""
+
+    request: JointTrajectory
+    columns: NDArray[np.intp]
+    trajectory: Trajectory
+    time_s: float
+    renewed_at: int
+    deadline: int
+    next_time_s: float = 0.0
+    next_positions: Floats | None = None
+    planned: Floats | None = None
+    written_at: int = 0
+
+    @property
+    def progress(self) -> float:
+        return min(max(self.time_s / self.trajectory.duration_s, 0.0), 1.0)
+
+
+class MotionService(Closeable):
+    """Takes requests for motions of the driver of ``robot``, and makes one at a time.
+
+    ``present()`` returns the joints now, for any thread; it raises MessageError if that is not known.
+    ``check(session, now)`` raises MessageError if that commander may not move the robot now; ``name_of`` is
+    its program; ``on_change`` is called when a motion has started or ended: these three, and all methods
+    without another note, are for the thread of the loop.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        host_session: int,
+        targets: Targets,
+        *,
+        limits: Limits,
+        ttl_ns: int,
+        refusals: Refusals,
+        present: Callable[[], Present],
+        check: Callable[[int, int], None],
+        name_of: Callable[[int], str],
+        on_change: Callable[[], None],
+    ) -> None:
+        self._host_session = host_session
+        self._limits = limits
+        self._ttl_ns = ttl_ns
+        self._targets = targets
+        self._refusals = refusals
+        self._present, self._check, self._name_of, self._on_change = present, check, name_of, on_change
+        self._lock = fork_safe_lock()
+        self._waiting: tuple[Future[None], Callable[[int], None]] | None = None
+        """What the loop is to do at its next tick, with the present instant."""
+        self._motion: _Underway | None = None
+        self.outcomes: tuple[MotionOutcome, ...] = ()
+        """Of the last motions, newest last; a new tuple after each. May be read from any thread."""
+        self._queryable = RequestQueryable(session, motion_key(robot), self._answer)
+
+    def close(self) -> None:
+        """Take no further requests."""
+        self._queryable.close()
+
+    @property
+    def underway(self) -> tuple[tuple[int, int] | None, float]:
+        """Session and number of the motion under way, and its progress; for any thread."""
+        motion = self._motion
+        if motion is None:
+            return None, 0.0
+        return (motion.request.session, motion.request.seq), motion.progress
+
+    # Requests, in the thread of the queryable
+
+    def _answer(self, payload: bytes, encoding: str) -> Reply:
+        try:
+            findings = self._take(payload, encoding)
+        except (MessageError, InvalidInput) as error:
+            findings = (str(error),)
+            self._refusals.count(getattr(error, "reason", "motion"), error)
+        else:
+            if findings:
+                self._refusals.count("motion", "; ".join(findings))
+        texts = tuple(text[:_MAX_FINDING_LENGTH] for text in findings[:_MOST_FINDINGS])
+        reply = MotionReply(self._host_session, self._ttl_ns, texts)
+        return Reply(encode(reply), ENCODINGS[MotionReply])
+
+    def _take(self, payload: bytes, encoding: str) -> tuple[str, ...]:
+        """Hand the request to the loop, or return the findings. Raises MessageError and InvalidInput."""
+        if encoding == ENCODINGS[MotionCancel]:
+            cancel = decode(payload, encoding, MotionCancel)
+            self._call_in_loop(lambda _: self._cancel(cancel))
+            return ()
+        request = decode(payload, encoding, JointTrajectory)
+        planned = plan(request, self._limits, self._present_after_start(), time.time_ns())
+        if not planned.findings:
+            self._call_in_loop(lambda now: self._start(planned, now))
+        return planned.findings
+
+    def _present_after_start(self) -> Present:
+        """The joints now; of a loop that has just started, after its first tick. Raises MessageError."""
+        try:
+            return self._present()
+        except MessageError:
+            with suppress(MessageError):
+                self._call_in_loop(lambda _: None)
+            return self._present()
+
+    def _call_in_loop(self, action: Callable[[int], None]) -> None:
+        """Let the loop call ``action`` at its next tick. Raises MessageError, also that of ``action``."""
+        done: Future[None] = Future()
+        with self._lock:
+            self._waiting = (done, action)
+        try:
+            done.result(_TICK_WITHIN_S)
+        except NotDone:
+            if done.cancel():
+                text = f"the control loop has not begun a tick within {_TICK_WITHIN_S:g} s"
+                raise MessageError(text, reason="no tick") from None
+            done.result()
+
+    # The loop
+
+    def adopt(self, now: int) -> None:
+        """Start or cancel what was requested since the last tick."""
+        if self._waiting is None:
+            return
+        with self._lock:
+            waiting, self._waiting = self._waiting, None
+        assert waiting is not None, "only this thread takes it away"
+        done, action = waiting
+        if not done.set_running_or_notify_cancel():
+            return
+        try:
+            action(now)
+        except BaseException as error:
+            done.set_exception(error)
+            if not isinstance(error, MessageError):
+                raise
+        else:
+            done.set_result(None)
+
+    def renew(self, command: Command) -> None:
+        """Keep the motion of ``command`` valid; does nothing if it has ended."""
+        motion = self._motion
+        if motion is None or (command.session, command.motion) != (
+            motion.request.session,
+            motion.request.seq,
+        ):
+            return
+        motion.renewed_at, motion.deadline = command.arrived, command.deadline
+        self._targets.renew(command, motion.columns)
+
+    def replace(self, command: Command) -> None:
+        """End a motion of the joints of ``command``, whose targets are new."""
+        if self._motion is not None and np.isin(command.columns, self._motion.columns).any():
+            self.finish("replaced", f"by a command of {self._name_of(command.session)}")
+
+    def supervise(self, now: int, measured: Floats, measured_at: int) -> None:
+        """End a motion that has no commander any more, that has left its path, or reached its goal."""
+        motion = self._motion
+        if motion is None:
+            return
+        if motion.deadline <= now:
+            silence = format_duration(now - motion.renewed_at)
+            name = self._name_of(motion.request.session)
+            self.finish("aborted", f"nothing from {name} for {silence}")
+        elif motion.planned is not None and measured_at > motion.written_at:
+            self._compare(motion, measured[motion.columns] - motion.planned)
+
+    def next_target(self, resting: Floats, dt_s: float) -> tuple[Floats, Floats | None]:
+        """Positions and velocities at the end of the next step of ``dt_s``; ``resting`` are other joints'."""
+        motion = self._motion
+        if motion is None:
+            return resting, None
+        motion.next_time_s = motion.time_s + dt_s
+        at, rates, _ = motion.trajectory.sample(motion.next_time_s)
+        motion.next_positions = at
+        positions, velocities = resting.copy(), np.zeros(len(resting))
+        positions[motion.columns], velocities[motion.columns] = at, rates
+        return positions, velocities
+
+    def written(self, now: int) -> None:
+        """The setpoint of ``next_target`` has been written at ``now``."""
+        motion = self._motion
+        if motion is not None:
+            motion.time_s, motion.planned, motion.written_at = motion.next_time_s, motion.next_positions, now
+
+    def finish(self, name: OutcomeName, reason: str, positions: Floats | None = None) -> None:
+        """End the motion, if any. Its joints brake, or stay at ``positions`` while they are commanded."""
+        motion, self._motion = self._motion, None
+        if motion is None:
+            return
+        with suppress(MessageError):  # nothing moves while the joints are not known
+            at = self._present().resting[motion.columns] if positions is None else positions
+            self._targets.place(motion.columns, at)
+        request = motion.request
+        outcome = MotionOutcome(request.session, request.seq, name, reason[:_MAX_REASON_LENGTH])
+        self.outcomes = (*self.outcomes, outcome)[-_MOST_OUTCOMES:]
+        self._on_change()
+
+    def _start(self, planned: Plan, now: int) -> None:
+        """Make the motion ``planned`` in place of the last one. Raises MessageError if it must not start."""
+        request = planned.request
+        if self._is_known(request):
+            return
+        self._check(request.session, now)
+        present = self._present()
+        if present.stops is not planned.present.stops:
+            text = "a stop or its release arrived together with the motion; send it again"
+            raise MessageError(text, reason="stopped")
+        self.finish("replaced", f"by a motion of {self._name_of(request.session)}")
+        is_timed = planned.time_s < 0.0 or planned.present.velocities.any()
+        passed_s = (now - planned.planned_at) * 1e-9 if is_timed else 0.0
+        deadline = now + self._ttl_ns
+        at = present.resting[planned.columns]
+        self._targets.accept(Command(request.session, request.seq, planned.columns, at, now, deadline))
+        time_s = planned.time_s + passed_s
+        self._motion = _Underway(request, planned.columns, planned.trajectory, time_s, now, deadline)
+        self._on_change()
+
+    def _is_known(self, request: JointTrajectory) -> bool:
+        """Whether ``request`` is repeated, because the commander has not received the reply."""
+        ended = {(outcome.session, outcome.seq) for outcome in self.outcomes}
+        return (request.session, request.seq) in {*ended, self.underway[0]}
+
+    def _cancel(self, cancel: MotionCancel) -> None:
+        if self.underway[0] == (cancel.session, cancel.motion):
+            self.finish("cancelled", f"by {self._name_of(cancel.session)}")
+
+    def _compare(self, motion: _Underway, deviations: Floats) -> None:
+        """End ``motion`` if the joints are too far from its path, or, in time, near enough to its goal."""
+        errors = np.abs(deviations)
+        row = int(errors.argmax())
+        request, late_s = motion.request, motion.time_s - motion.trajectory.duration_s
+        name = request.names[row]
+        text = f"{name!r} is {errors[row]:.3g} {self._limits.units[motion.columns[row]]} from its"
+        if errors[row] > request.path_tolerance:
+            self.finish("aborted", f"{text} path, more than path_tolerance={request.path_tolerance:g}")
+        elif late_s >= 0.0 and errors[row] <= request.goal_tolerance:
+            self.finish("reached", "", motion.planned)
+        elif late_s > request.goal_time:
+            tolerance = f"goal_tolerance={request.goal_tolerance:g}"
+            self.finish(
+                "aborted", f"{text} goal {request.goal_time:g} s after the end, more than {tolerance}"
+            )
