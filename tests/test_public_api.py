@@ -92,7 +92,10 @@ SIGNATURES = {
     "TransformPublisher.publish": "(transforms, stamp=None)",
     "TransformPublisher.run": "(source, rate_hz=50.0, *, seconds=None)",
     "TransformPublisher.close": "()",
-    "JointStateListener": ("(session, robot, model=None, *, wire='native', on_reading=None, max_age_s=0.5)"),
+    "JointStateListener": (
+        "(session, robot, model=None, *, wire='native', stream='joint_states', on_reading=None, "
+        "max_age_s=0.5)"
+    ),
     "JointStateListener.read": "(stamp)",
     "JointStateListener.close": "()",
     "Transform": "(target, source, translation, rotation, stamp=None, *, kind=None)",

@@ -13,7 +13,9 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from helpers.manual_cdr import rosbags_numbers
 from helpers.processes import DEADLINE_S, repeated, until
+from helpers.raw_ros_nodes import COMMANDS, RosPublisher, announced_publisher
 from helpers.robots import RRBOT, wait_for_reader
 
 from zstate import JointReading, StatePublisher, load_model
@@ -25,6 +27,7 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
+from zstate.sources import JointStateListener
 from zstate.wire.keys import release_key
 from zstate.wire.messages import DriverState, JointCommand, Release, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
@@ -176,6 +179,26 @@ def test_a_dead_or_frozen_commander_leaves_the_joints_held_within_ttl_and_one_ti
     worst_tick_ns = report.lateness_us.max * 1e3 + 1e9 / RATE_HZ
     assert moved[-1] - dead_at <= 0.2e9 + worst_tick_ns
     assert writes[-1][0] > moved[-1], "the position is held by further writes"
+
+
+def test_setpoints_are_published_while_they_are_read(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        send_until(arm, {"elbow": 0.2}, lambda: len(driver.written()) > 5)
+        setpoints: list[JointReading] = []
+        with JointStateListener(
+            sessions[1], "arm", RRBOT, stream="joint_setpoints", on_reading=setpoints.append
+        ):
+            send_until(arm, {"elbow": 0.2}, lambda: setpoints)
+            send_until(arm, {"shoulder": 50.0}, lambda: setpoints[-1].positions[0] > 20 * STEP)
+        host.close()
+    written = driver.written()
+    rows = [int((written == one.positions).all(axis=1).argmax()) for one in setpoints]
+    assert rows[0] > 5, "those before the reader were not published"
+    for row, one in zip(rows, setpoints, strict=True):
+        assert (written[row] == one.positions).all()
+        if one.velocities[0]:
+            assert one.velocities == pytest.approx((written[row] - written[row - 1]) * RATE_HZ)
 
 
 def test_on_silence_relax_switches_the_torque_off(sessions):
@@ -640,7 +663,7 @@ def test_an_interrupted_stop_is_repeated_when_the_loop_ends(sessions):
             driver.stop_failures.append(KeyboardInterrupt())
 
         driver.enable = enable_once
-        put(command(elbow=0.1, ttl=50_000_000))
+        put(command(elbow=0.1))
         with pytest.raises(KeyboardInterrupt):
             host.run()
         driver.enable = enable
@@ -918,3 +941,105 @@ def test_a_stop_that_is_released_before_the_next_tick_is_obeyed(sessions):
         written = len(driver.written())
         send_until(arm, {"shoulder": 9.0}, lambda: host.report().refused.get("not released", 0) > 3)
         assert len(driver.written()) == written
+
+
+# Commands of ROS nodes
+
+ROS = "ros2:domain=0"
+CONTROLLED = {"wires": ("native", ROS), "ros2_controller": "forward_position_controller"}
+
+
+def publish_until(node: RosPublisher, positions: list[float], condition) -> None:
+    def is_done() -> bool:
+        node.numbers(positions)
+        return bool(condition())
+
+    until(is_done)
+
+
+def test_a_ros_node_commands_all_joints_in_the_order_of_the_driver_until_it_is_silent(sessions):
+    driver = RecordingDriver([0.5, -0.5])
+    with (
+        running(sessions[0], driver, **CONTROLLED) as host,
+        announced_publisher(sessions[1], "teleop", COMMANDS) as node,
+        JointStateListener(sessions[1], "arm", RRBOT, wire=ROS) as joints,
+        Commander(sessions[1], "arm") as arm,
+    ):
+        publish_until(
+            node, [0.4, 0.2], lambda: len(driver.written()) and driver.written()[-1].tolist() == [0.4, 0.2]
+        )
+        publish_until(node, [0.4, 0.2], lambda: arm.wait_for_driver().commander == "/teleop")
+        until(lambda: (reading := joints.read(0)) and reading.positions.tolist() == [0.4, 0.2])
+        until(lambda: host.state == "holding")
+        until(lambda: "nothing from /teleop for" in arm.wait_for_driver().reason)
+    path = np.vstack(([0.5, -0.5], driver.written()))
+    assert np.abs(np.diff(path, axis=0)).max() <= STEP * (1 + 1e-9)
+
+
+def test_of_two_ros_nodes_the_first_commands_until_it_is_silent(sessions):
+    driver = RecordingDriver()
+    with (
+        running(sessions[0], driver, ttl_s=1.5, **CONTROLLED) as host,
+        announced_publisher(sessions[1], "first", COMMANDS) as first,
+        announced_publisher(sessions[1], "second", COMMANDS) as second,
+        Commander(sessions[1], "arm") as arm,
+    ):
+        arm.wait_for_driver()
+        publish_until(first, [0.1, 0.1], lambda: host.state == "active")
+
+        def is_refused(count: int) -> bool:
+            first.numbers([0.1, 0.1])
+            return host.report().refused.get("second commander", 0) >= count
+
+        for send in (lambda: second.numbers([-1.0, -1.0]), lambda: arm.send({"elbow": -1.0})):
+            refused = host.report().refused.get("second commander", 0)
+            until(lambda send=send, refused=refused: (send(), is_refused(refused + 1))[1])
+        assert driver.written().min() >= 0.0
+        publish_until(second, [-0.2, 0.0], lambda: driver.written()[-1].tolist() == [-0.2, 0.0])
+
+
+def test_bad_commands_of_ros_nodes_are_refused_and_move_nothing(sessions):
+    narrow = Limits(RRBOT.joint_names, [-1.0, -0.5], [1.0, 0.5], [2.0, 2.0], [np.inf, np.inf])
+    driver = RecordingDriver()
+    with (
+        DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=narrow, **CONTROLLED) as host,
+        announced_publisher(sessions[1], "teleop", COMMANDS) as node,
+    ):
+        for numbers in ([0.1], [0.1, 0.1, 0.1], [], [0.1, np.nan], [np.inf, 0.1], [0.0, 0.6]):
+            node.numbers(numbers)
+        node.put(rosbags_numbers([0.1, 0.1])[:-1])
+        node.put(rosbags_numbers([0.1, 0.1]), None)
+        until(lambda: sum(host.report().refused.values()) == 7)
+        host.run(seconds=2 / RATE_HZ)
+        assert host.report().refused == {
+            "joint count": 3,
+            "not finite": 2,
+            "truncated": 1,
+            "no attachment": 1,
+            "outside limits": 1,
+        }
+    assert driver.written().size == 0
+
+
+def test_a_ros_node_that_commanded_a_stopped_robot_does_not_move_it_after_the_release(sessions):
+    driver = RecordingDriver()
+    with (
+        running(sessions[0], driver, **CONTROLLED) as host,
+        announced_publisher(sessions[1], "first", COMMANDS) as first,
+        Commander(sessions[1], "arm") as arm,
+    ):
+        arm.wait_for_driver()
+        publish_until(first, [50.0, 0.0], lambda: host.state == "active")
+        stop(sessions[1], "arm")
+        publish_until(first, [50.0, 0.0], lambda: host.report().refused.get("stopped"))
+        written = len(driver.written())
+        assert arm.release().state == "ready"
+        publish_until(first, [50.0, 0.0], lambda: host.report().refused.get("not released", 0) > 3)
+        assert len(driver.written()) == written
+        with announced_publisher(sessions[1], "restarted", COMMANDS) as restarted:
+            publish_until(restarted, [50.0, 0.0], lambda: len(driver.written()) > written)
+
+
+def test_a_controller_needs_the_wire_of_ros_nodes(sessions):
+    with pytest.raises(InvalidInput, match=r"pass wires=\('native', 'ros2'\)"):
+        DriverHost(sessions[0], RecordingDriver(), RRBOT, "arm", ros2_controller="arm_controller")

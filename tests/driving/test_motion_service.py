@@ -11,7 +11,9 @@ from contextlib import ExitStack, contextmanager, suppress
 import numpy as np
 import pytest
 from helpers.access_routers import router_with_users
+from helpers.manual_cdr import rosbags_trajectory
 from helpers.processes import DEADLINE_S, until
+from helpers.raw_ros_nodes import TRAJECTORY, RosPublisher, announced_publisher, tokens
 from helpers.robots import RRBOT
 
 from zstate.driving import Commander, DriverHost, Limits, Motion, SimulatedDriver, stop
@@ -331,3 +333,77 @@ def test_random_motions_commands_stops_and_takeovers_make_no_step_too_long(sessi
             until(lambda count=count: len(driver.setpoints) >= count or host.state != "active")
     assert len(motions) > 20, host.report().refused
     driver.assert_steps_within_limits()
+
+
+# Trajectories of ROS nodes
+
+CONTROLLED = {"wires": ("native", "ros2:domain=0"), "ros2_controller": "forward_position_controller"}
+
+
+@contextmanager
+def planner_of(sessions) -> Iterator[RosPublisher]:
+    """A ROS node that publishes trajectories, whose token has arrived at the host."""
+    with announced_publisher(sessions[1], "planner", TRAJECTORY) as planner:
+        until(lambda: planner.token in tokens(sessions[0]))
+        yield planner
+
+
+def outcome_of(arm: Commander) -> tuple[str, str]:
+    """How the first motion has ended."""
+    until(lambda: arm.wait_for_driver(DEADLINE_S).outcomes)
+    outcome = arm.wait_for_driver(DEADLINE_S).outcomes[0]
+    return outcome.name, outcome.reason
+
+
+def test_a_trajectory_of_a_ros_node_is_made_while_the_node_is_announced(sessions):
+    driver = Written()
+    with arm_of(sessions, driver, ttl_s=0.5, **CONTROLLED) as arm, planner_of(sessions) as planner:
+        # As from MoveIt, the first point is where the joints are, at the start.
+        path = (0.0, ([0.0, 0.0],)), (0.5, ([0.1, 0.2],)), (1.5, ([0.3, 0.1],))
+        planner.put(rosbags_trajectory(0, RRBOT.joint_names, *path))
+        assert outcome_of(arm) == ("reached", "")
+        assert arm.wait_for_driver(DEADLINE_S).commander == "/planner"
+    planned = Trajectory(RRBOT.joint_names, [[0, 0], [0.1, 0.2], [0.3, 0.1]], [0.0, 0.5, 1.5])
+    times = np.arange(1, round(1.5 * RATE_HZ) + 1) / RATE_HZ
+    assert np.abs(driver.path[1 : len(times) + 1] - planned.sample(times)[0]).max() < 1e-9
+
+
+def test_a_trajectory_ends_with_its_ros_node_or_by_one_without_points(sessions):
+    path = (20.0, ([1.0],))
+    for is_closed in (True, False):
+        driver = Written()
+        with arm_of(sessions, driver, ttl_s=0.5, **CONTROLLED) as arm:
+            with planner_of(sessions) as planner:
+                planner.put(rosbags_trajectory(0, ["elbow"], path))
+                until(lambda driver=driver: len(driver.setpoints) > 5)
+                if not is_closed:
+                    planner.put(rosbags_trajectory(0, []))
+                    assert outcome_of(arm) == ("cancelled", "by /planner")
+            if is_closed:
+                name, reason = outcome_of(arm)
+                assert name == "aborted"
+                assert reason.startswith("nothing from /planner for ")
+
+
+def test_trajectories_of_ros_nodes_are_checked_as_all_motions_are(sessions):
+    driver = Written()
+    with (
+        hosted(sessions[0], driver, **CONTROLLED) as host,
+        Commander(sessions[1], "arm") as arm,
+        planner_of(sessions) as planner,
+    ):
+        past = time.time_ns() - 10**10
+        for payload in (
+            rosbags_trajectory(0, ["elbow"], (0.01, ([1.0],))),
+            rosbags_trajectory(0, ["elbw"], (1.0, ([0.1],))),
+            rosbags_trajectory(past, ["elbow"], (1.0, ([0.1],)), (2.0, ([0.2],))),
+            rosbags_trajectory(0, ["elbow"], (1.0, ([np.nan],))),
+        ):
+            refused = host.report().refused.get("motion", 0)
+            planner.put(payload)
+            until(lambda refused=refused: host.report().refused.get("motion", 0) == refused + 1)
+        arm.send({"elbow": 0.0})
+        until(lambda: driver.setpoints)
+        planner.put(rosbags_trajectory(0, ["elbow"], (1.0, ([0.1],))))
+        until(lambda: host.report().refused.get("second commander") == 1)
+        assert not np.any(driver.setpoints)

@@ -102,3 +102,30 @@ def rosbags_tf_message(
         for stamp, (parent, child), pose in zip(stamps, edges, poses, strict=True)
     ]
     return rosbags_cdr("tf2_msgs/msg/TFMessage", transforms, little_endian=little_endian)
+
+
+def rosbags_numbers(
+    numbers: Sequence[float], labels: Sequence[str] = (), *, little_endian: bool = True
+) -> bytes:
+    """A Float64MultiArray with a dimension for each of ``labels``."""
+    types = STORE.types
+    dimensions = [types["std_msgs/msg/MultiArrayDimension"](label, len(numbers), 1) for label in labels]
+    layout = types["std_msgs/msg/MultiArrayLayout"](dimensions, 0)
+    data = np.array(numbers, "f8")
+    return rosbags_cdr("std_msgs/msg/Float64MultiArray", layout, data, little_endian=little_endian)
+
+
+Point = tuple[float, Sequence[Sequence[float]]]
+"""The time from the start [s]; positions, and what follows of velocities, accelerations and efforts."""
+
+
+def rosbags_trajectory(stamp: int, names: Sequence[str], *points: Point, little_endian: bool = True) -> bytes:
+    types = STORE.types
+    header = types["std_msgs/msg/Header"](rosbags_time(stamp), "")
+    rows = []
+    for time_s, numbers in points:
+        blocks = [np.array(block, "f8") for block in (*numbers, *[()] * (4 - len(numbers)))]
+        duration = types["builtin_interfaces/msg/Duration"](*divmod(round(time_s * SECOND), SECOND))
+        rows.append(types["trajectory_msgs/msg/JointTrajectoryPoint"](*blocks, duration))
+    name = "trajectory_msgs/msg/JointTrajectory"
+    return rosbags_cdr(name, header, list(names), rows, little_endian=little_endian)

@@ -7,12 +7,20 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import count
 from typing import Any
 
 import zenoh
-from helpers.manual_cdr import STORE, Edges, rosbags_cdr, rosbags_joint_state, rosbags_tf_message
+from helpers.manual_cdr import (
+    STORE,
+    Edges,
+    rosbags_cdr,
+    rosbags_joint_state,
+    rosbags_numbers,
+    rosbags_tf_message,
+)
 from helpers.processes import until
 from xxhash import xxh3_128_intdigest
 
@@ -37,6 +45,18 @@ DESCRIPTION = (
     "std_msgs::msg::dds_::String_",
     "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     ":1:,1:,:,:,,",
+)
+COMMANDS = (
+    "forward_position_controller/commands",
+    "std_msgs::msg::dds_::Float64MultiArray_",
+    "RIHS01_1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f",
+    "::,10:,:,:,,",
+)
+TRAJECTORY = (
+    "forward_position_controller/joint_trajectory",
+    "trajectory_msgs::msg::dds_::JointTrajectory_",
+    STORE.hash_rihs01("trajectory_msgs/msg/JointTrajectory"),
+    "::,10:,:,:,,",
 )
 TOPICS = (JOINT_STATES, TF, TF_STATIC, DESCRIPTION)
 HUMBLE = "TypeHashNotSupported"
@@ -109,6 +129,9 @@ class RosPublisher:
     def edge(self, stamp: int, parent: str, child: str, x: float) -> None:
         self.transforms(stamp, [(parent, child)], [moved(x)])
 
+    def numbers(self, numbers: Sequence[float]) -> None:
+        self.put(rosbags_numbers(numbers))
+
     def text(self, text: str) -> None:
         self.put(rosbags_cdr("std_msgs/msg/String", text))
 
@@ -131,13 +154,21 @@ class RosNode:
     def publisher(self, topic: Topic, written: str = "", namespace: str = "") -> RosPublisher:
         """On ``topic``, in ``namespace`` without outer slashes; ``written`` replaces the type hash."""
         name, dds, its_hash, qos = topic
-        path = f"%{namespace}%{name}" if namespace else f"%{name}"
+        path = f"/{namespace}/{name}".replace("//", "/").replace("/", "%")
         token = (
             f"@ros2_lv/{self._domain}/{self._session.zid}/{self._nid}/{next(_NUMBERS)}/MP/%/"
             f"{self._namespace.replace('/', '%')}/{self._name}/{path}/{dds}/{written or its_hash}/{qos}"
         )
         key = key_of(topic, namespace, self._domain, written)
         return RosPublisher(self._session, topic, key, token, latched=topic in (TF_STATIC, DESCRIPTION))
+
+
+@contextmanager
+def announced_publisher(session: Session, name: str, topic: Topic) -> Iterator[RosPublisher]:
+    """A publisher of the node ``name``, which has discovered its reader, until it closes."""
+    publisher = RosNode(session, name).publisher(topic).announce().wait_for_reader()
+    yield publisher
+    publisher.close()
 
 
 class KeySubscriber:

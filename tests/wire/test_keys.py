@@ -106,6 +106,7 @@ def test_every_key_of_a_robot_lies_under_its_own_prefix():
     assert keys.stream_key("panda", "tf_static", "mount") == "zstate/panda/tf_static/mount"
     assert keys.stream_key("panda", "robot_description") == "zstate/panda/robot_description"
     assert keys.stream_key("panda", "joint_commands") == "zstate/panda/joint_commands"
+    assert keys.stream_key("panda", "joint_setpoints") == "zstate/panda/joint_setpoints"
     assert keys.stream_key("panda", "scan", "front") == "zstate/panda/scan/front"
     assert keys.stream_key("hall", "map", "map") == "zstate/hall/map/map"
     assert keys.lookup_key("panda") == "zstate/panda/lookup"

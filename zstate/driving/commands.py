@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +20,7 @@ from zstate._util.format import suggestion_text
 from zstate._util.refusals import Refusals
 from zstate.errors import InvalidInput, MessageError, format_duration, printable
 from zstate.model.robot import near_joint
+from zstate.net.presence import announce
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.keys import shortened, stream_key
@@ -24,14 +28,17 @@ from zstate.wire.messages import JointCommand, check_size, from_block
 from zstate.wire.native import decode
 from zstate.wire.protocol import SerializedSample
 
+if TYPE_CHECKING:
+    from zstate.wire.ros2.wire import Ros2Controller
+
 Floats = NDArray[np.float64]
 
 _WAITING = 32
 """Commands that wait for a tick, of which each takes time to check; of more, the oldest are refused."""
 
 NO_DEADLINE = -1
-_NO_COLUMNS = np.array([], dtype=np.intp)
-_NO_POSITIONS = np.array([], dtype=np.float64)
+NO_COLUMNS = np.array([], dtype=np.intp)
+NO_POSITIONS = np.array([], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,38 +58,57 @@ class Command:
     motion: int | None = None
 
 
+_Reader: TypeAlias = "Callable[[SerializedSample, int], Command]"
+
+
 class CommandReceiver(Closeable):
     """Receives the commands of ``robot`` for ``joint_names``; ``drain`` returns those that can be used.
 
     A command counts from its arrival, for its own ttl or for ``ttl_ns``, which is also the longest that is
-    granted. ``refusals`` counts the others by reason.
+    granted. ROS nodes send them to the ``controller``, if there is one, in the order of ``joint_names`` and
+    without a ttl. ``refusals`` counts the others by reason.
     """
 
     def __init__(
-        self, session: Session, robot: str, joint_names: Sequence[str], ttl_ns: int, refusals: Refusals
+        self,
+        session: Session,
+        robot: str,
+        joint_names: Sequence[str],
+        ttl_ns: int,
+        refusals: Refusals,
+        *,
+        controller: Ros2Controller | None = None,
     ) -> None:
         self._columns = {name: column for column, name in enumerate(joint_names)}
         self._ttl_ns = ttl_ns
         self._refusals = refusals
         self._arrived: deque[Command] = deque(maxlen=_WAITING)
-        key = stream_key(robot, "joint_commands")
-        self._subscriber = StreamSubscriber(session, key, self._on_samples)
+        with ExitStack() as opening:
+            key = stream_key(robot, "joint_commands")
+            on_samples = partial(self._on_samples, self._read)
+            opening.enter_context(StreamSubscriber(session, key, on_samples))
+            if controller is not None:
+                on_samples = partial(self._on_samples, partial(self._read_from_ros, controller))
+                opening.enter_context(StreamSubscriber(session, controller.commands, on_samples))
+                for token in controller.reader_tokens(session.zid, session.next_number):
+                    opening.enter_context(announce(session, token))
+            self._opened = opening.pop_all()
 
     def drain(self) -> list[Command]:
         """The newest commands since the last call, oldest first."""
         return [self._arrived.popleft() for _ in range(len(self._arrived))]
 
     def close(self) -> None:
-        self._subscriber.close()
+        self._opened.close()
 
-    def _on_samples(self, samples: list[SerializedSample]) -> None:
+    def _on_samples(self, read: _Reader, samples: list[SerializedSample]) -> None:
         now = time.monotonic_ns()
         for sample in samples:
-            self._on_sample(sample, now)
+            self._on_sample(read, sample, now)
 
-    def _on_sample(self, sample: SerializedSample, now: int) -> None:
+    def _on_sample(self, read: _Reader, sample: SerializedSample, now: int) -> None:
         try:
-            command = self._read(sample, now)
+            command = read(sample, now)
         except MessageError as error:
             self._refusals.count(error.reason, error)
             return
@@ -100,7 +126,7 @@ class CommandReceiver(Closeable):
             raise MessageError(f"{text}, which this driver grants at most", reason="ttl")
         deadline = now + (message.ttl or self._ttl_ns)
         if message.motion is not None:
-            head = (message.session, message.seq, _NO_COLUMNS, _NO_POSITIONS)
+            head = (message.session, message.seq, NO_COLUMNS, NO_POSITIONS)
             return Command(*head, now, deadline, message.motion)
         if not message.names:
             raise MessageError("a command has the names of its joints; this one has none", reason="no names")
@@ -109,10 +135,21 @@ class CommandReceiver(Closeable):
             raise MessageError(text, reason="mode")
         positions = from_block(message.positions)
         columns = self._columns_of(message.names)
-        for name, value in zip(message.names, positions.tolist(), strict=True):
-            if not math.isfinite(value):
-                raise MessageError(f"the position of {name!r} is {value}", reason="not finite")
+        _check_finite(message.names, positions)
         return Command(message.session, message.seq, columns, positions, now, deadline)
+
+    def _read_from_ros(self, controller: Ros2Controller, sample: SerializedSample, now: int) -> Command:
+        """The command of a ROS node in ``sample``. Raises MessageError with the reason why it is refused."""
+        session, seq, positions = controller.decode_command(sample)
+        names = tuple(self._columns)
+        if len(positions) != len(names):
+            raise MessageError(
+                f"a command of {len(positions)} numbers; this driver takes {len(names)}, the positions of "
+                f"{', '.join(names)} in this order",
+                reason="joint count",
+            )
+        _check_finite(names, positions)
+        return Command(session, seq, np.arange(len(names)), positions, now, now + self._ttl_ns)
 
     def _columns_of(self, names: Sequence[str]) -> NDArray[np.intp]:
         for name in names:
@@ -123,6 +160,12 @@ class CommandReceiver(Closeable):
         if len(set(names)) < len(names):
             raise MessageError("a joint is named twice in one command", reason="repeated joint")
         return np.array([self._columns[name] for name in names], dtype=np.intp)
+
+
+def _check_finite(names: Sequence[str], positions: Floats) -> None:
+    for name, value in zip(names, positions.tolist(), strict=True):
+        if not math.isfinite(value):
+            raise MessageError(f"the position of {name!r} is {value}", reason="not finite")
 
 
 class Targets:

@@ -1,11 +1,11 @@
-"""What a driver host reports: its state on the network, and the figures of its control loop."""
+"""What a driver host reports: its state and setpoints on the network, and the figures of its control loop."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,15 +13,18 @@ import numpy as np
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
+from zstate.driving.driver import Setpoint
 from zstate.errors import Closed, MessageError, SecondWriter
 from zstate.net.latched import LatchedPublisher, cached_values
 from zstate.net.ownership import wait_for_discovery
 from zstate.net.session import Session
+from zstate.net.writer import WireWriter
 from zstate.rate import RateReport
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import driver_key
-from zstate.wire.messages import DriverState, with_short_texts
+from zstate.wire.messages import DriverState, JointState, order_digest, to_block, with_short_texts
 from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.registry import get_wire
 
 PERIOD_S = 0.1
 JOIN_WITHIN_S = 0.5
@@ -109,6 +112,36 @@ class DriverStatePublisher(Closeable):
                 self._latched.set(encode(with_short_texts(self._build())))
                 if self._closed:
                     return
+
+
+class SetpointPublisher(Closeable):
+    """Publishes the setpoints of ``joint_names`` that ``writer`` writes to hardware, while they are read.
+
+    They are joint states with names: positions, and the velocities of the step. For one thread.
+    """
+
+    def __init__(self, session: Session, robot: str, joint_names: tuple[str, ...], writer: WriterId) -> None:
+        self._names = joint_names
+        self._order = order_digest(joint_names)
+        self._session_id = writer.session
+        self._seq = 0
+        with ExitStack() as opening:
+            wire_writer = opening.enter_context(WireWriter(session, get_wire("native"), robot, writer))
+            self._stream = wire_writer.open_stream("joint_setpoints")
+            _ = self._stream.has_readers  # the first call declares a listener: not in a tick
+            self._opened = opening.pop_all()
+
+    def publish(self, setpoint: Setpoint) -> None:
+        """Publish ``setpoint`` if it has a reader. Raises Closed."""
+        if not self._stream.has_readers:
+            return
+        head = (setpoint.stamp, self._seq, self._session_id, self._order)
+        blocks = to_block(setpoint.positions), to_block(setpoint.velocities)
+        self._stream.write(encode(JointState(*head, *blocks, names=self._names)))
+        self._seq += 1
+
+    def close(self) -> None:
+        self._opened.close()
 
 
 def check_only_host(session: Session, robot: str) -> None:

@@ -12,8 +12,10 @@ import os
 import secrets
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import Literal, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,13 @@ from zstate._util.refusals import Refusals
 from zstate.clock import MonotonicClock
 from zstate.driving.commands import Command, CommandReceiver, Targets
 from zstate.driving.driver import Driver, Setpoint, StopMode
-from zstate.driving.driver_state import DriverReport, DriverStatePublisher, Durations, check_only_host
+from zstate.driving.driver_state import (
+    DriverReport,
+    DriverStatePublisher,
+    Durations,
+    SetpointPublisher,
+    check_only_host,
+)
 from zstate.driving.limits import Limits
 from zstate.driving.motion_service import MotionService, Present
 from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
@@ -51,6 +59,10 @@ from zstate.sources import JointReading
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import check_robot
 from zstate.wire.messages import DriverState
+from zstate.wire.registry import as_wire_names, get_controller
+
+if TYPE_CHECKING:
+    from zstate.wire.ros2.wire import Ros2Controller
 
 _LOG = logging.getLogger("zstate")
 
@@ -80,6 +92,14 @@ class DriverHost(Closeable):
     ``zstate.driving.stop``, are latched: a restarted host stays stopped until a commander releases them, see
     ``zstate.driving.stops``.
 
+    ``wires`` are those on which the joint states are published. With ``ros2_controller``, the name of a
+    controller, ROS nodes on the wire "ros2" may command the joints as well, as in ros2_control: by
+    ``<ros2_controller>/commands`` (std_msgs/Float64MultiArray), positions of all joints in the order of
+    ``driver.joint_names``, each valid for ``ttl_s``; and by ``<ros2_controller>/joint_trajectory``
+    (trajectory_msgs/JointTrajectory), a motion that is valid while its publisher is announced. A ROS node
+    owns nothing: the first that sends is the commander until it is silent, and the others are refused. It
+    cannot release a stop.
+
     A robot has one host. Raises InvalidInput for unusable arguments, SecondWriter if another program hosts a
     driver of the robot or publishes these joints, and what ``driver.open`` raises. A context manager. Not a
     safety-rated channel: a stop waits for the calls of the driver, and is lost with the network.
@@ -98,9 +118,12 @@ class DriverHost(Closeable):
         on_silence: StopMode = "hold",
         faults_allowed: int = 3,
         following_error: float = 0.2,
+        wires: str | Sequence[str] = ("native",),
+        ros2_controller: str = "",
         program: str = "",
     ) -> None:
         self.robot = check_robot(robot or model.name)
+        self._wires = as_wire_names(wires)
         self._driver = SupervisedDriver(driver, self.robot)
         self._rate_hz = check_rate(rate_hz)
         self._ttl_ns = round(check_timeout(ttl_s) * 1e9)
@@ -141,11 +164,10 @@ class DriverHost(Closeable):
             check_only_host(session, self.robot)
             self._publisher, self._order = self._open_publisher(session, model, opening)
             self._stops = opening.enter_context(StopLatch(session, self.robot, self._refusals))
-            self._commands = opening.enter_context(
-                CommandReceiver(session, self.robot, names, self._ttl_ns, self._refusals)
+            self._commands, self._motions = self._open_inputs(session, ros2_controller, opening)
+            self._setpoints = opening.enter_context(
+                SetpointPublisher(session, self.robot, names, self._writer)
             )
-            self._motions = opening.enter_context(self._open_motions(session))
-            opening.enter_context(WriterWatch(session, self.robot, self._on_writer))
             opening.callback(driver.close)
             driver.open()
             opening.callback(self._driver.disable)
@@ -161,16 +183,32 @@ class DriverHost(Closeable):
         self, session: Session, model: RobotModel, opening: ExitStack
     ) -> tuple[StatePublisher | PartialStatePublisher, NDArray[np.intp]]:
         """The publisher of the driver's joints, and their columns in its order."""
-        program = self._writer.program
+        wires, program = self._wires, self._writer.program
         if set(self._names) == set(model.joint_names):
             order = [self._names.index(name) for name in model.joint_names]
-            publisher = StatePublisher(session, model, self.robot, program=program)
+            publisher = StatePublisher(session, model, self.robot, wires, program=program)
         else:
             order = list(range(len(self._names)))
-            publisher = PartialStatePublisher(session, model, self._names, self.robot, program=program)
+            publisher = PartialStatePublisher(session, model, self._names, self.robot, wires, program=program)
         return opening.enter_context(publisher), np.array(order, dtype=np.intp)
 
-    def _open_motions(self, session: Session) -> MotionService:
+    def _open_inputs(
+        self, session: Session, ros2_controller: str, opening: ExitStack
+    ) -> tuple[CommandReceiver, MotionService]:
+        """What receives commands and motions, whose senders are watched for their names."""
+        controller = get_controller(self._wires, self.robot, ros2_controller) if ros2_controller else None
+        commands = CommandReceiver(
+            session, self.robot, self._names, self._ttl_ns, self._refusals, controller=controller
+        )
+        opening.enter_context(commands)
+        motions = opening.enter_context(self._open_motions(session, controller))
+        opening.enter_context(WriterWatch(session, self.robot, self._on_writer))
+        if controller is not None:
+            on_node = partial(self._on_node, motions)
+            opening.enter_context(WriterWatch(session, self.robot, on_node, controller))
+        return commands, motions
+
+    def _open_motions(self, session: Session, controller: Ros2Controller | None) -> MotionService:
         return MotionService(
             session,
             self.robot,
@@ -183,6 +221,7 @@ class DriverHost(Closeable):
             check=self._check_commander,
             name_of=self._name_of,
             on_change=self._notify,
+            controller=controller,
         )
 
     @property
@@ -427,6 +466,7 @@ class DriverHost(Closeable):
             written_at = time.monotonic_ns()
             self._following.written(limited.positions, written_at)
             self._motions.written(written_at)
+            self._setpoints.publish(setpoint)
         elif self._setpoint is not None:
             self._limiter.start(self._setpoint.positions, self._setpoint.velocities)
         return failure
@@ -532,3 +572,7 @@ class DriverHost(Closeable):
     def _on_writer(self, announced: Announcement, alive: bool) -> None:
         if alive and announced.stream == "joint_commands":
             self._programs[announced.writer.session] = str(announced.writer)
+
+    def _on_node(self, motions: MotionService, announced: Announcement, alive: bool) -> None:
+        self._on_writer(announced, alive)
+        motions.set_announced(announced.writer.session, alive)

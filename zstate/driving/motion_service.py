@@ -7,6 +7,10 @@ adopts it at its next tick, and replies by that thread.
 The time of a motion advances by one period at each tick that writes a setpoint. A tick that was missed delays
 the motion; no step becomes longer by it. A motion is valid for the host's ttl, unless its commander renews
 it: then the joints brake, as they do after commands.
+
+A ROS node does not renew what it sends: its motion is valid while the node is announced, by its liveliness
+token. As in ros2_control, points that are due already are left out, and a trajectory without points ends the
+motion.
 """
 
 from __future__ import annotations
@@ -15,9 +19,10 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotDone
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +30,13 @@ from numpy.typing import NDArray
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
-from zstate.driving.commands import Command, Targets
+from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
 from zstate.driving.limits import Limits
 from zstate.driving.trajectory import Trajectory
 from zstate.errors import InvalidInput, MessageError, format_duration
 from zstate.net.queryable import Reply, RequestQueryable
 from zstate.net.session import Session
+from zstate.net.streams import StreamSubscriber
 from zstate.wire.keys import motion_key
 from zstate.wire.messages import (
     JointTrajectory,
@@ -39,8 +45,13 @@ from zstate.wire.messages import (
     MotionReply,
     OutcomeName,
     from_block,
+    without_past,
 )
 from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.protocol import SerializedSample
+
+if TYPE_CHECKING:
+    from zstate.wire.ros2.wire import Ros2Controller
 
 Floats = NDArray[np.float64]
 
@@ -147,7 +158,8 @@ class MotionService(Closeable):
     ``present()`` returns the joints now, for any thread; it raises MessageError if that is not known.
     ``check(session, now)`` raises MessageError if that commander may not move the robot now; ``name_of`` is
     its program; ``on_change`` is called when a motion has started or ended: these three, and all methods
-    without another note, are for the thread of the loop.
+    without another note, are for the thread of the loop. ROS nodes send their motions to the ``controller``,
+    if there is one.
     """
 
     def __init__(
@@ -164,6 +176,7 @@ class MotionService(Closeable):
         check: Callable[[int, int], None],
         name_of: Callable[[int], str],
         on_change: Callable[[], None],
+        controller: Ros2Controller | None = None,
     ) -> None:
         self._host_session = host_session
         self._limits = limits
@@ -171,17 +184,30 @@ class MotionService(Closeable):
         self._targets = targets
         self._refusals = refusals
         self._present, self._check, self._name_of, self._on_change = present, check, name_of, on_change
+        self._nodes: set[int] = set()
+        """The sessions of announced ROS nodes."""
+        self._requests = fork_safe_lock()
+        """Held while a request waits for the loop."""
         self._lock = fork_safe_lock()
         self._waiting: tuple[Future[None], Callable[[int], None]] | None = None
         """What the loop is to do at its next tick, with the present instant."""
         self._motion: _Underway | None = None
         self.outcomes: tuple[MotionOutcome, ...] = ()
         """Of the last motions, newest last; a new tuple after each. May be read from any thread."""
-        self._queryable = RequestQueryable(session, motion_key(robot), self._answer)
+        with ExitStack() as opening:
+            opening.enter_context(RequestQueryable(session, motion_key(robot), self._answer))
+            if controller is not None:
+                on_samples = partial(self._on_ros_samples, controller)
+                opening.enter_context(StreamSubscriber(session, controller.trajectories, on_samples))
+            self._opened = opening.pop_all()
 
     def close(self) -> None:
         """Take no further requests."""
-        self._queryable.close()
+        self._opened.close()
+
+    def set_announced(self, session: int, alive: bool) -> None:
+        """The ROS node of ``session`` is announced, or not any more; for any thread."""
+        (self._nodes.add if alive else self._nodes.discard)(session)
 
     @property
     def underway(self) -> tuple[tuple[int, int] | None, float]:
@@ -191,20 +217,29 @@ class MotionService(Closeable):
             return None, 0.0
         return (motion.request.session, motion.request.seq), motion.progress
 
-    # Requests, in the thread of the queryable
+    # Requests, in the threads of the queryable and of the subscriber
 
     def _answer(self, payload: bytes, encoding: str) -> Reply:
+        findings = self._counted(lambda: self._take(payload, encoding))
+        texts = tuple(text[:_MAX_FINDING_LENGTH] for text in findings[:_MOST_FINDINGS])
+        reply = MotionReply(self._host_session, self._ttl_ns, texts)
+        return Reply(encode(reply), ENCODINGS[MotionReply])
+
+    def _on_ros_samples(self, controller: Ros2Controller, samples: list[SerializedSample]) -> None:
+        for sample in samples:
+            self._counted(lambda sample=sample: self._take_from_ros(controller, sample))
+
+    def _counted(self, take: Callable[[], tuple[str, ...]]) -> tuple[str, ...]:
+        """The findings of ``take()``, which are counted, or its error as one."""
         try:
-            findings = self._take(payload, encoding)
+            findings = take()
         except (MessageError, InvalidInput) as error:
             findings = (str(error),)
             self._refusals.count(getattr(error, "reason", "motion"), error)
         else:
             if findings:
                 self._refusals.count("motion", "; ".join(findings))
-        texts = tuple(text[:_MAX_FINDING_LENGTH] for text in findings[:_MOST_FINDINGS])
-        reply = MotionReply(self._host_session, self._ttl_ns, texts)
-        return Reply(encode(reply), ENCODINGS[MotionReply])
+        return findings
 
     def _take(self, payload: bytes, encoding: str) -> tuple[str, ...]:
         """Hand the request to the loop, or return the findings. Raises MessageError and InvalidInput."""
@@ -212,7 +247,17 @@ class MotionService(Closeable):
             cancel = decode(payload, encoding, MotionCancel)
             self._call_in_loop(lambda _: self._cancel(cancel))
             return ()
-        request = decode(payload, encoding, JointTrajectory)
+        return self._plan_and_start(decode(payload, encoding, JointTrajectory))
+
+    def _take_from_ros(self, controller: Ros2Controller, sample: SerializedSample) -> tuple[str, ...]:
+        """The same for a message of a ROS node."""
+        session, request = controller.decode_trajectory(sample)
+        if request is None:
+            self._call_in_loop(lambda _: self._cancel_of(session))
+            return ()
+        return self._plan_and_start(without_past(request, time.time_ns()))
+
+    def _plan_and_start(self, request: JointTrajectory) -> tuple[str, ...]:
         planned = plan(request, self._limits, self._present_after_start(), time.time_ns())
         if not planned.findings:
             self._call_in_loop(lambda now: self._start(planned, now))
@@ -230,15 +275,16 @@ class MotionService(Closeable):
     def _call_in_loop(self, action: Callable[[int], None]) -> None:
         """Let the loop call ``action`` at its next tick. Raises MessageError, also that of ``action``."""
         done: Future[None] = Future()
-        with self._lock:
-            self._waiting = (done, action)
-        try:
-            done.result(_TICK_WITHIN_S)
-        except NotDone:
-            if done.cancel():
-                text = f"the control loop has not begun a tick within {_TICK_WITHIN_S:g} s"
-                raise MessageError(text, reason="no tick") from None
-            done.result()
+        with self._requests:
+            with self._lock:
+                self._waiting = (done, action)
+            try:
+                done.result(_TICK_WITHIN_S)
+            except NotDone:
+                if done.cancel():
+                    text = f"the control loop has not begun a tick within {_TICK_WITHIN_S:g} s"
+                    raise MessageError(text, reason="no tick") from None
+                done.result()
 
     # The loop
 
@@ -269,6 +315,9 @@ class MotionService(Closeable):
             motion.request.seq,
         ):
             return
+        self._renew(motion, command)
+
+    def _renew(self, motion: _Underway, command: Command) -> None:
         motion.renewed_at, motion.deadline = command.arrived, command.deadline
         self._targets.renew(command, motion.columns)
 
@@ -282,12 +331,20 @@ class MotionService(Closeable):
         motion = self._motion
         if motion is None:
             return
+        if motion.request.session in self._nodes:
+            self._renew(motion, self._renewal(motion.request, now))
         if motion.deadline <= now:
             silence = format_duration(now - motion.renewed_at)
             name = self._name_of(motion.request.session)
             self.finish("aborted", f"nothing from {name} for {silence}")
         elif motion.planned is not None and measured_at > motion.written_at:
             self._compare(motion, measured[motion.columns] - motion.planned)
+
+    def _renewal(self, request: JointTrajectory, now: int) -> Command:
+        """What a commander sends to keep the motion of ``request`` valid."""
+        deadline = now + self._ttl_ns
+        head = (request.session, request.seq, NO_COLUMNS, NO_POSITIONS)
+        return Command(*head, now, deadline, request.seq)
 
     def next_target(self, resting: Floats, dt_s: float) -> tuple[Floats, Floats | None]:
         """Positions and velocities at the end of the next step of ``dt_s``; ``resting`` are other joints'."""
@@ -344,6 +401,10 @@ class MotionService(Closeable):
         """Whether ``request`` is repeated, because the commander has not received the reply."""
         ended = {(outcome.session, outcome.seq) for outcome in self.outcomes}
         return (request.session, request.seq) in {*ended, self.underway[0]}
+
+    def _cancel_of(self, session: int) -> None:
+        if self._motion is not None and self._motion.request.session == session:
+            self.finish("cancelled", f"by {self._name_of(session)}")
 
     def _cancel(self, cancel: MotionCancel) -> None:
         if self.underway[0] == (cancel.session, cancel.motion):

@@ -28,7 +28,7 @@ from zstate.net.session import Session
 from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READERS, Stream, parse_reader_key, shortened
-from zstate.wire.protocol import Wire
+from zstate.wire.protocol import Wire, WriterTokens
 from zstate.wire.registry import get_wire
 
 CAPACITY = 16_384
@@ -269,7 +269,7 @@ class WriterWatch(Receiver[zenoh.Sample]):
         session: Session,
         robot: str | Sequence[str],
         callback: Callable[[Announcement, bool], None],
-        wire: str = "native",
+        wire: str | WriterTokens = "native",
         on_cut_off: Callable[[Announcement], None] | None = None,
     ) -> None:
         self.foreign = 0
@@ -282,7 +282,7 @@ class WriterWatch(Receiver[zenoh.Sample]):
         self._routers = None if on_cut_off is None else RouterLossDetector(session)
         robots = (robot,) if isinstance(robot, str) else robot
         self._robot = robots[0] if len(robots) == 1 else ANY
-        self._wire = get_wire(wire)
+        self._wire = get_wire(wire) if isinstance(wire, str) else wire
         # In ROS robots share one expression.
         self._expressions = list(dict.fromkeys(self._wire.writers_expression(one) for one in robots))
         declare = partial(session.zenoh.liveliness().declare_subscriber, history=True)

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from typing import Literal
 
 from zstate._util.bounded import BoundedQueue
 from zstate._util.closeable import Closeable
@@ -38,8 +39,8 @@ _CAPACITY = 1024
 class JointStateReader:
     """Computes readings of all joints of ``robot`` from its messages of whole or partial joint states.
 
-    ``max_age_s`` and incomplete readings are those of ``JointStateListener``. ``on_error(reason, text)`` is
-    called for each unusable message.
+    ``max_age_s``, ``stream`` and incomplete readings are those of ``JointStateListener``.
+    ``on_error(reason, text)`` is called for each unusable message.
     """
 
     def __init__(
@@ -49,6 +50,8 @@ class JointStateReader:
         wire: Wire,
         max_age_s: float,
         on_error: Callable[[str, object], object],
+        *,
+        stream: Stream = "joint_states",
     ) -> None:
         self.model = model
         self.newest: JointReading | None = None
@@ -56,7 +59,7 @@ class JointStateReader:
         self._robot = robot
         self._on_error = on_error
         self._is_shared = bool(wire.shared)
-        self._whole_key = wire.expression(robot, "joint_states")
+        self._whole_key = wire.expression(robot, stream)
         self._validator = JointStateValidator(model)
         self._merger = JointStateMerger(model, max_age_s, others=self._is_shared)
         self._explained: set[tuple[str, ...]] = set()
@@ -110,6 +113,9 @@ class JointStateListener(Closeable):
     reading is complete if no value is more than ``max_age_s`` [s] older than the newest, by their stamps;
     ``incomplete`` counts samples that gave none. The log names the missing joints and their writers once.
 
+    With ``stream="joint_setpoints"`` the samples are what a ``DriverHost`` writes to its driver, on the
+    native wire only. If its driver owns some of the joints, pass their ``model.part(names)``.
+
     Numbers are in the order of ``model.joint_names``. The default model is the one in the robot's
     description; samples that arrive before it are kept. ``refused`` counts unusable samples by reason; the
     first of each reason is also logged. A context manager.
@@ -125,13 +131,14 @@ class JointStateListener(Closeable):
         model: RobotModel | None = None,
         *,
         wire: str = "native",
+        stream: Literal["joint_states", "joint_setpoints"] = "joint_states",
         on_reading: Callable[[JointReading], object] | None = None,
         max_age_s: float = MAX_AGE_S,
     ) -> None:
         if not (math.isfinite(max_age_s) and max_age_s > 0.0):
             raise InvalidInput(f"max_age_s is a positive number of seconds, not {max_age_s!r}")
         self.robot = robot
-        self._refusals = Refusals("joint_states")
+        self._refusals = Refusals(stream)
         self.refused: dict[str, int] = self._refusals.counts
         self._max_age_s = max_age_s
         self._wire = get_wire(wire)
@@ -140,16 +147,19 @@ class JointStateListener(Closeable):
         self._unread: Inbox[JointReading] = Inbox(_CAPACITY, session.check)
         self._lock = fork_safe_lock()
         self._on_reading = on_reading
-        streams: tuple[Stream, ...] = tuple(dict.fromkeys(("joint_states", self._wire.partial_joint_states)))
+        self._stream: Stream = stream
+        streams: tuple[Stream, ...] = (stream,)
+        if stream == "joint_states":
+            streams = tuple(dict.fromkeys((stream, self._wire.partial_joint_states)))
         with ExitStack() as opening:
             if model is None:
                 opening.enter_context(DescriptionSubscriber(session, robot, self._on_description, wire))
             else:
                 self._set_model(model)
             on_error = self._refusals.count
-            for stream in streams:
+            for one in streams:
                 opening.enter_context(
-                    subscribe(session, self._wire, robot, stream, self._on_messages, on_error=on_error)
+                    subscribe(session, self._wire, robot, one, self._on_messages, on_error=on_error)
                 )
             for announcement in announce_reader(session, self._wire, robot, streams):
                 opening.enter_context(announcement)
@@ -170,7 +180,9 @@ class JointStateListener(Closeable):
 
     def _set_model(self, model: RobotModel) -> JointStateReader:
         on_error = self._refusals.count
-        self._reader = JointStateReader(self.robot, model, self._wire, self._max_age_s, on_error)
+        self._reader = JointStateReader(
+            self.robot, model, self._wire, self._max_age_s, on_error, stream=self._stream
+        )
         return self._reader
 
     def _on_description(self, _: str, model: RobotModel) -> None:

@@ -10,6 +10,7 @@
 ``zstate/<robot>/scan/<sensor>``                  LaserScan, each scan; the sensor is the writer's name
 ``zstate/<robot>/map/<writer>``                   OccupancyGrid, latched
 ``zstate/<robot>/joint_commands``                 JointCommand, to a driver
+``zstate/<robot>/joint_setpoints``                JointState with joint names, of a driver, while read
 ``zstate/<robot>/driver``                         DriverState, latched
 ``zstate/<robot>/stop/<id>``                      Stop, latched: of one program that stops the driver
 ``zstate/<robot>/release/<id>``                   Release, of a commander
@@ -47,6 +48,7 @@ Stream = Literal[
     "tf_static",
     "robot_description",
     "joint_commands",
+    "joint_setpoints",
     "scan",
     "map",
     "clock",

@@ -255,6 +255,21 @@ class JointTrajectory(StampedMessage, frozen=True, array_like=True, gc=False):
             raise InvalidInput(f"goal_time is finite and not negative [s], not {self.goal_time}")
 
 
+def without_past(request: JointTrajectory, stamp: int) -> JointTrajectory:
+    """``request`` without the first points that are due at ``stamp`` [ns]. Raises InvalidInput if all are."""
+    times = from_block(request.times)
+    passed_s = 0.0 if request.start is None else (stamp - request.start) * 1e-9
+    first = int((times <= passed_s).sum())
+    if first == len(times):
+        raise InvalidInput(f"the last point was due {passed_s - times[-1]:.6g} s ago")
+    blocks = {
+        name: block[len(block) // len(times) * first :]
+        for name in ("times", "points", "velocities", "accelerations")
+        if (block := getattr(request, name)) is not None
+    }
+    return msgspec.structs.replace(request, **blocks)
+
+
 class MotionCancel(StampedMessage, frozen=True, array_like=True, gc=False):
     """A request to end the ``motion``: the ``seq`` of a JointTrajectory of the same session."""
 
@@ -576,6 +591,7 @@ MAX_BYTES: Mapping[Stream, int] = {
     "tf": SAMPLE_BYTES,
     "transforms": SAMPLE_BYTES,
     "joint_commands": SAMPLE_BYTES,
+    "joint_setpoints": SAMPLE_BYTES,
     "scan": SCAN_BYTES,
     "tf_static": 1_000_000,
     "robot_description": LATCHED_BYTES,

@@ -76,6 +76,7 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "tf_static": StaticTransforms,
     "robot_description": RobotDescription,
     "joint_commands": JointCommand,
+    "joint_setpoints": JointState,
     "scan": LaserScan,
     "map": OccupancyGrid,
     "clock": ClockMessage,

@@ -94,7 +94,19 @@ def carrier(wire: Wire, stream: Stream) -> Stream:
     return wire.partial_joint_states if stream == "partial_joint_states" else stream
 
 
-class Wire(Protocol):
+class WriterTokens(Protocol):
+    """The liveliness tokens of writers on the network."""
+
+    def writers_expression(self, robot: str) -> str:
+        """The key expression of the tokens of all writers of ``robot``, or of all robots for ``"*"``."""
+        ...
+
+    def parse_token(self, token: str, robot: str) -> tuple[Announcement, ...]:
+        """The writer with each of its streams in a token under that expression; empty for any other token."""
+        ...
+
+
+class Wire(WriterTokens, Protocol):
     """One wire format for the streams of a robot: keys, encodings and bytes.
 
     A stream carries the same messages in each: JointState on ``joint_states``, TransformSample on ``tf``,
@@ -159,16 +171,8 @@ class Wire(Protocol):
         """
         ...
 
-    def writers_expression(self, robot: str) -> str:
-        """The key expression of the tokens of all writers of ``robot``, or of all robots for ``"*"``."""
-        ...
-
     def joined_tokens(self, tokens: Sequence[str]) -> Sequence[str]:
         """As few liveliness tokens as can announce the same streams of one writer as ``tokens``."""
-        ...
-
-    def parse_token(self, token: str, robot: str) -> tuple[Announcement, ...]:
-        """The writer with each of its streams in a token under that expression; empty for any other token."""
         ...
 
 

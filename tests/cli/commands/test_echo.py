@@ -53,6 +53,12 @@ def test_documents_follow_each_other_until_ctrl_c(spawn: Spawn):
         interrupted(command)
 
 
+def test_setpoints_of_a_robot_without_a_driver_host_are_explained():
+    with published_robot():
+        message = failure("echo", "rrbot", "--stream", "joint_setpoints", "--once", "--timeout", "1")
+    assert "'rrbot' has no driver host; start the program with its zstate.driving.DriverHost" in message
+
+
 def test_transforms_are_documents_of_poses_by_edge(spawn: Spawn):
     started(spawn, "transform", "odom", "base", "--xyz", "1", "2", "3", "--robot", "r1").line()
     document = json.loads(zstate("echo", "r1", "--stream", "transforms", "--once", "--json").stdout)

@@ -100,6 +100,8 @@ WRITES = [
     ("teleop", "zstate/r1/stop/teleop", True),
     ("teleop", "zstate/r1/joint_states", False),
     ("teleop", "zstate/r1/driver", False),
+    ("r1", "zstate/r1/joint_setpoints", True),
+    ("teleop", "zstate/r1/joint_setpoints", False),
     ("desk", "zstate/r1/stop/desk", True),
     ("desk", "zstate/r1/release/desk", False),
     ("r2", "zstate/r1/stop/r2", True),

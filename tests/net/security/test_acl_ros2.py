@@ -21,9 +21,11 @@ from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
 
 WIRE = "ros2:domain=7,namespace=*"
-FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), wires=(WIRE,))
+FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), wires=(WIRE,), commanders=("teleop",))
 USERS = (*FLEET.identities, "stranger")
 JOINTS = "sensor_msgs::msg::dds_::JointState_/hash"
+TRAJECTORY = "trajectory_msgs::msg::dds_::JointTrajectory_/hash"
+NUMBERS = "std_msgs::msg::dds_::Float64MultiArray_/hash"
 ENDPOINT = "@ros2_lv/7/z/0/{number}/{kind}/%/%{robot}/node/%{topic}/type/hash/::,10:,:,:,,"
 
 Join = Callable[[str], Session]
@@ -57,6 +59,14 @@ WRITES = [
     ("desk", f"7/r1/joint_states/{JOINTS}", False),
     ("desk", f"7/tf/{JOINTS}", False),
     ("hand", f"7/r1/joint_states/{JOINTS}", False),
+    ("hand", f"7/r1/arm_controller/commands/{NUMBERS}", True),
+    ("teleop", f"7/r1/arm_controller/commands/{NUMBERS}", True),
+    ("teleop", f"7/r1/arm_controller/joint_trajectory/{TRAJECTORY}", True),
+    ("desk", f"7/r1/arm_controller/joint_trajectory/{TRAJECTORY}", False),
+    ("teleop", f"7/r1/arm_controller/state/{NUMBERS}", False),
+    ("teleop", f"7/r1/joint_states/{JOINTS}", False),
+    ("desk", f"7/r1/arm_controller/commands/{NUMBERS}", False),
+    ("r2", f"7/r1/arm_controller/commands/{NUMBERS}", False),
     ("simulator", f"7/clock/{JOINTS}", True),
     ("simulator", f"7/r1/joint_states/{JOINTS}", False),
     ("stranger", f"7/r1/joint_states/{JOINTS}", False),
@@ -81,6 +91,8 @@ TOKENS = [
     ("desk", ENDPOINT.format(number=11, kind="MS", robot="r1", topic="r1%joint_states"), True),
     ("desk", "@ros2_lv/7/z/12/12/NN/%/%/rviz", True),
     ("desk", ENDPOINT.format(number=13, kind="MP", robot="r1", topic="r1%joint_states"), False),
+    ("teleop", ENDPOINT.format(number=16, kind="MP", robot="", topic="r1%arm_controller%commands"), True),
+    ("desk", ENDPOINT.format(number=17, kind="MP", robot="", topic="r1%arm_controller%commands"), False),
     ("simulator", ENDPOINT.format(number=14, kind="MP", robot="gz", topic="clock"), True),
     ("stranger", "@ros2_lv/7/z/15/15/NN/%/%r1/node", False),
 ]

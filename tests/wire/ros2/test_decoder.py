@@ -2,12 +2,20 @@
 
 import numpy as np
 import pytest
-from helpers.manual_cdr import rosbags_cdr, rosbags_joint_state, rosbags_tf_message, rosbags_time
+from helpers.manual_cdr import (
+    rosbags_cdr,
+    rosbags_joint_state,
+    rosbags_numbers,
+    rosbags_tf_message,
+    rosbags_time,
+    rosbags_trajectory,
+)
 
 from zstate.errors import MessageError
 from zstate.wire.messages import (
     ClockMessage,
     JointState,
+    JointTrajectory,
     RobotDescription,
     StaticTransforms,
     TransformSample,
@@ -15,7 +23,7 @@ from zstate.wire.messages import (
     poses_from_block,
     to_block,
 )
-from zstate.wire.ros2.decoder import RosDecoder
+from zstate.wire.ros2.decoder import RosDecoder, decode_numbers, decode_trajectory
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
 
@@ -101,3 +109,59 @@ def test_truncated_payload_is_refused(stream):
     with pytest.raises(MessageError) as caught:
         decoded(stream, b"\x00\x01\x00\x00\x01")
     assert caught.value.reason == "truncated"
+
+
+@pytest.mark.parametrize("labels", [(), ("joints",), ("rows", "columns of any width")])
+@pytest.mark.parametrize("little_endian", [True, False])
+def test_a_multi_array_is_its_numbers_whatever_its_layout_is(labels, little_endian: bool):
+    for numbers in ([], [0.5], [1.0, -2.0, 3.25]):
+        payload = rosbags_numbers(numbers, labels, little_endian=little_endian)
+        assert decode_numbers(payload).tolist() == numbers
+        if little_endian:
+            for length in range(len(payload)):
+                with pytest.raises(MessageError, match=r"cut off|encapsulation") as caught:
+                    decode_numbers(payload[:length])
+                assert caught.value.reason in ("truncated", "malformed")
+
+
+def test_a_multi_array_of_more_dimensions_than_bytes_is_refused():
+    with pytest.raises(MessageError) as caught:
+        decode_numbers(rosbags_numbers([0.5]).replace(bytes(4), b"\xff" * 4, 1))
+    assert caught.value.reason in ("truncated", "malformed")
+
+
+NAMES = ("shoulder", "elbow")
+PATH = ((0.5, ([1.0, -2.0], [0.5, 0.25])), (1.25, ([3.0, 4.0], [0.0, 0.0])))
+
+
+@pytest.mark.parametrize("little_endian", [True, False])
+def test_a_trajectory_is_a_motion_from_its_stamp_or_its_arrival(little_endian: bool):
+    for stamp, start in ((STAMP, STAMP), (0, None)):
+        payload = rosbags_trajectory(stamp, NAMES, *PATH, little_endian=little_endian)
+        blocks = to_block([0.5, 1.25]), to_block([1.0, -2.0, 3.0, 4.0]), to_block([0.5, 0.25, 0.0, 0.0])
+        assert decode_trajectory(payload, 77, 5) == JointTrajectory(stamp, 5, 77, NAMES, *blocks, start=start)
+        for length in range(4, len(payload), 5):
+            with pytest.raises(MessageError) as caught:
+                decode_trajectory(payload[:length], 77, 5)
+            assert caught.value.reason in ("truncated", "malformed")
+
+
+def test_a_trajectory_without_points_is_no_motion():
+    assert decode_trajectory(rosbags_trajectory(STAMP, NAMES), 77, 5) is None
+
+
+@pytest.mark.parametrize(
+    ("point", "reason"),
+    [
+        ((0.5, ([1.0],)), "malformed"),
+        ((0.5, ([],)), "malformed"),
+        ((0.5, ([1.0, 2.0], [1.0])), "malformed"),
+        ((0.5, ([1.0, 2.0], [1.0, 2.0])), "malformed"),
+        ((0.5, ([1.0, 2.0], [], [], [1.0, 2.0])), "mode"),
+    ],
+)
+def test_points_with_other_numbers_than_those_of_the_joints_are_refused(point, reason: str):
+    payload = rosbags_trajectory(STAMP, NAMES, point, (1.25, ([3.0, 4.0],)))
+    with pytest.raises(MessageError) as caught:
+        decode_trajectory(payload, 77, 5)
+    assert caught.value.reason == reason

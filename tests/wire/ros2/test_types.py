@@ -8,7 +8,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zstate.wire.ros2.types import (
     CLOCK,
+    FLOAT64_MULTI_ARRAY,
     JOINT_STATE,
+    JOINT_TRAJECTORY,
     LASER_SCAN,
     OCCUPANCY_GRID,
     POSE_WITH_COVARIANCE,
@@ -17,7 +19,17 @@ from zstate.wire.ros2.types import (
     RosType,
 )
 
-TYPES = (JOINT_STATE, TF_MESSAGE, STRING, CLOCK, POSE_WITH_COVARIANCE, LASER_SCAN, OCCUPANCY_GRID)
+TYPES = (
+    JOINT_STATE,
+    TF_MESSAGE,
+    STRING,
+    CLOCK,
+    POSE_WITH_COVARIANCE,
+    LASER_SCAN,
+    OCCUPANCY_GRID,
+    FLOAT64_MULTI_ARRAY,
+    JOINT_TRAJECTORY,
+)
 EACH = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])
 
 

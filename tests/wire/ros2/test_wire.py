@@ -3,14 +3,16 @@
 import struct
 
 import pytest
-from helpers.manual_cdr import rosbags_joint_state
+from helpers.manual_cdr import rosbags_joint_state, rosbags_numbers, rosbags_trajectory
 from helpers.raw_ros_nodes import (
+    COMMANDS,
     DESCRIPTION,
     HUMBLE,
     JOINT_STATES,
     TF,
     TF_STATIC,
     TOPICS,
+    TRAJECTORY,
     attachment,
     gid_of,
     key_of,
@@ -18,13 +20,13 @@ from helpers.raw_ros_nodes import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zstate.errors import MessageError
-from zstate.wire.identity import WriterId
+from zstate.errors import InvalidInput, MessageError
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream
 from zstate.wire.protocol import SerializedSample, StreamEncoder, WriterNode
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
-from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
+from zstate.wire.ros2.wire import Ros2Controller, Ros2DdsWire, Ros2Wire
 
 STAMP = 1_700_000_000_123_456_789
 GOOD = rosbags_joint_state(STAMP, "", ("a",), [1.0], [], [])
@@ -238,3 +240,59 @@ def test_any_token_is_parsed_or_ignored(token: str, namespace: str, robot: str):
     for one in (wire(namespace=namespace), Ros2DdsWire(Ros2Options(namespace=namespace))):
         one.parse_token(token, robot)
         one.parse_token(f"@/{ZID}/@ros2_lv/MP/{token}", robot)
+
+
+# Controllers
+
+
+def controller(**options) -> Ros2Controller:
+    return Ros2Controller(Ros2Options(**options), "r1", "forward_position_controller")
+
+
+def mangled(topic: tuple[str, ...]) -> tuple[str, ...]:
+    return (topic[0].replace("/", "%"), *topic[1:])
+
+
+@pytest.mark.parametrize("namespace", ["", "r1"])
+def test_a_controller_is_a_node_that_subscribes_to_its_topics(namespace: str):
+    one = controller(namespace=namespace)
+    numbers = iter([3, 9, 9])
+    node, *subscriptions = one.reader_tokens(ZID, lambda: next(numbers))
+    name = "forward_position_controller"
+    assert node == f"@ros2_lv/0/{ZID}/3/3/NN/%/%{namespace}/{name}"
+    for topic, token, expression in zip(
+        (COMMANDS, TRAJECTORY), subscriptions, (one.commands, one.trajectories), strict=True
+    ):
+        assert token == endpoint(mangled(topic), name, kind="MS", namespace=namespace)
+        assert key_of(topic, namespace).startswith(expression.removesuffix("*"))
+
+
+def test_publishers_of_commands_are_commanders_by_the_name_of_their_node():
+    token = endpoint(mangled(COMMANDS), "teleop")
+    session = int.from_bytes(gid_of(token)[:8], "little")
+    writer = WriterId("/teleop", "", 0, 0, session)
+    assert controller().parse_token(token, "r1") == (Announcement("r1", "joint_commands", writer),)
+    others = (endpoint(JOINT_STATES, "teleop"), token.replace("/MP/", "/MS/"), "zstate/r1/@writer/x/y")
+    assert [controller().parse_token(other, "r1") for other in others] == [()] * 3
+
+
+def test_a_command_has_the_number_of_its_publisher():
+    sample = arrival(rosbags_numbers([0.5, -1.0]), key=key_of(COMMANDS))
+    session, seq, positions = controller().decode_command(sample)
+    assert (session, seq) == (int.from_bytes(GID[:8], "little"), 7)
+    assert positions.tolist() == [0.5, -1.0]
+    with pytest.raises(MessageError, match="no attachment"):
+        controller().decode_command(arrival(rosbags_numbers([0.5]), None))
+
+
+def test_a_motion_has_the_numbers_of_its_publisher_and_of_the_message():
+    payload = rosbags_trajectory(0, ["elbow"], (0.5, ([1.0],)))
+    session, request = controller().decode_trajectory(arrival(payload, key=key_of(TRAJECTORY)))
+    assert request is not None
+    assert session == request.session == int.from_bytes(GID[:8], "little")
+    assert (request.seq, request.names) == (7, ("elbow",))
+
+
+def test_a_controller_has_a_name_that_ros_allows():
+    with pytest.raises(InvalidInput, match="controller '/fpc', which becomes a part of ROS topics"):
+        Ros2Controller(Ros2Options(), "r1", "/fpc")

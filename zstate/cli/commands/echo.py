@@ -1,4 +1,4 @@
-"""zstate echo: joint states, transforms, scans or maps as documents."""
+"""zstate echo: joint states, setpoints, transforms, scans or maps as documents."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ def _check_amount(amount: float) -> float:
 @click.argument("robot", required=False)
 @click.option(
     "--stream",
-    type=click.Choice(["joint_states", "partial_joint_states", "transforms", "scan", "map"]),
+    type=click.Choice(
+        ["joint_states", "partial_joint_states", "joint_setpoints", "transforms", "scan", "map"]
+    ),
     default="joint_states",
     show_default=True,
 )
@@ -65,17 +67,19 @@ def echo_command(
     form: str | None,
     wire: str,
 ) -> None:
-    """Print the joint states, transforms, scans or maps of ROBOT as they arrive, as YAML documents.
+    """Print joint states, setpoints, transforms, scans or maps of ROBOT as they arrive, as YAML documents.
 
     ROBOT may be left out if only one robot is announced. Transforms, and partial joint states, are those of
-    all their writers; on a ROS wire these are all messages of /tf, or /joint_states. A scan or a map is a
-    summary: geometry and counts; --json, --csv and --field also have the ranges of a scan [m], null where
-    nothing was measured.
+    all their writers; on a ROS wire these are all messages of /tf, or /joint_states. Joint setpoints are what
+    the program that owns the robot's hardware writes to it, while it moves or holds the joints. A scan or a
+    map is a summary: geometry and counts; --json, --csv and --field also have the ranges of a scan [m], null
+    where nothing was measured.
 
     \b
     zstate echo
     zstate echo panda
     zstate echo panda --stream transforms
+    zstate echo panda --stream joint_setpoints
     zstate echo diffbot --stream scan --json
     zstate echo hall --stream map --once
     zstate echo panda --field panda_joint1 --csv > joint1.csv

@@ -24,7 +24,9 @@ _SETTLING_S = 0.1
 @click.argument("robot", required=False)
 @click.option(
     "--stream",
-    type=click.Choice(["joint_states", "partial_joint_states", "tf", "transforms", "scan"]),
+    type=click.Choice(
+        ["joint_states", "partial_joint_states", "joint_setpoints", "tf", "transforms", "scan"]
+    ),
     default="joint_states",
     show_default=True,
 )

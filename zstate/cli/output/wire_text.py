@@ -77,6 +77,13 @@ class NativeMessages:
         streams = {written for info in robots if info.name == robot for written, _ in info.writers}
         if not streams:
             return self.unknown(robot, robots)
+        if stream == "joint_setpoints":
+            if stream in streams:
+                return (
+                    f"the driver host of {robot!r} writes no {'new ' * ended}setpoints: nothing commands it"
+                )
+            start = "start the program with its zstate.driving.DriverHost"
+            return f"{robot!r} has no driver host{' any more' * ended}; {start}"
         if stream in streams:
             fact = f"{robot!r} is announced with {stream}, but no {'new ' * ended}sample arrives"
             return f"{fact}; `zstate doctor {robot}` finds the reason"

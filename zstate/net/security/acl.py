@@ -27,7 +27,7 @@ from zstate.net.security.credentials import check_identity
 from zstate.wire.keys import CLOCK_KEY, MOTION_CHUNK, VERBATIM_CHUNKS, check_robot
 from zstate.wire.registry import ros_options
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.types import OCCUPANCY_GRID
+from zstate.wire.ros2.types import FLOAT64_MULTI_ARRAY, JOINT_TRAJECTORY, OCCUPANCY_GRID
 
 Rule = dict[str, object]
 
@@ -163,8 +163,9 @@ class _Ros2Rules:
 
     A robot writes the topics of its namespace, serves its services, and announces only these in the graph;
     global /tf and /tf_static belong to all robots, and all robots read the maps in other namespaces. A viewer
-    subscribes to all topics and calls no service; an operator does. Raises InvalidInput for robots in one
-    namespace.
+    subscribes to all topics and calls no service; an operator does. A commander writes
+    ``<controller>/commands`` and ``<controller>/joint_trajectory`` of all robots. Raises InvalidInput for
+    robots in one namespace.
     """
 
     def __init__(self, roles: AclRoles, options: Ros2Options) -> None:
@@ -207,6 +208,13 @@ class _Ros2Rules:
         yield roles.readers, _ingress(self._id("viewers ask"), SUBSCRIBE, (history, graph))
         yield roles.readers, _egress(self._id("viewers are given"), PUBLISH, everything)
         yield roles.operators, _ingress(self._id("operators call"), ("query",), (topics,))
+        topics_in = {"commands": FLOAT64_MULTI_ARRAY, "joint_trajectory": JOINT_TRAJECTORY}
+        commands = [f"{self._domain}/**/{name}/{kind.dds}/*" for name, kind in topics_in.items()]
+        command_writers = [self._token("MP", "*", f"$*%{name}") for name in topics_in]
+        commanders = (*roles.operators, *roles.commanders)
+        written = ("put", "liveliness_token")
+        yield commanders, _ingress(self._id("commanders command"), written, (*commands, *command_writers))
+        yield commanders, _egress(self._id("commanders are asked"), SUBSCRIBE, commands)
         clock_writer = self._token("MP", "*", "%clock")
         yield roles.timekeepers, _ingress(self._id("timekeepers write"), PUBLISH, (*clock, clock_writer))
 

@@ -1,4 +1,4 @@
-"""Decoder of ROS 2 topics into zstate's messages: JointState, TFMessage, LaserScan and OccupancyGrid."""
+"""Decoder of ROS 2 topics into zstate's messages: joint states, transforms, scans, maps and commands."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from zstate.wire.messages import (
     ClockMessage,
     Edges,
     JointState,
+    JointTrajectory,
     LaserScan,
     Message,
     OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     TransformSample,
+    from_block,
     order_digest,
     poses_from_block,
     to_block,
@@ -38,7 +40,14 @@ from zstate.wire.ros2.cdr import (
     unpack_stamps,
 )
 from zstate.wire.ros2.topics import FrameNames
-from zstate.wire.ros2.types import JOINT_STATE, LASER_SCAN, OCCUPANCY_GRID, TF_MESSAGE
+from zstate.wire.ros2.types import (
+    FLOAT64_MULTI_ARRAY,
+    JOINT_STATE,
+    JOINT_TRAJECTORY,
+    LASER_SCAN,
+    OCCUPANCY_GRID,
+    TF_MESSAGE,
+)
 
 FLOAT_BYTES = 4
 """Of a float32, in which ROS has ranges."""
@@ -325,3 +334,46 @@ def decode_grid(payload: bytes, session: int, names: FrameNames) -> OccupancyGri
 
 def _floats(reader: CdrReader, count: int) -> tuple[float, ...]:
     return struct.unpack(f"<{count}f", reader.numbers(count, FLOAT_BYTES))
+
+
+def decode_numbers(payload: bytes) -> NDArray[np.float64]:
+    """The data of a Float64MultiArray: (n,), read-only. Its layout is ignored, as by ros2_control.
+
+    Raises MessageError with the reason "truncated" or "malformed".
+    """
+    reader = CdrReader(payload, FLOAT64_MULTI_ARRAY.name)
+    for _ in range(reader.count()):
+        reader.text()  # label
+        reader.count()  # size
+        reader.count()  # stride
+    reader.count()  # data_offset
+    return from_block(reader.sequence())
+
+
+def decode_trajectory(payload: bytes, session: int, seq: int) -> JointTrajectory | None:
+    """The motion in a JointTrajectory of ROS; None for one without points, which ends a motion.
+
+    It starts at its stamp, or at its arrival if that is zero. Does not check that numbers are finite, and
+    times ascend. Raises MessageError with the reason "truncated", "malformed", or "mode" for efforts.
+    """
+    reader = CdrReader(payload, JOINT_TRAJECTORY.name)
+    stamp, _ = reader.stamp(), reader.text()
+    names = tuple(reader.text() for _ in range(reader.count()))
+    blocks: tuple[list[bytes], ...] = [], [], [], []
+    times: list[int] = []
+    for _ in range(reader.count()):
+        for block in blocks:
+            block.append(reader.sequence())
+        times.append(reader.stamp())
+    points, velocities, accelerations, efforts = (b"".join(block) for block in blocks)
+    if efforts:
+        raise MessageError("a trajectory with efforts, which are not supported", reason="mode")
+    if not times:
+        return None
+    if any(len(block) not in (0, 8 * len(names)) for each in blocks for block in each):
+        raise reader.malformed(f"a point has not one number for each of {len(names)} joints")
+    numbers = to_block(np.array(times) / SECOND_NS), points, velocities or None, accelerations or None
+    try:
+        return JointTrajectory(stamp, seq, session, names, *numbers, start=stamp or None)
+    except InvalidInput as error:
+        raise reader.malformed(str(error)) from None

@@ -12,6 +12,19 @@ _FIELDS: dict[str, tuple[tuple[str, str], ...]] = {
     "builtin_interfaces/Time": (("int32", "sec"), ("uint32", "nanosec")),
     "std_msgs/Header": (("builtin_interfaces/Time", "stamp"), ("string", "frame_id")),
     "std_msgs/String": (("string", "data"),),
+    "std_msgs/MultiArrayDimension": (("string", "label"), ("uint32", "size"), ("uint32", "stride")),
+    "std_msgs/MultiArrayLayout": (("std_msgs/MultiArrayDimension[]", "dim"), ("uint32", "data_offset")),
+    "std_msgs/Float64MultiArray": (("std_msgs/MultiArrayLayout", "layout"), ("float64[]", "data")),
+    "builtin_interfaces/Duration": (("int32", "sec"), ("uint32", "nanosec")),
+    "trajectory_msgs/JointTrajectoryPoint": (
+        *(("float64[]", name) for name in ("positions", "velocities", "accelerations", "effort")),
+        ("builtin_interfaces/Duration", "time_from_start"),
+    ),
+    "trajectory_msgs/JointTrajectory": (
+        ("std_msgs/Header", "header"),
+        ("string[]", "joint_names"),
+        ("trajectory_msgs/JointTrajectoryPoint[]", "points"),
+    ),
     "rosgraph_msgs/Clock": (("builtin_interfaces/Time", "clock"),),
     "sensor_msgs/JointState": (
         ("std_msgs/Header", "header"),
@@ -128,4 +141,6 @@ STRING = RosType.from_fields("std_msgs/String")
 LASER_SCAN = RosType.from_fields("sensor_msgs/LaserScan")
 OCCUPANCY_GRID = RosType.from_fields("nav_msgs/OccupancyGrid")
 CLOCK = RosType.from_fields("rosgraph_msgs/Clock")
+FLOAT64_MULTI_ARRAY = RosType.from_fields("std_msgs/Float64MultiArray")
+JOINT_TRAJECTORY = RosType.from_fields("trajectory_msgs/JointTrajectory")
 POSE_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/PoseWithCovarianceStamped")
