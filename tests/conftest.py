@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from helpers.processes import Child, find_free_port
+from helpers.processes import Child, find_free_port, until
 
 from zstate.net.session import Session, connect
+
+if TYPE_CHECKING:
+    from zstate.driving import DriverHost
 
 # bench/ is not in the package, so it is imported from the repository. The path is appended: the tests use an
 # installed zstate if there is one.
@@ -38,6 +44,37 @@ def sessions() -> Iterator[tuple[Session, Session]]:
     """A session for publishers and a session for readers."""
     with connect() as writer, connect() as reader:
         yield writer, reader
+
+
+@pytest.fixture
+def host_driver(
+    sessions: tuple[Session, Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., DriverHost]]:
+    """``host_driver()`` runs the driver of the robot "arm" until the end of the test.
+
+    It is a simulated rrbot whose joints are at their setpoints, with 2 rad/s at most. ``options`` are those
+    of DriverHost. Stops are kept in a folder of the test.
+    """
+    from helpers.robots import RRBOT
+
+    from zstate.driving import DriverHost, Limits, SimulatedDriver
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    limits = Limits.of(RRBOT, velocity=2.0)
+    with ExitStack() as opened:
+
+        def hosted(**options: Any) -> DriverHost:
+            driver = SimulatedDriver(RRBOT, "mirror")
+            options = {"rate_hz": 100.0, "limits": limits, "program": "driver", **options}
+            host = opened.enter_context(DriverHost(sessions[0], driver, RRBOT, "arm", **options))
+            thread = threading.Thread(target=host.run)
+            thread.start()
+            opened.callback(thread.join)
+            opened.callback(host.close)
+            until(lambda: host.state == "ready")
+            return host
+
+        yield hosted
 
 
 @pytest.fixture

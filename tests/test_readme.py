@@ -61,6 +61,7 @@ def test_every_python_block_is_a_program_tested_here() -> None:
         "driver.py",
         "gripper.py",
         "odometry.py",
+        "teleop.py",
         "buffer.py",
         "place.py",
         "recording.py",
@@ -133,6 +134,26 @@ def test_three_terminals_print_the_pose_of_the_hand(
         process.send_signal(signal.SIGINT)
         process.wait(DEADLINE_S)
         assert "Traceback" not in process.communicate()[1]
+
+
+def test_a_simulated_robot_is_driven_stopped_and_released(
+    start: Callable[[list[str]], subprocess.Popen[str]],
+    spawn: Callable[..., Child],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    drive, *others = commands("Drive")
+    host = start(drive)
+    assert host.stdout
+    assert host.stdout.readline().startswith("driving 'rrbot' (2 joints, sim)")
+    for command in others:
+        ended = start(command)
+        assert ended.wait(DEADLINE_S) == 0, ended.communicate()[1]
+    teleop = spawn(PROGRAMS["teleop.py"])
+    assert teleop.line() == "('shoulder', 'elbow')"
+    lines = iter(host.stdout.readline, "")
+    assert any(line.startswith("active by ") for line in lines)
 
 
 @pytest.mark.robots

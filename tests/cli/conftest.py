@@ -1,9 +1,16 @@
-"""What the tests of commands have: a router in the place of rmw_zenohd."""
+"""What the tests of commands have: a folder for stops, and a router in the place of rmw_zenohd."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from helpers.cli_runner import Spawn, started
+
+
+@pytest.fixture(autouse=True)
+def state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 
 @pytest.fixture

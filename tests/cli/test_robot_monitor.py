@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, repeated, until
+from helpers.prometheus_text import row, scraped
+
+from zstate.driving import Commander
 
 pytestmark = pytest.mark.processes
 
@@ -112,3 +115,26 @@ def test_a_robot_that_stops_is_silent(spawn: Spawn):
 def test_robots_and_frames_exclude_each_other():
     assert "--robots takes no frames" in failure("monitor", "--robots", "base", "tool", code=2)
     assert "--metrics needs --robots" in failure("monitor", "--metrics", "0", code=2)
+
+
+def test_a_driver_has_a_line_of_its_own_and_is_in_the_metrics(sessions, host_driver, spawn: Spawn):
+    host = host_driver()
+    with Commander(sessions[1], "arm", program="teleop") as teleop:
+        teleop.wait_for_driver(DEADLINE_S)
+        with repeated(lambda: teleop.send({"elbow": 0.1})):
+            until(lambda: host.state == "active")
+            line, driver = zstate("monitor", "--robots", "--once").stdout.decode().splitlines()
+            command = started(spawn, "monitor", "--robots", "--json", "--metrics", "0")
+            until(lambda: (json.loads(command.line())["driver"] or {}).get("state") == "active")
+            url = re.search(r"metrics at (\S+)", command.stderr)
+            assert url is not None
+            rows = scraped(url.group(1))
+    assert line.startswith("arm  ")
+    assert re.match(
+        r"arm  driver active, commanded by teleop@\S+ pid \d+  loop [\d.]+ Hz  skipped \d+  faults 0  "
+        r"command age [\d.]+ ms  refused 0",
+        driver,
+    )
+    assert rows[row("zstate_driver_state", robot="arm", state="active")] == 1.0
+    assert rows[row("zstate_driver_faults_total", robot="arm")] == 0.0
+    interrupted(command)

@@ -6,17 +6,20 @@ import time
 from dataclasses import replace
 
 import pytest
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, repeated, until
 from helpers.prometheus_text import collected, row
 from helpers.robots import RRBOT, wait_for_stream_readers
 from prometheus_client.core import CounterMetricFamily
 
+from zstate.driving import Commander
+from zstate.driving.driver_state import DriverStateListener
 from zstate.errors import InFuture, InvalidInput
 from zstate.metrics.buffer import InstrumentedBuffer
 from zstate.metrics.collectors import (
     MAX_ROBOTS,
     ConnectionMetrics,
     CounterRates,
+    DriverMetrics,
     ListenerMetrics,
     MetricFamilies,
     PublisherMetrics,
@@ -247,3 +250,26 @@ def test_a_restarted_counter_has_no_negative_rate():
     clock.time_s += 1.0
     assert rates.update("a", 3) == 0.0
     assert rates.update("b", 3) == 0.0
+
+
+def test_a_driver_has_its_state_refused_commands_and_the_age_of_the_newest(sessions, host_driver):
+    host = host_driver()
+    with (
+        DriverStateListener(sessions[1], "*") as drivers,
+        Commander(sessions[1], "arm") as commander,
+    ):
+        commander.wait_for_driver(DEADLINE_S)
+        with repeated(lambda: commander.send({"elbow": 0.1})):
+            until(lambda: host.state == "active")
+        publisher = StreamPublisher(sessions[1], "zstate/arm/joint_commands", ENCODINGS[JointState])
+        until(lambda: publisher.put(b"") or host.report().refused.get("foreign"))
+        until(lambda: "foreign" in drivers.states()["arm"].state.refused)
+        rows = collected(DriverMetrics(drivers))
+        host.close()
+        until(lambda: drivers.states()["arm"].state.state == "off")
+        ended = collected(DriverMetrics(drivers))
+    assert rows[row("zstate_driver_refused_total", robot="arm", reason="foreign")] >= 1.0
+    assert rows[row("zstate_driver_ticks_total", robot="arm")] > 0.0
+    assert rows[row("zstate_driver_command_age_seconds", robot="arm")] > 0.0
+    states = [value for (name, _), value in ended.items() if name == "zstate_driver_state"]
+    assert sorted(states) == [0.0] * 6 + [1.0]

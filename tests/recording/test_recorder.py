@@ -19,6 +19,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from zstate.driving import Commander
 from zstate.errors import InvalidInput, RecordingError
 from zstate.model.kinematics import MovingEdges
 from zstate.model.load import load_model
@@ -29,13 +30,22 @@ from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.recording.info import read_info, recorded_robots
+from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
 from zstate.recording.recording import Recording
 from zstate.scans import Grid, MapPublisher, ScanPublisher
 from zstate.sources import SineSource
 from zstate.transform import Transform
-from zstate.wire.messages import ClockMessage, JointState, order_digest, to_block
+from zstate.wire.messages import (
+    ClockMessage,
+    JointCommand,
+    JointState,
+    from_block,
+    order_digest,
+    to_block,
+)
 from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
@@ -666,3 +676,38 @@ def test_withdrawn_map_keeps_static_edges_of_its_name(sessions, tmp_path: Path):
     sizes = [message.info.width for message in read(tmp_path / "run.mcap", "/floor")]
     edges = [len(message.transforms) for message in read(tmp_path / "run.mcap", "/tf_static")]
     assert (sizes, edges) == ([1, 0], [1])
+
+
+def test_commands_are_recorded_as_joint_states_and_not_replayed(sessions, tmp_path):
+    path = tmp_path / "run.mcap"
+    with (
+        StatePublisher(sessions[0], RRBOT, "arm") as publisher,
+        Recorder(sessions[1], path, ["arm"]) as recorder,
+        Commander(sessions[0], "arm", program="teleop") as commander,
+    ):
+        wait_for_stream_readers(sessions[0], "arm", "joint_states", "joint_commands")
+        publisher.publish([0.0, 0.0])
+        with StreamPublisher(sessions[0], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as renewal:
+            renewal.put(encode(JointCommand(STAMP, 0, 1, order_digest(()), names=(), motion=0)))
+        commander.send({"elbow": 0.25})
+        until(lambda: recorder.stats.messages.get(("arm", "joint_commands")))
+        until(lambda: recorder.stats.messages.get(("arm", "joint_states")))
+        assert recorder.stats.refused == {}
+    (command,) = read(path, "/joint_commands")
+    assert (command.name, command.position.tolist()) == (["elbow"], [0.25])
+    with Recording(path) as recording:
+        (same,) = recording.commands("arm")
+    assert same.stamp == stamp_of(command.header)
+    assert (same.names, from_block(same.positions).tolist()) == (("elbow",), [0.25])
+    (robot,) = recorded_robots(read_info(path))
+    (stream,) = [one for one in robot.streams if one.stream == "joint_commands"]
+    assert (stream.count, stream.writer.partition("@")[0]) == (1, "teleop")
+    with (
+        closing(SampleCollector(sessions[1], "zstate/arm/joint_commands")) as commands,
+        closing(SampleCollector(sessions[1], "zstate/arm/joint_states")) as states,
+        Player(sessions[0], path, rate=math.inf) as player,
+    ):
+        wait_for_stream_readers(sessions[0], "arm", "joint_states", "joint_commands")
+        player.run()
+        states.joint_states(1)
+        assert commands.arrivals == []

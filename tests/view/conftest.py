@@ -154,15 +154,20 @@ def show_view() -> Iterator[Callable[..., RunningView]]:
 
     with ExitStack() as opened:
 
-        def shown(session: Session, *robots: str, sliders: Sequence[SliderPublisher] = ()) -> RunningView:
-            return opened.enter_context(_shown(session, robots, sliders))
+        def shown(
+            session: Session,
+            *robots: str,
+            sliders: Sequence[SliderPublisher] = (),
+            can_command: bool = False,
+        ) -> RunningView:
+            return opened.enter_context(_shown(session, robots, sliders, can_command))
 
         yield shown
 
 
 @contextmanager
 def _shown(
-    session: Session, robots: Sequence[str], sliders: Sequence[SliderPublisher]
+    session: Session, robots: Sequence[str], sliders: Sequence[SliderPublisher], can_command: bool
 ) -> Generator[RunningView]:
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
@@ -172,7 +177,7 @@ def _shown(
     with (
         ViewSource(session, robots) as source,
         ViewServer(port=0) as page,
-        View(source, page, sliders=sliders) as view,
+        View(source, page, sliders=sliders, can_command=can_command) as view,
     ):
         drawing = threading.Thread(target=view.run, args=(stop,), daemon=True)
         drawing.start()

@@ -1,15 +1,19 @@
-"""SliderPublisher: published values, limits, rates and conflicts, and the mapping of its sliders."""
+"""Sliders as joint states and as commands of a driver: values, limits, rates, conflicts, control."""
 
 from __future__ import annotations
 
 import math
 import os
+import re
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from helpers.processes import SOON_S, until
+from helpers.processes import DEADLINE_S, SOON_S, until
 from helpers.robots import RRBOT, SampleCollector
 
+from zstate.driving import Commander, DriverHost, stop
+from zstate.driving.driver_state import DriverStateListener
 from zstate.errors import InvalidInput
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
@@ -18,7 +22,7 @@ from zstate.net.presence import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.se3 import quaternion_from_rpy
-from zstate.view.sliders import SliderMapping, SliderPublisher, SliderSpec
+from zstate.view.sliders import SliderCommander, SliderMapping, SliderPublisher, SliderSpec
 from zstate.wire.messages import from_block
 
 ARM = parse_urdf(
@@ -206,3 +210,72 @@ def test_robot_without_joints_has_no_sliders():
 def test_panda_has_one_slider_for_each_joint():
     panda = load_model("panda")
     assert tuple(spec.name for spec in SliderMapping(panda).specs) == panda.joint_names
+
+
+@pytest.fixture
+def commander(sessions, host_driver) -> Iterator[SliderCommander]:
+    """The sliders of a driver, which has published its state."""
+    with (
+        DriverStateListener(sessions[1], "arm") as states,
+        SliderCommander(sessions[1], "arm", states) as sliders,
+    ):
+        yield sliders
+
+
+def in_control(sliders: SliderCommander) -> SliderCommander:
+    until(sliders.take_control)  # the driver's state may not have arrived yet
+    return sliders
+
+
+def test_a_driver_is_commanded_from_the_first_move_of_a_slider_until_control_is_released(
+    sessions, host_driver, commander
+):
+    host: DriverHost = host_driver()
+    commander.set("elbow", 0.5)
+    in_control(commander)
+    assert commander.targets == {}
+    with TransformListener(sessions[1], "arm") as listener:
+        listener.buffer.wait("base", "lower", timeout_s=DEADLINE_S)
+        commander.set("elbow", 0.25)
+        until(lambda: listener.buffer.joint_positions("arm")[0].tolist() == [0.0, 0.25])
+    assert host.state == "active"
+    commander.release_control()
+    until(lambda: host.state == "holding")
+    assert not commander.has_control
+    assert commander.problem == ""
+
+
+def test_a_stop_ends_control_and_after_its_release_nothing_moves_before_a_slider(
+    sessions, host_driver, commander
+):
+    host: DriverHost = host_driver()
+    in_control(commander).set("elbow", 3.0)
+    until(lambda: host.state == "active")
+    stop(sessions[0], "arm", "door open", timeout_s=DEADLINE_S)
+    until(lambda: not commander.has_control)
+    assert re.match("control has ended: stopped by .*: door open", commander.problem)
+    in_control(commander).set("elbow", 3.0)  # ignored while the driver is stopped
+    commander.release_stops()
+    until(lambda: host.state == "ready")
+    assert commander.has_control
+    assert commander.targets == {}
+    commander.stop()
+    until(lambda: host.state == "stopped")
+    assert not commander.has_control
+
+
+def test_control_is_refused_while_another_program_commands_the_robot(sessions, host_driver, commander):
+    host_driver()
+    with Commander(sessions[0], "arm", program="teleop") as teleop:
+        teleop.wait_for_driver(DEADLINE_S)
+        assert not commander.take_control()
+        assert "teleop@" in commander.problem
+        assert not commander.has_control
+
+
+def test_control_ends_when_the_driver_ends(host_driver, commander):
+    host: DriverHost = host_driver()
+    in_control(commander)
+    host.close()
+    until(lambda: not commander.has_control)
+    assert commander.problem == "control has ended: off: the loop has ended"

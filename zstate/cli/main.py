@@ -15,7 +15,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from importlib import import_module
 from itertools import combinations
 from pathlib import Path
 from types import FrameType
@@ -23,13 +22,16 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
+from zstate.cli.commands import load_command
 from zstate.cli.output import logs
 from zstate.errors import ZStateError
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
-# name: (section of the help, summary); zstate.cli.commands.<name> holds the command <name>_command.
+    from zstate.net.session import Session
+
+# name: (section of the help, summary)
 _COMMANDS = {
     "demo": ("Start here", "A robot that moves, its state over Zenoh, and a live table of it."),
     "publish": ("Write", "Publish a robot's state: its model, fixed edges, and transforms."),
@@ -38,6 +40,9 @@ _COMMANDS = {
     "transform": ("Write", "Publish moving edges: one pose at a rate, or lines of JSON."),
     "scan": ("Write", "Publish the scans of a simulated or dummy laser."),
     "map": ("Write", "Publish the map of a place."),
+    "drive": ("Drive", "Host the driver of a robot: the program that owns its hardware."),
+    "move": ("Drive", "Move joints of a robot that has a driver, and wait until they are there."),
+    "stop": ("Drive", "Stop a robot that has a driver, until that is released."),
     "tf": ("Look", "The pose of one frame in another."),
     "monitor": ("Look", "How samples come in, by edge or by robot: rates, latencies, losses."),
     "tree": ("Look", "The frames of the announced robots, as a tree."),
@@ -73,6 +78,7 @@ _SYNONYMS = {
     "bag": "record | replay | info",
     "ros2_bag": "record | replay | info",
     "check_urdf": "check",
+    "controller_manager": "drive",
     "dummy_joint_states": "joints",
     "dummy_laser": "scan ROBOT --frame FRAME --dummy",
     "dummy_map_server": "map FILE.yaml",
@@ -80,6 +86,7 @@ _SYNONYMS = {
     "info_urdf": "check",
     "joint_state_publisher": "joints",
     "joint_state_publisher_gui": "view ROBOT --sliders",
+    "joint_trajectory_controller": "move",
     "laser": "scan ROBOT --frame FRAME --simulate MAP.yaml",
     "launch": "up FILE.toml",
     "lidar": "scan ROBOT --frame FRAME --simulate MAP.yaml",
@@ -96,6 +103,8 @@ _SYNONYMS = {
     "rmw_zenohd": "router --ros2",
     "robot_state_publisher": "publish",
     "ros1_bridge": "ros1",
+    "ros2_control": "drive | move | stop",
+    "ros2_control_node": "drive",
     "rosbag": "record | replay | info",
     "roslaunch": "up FILE.toml",
     "rostopic": "ls | echo | hz",
@@ -129,7 +138,14 @@ COMPLETION_VARIABLE = "_ZSTATE_COMPLETE"
 # Robots on this host are discovered in a fraction of this; a longer delay is annoying at a prompt.
 _ROBOTS_WITHIN_S = 0.4
 # The arguments that are models, by command.
-_MODELS = {"check": "file", "demo": "robot", "init": "robot", "joints": "robot", "publish": "robot"}
+_MODELS = {
+    "check": "file",
+    "demo": "robot",
+    "drive": "robot",
+    "init": "robot",
+    "joints": "robot",
+    "publish": "robot",
+}
 
 # Columns that click leaves free at the right.
 _MARGIN = 2
@@ -195,8 +211,7 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in _COMMANDS:
             return None
-        command = getattr(import_module(f"zstate.cli.commands.{cmd_name}"), f"{cmd_name}_command")
-        assert isinstance(command, click.Command)
+        command = load_command(cmd_name)
         for one in (command, *(command.commands.values() if isinstance(command, click.Group) else ())):
             one.context_class = HelpContext
             for parameter in one.params if COMPLETION_VARIABLE in os.environ else ():
@@ -255,6 +270,10 @@ def _completed_type(command: str, argument: click.Argument) -> Any:
     """The type of an argument while a shell completes: robots, models, files and parameters."""
     if _MODELS.get(command) == argument.name:
         return _Completed(_catalog_names, or_file=True)
+    if argument.name == "driver":
+        return _Completed(lambda _, incomplete: ["sim"] if "sim".startswith(incomplete) else [], or_file=True)
+    if command == "move" and argument.name == "positions":
+        return _Completed(_driven_joints, or_file=False)
     if command == "up" and argument.name == "parameters":
         return _Completed(_settings, or_file=False)
     if argument.name in ("robot", "robots"):
@@ -269,14 +288,30 @@ def _catalog_names(_: click.Context, incomplete: str) -> Iterator[str]:
 
 
 def _announced_names(ctx: click.Context, incomplete: str) -> Iterator[str]:
-    from zstate.cli.session import SessionOptions
     from zstate.net.presence import discover
+
+    with suppress(ZStateError), _opened_session(ctx) as session:  # the command reports errors
+        robots = discover(session, _ROBOTS_WITHIN_S, wire=ctx.params.get("wire") or "native")
+        yield from (robot.name for robot in robots if robot.name.startswith(incomplete))
+
+
+def _driven_joints(ctx: click.Context, incomplete: str) -> Iterator[str]:
+    """JOINT= for each joint of the driver of the robot on the command line."""
+    from zstate.driving.stops import wait_for_state
+
+    with suppress(ZStateError), _opened_session(ctx) as session:
+        state = wait_for_state(session, str(ctx.params.get("robot")), lambda _: True, _ROBOTS_WITHIN_S)
+        names = () if state is None else state.joint_names
+        yield from (f"{name}=" for name in names if name.startswith(incomplete))
+
+
+def _opened_session(ctx: click.Context) -> Session:
+    """A session with the options of the command line that is completed."""
+    from zstate.cli.session import SessionOptions
 
     get = ctx.params.get
     network = SessionOptions(get("mode"), get("connect") or (), get("listen") or (), get("config"))
-    with suppress(ZStateError), network.open(_ROBOTS_WITHIN_S) as session:  # the command reports errors
-        robots = discover(session, _ROBOTS_WITHIN_S, wire=get("wire") or "native")
-        yield from (robot.name for robot in robots if robot.name.startswith(incomplete))
+    return network.open(_ROBOTS_WITHIN_S)
 
 
 def _settings(ctx: click.Context, incomplete: str) -> Iterator[str]:

@@ -11,6 +11,7 @@ from zstate.cli.output.console import print_status
 if TYPE_CHECKING:
     from zstate.bridges.ros2 import Bridge
     from zstate.cli.robot_directory import RobotDirectory
+    from zstate.driving.driver_state import DriverStateListener
     from zstate.metrics.collectors import Listened
     from zstate.metrics.endpoint import BindAddress, MetricsCollector
     from zstate.net.session import Session
@@ -46,6 +47,11 @@ def listener_collector(listeners: Callable[[], Sequence[Listened]]) -> Factory:
 def writer_collector(directory: RobotDirectory) -> Factory:
     """Metrics of the announced writers."""
     return lambda: _collectors().WriterMetrics(directory.robots)
+
+
+def driver_collector(listener: DriverStateListener) -> Factory:
+    """Metrics of the drivers of robots."""
+    return lambda: _collectors().DriverMetrics(listener)
 
 
 def connection_collector(session: Session) -> Factory:

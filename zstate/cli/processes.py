@@ -113,6 +113,8 @@ class ChildProcess(Closeable):
         self.name = name
         self.last_error = ""
         self._is_program = is_program
+        # Code of the user takes its time: that of a program, and of the driver inside `zstate drive`.
+        self._later_s = _PROGRAM_ENDS_WITHIN_S if is_program or arguments[0] == "drive" else 0.0
         own = ["-ISc", _GUARDIAN] if is_program else ["-m", "zstate", "--until-eof"]
         # A session of its own: Ctrl-C at the terminal reaches this process alone, which stops its children.
         self._process = subprocess.Popen(
@@ -143,7 +145,7 @@ class ChildProcess(Closeable):
         return self._process.poll()
 
     def close(self) -> None:
-        """Stop it and wait, less than 1 s; a user's program gets 3 s more."""
+        """Stop it and wait, less than 1 s; a user's program or driver gets 3 s more."""
         self.request_exit()
         self.wait(time.monotonic() + END_WITHIN_S)
 
@@ -153,10 +155,9 @@ class ChildProcess(Closeable):
             self._signal(signal.SIGINT if self._is_program else signal.SIGTERM)
 
     def wait(self, deadline: float) -> None:
-        """Wait for its exit; kill it after ``deadline`` (monotonic), a user's program 3 s later."""
-        later_s = _PROGRAM_ENDS_WITHIN_S if self._is_program else 0.0
+        """Wait for its exit; kill it after ``deadline`` (monotonic), a user's program or driver 3 s later."""
         try:
-            self._process.wait(max(0.0, deadline - time.monotonic()) + later_s)
+            self._process.wait(max(0.0, deadline - time.monotonic()) + self._later_s)
         except subprocess.TimeoutExpired:
             self._signal(signal.SIGKILL)
             self._process.wait()

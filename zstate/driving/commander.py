@@ -14,6 +14,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.checks import real_numbers
 from zstate.driving.commands import check_named_positions
+from zstate.driving.driver_state import SILENT_S
 from zstate.driving.motion import Motion, Points, rows_block
 from zstate.errors import (
     Closed,
@@ -49,9 +50,6 @@ from zstate.wire.messages import (
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
-
-_SILENT_S = 0.5
-"""A driver publishes its state ten times a second; one that is silent for so long is gone or frozen."""
 
 _RELEASE_PERIOD_S = 0.1
 
@@ -100,7 +98,7 @@ class Commander(Closeable):
     def driver(self) -> DriverState | None:
         """The newest state of the driver; None if none has arrived for half a second."""
         newest = self._state
-        if newest is None or time.monotonic() - newest[1] > _SILENT_S:
+        if newest is None or time.monotonic() - newest[1] > SILENT_S:
             return None
         return newest[0]
 

@@ -1,8 +1,9 @@
-"""What a driver host reports: its state and setpoints on the network, and the figures of its control loop."""
+"""What a driver host reports: state, setpoints and figures of its control loop; and a listener of its state."""
 
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
@@ -11,22 +12,27 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe
+from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.driving.driver import Setpoint
-from zstate.errors import Closed, MessageError, SecondWriter
-from zstate.net.latched import LatchedPublisher, cached_values
+from zstate.errors import Closed, InvalidInput, MessageError, SecondWriter, format_duration
+from zstate.net.latched import LatchedPublisher, LatchedSubscriber, cached_values
 from zstate.net.ownership import wait_for_discovery
 from zstate.net.session import Session
 from zstate.net.writer import WireWriter
 from zstate.rate import RateReport
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import driver_key
+from zstate.wire.keys import driver_expression, driver_key, robot_from_key
 from zstate.wire.messages import DriverState, JointState, order_digest, to_block, with_short_texts
 from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 
 PERIOD_S = 0.1
+SILENT_S = 5 * PERIOD_S
+"""A driver that has not published its state for so long is gone or frozen."""
+
 JOIN_WITHIN_S = 0.5
 _CACHES_WITHIN_S = 0.5
 
@@ -158,3 +164,73 @@ def check_only_host(session: Session, robot: str) -> None:
                 stream="driver",
                 first=first,
             )
+
+
+class ReceivedState(NamedTuple):
+    """The newest state of a driver, and the time since it arrived [s]."""
+
+    state: DriverState
+    age_s: float
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the driver publishes its state."""
+        return self.age_s < SILENT_S
+
+    @property
+    def last_motion(self) -> str:
+        """How the last motion has ended, and why; empty without any."""
+        if not self.state.outcomes:
+            return ""
+        newest = self.state.outcomes[-1]
+        return f"{newest.name}: {newest.reason}" if newest.reason else newest.name
+
+    def __str__(self) -> str:
+        state, text = self.state, self.state.state
+        if state.state == "active":
+            text += f", commanded by {state.commander}"
+            text += f", motion {state.progress:.0%} done" if state.motion is not None else ""
+        elif state.reason.startswith(f"{text} by "):
+            text = state.reason
+        elif state.reason:
+            text += f": {state.reason}"
+        if self.is_live or state.state == "off":  # it has been closed
+            return text
+        return f"silent for {format_duration(round(self.age_s * 1e9))}, was {text}"
+
+
+class DriverStateListener(Closeable):
+    """Receives the states of the driver of ``robot``, or of the drivers of all robots for "*".
+
+    ``on_state(robot)`` is called after each, from one thread.
+    """
+
+    def __init__(
+        self, session: Session, robot: str, on_state: Callable[[str], object] = lambda _: None
+    ) -> None:
+        self._on_state = on_state
+        self._lock = fork_safe_lock()
+        self._newest: BoundedDict[str, tuple[DriverState, float]] = BoundedDict()
+        self._subscriber = LatchedSubscriber(session, driver_expression(robot), self._on_value)
+
+    def get(self, robot: str) -> ReceivedState | None:
+        """The newest state of the driver of ``robot``, however old it is; None if none has arrived."""
+        return self.states().get(robot)
+
+    def states(self) -> dict[str, ReceivedState]:
+        """The newest state of each driver, by robot, sorted."""
+        with self._lock:
+            newest = dict(self._newest)
+        now = time.monotonic()
+        return {robot: ReceivedState(state, now - at) for robot, (state, at) in sorted(newest.items())}
+
+    def close(self) -> None:
+        self._subscriber.close()
+
+    def _on_value(self, sample: SerializedSample) -> None:
+        with suppress(MessageError, InvalidInput):
+            robot = robot_from_key(sample.key)
+            state = decode(sample.payload, sample.encoding, DriverState)
+            with self._lock:
+                self._newest[robot] = state, time.monotonic()
+            self._on_state(robot)

@@ -49,7 +49,7 @@ from zstate.errors import (
 )
 from zstate.model.robot import RobotModel
 from zstate.net.at_exit import forked_text
-from zstate.net.presence import WriterWatch, local_writer
+from zstate.net.presence import WriterWatch, announce_reader, local_writer
 from zstate.net.queryable import check_timeout
 from zstate.net.session import Session
 from zstate.nodes.partial_publisher import PartialStatePublisher
@@ -59,7 +59,7 @@ from zstate.sources import JointReading
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import check_robot
 from zstate.wire.messages import DriverState
-from zstate.wire.registry import as_wire_names, get_controller
+from zstate.wire.registry import as_wire_names, get_controller, get_wire
 
 if TYPE_CHECKING:
     from zstate.wire.ros2.wire import Ros2Controller
@@ -201,6 +201,9 @@ class DriverHost(Closeable):
             session, self.robot, self._names, self._ttl_ns, self._refusals, controller=controller
         )
         opening.enter_context(commands)
+        program = self._writer.program
+        for token in announce_reader(session, get_wire("native"), self.robot, ["joint_commands"], program):
+            opening.enter_context(token)
         motions = opening.enter_context(self._open_motions(session, controller))
         opening.enter_context(WriterWatch(session, self.robot, self._on_writer))
         if controller is not None:

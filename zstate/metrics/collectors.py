@@ -1,4 +1,4 @@
-"""Prometheus collectors of publishers, listeners, writers, connections, recorders and bridges.
+"""Prometheus collectors of publishers, listeners, writers, drivers, connections, recorders and bridges.
 
 Each reads existing counters at a scrape. ``CounterRates`` computes rates from them.
 """
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
     from zstate.bridges.ros2 import Bridge
+    from zstate.driving.driver_state import DriverStateListener
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
     from zstate.nodes.sample_publisher import SamplePublisher
@@ -235,6 +236,38 @@ class WriterMetrics:
         for robot in robots[:MAX_ROBOTS]:
             for stream, _ in robot.writers:
                 families.gauge("zstate_writers", "Live writers.", 1, robot=robot.name, stream=stream)
+        return families
+
+
+_DRIVER_STATES = ("off", "ready", "active", "holding", "stopped", "fault", "silent")
+
+
+class DriverMetrics:
+    """Metrics of the drivers whose states ``listener`` receives."""
+
+    def __init__(self, listener: DriverStateListener) -> None:
+        self._listener = listener
+
+    def collect(self) -> Iterable[Metric]:
+        families = MetricFamilies()
+        count, gauge = families.count, families.gauge
+        for robot, received in list(self._listener.states().items())[:MAX_ROBOTS]:
+            state = received.state
+            present = state.state if received.is_live else "silent"
+            text = "1 for the present state of a driver; silent if it does not publish any."
+            for name in _DRIVER_STATES:
+                gauge("zstate_driver_state", text, name == present, robot=robot, state=name)
+            gauge("zstate_driver_rate_hertz", "The rate of its loop.", state.rate_hz, robot=robot)
+            count("zstate_driver_ticks", "Ticks of its loop.", state.ticks, robot=robot)
+            count("zstate_driver_skipped_ticks", "Ticks that were missed.", state.skipped, robot=robot)
+            count("zstate_driver_faults", "Calls of the driver that failed.", state.faults, robot=robot)
+            for reason, number in state.refused.items():
+                text = "Commands that were refused."
+                count("zstate_driver_refused", text, number, robot=robot, reason=reason)
+            if state.command_age is not None:
+                age_s = state.command_age * 1e-9 + received.age_s
+                text = "The time since the newest command arrived."
+                gauge("zstate_driver_command_age_seconds", text, age_s, robot=robot)
         return families
 
 

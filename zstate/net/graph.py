@@ -85,7 +85,7 @@ class Graph:
         return [StreamGroup(*ends, tuple(streams)) for ends, streams in groups.items()]
 
 
-_OPTIONAL: frozenset[Stream] = frozenset({"transforms", "partial_joint_states"})
+_OPTIONAL: frozenset[Stream] = frozenset({"transforms", "partial_joint_states", "joint_commands"})
 """Streams that a robot with other ones does not lack."""
 
 RateLookup = Callable[[str, Stream, WriterId], float | None]

@@ -109,10 +109,13 @@ def announce(session: Session, token: str) -> LivelinessToken:
 
 
 def announce_reader(
-    session: Session, wire: Wire, robot: str, streams: Sequence[Stream]
+    session: Session, wire: Wire, robot: str, streams: Sequence[Stream], program: str = ""
 ) -> list[LivelinessToken]:
-    """Announce this program as a reader of ``streams`` of ``robot``, if ``wire`` announces readers."""
-    tokens = wire.reader_tokens(robot, streams, local_writer(0), session.zid, session.next_number)
+    """Announce this program as a reader of ``streams`` of ``robot``, if ``wire`` announces readers.
+
+    ``program`` is its name for others; default: the script's name.
+    """
+    tokens = wire.reader_tokens(robot, streams, local_writer(0, program), session.zid, session.next_number)
     return [announce(session, token) for token in tokens]
 
 

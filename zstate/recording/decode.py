@@ -15,7 +15,7 @@ from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance
-from zstate.recording.encode import TOPICS, StaticAccumulator
+from zstate.recording.encode import CARRIERS, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
 from zstate.wire.keys import Stream
@@ -39,6 +39,10 @@ joint_states with such a name."""
 
 SCAN_STREAMS: tuple[Stream, ...] = ("scan", "map")
 """Further streams that can be decoded: the channels of these types, whatever their topic is."""
+
+COMMAND_STREAMS: tuple[Stream, ...] = ("joint_commands",)
+"""Those of commands of drivers, in recordings by zstate. They are never published again, since a replay must
+not move hardware."""
 
 _NAMED: dict[Stream, Stream] = {topic: named for named, topic in TOPICS.items()}
 
@@ -71,18 +75,17 @@ class RecordedWriter:
     def from_channel(cls, channel: Channel) -> RecordedWriter | None:
         """The writer of ``channel``; None if it is no stream of a robot."""
         stream: Stream = "transforms"
-        name = channel.topic.rpartition("/")[2]
+        name, facts = channel.topic.rpartition("/")[2], channel.metadata
+        foreign = _SESSION not in facts
         if child_frame(channel) is None:
-            for stream in (*_TOPICS, *SCAN_STREAMS):
+            for stream in (*_TOPICS, *SCAN_STREAMS, *(() if foreign else COMMAND_STREAMS)):
                 is_named = name == stream or stream in SCAN_STREAMS
-                if is_named and channel.type_name == ros_type(stream).name:
+                if is_named and channel.type_name == ros_type(CARRIERS.get(stream, stream)).name:
                     break
             else:
                 return None
-        facts = channel.metadata
         if EDGE_WRITER in facts:
             stream = _NAMED.get(stream, stream)
-        foreign = _SESSION not in facts
         digest = blake2b(channel.topic.encode(), digest_size=4).digest()
         robot = robot_from_topic(channel.topic) if foreign else facts.get(ROBOT, "")
         return cls(
@@ -242,7 +245,7 @@ class DecodedRecording:
             if writer is not None:
                 options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))
                 names = FrameNames(options, writer.robot or SHARED)
-                topic = TOPICS.get(writer.stream, writer.stream)
+                topic = CARRIERS.get(writer.stream, writer.stream)
                 decoder = ChannelDecoder(writer, topic, names, RosDecoder(), child_frame(channel) or "")
             self._known[channel] = decoder
         return self._known[channel]

@@ -26,6 +26,7 @@ from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     POSE_BYTES,
     ClockMessage,
+    JointCommand,
     JointState,
     LaserScan,
     Message,
@@ -68,6 +69,7 @@ _STREAMS: dict[type[Message], Stream] = {
     TransformSample: "tf",
     StaticTransforms: "tf_static",
     RobotDescription: "robot_description",
+    JointCommand: "joint_commands",
     LaserScan: "scan",
     OccupancyGrid: "map",
     ClockMessage: "clock",
@@ -82,6 +84,9 @@ _NAMED_STREAMS: dict[type[Message], Stream] = {
 
 TOPICS: dict[Stream, Stream] = {"transforms": "tf", "partial_joint_states": "joint_states"}
 """The streams after which the topics of others are named: ROS has no topics of single writers."""
+
+CARRIERS: dict[Stream, Stream] = {**TOPICS, "joint_commands": "joint_states"}
+"""The streams with the messages of others: commands are joint states, on a topic of their own."""
 
 NO_MAP = OccupancyGrid(0, 1, "map", 1.0, 0, 0, to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), b"")
 """Recorded when a map is withdrawn."""
@@ -192,6 +197,8 @@ class RecordingEncoder:
                 self._counts[robot, stream] += 1
 
     def _write_sample(self, robot: str, message: StampedMessage, log_time: int, edge_writer: str) -> None:
+        if isinstance(message, JointCommand) and message.motion is not None:
+            return  # keeps a motion valid, and has no positions
         sample_names = self._orders_of(robot).sample_names(message)
         if sample_names is None:
             self._pending.append(robot, message, log_time)
@@ -201,6 +208,8 @@ class RecordingEncoder:
             edges = sample_names.moving_edges if message.edges is None else message.edges
             for one in known_covariances(message, edges):
                 self._write_covariance(robot, message, one, log_time, edge_writer)
+        if isinstance(message, JointCommand):
+            message = _as_joint_state(message)
         channel = self._channel(robot, stream, message.session, log_time, edge_writer)
         payload = channel.encode(message, sample_names)
         # MCAP begins in 1970; the payload keeps an earlier stamp.
@@ -312,8 +321,10 @@ class RecordingEncoder:
             metadata[EDGE_WRITER] = edge_writer
         if session in self._programs:
             metadata["zstate.program"] = self._programs[session]
-        carrier = TOPICS.get(stream, stream)
+        carrier = CARRIERS.get(stream, stream)
         topic, kind = RmwKeys(options).topic(robot, carrier, ros_name(edge_writer)), ros_type(carrier)
+        if stream == "joint_commands":
+            topic = f"{topic.rpartition('/')[0]}/{stream}"
         if covariances_of:
             metadata[CHILD_FRAME] = child = names.to_ros(covariances_of)
             topic, kind = covariance_topic(options.namespace, names.to_zstate(child)), POSE_WITH_COVARIANCE
@@ -333,6 +344,14 @@ class RecordingEncoder:
                 name += "_"
             self._namespaces[robot] = name
         return Ros2Options(namespace=self._namespaces[robot], frame_prefix=f"{robot}/")
+
+
+def _as_joint_state(command: JointCommand) -> JointState:
+    """The positions of a command. Raises InvalidInput if it has none, or no names of joints."""
+    if command.positions is None or command.names is None:
+        raise InvalidInput("a command without positions or without names of joints, which drivers refuse")
+    head = command.stamp, command.seq, command.session, command.order
+    return JointState(*head, command.positions, names=command.names)
 
 
 def _latched_key(robot: str, stream: Stream, name: str) -> str:

@@ -237,6 +237,17 @@ class Recording(Closeable):
                 except InvalidInput as error:
                     refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
 
+    def commands(self, robot: str | None = None) -> Iterator[JointState]:
+        """The commands that were sent to the driver of ``robot``, by default of all robots, one by one.
+
+        Each has the names of its joints, and their commanded positions [rad] or [m]. They are all that
+        arrived at the recorder, also those that the driver has refused. Raises InvalidInput for a robot that
+        is not in the recording.
+        """
+        for _, message, _ in self._messages(robot, "joint_commands", Refusals("recorded joint_commands")):
+            assert isinstance(message, JointState)
+            yield message
+
     def _messages(self, robot: str | None, stream: Stream, refusals: Refusals) -> Iterator[DecodedMessage]:
         recording = DecodedRecording(self._reader, refusals.count)
         robot = robot or self.robot

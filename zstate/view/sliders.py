@@ -1,11 +1,12 @@
-"""SliderPublisher: joint states set by sliders, as joint_state_publisher_gui, published at an exact rate."""
+"""Sliders that move a robot: as its joint states, like joint_state_publisher_gui, or by its driver."""
 
 from __future__ import annotations
 
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal
 
@@ -16,7 +17,9 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import did_you_mean
 from zstate.clock import Clock
-from zstate.errors import InvalidInput, SecondWriter
+from zstate.driving import Commander, stop
+from zstate.driving.driver_state import DriverStateListener, ReceivedState
+from zstate.errors import InvalidInput, SecondWriter, ZStateError
 from zstate.model.robot import Joint, RobotModel
 from zstate.net.session import Session
 from zstate.nodes.publisher import STREAMS, StatePublisher
@@ -30,6 +33,9 @@ Values = NDArray[np.float64]
 _REACH_M = 2.0
 """Range of a coordinate without limits, each way."""
 _JOIN_TIMEOUT_S = 1.0
+_SEND_PERIOD_S = 0.05
+_SILENT_S = 2.0
+"""A driver that is silent for so long has lost its connection, or a busy machine was this busy."""
 
 _FLOATING: tuple[tuple[str, Unit, float], ...] = (
     ("x", "m", _REACH_M),
@@ -300,3 +306,158 @@ def _conflict_text(error: SecondWriter) -> str:
         f"{program} has written {error.stream} of {error.robot!r} since {since:%Y-%m-%d %H:%M:%S}; "
         "stop it, then try again"
     )
+
+
+@dataclass(eq=False)
+class _Control:
+    """The time from taking control to its end; ``stops`` are those that were latched before it.
+
+    Commands are sent every ``period_s`` [s].
+    """
+
+    commander: Commander
+    period_s: float
+    driver_session: int
+    stops: set[tuple[int, int]]
+    targets: dict[str, float] = field(default_factory=dict[str, float])
+    ended: threading.Event = field(default_factory=threading.Event)
+
+
+class SliderCommander(Closeable):
+    """Sends slider values to the driver of ``robot`` while a user has control of it.
+
+    Control begins with ``take_control``, and nothing is sent until ``set``: from then on that joint's
+    position is sent, again and again, and no other's. Control ends with ``release_control`` or ``stop``, and
+    by itself if the driver is stopped, ends, restarts or is silent, or a command cannot be sent; ``problem``
+    is why. However it ends, the driver brakes, and holds the joints once the last command has expired. Any
+    thread may call. Not a safety-rated channel.
+    """
+
+    def __init__(self, session: Session, robot: str, states: DriverStateListener) -> None:
+        self.robot = robot
+        self.problem = ""
+        """Why control has ended, or could not be taken or a stop not be confirmed; else empty."""
+        self._session = session
+        self._states = states
+        self._lock = fork_safe_lock()
+        self._control: _Control | None = None
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    @property
+    def has_control(self) -> bool:
+        """Whether moved sliders command the driver."""
+        control = self._control
+        return control is not None and not control.ended.is_set()
+
+    @property
+    def targets(self) -> dict[str, float]:
+        """The positions [rad] or [m] that are sent, by joint."""
+        control = self._control
+        return {} if control is None or control.ended.is_set() else control.targets
+
+    def take_control(self) -> bool:
+        """Become the robot's commander; whether that is so now. Waits up to some seconds."""
+        with self._lock:
+            if self.has_control or self._closed:
+                return self.has_control
+            self._join()
+            self.problem = ""
+            try:
+                control = self._control = self._open_control()
+            except ZStateError as error:
+                self.problem = str(error)
+                return False
+            self._thread = threading.Thread(
+                target=self._run, args=(control,), name="zstate slider commands", daemon=True
+            )
+            self._thread.start()
+            return True
+
+    def _open_control(self) -> _Control:
+        with ExitStack() as opening:
+            commander = opening.enter_context(Commander(self._session, self.robot, program="zstate view"))
+            state = commander.wait_for_driver()
+            opening.pop_all()
+        period_s = min(_SEND_PERIOD_S, 0.25e-9 * state.ttl)
+        return _Control(commander, period_s, state.session, set(state.stops))
+
+    def set(self, name: str, value: float) -> None:
+        """Send the position ``value`` [rad] or [m] of the joint ``name`` from now on.
+
+        Does nothing without control, and while the driver is stopped.
+        """
+        control, received = self._control, self._states.get(self.robot)
+        if control is not None and received is not None and received.state.state != "stopped":
+            control.targets = {**control.targets, name: value}
+
+    def release_control(self, problem: str = "") -> None:
+        """Send no more, because of ``problem`` unless a user wants it. Does not wait for the driver."""
+        control = self._control
+        if control is not None and not control.ended.is_set():
+            self.problem = problem
+            control.ended.set()
+
+    def stop(self) -> None:
+        """End control, and stop the driver until ``release_stops``. Waits up to a second for its reply."""
+        self.release_control()
+        self.problem = ""
+        try:
+            stop(self._session, self.robot, "the stop button of a page of zstate view")
+        except ZStateError as error:
+            self.problem = str(error)
+
+    def release_stops(self) -> None:
+        """Release the stops of the driver. Nothing moves by that. Waits up to some seconds.
+
+        Does nothing without control.
+        """
+        control = self._control
+        if control is not None and not control.ended.is_set():
+            try:
+                control.commander.release()
+            except ZStateError as error:
+                self.problem = str(error)
+
+    def close(self) -> None:
+        """End control. A second call does nothing."""
+        self.release_control()
+        with self._lock:
+            self._closed = True
+            self._join()
+
+    def _join(self) -> None:
+        if self._thread is not None:
+            self._thread.join(_JOIN_TIMEOUT_S)
+
+    def _run(self, control: _Control) -> None:
+        with control.commander:
+            while not control.ended.is_set():
+                problem = self._send(control)
+                if problem:
+                    self.problem = f"control has ended: {problem}"
+                    control.ended.set()
+                control.ended.wait(control.period_s)
+
+    def _send(self, control: _Control) -> str:
+        """Send the targets, if the driver is as it was when control began. Returns why control ends."""
+        received = self._states.get(self.robot)
+        problem = _problem_of(received, control)
+        if problem or received is None or received.state.state == "stopped" or not control.targets:
+            return problem
+        try:
+            control.commander.send(control.targets)
+        except ZStateError as error:
+            return str(error)
+        return ""
+
+
+def _problem_of(received: ReceivedState | None, control: _Control) -> str:
+    """Why the driver must not be commanded any more; empty if it may."""
+    if received is None or received.age_s > _SILENT_S:
+        return "the driver has published no state for a while"
+    state = received.state
+    if state.session != control.driver_session:
+        return "the driver has restarted"
+    has_new_stop = not control.stops.issuperset(state.stops)
+    return str(received) if has_new_stop or state.state in ("off", "fault") else ""

@@ -22,7 +22,13 @@ from zstate.rate import Rate
 from zstate.view.camera import FIELD_OF_VIEW, Camera, CameraPose, Visibility, fit_camera, robot_visibility
 from zstate.view.data_source import FixedFrame, ViewSource
 from zstate.view.panels import html
-from zstate.view.panels.control_panels import PlotsPanel, SlidersPanel, TimeCursor, TimePanel
+from zstate.view.panels.control_panels import (
+    DriversPanel,
+    PlotsPanel,
+    SlidersPanel,
+    TimeCursor,
+    TimePanel,
+)
 from zstate.view.panels.display_panels import (
     DisplayPanel,
     FramesPanel,
@@ -47,7 +53,8 @@ _NO_POSES: Poses = np.empty((0, 7))
 class View(Closeable):
     """Draws ``source`` on ``page`` at most ``rate_hz`` times a second; twice a second without a browser.
 
-    ``sliders`` belong to robots that are moved from the page; the caller closes them and the source.
+    ``sliders`` belong to robots that are moved from the page; the caller closes them and the source. Drivers
+    can be stopped from it, and with ``can_command`` a browser may take control of them.
     ``folders`` maps the text of each URDF file that the user named to its folder: a robot with such a URDF
     is drawn with every file that it names, other robots with files in packages only.
     ``fixed_frame`` and ``camera`` are the initial ones; the default camera shows all robots, in a picture
@@ -61,6 +68,7 @@ class View(Closeable):
         page: ViewServer,
         *,
         sliders: Sequence[SliderPublisher] = (),
+        can_command: bool = False,
         rate_hz: float = 30.0,
         folders: Mapping[str, Path] | None = None,
         fixed_frame: str = "",
@@ -72,7 +80,9 @@ class View(Closeable):
         self._rate_hz = rate_hz
         self._folders = folders or {}
         self.scene = Scene(page.server)
-        self.layout = PanelLayout(page.server, source, self.scene, sliders, fixed_frame)
+        self.layout = PanelLayout(
+            page.server, source, self.scene, sliders, fixed_frame, can_command=can_command
+        )
         self._camera = camera
         self._aspect = aspect
         self._version = -1
@@ -228,9 +238,9 @@ class View(Closeable):
 class PanelLayout(Closeable):
     """Adds the panels to the page of ``server``; ``sliders`` belong to the robots that are moved from it.
 
-    ``fixed_frame`` is selected at first. The drawing thread reads ``stamp`` and ``fixed`` for each picture,
-    and calls ``update`` with the snapshot on display a few times a second. ``fault`` is why the last picture
-    could not be drawn; empty if it was drawn.
+    With ``can_command`` drivers can be commanded from it, too. ``fixed_frame`` is selected at first. The
+    drawing thread reads ``stamp`` and ``fixed`` for each picture, and calls ``update`` with the snapshot on
+    display a few times a second. ``fault`` is why the last picture could not be drawn; empty if it was drawn.
     """
 
     def __init__(
@@ -240,6 +250,8 @@ class PanelLayout(Closeable):
         scene: Scene,
         sliders: Sequence[SliderPublisher] = (),
         fixed_frame: str = "",
+        *,
+        can_command: bool = False,
     ) -> None:
         gui = server.gui
         self._source = source
@@ -248,6 +260,7 @@ class PanelLayout(Closeable):
         self.cursor = TimeCursor(live=source.session is not None)
         self.fault = ""
         self._fault_html = gui.add_html("")
+        drivers = gui.add_folder(None)
         tabs = gui.add_tab_group()
         # The display panel is first: a fixed frame selected there applies to the other panels.
         with tabs.add_tab("View"):
@@ -263,6 +276,9 @@ class PanelLayout(Closeable):
             for publisher in sliders:
                 with gui.add_folder(f"Move {publisher.robot}"):
                     self._panels.append(SlidersPanel(gui, publisher))
+            if source.session is not None:
+                panel = DriversPanel(server, source, source.session, drivers, can_command=can_command)
+                self._panels.append(self._resources.enter_context(panel))
             with gui.add_folder("Plot"):
                 self._panels.append(PlotsPanel(gui, source))
         with tabs.add_tab("Time"):
@@ -294,5 +310,5 @@ class PanelLayout(Closeable):
             self._fault_html.content = html.paragraph(text, color=html.ALARM) if fault else ""
 
     def close(self) -> None:
-        """Stop monitoring the graph. A second call does nothing."""
+        """End control of drivers, and stop monitoring the graph. A second call does nothing."""
         self._resources.close()

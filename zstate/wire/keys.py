@@ -183,6 +183,11 @@ def driver_key(robot: str) -> str:
     return f"zstate/{check_robot(robot)}/driver"
 
 
+def driver_expression(robot: str) -> str:
+    """The key expression of the ``driver_key`` of ``robot``, or of all robots."""
+    return f"zstate/{_check_robot_or_any(robot)}/driver"
+
+
 def stop_key(robot: str, identity: str) -> str:
     """The key on which one program stops the driver of a robot."""
     return f"zstate/{check_robot(robot)}/stop/{identity}"

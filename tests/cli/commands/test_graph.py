@@ -12,6 +12,7 @@ from helpers.processes import until
 from zstate import StaticPublisher, TransformListener, connect, discover
 from zstate.cli.commands.graph import graph_drawing, graph_text
 from zstate.cli.output.drawing import dot, mermaid, svg
+from zstate.driving import Commander
 from zstate.net.graph import Graph, StreamUse
 
 DRIVER, PUBLISH, VIEWER = "driver@jetson pid 4", "zstate-publish@nuc pid 5", "viewer@desk pid 6"
@@ -104,3 +105,11 @@ def test_on_ros_side_topics_have_the_nodes_at_their_ends(ros_router: str):
     assert text.splitlines()[0] == "/joint_states, /robot_description, /tf, /tf_static"
     assert text.count("written by  /") == 1
     assert text.count("read by     none") == 1
+
+
+def test_commands_go_from_the_commander_to_the_driver(sessions, host_driver):
+    host_driver()
+    with Commander(sessions[1], "arm", program="teleop"):
+        text = zstate("graph", "arm").stdout.decode()
+    place = f"{socket.gethostname()} pid {os.getpid()}"
+    assert f"arm: joint_commands\n  written by  teleop@{place}\n  read by     driver@{place}\n" in text, text

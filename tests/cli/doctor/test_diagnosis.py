@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import time
@@ -12,10 +13,11 @@ from typing import Any
 
 import pytest
 from helpers.cli_runner import ALL_STREAMS, RRBOT, Spawn, failure, published_robot, started, zstate
-from helpers.processes import find_free_port, repeated
+from helpers.processes import DEADLINE_S, find_free_port, repeated, until
 
 from zstate import PartialStatePublisher, StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import ManualClock, SystemClock
+from zstate.driving import Commander, stop
 from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.wire.keys import Stream
@@ -571,3 +573,43 @@ def test_a_single_old_sample_is_a_known_pose():
     (poses,) = [check for check in report["checks"] if check["name"] == "poses"]
     assert poses["state"] == "ok"
     assert "rrbot/world is known" in poses["text"]
+
+
+def driver_checks(report: dict[str, Any]) -> dict[str, tuple[str, str]]:
+    """State and text of the checks of a driver, by name."""
+    names = ("driver", "commander", "commands")
+    return {one["name"]: (one["state"], one["text"]) for one in report["checks"] if one["name"] in names}
+
+
+def test_a_driver_its_commander_and_the_age_of_its_commands_are_checked(sessions, host_driver):
+    host = host_driver()
+    found = driver_checks(diagnosed("arm", code=0))
+    program = f"driver@{socket.gethostname()} pid {os.getpid()}"
+    assert found["driver"][1].startswith(f"{program}: ready; its loop runs at ")
+    assert found["commander"] == ("ok", "none: no program commands 'arm'")
+    assert found["commands"] == ("skipped", "the driver has accepted none yet")
+    with Commander(sessions[1], "arm", program="teleop") as teleop:
+        teleop.wait_for_driver(DEADLINE_S)
+        with repeated(lambda: teleop.send({"elbow": 0.1})):
+            until(lambda: host.state == "active")
+            found = driver_checks(diagnosed("arm", code=0))
+    commander = program.replace("driver", "teleop", 1)
+    assert f"active, commanded by {commander}" in found["driver"][1]
+    assert found["commander"] == ("ok", commander)
+    assert re.fullmatch(r"the newest is [\d.]+ ms old, valid for 250.0 ms at most", found["commands"][1])
+
+
+def test_a_stopped_driver_is_the_broken_link_with_the_reason_and_the_release(sessions, host_driver):
+    host_driver()
+    stop(sessions[1], "arm", "door open", timeout_s=DEADLINE_S)
+    found = broken_link("arm")
+    assert found["name"] == "driver"
+    assert re.search(r": stopped by .*: door open$", found["text"])
+    assert found["next"] == "zstate stop arm --release  # when it may move again"
+
+
+def test_a_commander_without_a_driver_is_broken(sessions):
+    with published_robot("arm"), Commander(sessions[0], "arm", program="teleop"):
+        found = broken_link("arm")
+    assert found["name"] == "driver"
+    assert found["text"].endswith("commands 'arm', which has no driver that publishes its state")

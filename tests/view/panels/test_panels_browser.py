@@ -6,6 +6,7 @@ import math
 import re
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from helpers.processes import repeated
@@ -15,6 +16,7 @@ from zstate import Transform, TransformPublisher
 from zstate.model.load import load_model
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import discover
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import OdometrySource, SquareDrive, WheelPair, WheelSource
 from zstate.view.sliders import SliderPublisher
@@ -79,8 +81,8 @@ class Panels:
 
 @pytest.fixture
 def panels(open_tab, show_view) -> Callable[..., Panels]:
-    def opened(session, *robots: str, sliders=()) -> Panels:
-        return Panels(open_tab(show_view(session, *robots, sliders=sliders).page.url))
+    def opened(session, *robots: str, **options: Any) -> Panels:
+        return Panels(open_tab(show_view(session, *robots, **options).page.url))
 
     return opened
 
@@ -125,6 +127,40 @@ def test_slider_panel_names_the_conflicting_writer(panels, sessions):
         until(lambda: not discover(sessions[0], 0.2))
         page.press("Try again")
         page.view_tab.text("Publishing r1 at 50 Hz")
+
+
+def test_sliders_command_a_driver_only_in_control_and_the_stop_button_ends_that(
+    panels, sessions, host_driver
+):
+    host = host_driver()
+    page = panels(sessions[1], "arm", can_command=True)
+    page.view_tab.text("Driver of arm: ready")
+    page.open("Joints")
+    page.view_tab.text("The sliders follow the joints")
+    page.field(ELBOW).fill("0.5")
+    until(lambda: page.field(ELBOW).input_value() == "0")
+    page.press("Command arm by sliders")
+    page.view_tab.text("In control: nothing is sent until a slider is moved.")
+    assert host.report().written == 0
+    page.field(ELBOW).fill("0.25")
+    with TransformListener(sessions[1], "arm") as listener:
+        listener.buffer.wait("base", "lower", timeout_s=TIMEOUT_S)
+        until(lambda: listener.buffer.joint_positions("arm")[0].tolist() == [0.0, 0.25])
+    page.view_tab.text("Driver of arm: active, commanded by zstate view@")
+    page.view_tab.save_screenshot("panels_driver")
+    page.press("STOP arm")
+    assert "the stop button" in page.view_tab.text("Driver of arm: stopped by").inner_text()
+    page.press("Command arm by sliders")
+    page.view_tab.text("In control of a stopped driver")
+    page.view_tab.save_screenshot("panels_driver_stopped")
+    written = host.report().written
+    page.press("Release the stop")
+    page.view_tab.text("Driver of arm: ready: released by zstate view@")
+    assert host.report().written == written
+    page.field(ELBOW).fill("-0.25")
+    until(lambda: host.state == "active")
+    page.tab.close()
+    until(lambda: host.state == "holding")
 
 
 def test_frame_search_selects_a_frame_and_its_pose_follows_the_fixed_frame(panels, sessions):

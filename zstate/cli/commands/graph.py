@@ -33,7 +33,8 @@ _PROGRAM_FILL = "#eef2ff"
 def graph_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show the writers and readers of the streams of ROBOT, or of all robots.
 
-    Programs that use zstate announce what they read and write; subscribers to raw keys do not appear.
+    Programs that use zstate announce what they read and write; subscribers to raw keys do not appear. Of a
+    robot with a driver, joint_commands go from its commander to the driver.
     Streams that are read but have no writer stand out. On a ROS wire: the nodes and the topics of robot
     states, in all namespaces.
 
@@ -82,7 +83,13 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.wire.registry import get_wire
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
-        always: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "transforms", "scan")
+        always: tuple[Stream, ...] = (
+            "joint_states",
+            "partial_joint_states",
+            "transforms",
+            "scan",
+            "joint_commands",
+        )
         for stream in always:
             statistics.subscribe(stream)
         robots = discover(session)

@@ -13,7 +13,7 @@ import click
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.cli import options
-from zstate.cli.metrics import listener_collector, serve_metrics, writer_collector
+from zstate.cli.metrics import driver_collector, listener_collector, serve_metrics, writer_collector
 from zstate.cli.options import open_clock
 from zstate.cli.output.console import (
     fail,
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
     from zstate.cli.edge_statistics import EdgeRow, EdgeStatistics
     from zstate.clock import Clock
+    from zstate.driving.driver_state import ReceivedState
     from zstate.ingest.counters import ListenerStats
     from zstate.metrics.buffer import MeteredBuffer
     from zstate.metrics.endpoint import BindAddress
@@ -87,8 +88,8 @@ def monitor_command(
     be looked up, and counts since the start: received, dropped here, missed on the way, late (older than the
     history), refused, and off the clock (stamped more than a minute away from the time here). Rate, age and
     latency are those of its joint states, if it has any; transforms besides them, and scans, have a rate of
-    their own. On a ROS wire this is /tf, all nodes together; with --robot, the joint states of a robot that
-    has a description.
+    their own. A robot with a driver has a second line, with the driver's state. On a ROS wire this is
+    /tf, all nodes together; with --robot, the joint states of a robot that has a description.
 
     \b
     zstate monitor
@@ -117,7 +118,12 @@ def monitor_command(
         if robots:
             monitor = opened.enter_context(RobotMonitor(session, directory, robot, wire, selected_clock))
             opened.enter_context(
-                serve_metrics(metrics, listener_collector(monitor.robots), writer_collector(directory))
+                serve_metrics(
+                    metrics,
+                    listener_collector(monitor.robots),
+                    writer_collector(directory),
+                    driver_collector(monitor.drivers),
+                )
             )
             _report_robots(monitor, once_s, as_json=as_json)
             return
@@ -282,6 +288,7 @@ class RobotMonitor(Closeable):
     def __init__(
         self, session: Session, directory: RobotDirectory, robot: str, wire: str, clock: Clock | None
     ) -> None:
+        from zstate.driving.driver_state import DriverStateListener
         from zstate.net.topic_statistics import TopicStatistics
         from zstate.wire.registry import get_wire
 
@@ -292,6 +299,8 @@ class RobotMonitor(Closeable):
         self._listeners: dict[Follow, tuple[TransformListener, MeteredBuffer]] = {}
         self._robots: BoundedDict[str, MonitoredRobot] = BoundedDict()
         self._opened = ExitStack()
+        self.drivers = self._opened.enter_context(DriverStateListener(session, robot))
+        """Those of the native wire; other wires have none."""
         scans = TopicStatistics(session, get_wire(wire), sources=lambda name, _, __: (name,), clock=clock)
         self._scans = self._opened.enter_context(scans)
         scans.subscribe("scan", robot)
@@ -349,14 +358,16 @@ class RobotMonitor(Closeable):
     def report(self, *, as_json: bool) -> None:
         from zstate.cli.edge_statistics import time_text
 
+        drivers = self.drivers.states()
         for one in self.robots():
             measure, stats = one.buffer.measure(one.robot), one.stats
+            driver = drivers.get(one.robot)
             scans = self._scans.get(one.robot)
             window = None if scans is None else scans.recent(_SCANS_WITHIN_NS)
             scans_hz = None if window is None else window.rate_hz
             if as_json:
                 facts = {"robot": one.robot, **asdict(measure), "scans_hz": scans_hz, **asdict(stats)}
-                print_json(facts)
+                print_json({**facts, "driver": None if driver is None else _driver_facts(driver)})
                 continue
             rate = _rate_text(one.buffer.statistics_of(one.robot), measure.rate_hz)
             if measure.transforms_hz is not None:
@@ -373,6 +384,35 @@ class RobotMonitor(Closeable):
                 f"{f' ({reasons})' if reasons else ''}"
                 f"{f'  off the clock {stats.off_clock}' if stats.off_clock else ''}"
             )
+            if driver is not None:
+                print_wrapped(f"{one.robot}  driver {_driver_text(driver)}")
+
+
+def _driver_text(driver: ReceivedState) -> str:
+    """The state of a driver, the age of its newest command, and counts since its start."""
+    from zstate.cli.edge_statistics import time_text
+
+    state = driver.state
+    age_s = None if state.command_age is None else state.command_age * 1e-9
+    reasons = ", ".join(f"{reason} {count}" for reason, count in state.refused.items())
+    limited = ", ".join(state.limited)
+    return (
+        f"{driver}  loop {rate_text(state.rate_hz)}  skipped {state.skipped}  faults {state.faults}  "
+        f"command age {time_text(age_s)}  refused {sum(state.refused.values())}"
+        f"{f' ({reasons})' if reasons else ''}"
+        f"{f'  slowed by limits {limited}' if limited else ''}"
+        f"{f'  last motion {driver.last_motion}' if driver.last_motion else ''}"
+    )
+
+
+def _driver_facts(driver: ReceivedState) -> dict[str, Any]:
+    """The same for JSON: the fields of its state, ages in seconds."""
+    state = driver.state
+    names = ("program", "state", "reason", "commander", "rate_hz", "ticks", "skipped", "faults", "refused")
+    facts: dict[str, Any] = {name: getattr(state, name) for name in names}
+    facts["command_age_s"] = None if state.command_age is None else state.command_age * 1e-9
+    facts["motion_progress"] = None if state.motion is None else state.progress
+    return {**facts, "last_motion": driver.last_motion, "age_s": driver.age_s}
 
 
 def _rate_text(statistics: IntervalStatistics, rate_hz: float | None) -> str:

@@ -99,7 +99,8 @@ def record_command(
 
     Writes ROS 2 messages, which Foxglove, PlotJuggler, Rerun and rosbags read directly. Each file of a split
     recording is complete by itself: the model and the fixed edges are written at its start and every 10 s,
-    a map at its start and when it changes. After a crash all but the last 0.5 s is in the file; `zstate
+    a map at its start and when it changes. Commands of drivers are on the topic joint_commands, as joint
+    states. After a crash all but the last 0.5 s is in the file; `zstate
     recover` makes a complete file of it.
 
     FILE may have the start time in its name: %Y %m %d %H %M %S are replaced by the local time (also %y and

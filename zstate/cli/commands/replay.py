@@ -67,6 +67,8 @@ def replay_command(
     FILE is an MCAP file of `zstate record`, or a ROS 2 bag. The time of the recording is published on
     zstate/clock, and on /clock for a ROS wire. Fails if the same robots have live writers, unless --takeover.
 
+    Recorded commands of drivers are never published: a replay moves no hardware.
+
     A recording of maps alone, or of models and static edges, has no samples: they are published until Ctrl-C,
     or for --duration.
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _RECORDINGS = (".mcap", ".db3")
 _DISCOVERY_S = 0.3
+_DRIVER_WITHIN_S = 0.5
 _ANNOUNCED_WITHIN_S = 5.0
 # Several robots are rarely announced at once.
 _OTHERS_WITHIN_S = 0.5
@@ -67,7 +68,11 @@ def _point(text: str) -> tuple[float, float, float]:
 
 @click.command("view")
 @click.argument("robots", nargs=-1, metavar="[ROBOT [NAME:=VALUE]...]...")
-@click.option("--sliders", is_flag=True, help="Move robots from the page, and publish their joint states.")
+@click.option(
+    "--sliders",
+    is_flag=True,
+    help="Move robots from the page: command their drivers, or publish joint states.",
+)
 @click.option(
     "--host", default="127.0.0.1", show_default=True, help="Listen at this address; 0.0.0.0 is all of them."
 )
@@ -122,8 +127,13 @@ def view_command(
     address; the connection is not encrypted.
 
     With --sliders you move each ROBOT from the page: an announced robot, or a name or file as for `zstate
-    publish`, with NAME:=VALUE for xacro. It must have no other writer of joint states. A ROBOT may also be a
-    recording. --snapshot needs an installed Chromium, but no screen. Needs viser: pip install 'zstate[view]'.
+    publish`, with NAME:=VALUE for xacro. It must have no other writer of joint states than its driver. A
+    ROBOT may also be a recording. --snapshot needs an installed Chromium, but no screen. Needs viser: pip
+    install 'zstate[view]'.
+
+    A robot with a driver has a stop button; it is no emergency stop. With --sliders a browser can take
+    control of the driver. It then commands each joint from the first move of its slider, until it releases
+    control or leaves the page, or the driver is stopped; the driver holds the joints.
 
     Meshes package://NAME/... are searched below the folders in ROS_PACKAGE_PATH, in share/ of those in
     AMENT_PREFIX_PATH, and in example-robot-data. Relative paths, and packages around the URDF file, are used
@@ -171,7 +181,8 @@ def view_command(
             session = opened.enter_context(open_session(network, (wire,)))
             if sliders:
                 moved = [(one, opened.enter_context(its)) for one, its in _open_sliders(session, named, wire)]
-                named, publishers = [one for one, _ in moved], [its for _, its in moved]
+                named = [one for one, _ in moved]
+                publishers = [its for _, its in moved if not _has_driver(session, its)]
             selected_clock = opened.enter_context(open_clock(session, clock, wire))
             source = opened.enter_context(
                 ViewSource(session, [one.robot for one in named], wire=wire, clock=selected_clock)
@@ -182,6 +193,7 @@ def view_command(
                 source,
                 page,
                 sliders=publishers,
+                can_command=sliders,
                 rate_hz=rate,
                 folders={one.model.urdf: one.folder for one in named if one.model and one.folder},
                 fixed_frame=fixed_frame,
@@ -248,10 +260,21 @@ def _open_sliders(
             model = _receive_model(session, one.robot, wire)
         elif model is None:
             selected, model = _load_named(one.robot)
-        sliders = SliderPublisher(session, model, selected.robot, wires=(wire,))
-        if sliders.conflict:
-            print_status(f"{selected.robot!r} is not moved: {sliders.conflict}", robot=selected.robot)
-        yield selected, sliders
+        yield selected, SliderPublisher(session, model, selected.robot, wires=(wire,))
+
+
+def _has_driver(session: Session, sliders: SliderPublisher) -> bool:
+    """Whether the robot of ``sliders`` is moved by its driver; prints any other reason for not moving it."""
+    from zstate.driving.stops import wait_for_state
+
+    robot = sliders.robot
+    if not sliders.conflict:
+        return False
+    if wait_for_state(session, robot, lambda state: state.state != "off", _DRIVER_WITHIN_S) is not None:
+        print_status(f"{robot!r} has a driver: take control of it on the page, tab Joints", robot=robot)
+        return True
+    print_status(f"{robot!r} is not moved: {sliders.conflict}", robot=robot)
+    return False
 
 
 def _receive_model(session: Session, robot: str, wire: str) -> RobotModel:

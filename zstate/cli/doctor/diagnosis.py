@@ -9,13 +9,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from difflib import get_close_matches
-from importlib import import_module, metadata
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from zstate import __version__
+from zstate.cli.commands import load_command
 from zstate.cli.doctor.check import Check, broken, ok, warning
 from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import RosMessages, is_ros, messages_for, publish_command_for
@@ -108,7 +109,7 @@ def with_same_options(command: str, network: SessionOptions, wire: str) -> str:
     program, *words = text.split() or [""]
     if program != "zstate":
         return command
-    parameters = getattr(import_module(f"zstate.cli.commands.{words[0]}"), f"{words[0]}_command").params
+    parameters = load_command(words[0]).params
     accepted = {option for parameter in parameters for option in parameter.opts}
     wires = ("--wire", wire) if wire != "native" else ()
     endpoints = tuple(word for endpoint in network.connect for word in ("--connect", endpoint))

@@ -1,4 +1,4 @@
-"""Checks of one robot: writers, model, samples, joint limits, static edges and poses."""
+"""Checks of one robot: writers, model, driver, samples, joint limits, static edges and poses."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from zstate.cli.doctor.robot_probe import RobotProbe, StreamSamples, WriterSampl
 from zstate.cli.frame_checks import similar_frames, without_program_advice
 from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import publish_command_for
+from zstate.driving.driver_state import ReceivedState
 from zstate.errors import LookupFailed, ModelError, format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.model.robot import RobotModel, coordinate_names, representative_links
@@ -19,10 +20,13 @@ from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, foreign_edge_problem, full_name
-from zstate.wire.messages import Status
+from zstate.wire.messages import DriverState, Status
 
 _MIN_RECEIVED = 0.8
 """The least ratio of received to sent samples."""
+
+_MAX_SKIPPED = 0.01
+"""The greatest ratio of the skipped to the due ticks of a driver's loop."""
 
 _MIN_RATE = 0.95
 """The least ratio of the achieved to the commanded rate."""
@@ -52,6 +56,7 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
         return
     model, check = model_check(probe)
     yield check
+    yield from driver_checks(probe)
     if probe.info.part_names and "joint_states" not in probe.streams:
         yield from _parts_checks(probe, model)
     elif not probe.has_only_transforms:
@@ -141,6 +146,70 @@ def model_check(probe: RobotProbe) -> tuple[RobotModel | None, Check]:
         text += f"; {count_text(len(model.findings), 'warning')}, such as line {first.line}: {first.message}"
         return model, warning("model", text, "zstate check FILE")
     return model, ok("model", text)
+
+
+def driver_checks(probe: RobotProbe) -> Iterator[Check]:
+    """Whether the robot's driver works, which program commands it, and how old its commands are.
+
+    Nothing for a robot without a driver and a commander.
+    """
+    robot, received = probe.info.name, probe.driver
+    commanders = probe.writers("joint_commands")
+    if received is None:
+        if commanders:
+            text = f"{commanders[-1]} commands {robot!r}, which has no driver that publishes its state"
+            yield broken("driver", text, "zstate ls  # start the program with its DriverHost")
+        return
+    yield _driver_check(robot, received)
+    if received.is_live and received.state.state not in ("off", "fault"):
+        yield _commander_check(robot, received.state, commanders)
+        yield _commands_check(received.state)
+
+
+def _driver_check(robot: str, received: ReceivedState) -> Check:
+    """Whether the driver can be commanded, and its loop keeps its rate."""
+    state, monitor = received.state, f"zstate monitor --robots --robot {robot}"
+    text = f"{state.program}: {received}"
+    if state.state == "stopped":
+        return broken("driver", text, f"zstate stop {robot} --release  # when it may move again")
+    if state.state == "fault":
+        return broken("driver", text, f"zstate ls  # restart {state.program}, then release the stop")
+    if state.state == "off" or not received.is_live:
+        return broken("driver", text, f"zstate ls  # shows whether {state.program} runs")
+    text += f"; its loop runs at {state.rate_hz:.1f} Hz"
+    if state.faults:
+        text += f"; {count_text(state.faults, 'call')} of the driver failed, the first is in its log"
+        return warning("driver", text, monitor)
+    if state.skipped > _MAX_SKIPPED * (state.ticks + state.skipped):
+        due = state.ticks + state.skipped
+        text += f", and skipped {state.skipped} of {due} ticks: the driver or the machine is too slow for it"
+        return warning("driver", text, monitor)
+    return ok("driver", text)
+
+
+def _commander_check(robot: str, state: DriverState, commanders: Sequence[WriterId]) -> Check:
+    """Which program commands the driver, and whether its commands can be used."""
+    text = f"none: no program commands {robot!r}"
+    if commanders:
+        text = f"{commanders[-1]}, which has sent no command yet"
+        if state.commander == str(commanders[-1]):
+            text = state.commander
+    if state.refused:
+        refused = ", ".join(f"{reason} {count}" for reason, count in state.refused.items())
+        text += f"; commands were refused ({refused}), the newest: {state.last_refusal}"
+        return warning("commander", text, f"zstate monitor --robots --robot {robot}")
+    return ok("commander", text)
+
+
+def _commands_check(state: DriverState) -> Check:
+    """Whether commands arrive before the last one expires."""
+    if state.command_age is None:
+        return skipped("commands", "the driver has accepted none yet")
+    age, ttl = format_duration(state.command_age), format_duration(state.ttl)
+    text = f"the newest is {age} old, valid for {ttl} at most"
+    if state.state == "holding":
+        text += ": the joints are held until the next"
+    return ok("commands", text)
 
 
 def _samples_check(probe: RobotProbe) -> Check:

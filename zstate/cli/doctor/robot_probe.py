@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate.cli.waiting import ConditionWaiter
+from zstate.driving.driver_state import DriverStateListener, ReceivedState
 from zstate.errors import Unreachable
 from zstate.ingest.events import WriterEvent
 from zstate.model.robot import RobotModel, coordinate_names
@@ -132,7 +133,7 @@ class RobotProbe(Closeable):
     ``neighbours`` are all announced robots. ``on_change()`` is called after each description and sample.
     ``nodes`` are the samples of each stream by ROS node, on a ROS wire; ``transforms`` and ``parts``, the
     partial joint states, are the samples of these streams by writer, on the native wire. ``scans`` are those
-    of its laser scanners, ``maps`` its maps by name.
+    of its laser scanners, ``maps`` its maps by name; ``driver`` is the state of its driver.
     """
 
     def __init__(
@@ -166,6 +167,7 @@ class RobotProbe(Closeable):
             self.samples = opening.enter_context(samples)
             self.transforms: StreamSamples | None = None
             self.parts: StreamSamples | None = None
+            self._drivers: DriverStateListener | None = None
             scans = StreamSamples(session, info.name, "scan", wire_format, on_change)
             self.scans = opening.enter_context(scans)
             if info.map_names:
@@ -177,6 +179,7 @@ class RobotProbe(Closeable):
                 transforms = StreamSamples(session, info.name, "transforms", wire_format)
                 self.transforms = opening.enter_context(transforms)
                 opening.enter_context(StatusSubscriber(session, info.name, self._on_status))
+                self._drivers = opening.enter_context(DriverStateListener(session, info.name))
             for stream in () if is_native else _ROS_STREAMS:
                 nodes = StreamSamples(session, info.name, stream, wire_format)
                 self.nodes[stream] = opening.enter_context(nodes)
@@ -220,6 +223,11 @@ class RobotProbe(Closeable):
         """The writer with this session number."""
         names = {writer.session: str(writer) for _, writer in self.info.writers}
         return names.get(session, "an unannounced writer")
+
+    @property
+    def driver(self) -> ReceivedState | None:
+        """The newest state of the robot's driver; None if none has arrived."""
+        return None if self._drivers is None else self._drivers.get(self.info.name)
 
     @property
     def is_incomplete(self) -> bool:

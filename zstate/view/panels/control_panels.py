@@ -1,11 +1,11 @@
-"""Tabs Joints and Time: sliders that move a robot, plots of its joints, and the instant on display."""
+"""Tabs Joints and Time: sliders that move a robot or command its driver, plots, the instant on display."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from datetime import datetime
 
 import numpy as np
@@ -13,16 +13,21 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
+from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.snapshot import TimeSpan
 from zstate.clock import SYSTEM
-from zstate.errors import InvalidInput
-from zstate.model.robot import coordinate_names
+from zstate.driving.driver_state import DriverStateListener, ReceivedState
+from zstate.errors import InvalidInput, LookupFailed, format_duration
+from zstate.model.robot import RobotModel, coordinate_names
+from zstate.net.session import Session
 from zstate.view.data_source import ViewSource
 from zstate.view.panels import html
 from zstate.view.panels.html import format_number
 from zstate.view.panels.panel import BoundWidget, PanelContext
-from zstate.view.sliders import SliderPublisher, SliderSpec
+from zstate.view.sliders import SliderCommander, SliderMapping, SliderPublisher, SliderSpec
+from zstate.wire.keys import ANY
+from zstate.wire.messages import DriverState
 
 _UNITS: tuple[str, ...] = ("rad", "deg")
 _NO_ROBOT: tuple[str, ...] = ("(none)",)
@@ -104,16 +109,21 @@ class SlidersPanel:
         publisher, unit = self._publisher, self._unit.value
         with self._folder:
             specs = zip(publisher.mapping.specs, publisher.values.tolist(), strict=True)
-            return [_JointSlider(self._gui, publisher, spec, value, unit) for spec, value in specs]
+            return [_JointSlider(self._gui, publisher.set, spec, value, unit) for spec, value in specs]
 
 
 class _JointSlider:
-    """One slider, in the unit on display."""
+    """One slider, in the unit on display; ``set_value(name, value)`` is called when the user moves it."""
 
     def __init__(
-        self, gui: viser.GuiApi, publisher: SliderPublisher, spec: SliderSpec, value: float, angle_unit: str
+        self,
+        gui: viser.GuiApi,
+        set_value: Callable[[str, float], None],
+        spec: SliderSpec,
+        value: float,
+        angle_unit: str = "rad",
     ) -> None:
-        self._publisher = publisher
+        self._set_value = set_value
         self._spec = spec
         unit = angle_unit if spec.unit == "rad" else spec.unit
         self._scale, self._precision = (math.degrees(1.0), 1) if unit == "deg" else (1.0, 3)
@@ -141,7 +151,167 @@ class _JointSlider:
         if event.client is not None and math.isfinite(value):
             # A limit is rounded for display, maybe to a value beyond it.
             limited = float(np.clip(value / self._scale, self._spec.lower, self._spec.upper))
-            self._publisher.set(self._spec.name, limited)
+            self._set_value(self._spec.name, limited)
+
+
+class DriversPanel(Closeable):
+    """The drivers of the robots on display: their states and stop buttons in ``top``, figures here.
+
+    With ``can_command`` there are sliders, too, that command a driver for the browser that has taken control.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        source: ViewSource,
+        session: Session,
+        top: viser.GuiFolderHandle,
+        *,
+        can_command: bool,
+    ) -> None:
+        self._server = server
+        self._source = source
+        self._session = session
+        self._top = top
+        self._can_command = can_command
+        self._folder = server.gui.add_folder(None)
+        self._drivers: dict[str, _DriverPanel] = {}
+        self._sliders: dict[str, _DriverSliders] = {}
+        self._resources = ExitStack()
+        self._states = self._resources.enter_context(DriverStateListener(session, ANY))
+        server.on_client_disconnect(self._on_left)
+
+    def update(self, context: PanelContext) -> None:
+        models = self._source.models
+        for robot, received in self._states.states().items():
+            if robot in models and robot not in self._drivers:
+                self._add(robot, models[robot], received.state)
+            if robot in self._drivers:
+                self._drivers[robot].update(received)
+            if robot in self._sliders:
+                self._sliders[robot].update(received.state, context)
+
+    def _add(self, robot: str, model: RobotModel, state: DriverState) -> None:
+        gui = self._server.gui
+        commander = SliderCommander(self._session, robot, self._states)
+        self._resources.enter_context(commander)
+        with self._folder, gui.add_folder(f"Driver of {robot}"):
+            self._drivers[robot] = _DriverPanel(gui, commander, self._top)
+            if self._can_command:
+                self._sliders[robot] = _DriverSliders(self._server, commander, model, state.joint_names)
+
+    def _on_left(self, client: viser.ClientHandle) -> None:
+        for sliders in list(self._sliders.values()):
+            sliders.release_if_of(client.client_id)
+
+    def close(self) -> None:
+        """End control of all drivers. A second call does nothing."""
+        self._resources.close()
+
+
+class _DriverPanel:
+    """The state of one driver and the button that stops it, in ``top``, and its figures."""
+
+    def __init__(self, gui: viser.GuiApi, commander: SliderCommander, top: viser.GuiFolderHandle) -> None:
+        self._robot = commander.robot
+        with top:
+            self._state = gui.add_html("")
+            hint = "Stops its driver until the stop is released. An emergency stop is wired to the power."
+            stop = gui.add_button(f"STOP {self._robot}", color="red", hint=hint)
+        self._figures = gui.add_html("")
+
+        def on_click(_: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            commander.stop()
+
+        stop.on_click(on_click)
+
+    def update(self, received: ReceivedState) -> None:
+        state = received.state
+        is_alarm = not received.is_live or state.state in ("stopped", "fault")
+        text = f"Driver of {self._robot}: {received}"
+        self._state.content = html.paragraph(text, color=html.ALARM if is_alarm else "")
+        refused = ", ".join(f"{reason} {count}" for reason, count in state.refused.items())
+        rows = [("program", state.program), ("loop", f"{state.rate_hz:.1f} Hz, {state.skipped} skipped")]
+        if state.command_age is not None:
+            age = format_duration(state.command_age)
+            rows += [("commander", state.commander), ("newest command", f"{age} ago")]
+        rows.append(("failed calls", str(state.faults)))
+        if state.refused:
+            rows += [("refused", refused), ("newest refusal", state.last_refusal)]
+        if received.last_motion:
+            rows.append(("last motion", received.last_motion))
+        if state.limited:
+            rows.append(("slowed by limits", ", ".join(state.limited)))
+        self._figures.content = html.pairs(rows)
+
+
+class _DriverSliders:
+    """Buttons that take and release control of a driver, and a slider for each of its joints.
+
+    Sliders follow the joints until they are moved. Nothing is sent before, and a stop is released by a
+    button of its own: neither opening the page nor taking control moves anything.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        commander: SliderCommander,
+        model: RobotModel,
+        joint_names: Sequence[str],
+    ) -> None:
+        gui = server.gui
+        self._server = server
+        self._commander = commander
+        self._client: int | None = None
+        self._columns = model.columns
+        self._positions = model.neutral
+        self._text = gui.add_html("")
+        self._take = gui.add_button(f"Command {commander.robot} by sliders")
+        self._release = gui.add_button("Stop commanding", visible=False)
+        self._release_stops = gui.add_button("Release the stop", color="orange", visible=False)
+        self._take.on_click(self._on_take)
+        self._release.on_click(lambda _: commander.release_control())
+        self._release_stops.on_click(lambda _: commander.release_stops())
+        specs = {spec.name: spec for spec in SliderMapping(model).specs}
+        self._sliders = {
+            name: _JointSlider(gui, commander.set, specs[name], 0.0) for name in joint_names if name in specs
+        }
+
+    def _on_take(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        if self._commander.has_control:
+            return
+        self._client = event.client_id
+        if self._commander.take_control() and event.client_id not in self._server.get_clients():
+            self.release_if_of(event.client_id)
+
+    def release_if_of(self, client: int | None) -> None:
+        """End control if the browser ``client``, which has left, had taken it."""
+        if client == self._client:
+            self._commander.release_control("the browser that had taken control has left the page")
+
+    def update(self, state: DriverState, context: PanelContext) -> None:
+        commander, targets = self._commander, self._commander.targets
+        has_control, is_stopped = commander.has_control, state.state == "stopped"
+        self._take.visible, self._release.visible = not has_control, has_control
+        self._release_stops.visible = has_control and is_stopped
+        is_known = False
+        with suppress(LookupFailed, InvalidInput):  # no samples yet, or the robot has been removed
+            self._positions, _ = context.buffer.joint_positions(commander.robot)
+            is_known = True
+        for name, slider in self._sliders.items():
+            value = targets.get(name, float(self._positions[self._columns[name]]))
+            slider.show(value, disabled=not (has_control and is_known) or is_stopped)
+        if commander.problem:
+            self._text.content = html.paragraph(commander.problem, color=html.ALARM)
+        elif has_control and is_stopped:
+            self._text.content = html.paragraph(
+                "In control of a stopped driver. Nothing moves before its release."
+            )
+        elif has_control:
+            sent = f"sending {', '.join(targets)}" if targets else "nothing is sent until a slider is moved"
+            self._text.content = html.paragraph(f"In control: {sent}.")
+        else:
+            self._text.content = html.paragraph("The sliders follow the joints, and command nothing.")
 
 
 class PlotsPanel:

@@ -1,0 +1,163 @@
+"""zstate drive: drivers of this package and of a user's file, as processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started
+from helpers.processes import DEADLINE_S, Child, until
+
+from zstate import TransformListener, connect
+from zstate.driving import Commander
+
+pytestmark = pytest.mark.processes
+
+ARM = """
+import os
+from pathlib import Path
+from zstate.driving import SimulatedDriver
+
+class Arm(SimulatedDriver):
+    def __init__(self, model, joint_names, log: str, failures: bool = False):
+        super().__init__(model, "mirror")
+        self.log, self.failures = Path(log), failures
+        self.log.write_text(f"{' '.join(joint_names)} ")
+
+    def read(self, stamp):
+        if self.failures:
+            raise OSError("no reply from servo 3")
+        return super().read(stamp)
+
+    def close(self):
+        self.log.write_text(self.log.read_text() + "closed")
+
+class Unreachable(Arm):
+    def open(self):
+        raise ConnectionError("/dev/ttyUSB0 is gone")
+
+class Nothing:
+    pass
+"""
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> str:
+    """The file of a driver."""
+    file = tmp_path / "arm.py"
+    file.write_text(ARM)
+    return str(file)
+
+
+def line_with(child: Child, text: str) -> str:
+    while text not in (line := child.line()):
+        pass
+    return line
+
+
+def test_changes_of_state_are_lines_and_the_end_is_a_report(spawn: Spawn):
+    child = started(spawn, "drive", "sim", "rrbot", "--ttl", "0.5")
+    assert child.line() == (
+        "driving 'rrbot' (2 joints, sim) at 100 Hz; the joints hold after 500.0 ms without a command"
+    )
+    assert child.line() == "ready"
+    with connect() as session, Commander(session, "rrbot", program="teleop") as commander:
+        commander.wait_for_driver(DEADLINE_S)
+        until(lambda: _is_moved(commander))
+        assert child.line().startswith("active by teleop@")
+        assert child.line().startswith("holding: nothing from teleop@")
+        with TransformListener(session, "rrbot") as listener:
+            assert listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
+    interrupted(child)
+    assert " samples; commanded 100 Hz, achieved " in child.line()
+    assert child.line().startswith("late by ")
+    assert child.line().endswith(" written, 0 failures of the driver, commands refused: none")
+
+
+def _is_moved(commander: Commander) -> bool:
+    commander.send({"elbow": 0.1})
+    return commander.driver is not None and commander.driver.state == "active"
+
+
+def test_driver_of_a_file_gets_its_parameters_and_is_closed_at_the_end(
+    spawn: Spawn, arm: str, tmp_path: Path
+):
+    log = tmp_path / "log.txt"
+    child = started(spawn, "drive", f"{arm}:Arm", "rrbot", "--name", "left", "--param", f"log={log}")
+    line_with(child, "ready")
+    assert log.read_text() == "shoulder elbow "
+    child.process.send_signal(signal.SIGTERM)
+    assert child.wait() == 128 + signal.SIGTERM
+    assert log.read_text() == "shoulder elbow closed"
+
+
+def test_driver_that_fails_three_times_in_a_row_ends_the_command_stopped(
+    spawn: Spawn, arm: str, tmp_path: Path
+):
+    given = ("drive", f"{arm}:Arm", "rrbot", "--param", f"log={tmp_path / 'log.txt'}")
+    child = started(spawn, *given, "--param", "failures=true")
+    assert child.wait() == 1
+    assert "'rrbot' is stopped: the driver failed in 3 ticks in a row" in child.stderr
+    assert "no reply from servo 3" in child.stderr
+    assert line_with(child, "failures of the driver").startswith("0 setpoints written, 3 failures")
+    # The stop is kept for the next host.
+    again = started(spawn, *given)
+    line_with(again, "stopped by zstate-drive@")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "error"),
+    [
+        (("arm.urdf",), 2, "'arm.urdf' is neither 'sim' nor FILE.py:CLASS"),
+        (("gone.py:Arm",), 2, "there is no file 'gone.py'"),
+        (("ARM:Amr",), 1, "has no 'Amr'; did you mean 'Arm'?"),
+        (("ARM:Arm",), 1, "missing a required argument: 'log'; it is "),
+        (("ARM:Arm", "--param", "port"), 2, "'port' is not a parameter; write KEY=VALUE"),
+        (("ARM:Nothing",), 1, "is no driver: it has no joint_names, modes, open, enable, read, write"),
+        (("ARM:Unreachable", "--param", "log=/dev/null"), 1, "ConnectionError: /dev/ttyUSB0 is gone ("),
+        (("ARM:Arm", "--plant", "lag"), 2, "--plant is of `sim`"),
+        (("sim", "--velocity", "elbow=fast"), 2, "'elbow=fast' is not JOINT=VALUE with a number"),
+        (("sim", "--velocity", "9"), 1, "velocity 9 of 'shoulder' is above 2.5, the limit in the URDF"),
+        (("sim", "--velocity", "1", "--velocity", "elbow=2"), 2, "--velocity is one number for all joints"),
+    ],
+)
+def test_unusable_drivers_and_options_are_refused(
+    arm: str, arguments: tuple[str, ...], code: int, error: str
+):
+    driver, *rest = arguments
+    assert error in failure("drive", driver.replace("ARM", arm), "rrbot", *rest, code=code)
+
+
+def test_joint_without_a_velocity_limit_needs_one(tmp_path: Path):
+    urdf = tmp_path / "wheel.urdf"
+    urdf.write_text(
+        "<robot name='wheel'><link name='a'/><link name='b'/><joint name='turn' type='continuous'>"
+        "<parent link='a'/><child link='b'/></joint></robot>"
+    )
+    message = failure("drive", "sim", str(urdf), code=2)
+    assert "no limit for the velocity of turn; give one, such as --velocity turn=1.0" in message
+
+
+def test_second_host_of_a_robot_is_refused_with_the_name_of_the_first(spawn: Spawn):
+    child = started(spawn, "drive", "sim", "rrbot")
+    line_with(child, "ready")
+    message = failure("drive", "sim", "rrbot")
+    assert f"zstate-drive@{os.uname().nodename} pid {child.process.pid}" in message
+
+
+def test_up_starts_a_driver_as_a_program_and_closes_it(spawn: Spawn, arm: str, tmp_path: Path):
+    log = tmp_path / "log.txt"
+    run = ["zstate", "drive", "arm.py:Arm", RRBOT, "--param", f"log={log}"]
+    cell = tmp_path / "cell.toml"
+    cell.write_text(
+        f"[[program]]\nname = 'driver'\nrun = {json.dumps(run)}\n"
+        "[[program]]\nname = 'note'\nrun = 'echo driven'\nafter = 'driver'\n"
+    )
+    child = started(spawn, "up", str(cell))
+    assert "driving 'rrbot' (2 joints, arm.py:Arm)" in line_with(child, "driv")
+    line_with(child, "driven")
+    interrupted(child)
+    assert log.read_text() == "shoulder elbow closed"

@@ -1,0 +1,340 @@
+"""zstate drive: the host of a driver, the one program that owns a robot's hardware."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import sys
+import traceback
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import click
+
+from zstate._util.closeable import Closeable
+from zstate._util.format import did_you_mean
+from zstate.cli import options
+from zstate.cli.options import load_robot
+from zstate.cli.output.console import count_text, fail, print_wrapped, report_text
+from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import InvalidInput, MessageError, ZStateError, format_duration
+
+if TYPE_CHECKING:
+    from zstate.driving import Driver, DriverHost, DriverReport, Limits
+    from zstate.driving.driver_state import Spread
+    from zstate.model.robot import RobotModel
+    from zstate.net.session import Session
+    from zstate.wire.messages import DriverState
+    from zstate.wire.protocol import SerializedSample
+
+_SIMULATED = "sim"
+_MODULE = "zstate_driver"
+"""The name of the module that a driver's file becomes."""
+
+_Limit: TypeAlias = "tuple[str | None, float]"
+"""A number for the joint of this name, or for all joints."""
+
+
+def _check_driver(text: str) -> str:
+    file, _, name = text.rpartition(":")
+    if text == _SIMULATED or (name.isidentifier() and Path(file).is_file()):
+        return text
+    if name.isidentifier() and file.endswith(".py"):
+        raise InvalidInput(f"there is no file {file!r}")
+    raise InvalidInput(f"{text!r} is neither 'sim' nor FILE.py:CLASS, such as servos.py:ServoBus")
+
+
+def _parse_parameter(text: str) -> tuple[str, Any]:
+    key, sign, value = text.partition("=")
+    if not sign or not key.isidentifier():
+        raise InvalidInput(f"{text!r} is not a parameter; write KEY=VALUE, such as port=/dev/ttyUSB0")
+    try:
+        return key, json.loads(value)
+    except ValueError:
+        return key, value
+
+
+def parse_joint_value(text: str) -> tuple[str, float]:
+    """``JOINT=VALUE``. Raises InvalidInput."""
+    joint, sign, value = text.partition("=")
+    try:
+        if joint and sign:
+            return joint, float(value)
+    except ValueError:
+        pass
+    raise InvalidInput(f"{text!r} is not JOINT=VALUE with a number, such as elbow=0.5 [rad or m]")
+
+
+def _parse_limit(text: str) -> _Limit:
+    if "=" in text:
+        return parse_joint_value(text)
+    with suppress(ValueError):
+        return None, float(text)
+    raise InvalidInput(f"{text!r} is neither a number for all joints nor JOINT=NUMBER for one")
+
+
+_PARAMETER = options.Checked("KEY=VALUE", _parse_parameter)
+_LIMIT = options.Checked("[JOINT=]V", _parse_limit)
+
+
+@click.command("drive")
+@click.argument("driver", type=options.Checked("text", _check_driver), metavar="FILE.py:CLASS|sim")
+@click.argument("robot")
+@options.xacro_arguments
+@click.option(
+    "--param",
+    "parameters",
+    type=_PARAMETER,
+    multiple=True,
+    help="A keyword argument of CLASS: VALUE is JSON (1000000, true, [1, 2]), or else text. Repeatable.",
+)
+@click.option(
+    "--plant",
+    type=click.Choice(["mirror", "lag", "dynamics"]),
+    help="Of sim: joints are at their setpoints, follow with a lag of 50 ms, or are rigid bodies with the "
+    "inertias and effort limits of the URDF; default: lag.",
+)
+@options.rate_option
+@click.option(
+    "--ttl",
+    type=options.SECONDS,
+    default=0.25,
+    show_default=True,
+    help="How long a command is valid at most, from its arrival; then the joints hold, or relax.",
+)
+@click.option(
+    "--on-silence",
+    type=click.Choice(["hold", "relax"]),
+    default="hold",
+    show_default=True,
+    help="When no command is valid any more: brake and hold, or switch the torque off.",
+)
+@click.option(
+    "--velocity",
+    "velocities",
+    type=_LIMIT,
+    multiple=True,
+    help="Limit of the speed, of all joints or of one [rad/s or m/s]; default: that of the URDF. Repeatable.",
+)
+@click.option(
+    "--acceleration",
+    "accelerations",
+    type=_LIMIT,
+    multiple=True,
+    help="The same for the acceleration, of which a URDF has none [rad/s^2 or m/s^2]. Repeatable.",
+)
+@options.seconds_option
+@options.name_option
+@options.session_options
+def drive_command(
+    *,
+    driver: str,
+    robot: str,
+    xacro_args: dict[str, str],
+    parameters: tuple[tuple[str, Any], ...],
+    plant: str | None,
+    rate: float,
+    ttl: float,
+    on_silence: Literal["hold", "relax"],
+    velocities: tuple[_Limit, ...],
+    accelerations: tuple[_Limit, ...],
+    seconds: float | None,
+    name: str | None,
+    network: SessionOptions,
+) -> None:
+    """Host the driver of ROBOT: publish its joints, and write the commands that are sent to it.
+
+    CLASS in FILE.py is a driver as in zstate.driving.Driver; sim is one without hardware. ROBOT is a name
+    such as panda, or a URDF or xacro file; NAME:=VALUE are xacro arguments. CLASS is called with the --param
+    as keywords, and gets the robot's RobotModel as `model` and the names of its joints as `joint_names` if it
+    has parameters of these names.
+
+    `zstate move` or a zstate.driving.Commander moves the joints, within the limits of the URDF; `zstate stop`
+    stops them. Each change of state is a line. A driver that fails three times in a row is stopped, and the
+    exit code is 1. After Ctrl-C the joints are stopped as after silence, and the driver is closed.
+
+    This is NOT a safety-rated channel: an emergency stop is wired to the power of the hardware.
+
+    \b
+    zstate drive sim panda
+    zstate drive sim arm.urdf --plant dynamics --rate 500
+    zstate drive servos.py:ServoBus arm.urdf --param port=/dev/ttyUSB0 --param ids=[1,2,3]
+    zstate drive servos.py:ServoBus arm.urdf --velocity 0.5 --acceleration elbow=4 --acceleration wrist=8
+    """
+    from zstate.driving import DriverHost
+
+    if plant is not None and driver != _SIMULATED:
+        raise click.UsageError("--plant is of `sim`; a driver in a file gets its arguments by --param")
+    model, robot_name = load_robot(robot, name, xacro_args)
+    given = dict(parameters) | ({} if plant is None else {"plant": plant})
+    hardware = _new_driver(driver, model, given)
+    limits = _limits(model, hardware, velocities, accelerations)
+    with open_session(network) as session, ExitStack() as opened:
+        with _failures_of(driver):
+            host = opened.enter_context(
+                DriverHost(
+                    *(session, hardware, model, robot_name),
+                    rate_hz=rate,
+                    ttl_s=ttl,
+                    limits=limits,
+                    on_silence=on_silence,
+                )
+            )
+        joints = count_text(len(hardware.joint_names), "joint")
+        then = "hold" if on_silence == "hold" else "lose their torque"
+        print_wrapped(
+            f"driving {robot_name!r} ({joints}, {driver}) at {rate:g} Hz; the joints {then} after "
+            f"{format_duration(round(ttl * 1e9))} without a command"
+        )
+        opened.enter_context(_StateLines(session, robot_name))
+        _run(host, seconds)
+
+
+def _run(host: DriverHost, seconds: float | None) -> None:
+    """Run the loop, with the report at its end, also after a signal or a fault.
+
+    A signal interrupts only the calling thread, which waits: never a call of the driver.
+    """
+    from zstate.cli.processes import BackgroundCall
+
+    call = BackgroundCall("zstate drive", lambda: host.run(seconds=seconds))
+    try:
+        call.result()
+    finally:
+        host.close()
+        for line in _report_lines(host.report()):
+            print_wrapped(line)
+
+
+def _report_lines(report: DriverReport) -> Iterator[str]:
+    if report.rate is not None:
+        yield report_text(report.rate)
+    spreads = (("late by", report.lateness_us), ("read in", report.read_us), ("written in", report.write_us))
+    yield "; ".join(f"{what} {_spread_text(spread)}" for what, spread in spreads if spread.max)
+    refused = ", ".join(f"{count} {reason}" for reason, count in report.refused.items())
+    yield (
+        f"{count_text(report.written, 'setpoint')} written, {count_text(report.faults, 'failure')} of the "
+        f"driver, commands refused: {refused or 'none'}"
+    )
+
+
+def _spread_text(spread: Spread) -> str:
+    p50, p99, most = (format_duration(round(microseconds * 1e3)) for microseconds in spread)
+    return f"{p50} (median), {p99} (p99), {most} (max)"
+
+
+class _StateLines(Closeable):
+    """Prints a line for each change of the state of the driver of ``robot``, which this process hosts."""
+
+    def __init__(self, session: Session, robot: str) -> None:
+        from zstate.net.latched import LatchedSubscriber
+        from zstate.wire.keys import driver_key
+
+        self._newest = ""
+        self._subscriber = LatchedSubscriber(session, driver_key(robot), self._on_state)
+
+    def close(self) -> None:
+        self._subscriber.close()
+
+    def _on_state(self, sample: SerializedSample) -> None:
+        from zstate.wire.messages import DriverState
+        from zstate.wire.native import decode
+
+        with suppress(MessageError):
+            state = decode(sample.payload, sample.encoding, DriverState)
+            text = state_text(state)
+            if state.state != "off" and text != self._newest:
+                print_wrapped(text)
+            self._newest = text
+
+
+def state_text(state: DriverState) -> str:
+    """The state of a driver and its reason, in one line."""
+    if state.state == "active":
+        return f"active by {state.commander}"
+    if not state.reason or state.reason.startswith(f"{state.state} by "):
+        return state.reason or state.state
+    return f"{state.state}: {state.reason}"
+
+
+def _limits(
+    model: RobotModel, driver: Driver, velocities: Sequence[_Limit], accelerations: Sequence[_Limit]
+) -> Limits:
+    """The limits of the joints of ``driver``: those of the URDF, and those of the options."""
+    from zstate.driving import Limits
+
+    names = model.part(driver.joint_names).joint_names
+    velocity, acceleration = _by_joint(velocities, "--velocity"), _by_joint(accelerations, "--acceleration")
+    limits = Limits.of(model, names, velocity=velocity, acceleration=acceleration)
+    unlimited = [name for name, most in zip(names, limits.velocity.tolist(), strict=True) if most == math.inf]
+    if unlimited:
+        raise click.UsageError(
+            f"the URDF has no limit for the velocity of {', '.join(unlimited)}; give one, such as --velocity "
+            f"{unlimited[0]}=1.0"
+        )
+    return limits
+
+
+def _by_joint(limits: Sequence[_Limit], option: str) -> float | Mapping[str, float] | None:
+    """One number for all joints, or numbers by joint. Raises UsageError for both."""
+    for_all = [value for joint, value in limits if joint is None]
+    if for_all and len(limits) > 1:
+        raise click.UsageError(f"{option} is one number for all joints, or JOINT=NUMBER for each")
+    if for_all:
+        return for_all[0]
+    return {joint: value for joint, value in limits if joint is not None} or None
+
+
+def _new_driver(text: str, model: RobotModel, parameters: Mapping[str, Any]) -> Driver:
+    """The driver that ``text`` names, called with ``parameters``, and what it takes of ``model``."""
+    from zstate.driving import Driver, SimulatedDriver
+
+    factory: Callable[..., Any] = SimulatedDriver if text == _SIMULATED else _load_class(text)
+    signature = inspect.signature(factory)
+    offered = {"model": model, "joint_names": model.joint_names}
+    arguments = {name: value for name, value in offered.items() if name in signature.parameters}
+    arguments |= parameters
+    try:
+        signature.bind(**arguments)
+    except TypeError as error:
+        fail(f"{text} cannot be called: {error}; it is {text}{signature}, and --param KEY=VALUE sets one")
+    with _failures_of(text):
+        driver = factory(**arguments)
+    missing = [name for name in vars(Driver) if not name.startswith("_") and not hasattr(driver, name)]
+    if missing:
+        fail(f"{text} is no driver: it has no {', '.join(missing)}; zstate.driving.Driver describes them")
+    return driver
+
+
+def _load_class(text: str) -> Callable[..., Any]:
+    """The class in ``FILE.py:CLASS``; the file may import modules of its folder, as a script may."""
+    file, _, name = text.rpartition(":")
+    sys.path.insert(0, str(Path(file).resolve().parent))
+    spec = spec_from_file_location(_MODULE, file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[_MODULE] = module_from_spec(spec)
+    with _failures_of(file):
+        spec.loader.exec_module(module)
+    try:
+        return getattr(module, name)
+    except AttributeError:
+        classes = [key for key, value in vars(module).items() if inspect.isclass(value)]
+        fail(f"{file} has no {name!r}{did_you_mean(name, classes)}")
+
+
+@contextmanager
+def _failures_of(driver: str) -> Generator[None]:
+    """End the command for exceptions of a driver, with the line of its code instead of a traceback."""
+    try:
+        yield
+    except (ZStateError, click.ClickException):
+        raise
+    except Exception as error:
+        *_, place = traceback.extract_tb(error.__traceback__)
+        at = f"{place.filename}, line {place.lineno}"
+        fail(f"{driver} failed: {type(error).__name__}: {error} ({at})")

@@ -1,0 +1,270 @@
+"""zstate move and zstate stop: move the joints of a driver, stop it, and release the stop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from zstate.cli import options
+from zstate.cli.commands.drive import parse_joint_value, state_text
+from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
+from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import MotionRefused, MotionTimeout, Unreachable, ZStateError
+
+if TYPE_CHECKING:
+    from zstate.driving import Commander
+    from zstate.driving.driver import StopMode
+    from zstate.driving.motion import Motion, Outcome
+    from zstate.net.session import Session
+    from zstate.wire.messages import DriverState
+
+_SECONDS = 1.0
+_CHECK_S = 1.0
+_CANCELLED_WITHIN_S = 2.0
+_CACHES_WITHIN_S = 0.5
+
+
+@click.command("move")
+@click.argument("robot")
+@click.argument(
+    "positions",
+    nargs=-1,
+    type=options.Checked("JOINT=VALUE", parse_joint_value),
+    metavar="[JOINT=VALUE]...",
+)
+@click.option(
+    "--seconds",
+    type=options.SECONDS,
+    help=f"Arrive after so many seconds; default: {_SECONDS:g}, or as many as the limits need.",
+)
+@click.option(
+    "--file",
+    type=options.EXISTING_FILE,
+    metavar="CSV",
+    help="Move through the points of a file: a line time,JOINT,... then the seconds after the start and the "
+    "positions of each point.",
+)
+@click.option("--stretch", is_flag=True, help="Move slower where the limits need it, instead of refusing.")
+@options.timeout_option("Fail if no driver has published its state after this time [s].", 5.0)
+@options.json_option("One JSON object, also for a motion that is refused.")
+@options.session_options
+def move_command(
+    *,
+    robot: str,
+    positions: tuple[tuple[str, float], ...],
+    seconds: float | None,
+    file: str | None,
+    stretch: bool,
+    timeout: float,
+    as_json: bool,
+    network: SessionOptions,
+) -> None:
+    """Move joints of ROBOT, which has a driver, and wait until they are there.
+
+    VALUE is a position in radians, or metres for a linear joint; other joints stay where they are. The motion
+    starts and ends at rest, and is checked as a whole against the limits of position, velocity and
+    acceleration: a motion that would leave them is refused with all findings, and nothing moves. Ctrl-C
+    cancels it, and the joints brake. The exit code is 0 if the joints have reached the last point.
+
+    This is NOT a safety-rated channel: an emergency stop is wired to the power of the hardware.
+
+    \b
+    zstate move panda panda_joint4=-1.2 panda_joint6=2
+    zstate move panda panda_joint4=-1.2 --seconds 3
+    zstate move panda --file wave.csv --stretch
+    """
+    if bool(positions) is (file is not None):
+        raise click.UsageError("give JOINT=VALUE for some joints, such as elbow=0.5, or --file CSV")
+    if file is not None and seconds is not None:
+        raise click.UsageError("--file has its own times; leave out --seconds")
+    from zstate.driving import Commander
+
+    if file is not None:
+        points, times_s = _read_points(file)
+    else:
+        points, times_s = {joint: [value] for joint, value in positions}, [seconds or _SECONDS]
+        if len(points) < len(positions):
+            raise click.UsageError("a joint is given twice")
+    with open_session(network) as session, Commander(session, robot) as commander:
+        commander.wait_for_driver(timeout)
+        started = time.monotonic()
+        try:
+            motion = commander.move(points, times_s, stretch=stretch or (file is None and seconds is None))
+        except MotionRefused as refusal:
+            if as_json:
+                print_json(
+                    {"robot": robot, "outcome": "refused", "reason": None, "findings": refusal.findings}
+                )
+            raise
+        outcome = _outcome(commander, motion)
+    if as_json:
+        _print_outcome(robot, *outcome)
+    elif outcome.name == "reached":
+        print_result(f"reached in {time.monotonic() - started:.1f} s")
+    if outcome.name != "reached":
+        fail(f"the motion of {robot!r} was {outcome.name}: {outcome.reason}")
+
+
+def _print_outcome(robot: str, outcome: str, reason: str = "", *, findings: Sequence[str] = ()) -> None:
+    print_json({"robot": robot, "outcome": outcome, "reason": reason, "findings": findings})
+
+
+def _outcome(commander: Commander, motion: Motion) -> Outcome:
+    """How the motion has ended. A signal cancels it."""
+    try:
+        while (outcome := motion.outcome) is None:
+            if commander.driver is None:
+                fail(
+                    f"the driver of {motion.robot!r} has fallen silent at {motion.progress:.0%} of the motion"
+                )
+            with suppress(MotionTimeout):
+                motion.wait(_CHECK_S)
+    except SystemExit:
+        motion.cancel()
+        ended = motion.wait(_CANCELLED_WITHIN_S)
+        print_status(f"{ended.name}: the joints of {motion.robot!r} brake", event="cancelled")
+        raise
+    return outcome
+
+
+@click.command("stop")
+@click.argument("robots", nargs=-1, metavar="[ROBOT]...")
+@click.option("--all", "everything", is_flag=True, help="Every robot that has a driver.")
+@click.option("--relax", is_flag=True, help="Switch the torque off, too: joints without brakes fall.")
+@click.option("--reason", default="", metavar="TEXT", help="Why; shown to users until the release.")
+@click.option("--release", is_flag=True, help="Release the stops instead, of all programs.")
+@options.timeout_option("Fail if the driver has not confirmed it after this time [s].", 2.0)
+@options.json_option("One JSON object for each robot.")
+@options.session_options
+def stop_command(
+    *,
+    robots: tuple[str, ...],
+    everything: bool,
+    relax: bool,
+    reason: str,
+    release: bool,
+    timeout: float,
+    as_json: bool,
+    network: SessionOptions,
+) -> None:
+    """Stop the driver of ROBOT, until the stop is released.
+
+    The joints stay where they are. A stop is latched: the robot stays stopped, also if its driver restarts,
+    until `zstate stop ROBOT --release`, or Commander.release in a program. Then it stands until the next
+    command, and motions do not continue. Every program may stop a robot; behind a router with access control
+    only commanders release it.
+
+    The exit code is 1 if a driver has not confirmed the stop, which it then may not have received.
+
+    This is NOT a safety-rated channel: a stop is lost with the network, and waits for the calls of the
+    driver. An emergency stop is wired to the power of the hardware.
+
+    \b
+    zstate stop panda --reason "door open"
+    zstate stop --all
+    zstate stop panda --release
+    """
+    if bool(robots) is everything:
+        raise click.UsageError("name the robots to stop, or give --all")
+    if release and (relax or reason):
+        raise click.UsageError("--release ends stops; leave out --relax and --reason")
+    from zstate.cli.processes import BackgroundCall  # loads numpy, which --help does not need
+
+    act = partial(_release, timeout_s=timeout)
+    if not release:
+        act = partial(_stop, reason=reason, how="relax" if relax else "hold", timeout_s=timeout)
+    failures: list[str] = []
+    with open_session(network) as session:
+        names = robots or _driven_robots(session)
+        calls = {name: BackgroundCall("zstate stop", partial(act, session, name)) for name in names}
+        for name, call in calls.items():  # all at once, reported in their order
+            try:
+                state, error = call.result(), None
+            except ZStateError as failure:
+                state, error = None, str(failure)
+                failures.append(f"{name}: {failure}")
+            if as_json:
+                print_json(_as_document(name, state, error))
+            elif state is not None:
+                print_result(f"{name}: {state_text(state)}")
+            if release and state is not None and state.stops:
+                failures.append(f"{name} has been stopped again")
+    if failures:
+        fail("\n".join(failures))
+
+
+def _driven_robots(session: Session) -> list[str]:
+    """The robots that have a driver. Ends the command if there is none."""
+    from zstate.net.latched import cached_values
+    from zstate.net.ownership import wait_for_discovery
+    from zstate.wire.keys import driver_expression, robot_from_key
+
+    wait_for_discovery(session)
+    values = cached_values(session, driver_expression("*"), _CACHES_WITHIN_S)
+    return sorted({robot_from_key(value.key) for value in values}) or fail("no robot has a driver")
+
+
+def _stop(session: Session, robot: str, *, reason: str, how: StopMode, timeout_s: float) -> DriverState:
+    from zstate.driving import stop
+
+    try:
+        return stop(session, robot, reason, how=how, timeout_s=timeout_s)
+    except Unreachable:
+        raise Unreachable(
+            f"no driver has confirmed the stop within {timeout_s:g} s; is one running, and may this program "
+            "stop it (`zstate acl`)? One that starts later does not obey this stop",
+            endpoints=(),
+        ) from None
+
+
+def _release(session: Session, robot: str, *, timeout_s: float) -> DriverState:
+    from zstate.driving import Commander
+
+    with Commander(session, robot) as commander:
+        return commander.release(timeout_s)
+
+
+def _as_document(robot: str, state: DriverState | None, error: str | None) -> dict[str, object]:
+    if state is None:
+        return {"robot": robot, "state": None, "reason": None, "is_stopped": None, "error": error}
+    is_stopped = bool(state.stops)
+    return {
+        "robot": robot,
+        "state": state.state,
+        "reason": state.reason,
+        "is_stopped": is_stopped,
+        "error": error,
+    }
+
+
+def _read_points(path: str) -> tuple[dict[str, list[float]], list[float]]:
+    """Positions by joint, and the times [s], of the points in a CSV file. Ends the command if it has none."""
+    text = Path(path).read_text(encoding="utf-8", errors="replace")
+    lines = [line.split(",") for line in text.splitlines()] or [[""]]
+    first, *joints = [word.strip() for word in lines[0]]
+    if first != "time" or not joints or not all(joints) or len(set(joints)) < len(joints):
+        fail(f"{path} starts with {','.join(lines[0])!r}, not with time,JOINT,... of different joints")
+    rows = [
+        _numbers(words, 1 + len(joints), f"{path}, line {number}")
+        for number, words in enumerate(lines[1:], start=2)
+        if words != [""]
+    ]
+    if not rows:
+        fail(f"{path} has no point below its first line")
+    return {joint: [row[1 + n] for row in rows] for n, joint in enumerate(joints)}, [row[0] for row in rows]
+
+
+def _numbers(words: Sequence[str], count: int, place: str) -> list[float]:
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError as error:
+        fail(f"{place}: {error}")
+    if len(numbers) != count:
+        fail(f"{place} has {count_text(len(numbers), 'number')}, and the first line {count}")
+    return numbers
