@@ -1,11 +1,19 @@
+import gc
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
 import threading
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from helpers.processes import SteppingClock
 
-from zstate.clock import SystemClock
+from zstate.clock import ManualClock, MonotonicClock, SystemClock
 from zstate.errors import InvalidInput
-from zstate.rate import Rate, check_rate
+from zstate.rate import DevicePace, Rate, RateReport, Realtime, check_pace, check_rate, control_loop_pace
 
 SECOND = 1_000_000_000
 
@@ -116,3 +124,145 @@ def test_without_catching_up_ticks_are_half_a_period_apart_at_least():
     rate = Rate(100.0, clock, threading.Event(), 0.06, catch_up=False)
     assert [stamp / 1_000_000 for stamp in rate] == [0, 10, 29.9, 40, 50]
     assert (rate.report().ticks, rate.report().skipped) == (5, 1)
+
+
+# The pace of a device
+
+
+def paced(pauses_ns: list[int]) -> list[float]:
+    """The steps [s] at the ends of ``pauses_ns``, each after the motion at the end of the one before."""
+    clock = ManualClock()
+    pace = DevicePace(clock, threading.Event())
+    steps, moved_at = [], 0
+    for pause_ns, _ in zip(pauses_ns, pace, strict=False):
+        clock.set(clock.now() + pause_ns)
+        steps.append(pace.step_s(moved_at, clock.now()))
+        moved_at = clock.now()
+    return steps
+
+
+def test_a_step_at_a_devices_pace_lasts_as_long_as_the_time_that_has_passed():
+    # The first pause is the first period; later ones are within two of them.
+    pauses = [10_000_000, 8_000_000, 15_000_000, 40_000, 10_000_000]
+    assert paced(pauses)[1:] == [pause * 1e-9 for pause in pauses[1:]]
+
+
+def test_a_step_after_a_pause_of_the_device_lasts_for_two_of_its_periods():
+    steps = paced([10_000_000] * 20 + [200_000_000, 200_000_000])
+    # The pause counted as two periods of 10 ms, among the last 16.
+    assert steps[-2:] == pytest.approx([0.02, 2 * (0.01 + (0.02 - 0.01) / 16)])
+
+
+def test_a_devices_pace_ends_after_its_seconds_and_reports_its_rate():
+    clock = ManualClock()
+    pace = DevicePace(clock, threading.Event(), 0.1)
+    for _ in pace:
+        clock.advance(0.01)
+    assert pace.report() == RateReport(0.0, pytest.approx(100.0), ticks=10, skipped=0, late=0)
+
+
+def test_a_devices_pace_ends_when_it_is_stopped():
+    stop = threading.Event()
+    pace = DevicePace(ManualClock(), stop)
+    for number, _ in enumerate(pace, 1):
+        if number == 4:
+            stop.set()
+    assert pace.report().ticks == 4
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="waits are counted by Linux")
+def test_a_device_that_returns_at_once_is_refused_and_one_that_blocks_is_not():
+    nothing = threading.Event()
+    for ticks, _ in enumerate(DevicePace(MonotonicClock(), threading.Event())):
+        if ticks == 2000:
+            break
+        nothing.wait(1e-6)
+    with pytest.raises(InvalidInput, match=r"has waited \d+ times in 1000 ticks.*returns at once"):
+        for _ in DevicePace(MonotonicClock(), threading.Event()):
+            pass
+
+
+# Real-time scheduling
+
+
+def in_thread(function: Callable[[], None]) -> None:
+    """Runs ``function`` in a thread; skips the test where the system has no real-time scheduling for it."""
+    failures: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            function()
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    for failure in failures:
+        if "CAP_" in str(failure):
+            pytest.skip(str(failure))
+        raise failure
+
+
+@pytest.mark.parametrize("realtime", ["fifo", "spin"])
+def test_a_real_time_loop_has_its_scheduling_inside_the_block_only(realtime: Realtime):
+    def loop() -> None:
+        assert os.sched_getscheduler(0) == os.SCHED_OTHER
+        frozen, interval = gc.get_freeze_count(), sys.getswitchinterval()
+        with control_loop_pace(1000.0, realtime, threading.Event(), 0.02) as pace:
+            assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+            assert gc.get_freeze_count() > 0
+            assert "VmLck:\t       0 kB" not in Path("/proc/self/status").read_text()
+            ticks = len(list(pace))
+            assert ticks + pace.report().skipped == 20
+        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+        assert (gc.get_freeze_count(), sys.getswitchinterval()) == (frozen, interval)
+        assert "VmLck:\t       0 kB" in Path("/proc/self/status").read_text()
+
+    in_thread(loop)
+
+
+def test_a_stop_ends_a_real_time_loop_that_waits_for_its_next_tick():
+    stop = threading.Event()
+
+    def loop() -> None:
+        with control_loop_pace(0.001, "spin", stop, None) as pace:
+            threading.Timer(0.05, stop.set).start()
+            assert len(list(pace)) == 1
+
+    in_thread(loop)
+
+
+@pytest.mark.parametrize(("capability", "limit"), [("sys_nice", "ulimit -r 50"), ("ipc_lock", "ulimit -l")])
+def test_real_time_scheduling_that_the_system_refuses_is_an_error_with_what_to_do(
+    capability: str, limit: str
+):
+    code = """
+        import resource, threading
+        from zstate.rate import control_loop_pace
+        resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
+        try:
+            with control_loop_pace(100.0, "fifo", threading.Event(), None): print("permitted")
+        except ValueError as error:
+            print(error)
+    """
+    if os.geteuid() or not shutil.which("setpriv"):
+        pytest.skip("needs root and setpriv, to give up one capability")
+    command = ["setpriv", "--bounding-set", f"-{capability}", sys.executable, "-c", textwrap.dedent(code)]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert limit in text
+    assert f"CAP_{capability.upper()}" in text
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "realtime", "text"),
+    [
+        (100.0, "hard", "realtime is None, 'fifo' or 'spin', not 'hard'"),
+        (None, "spin", "realtime='spin' waits for deadlines"),
+        (0.0, None, "a rate is above 0"),
+    ],
+)
+def test_a_pace_that_no_control_loop_has_is_refused(rate_hz: float | None, realtime: str, text: str):
+    with pytest.raises(InvalidInput, match=text):
+        check_pace(rate_hz, realtime)

@@ -1,23 +1,33 @@
-"""Rate with absolute deadlines: a late tick does not delay the following ones."""
+"""The pace of loops: absolute deadlines, where a late tick does not delay the following ones, or a device."""
 
 from __future__ import annotations
 
+import gc
 import math
+import os
+import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
-from zstate.clock import MONOTONIC, SYSTEM, Clock
+from zstate.clock import MONOTONIC, SYSTEM, Clock, MonotonicClock
 from zstate.errors import InvalidInput
+
+Realtime: TypeAlias = Literal["fifo", "spin"]
+"""How a control loop waits: with SCHED_FIFO, and also without sleeping right before a deadline."""
 
 
 @dataclass(frozen=True, slots=True)
 class RateReport:
-    """Statistics of a Rate.
+    """Statistics of a Rate or a DevicePace.
 
     ``rate_hz`` is the achieved rate: the ticks after the first, over the time between the first and
     the last. ``skipped`` counts ticks that were dropped after a long delay, ``late`` the ticks that started
-    more than a period after their deadline.
+    more than a period after their deadline. If a device sets the pace, there are none, and ``commanded_hz``
+    is 0.
     """
 
     commanded_hz: float
@@ -33,6 +43,23 @@ _LONGEST_DELAY_NS = 100_000_000
 
 # Simulated time advances in steps, which are long if it runs fast.
 _LONGEST_STEP_NS = 1_000_000_000
+
+_SHORTEST_PERIOD_NS = 100_000
+_PERIODS = 16
+"""The period of a device is the mean of about so many."""
+
+_TICKS_WITH_WAITS = 1000
+"""Ticks of a device after which it is checked that at least half of them have waited for it."""
+
+_FIFO_PRIORITY = 50
+_SPIN_NS = 200_000
+_LONGEST_SLEEP_NS = 50_000_000
+_SWITCH_INTERVAL_S = 5e-4
+"""For how long another thread of Python may delay a tick: above the spin and the work of a tick, which it
+must not interrupt.
+"""
+
+_LOCK_CURRENT, _LOCK_FUTURE, _LOCK_ON_FAULT = 1, 2, 4
 
 
 class Rate:
@@ -58,9 +85,8 @@ class Rate:
     ) -> None:
         self.rate_hz = check_rate(rate_hz)
         self._period_ns = 1e9 / rate_hz
-        if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
-            raise InvalidInput(f"seconds is a positive number, or None for ever; got {seconds!r}")
-        self._max_ticks = math.inf if seconds is None else max(1, round(seconds * rate_hz))
+        ticks = _check_seconds(seconds) * rate_hz
+        self._max_ticks = max(1, round(ticks)) if ticks < math.inf else math.inf
         self._clock = clock
         self._is_stepping = clock.domain not in (SYSTEM, MONOTONIC)
         self._longest_delay_ns = _LONGEST_STEP_NS if self._is_stepping else _LONGEST_DELAY_NS
@@ -108,11 +134,191 @@ class Rate:
                 tick += 1
                 self._skipped += 1
 
+    def step_s(self, since: int, now: int) -> float:
+        """For how long a robot moves at a tick [s]: one period, also after a late tick: it never hurries."""
+        return self._period_ns * 1e-9
+
     def report(self) -> RateReport:
         """Statistics so far."""
-        span_ns = 0 if self._first is None else self._last - self._first
-        achieved = (self._ticks - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
-        return RateReport(self.rate_hz, achieved, self._ticks, self._skipped, self._late)
+        achieved_hz = _achieved_hz(self._ticks, self._first, self._last)
+        return RateReport(self.rate_hz, achieved_hz, self._ticks, self._skipped, self._late)
+
+
+class DevicePace:
+    """Iterate to get the stamp [ns] of each tick of a loop whose body waits for a device.
+
+    The next tick begins when the body has ended. Ends when ``stop`` is set, or after ``seconds``. Raises
+    InvalidInput if fewer than half of 1000 ticks have waited, which would occupy a processor (Linux only).
+    """
+
+    lateness_ns = 0
+    """Of the current tick, which has no deadline."""
+
+    def __init__(self, clock: Clock, stop: threading.Event, seconds: float | None = None) -> None:
+        self._longest_ns = _check_seconds(seconds) * 1e9
+        self._clock = clock
+        self._stop = stop
+        self._ticks = 0
+        self._first: int | None = None
+        self._last = 0
+        self._period_ns = float(_SHORTEST_PERIOD_NS)
+        """The mean of the last periods; longer pauses of the device count as two periods."""
+
+    def __iter__(self) -> Iterator[int]:
+        waits = _count_waits()
+        while not self._stop.is_set():
+            now = self._clock.now()
+            if self._first is None:
+                self._first = now
+            elif now - self._first >= self._longest_ns:
+                return
+            elif self._ticks == 1:
+                self._period_ns = float(now - self._first)
+            else:
+                elapsed = min(now - self._last, 2.0 * self._period_ns)
+                self._period_ns += (elapsed - self._period_ns) / _PERIODS
+            self._last = now
+            self._ticks += 1
+            yield now
+            if self._ticks % _TICKS_WITH_WAITS == 0:
+                waits = self._check_waits(waits)
+
+    def step_s(self, since: int, now: int) -> float:
+        """For how long a robot moves at ``now`` that moved last at ``since`` [ns]: until ``now``, in s.
+
+        After a pause of the device it moves for two of its periods at most: slower, never further.
+        """
+        return min(now - since, 2.0 * self._period_ns) * 1e-9
+
+    def report(self) -> RateReport:
+        """Statistics so far."""
+        return RateReport(0.0, _achieved_hz(self._ticks, self._first, self._last), self._ticks, 0, 0)
+
+    def _check_waits(self, before: int | None) -> int | None:
+        """The count of waits. Raises InvalidInput if there were hardly any after ``before``."""
+        waits = _count_waits()
+        if before is not None and waits is not None and waits - before < _TICKS_WITH_WAITS // 2:
+            rate_hz = 1e9 / self._period_ns
+            raise InvalidInput(
+                f"the loop has waited {waits - before} times in {_TICKS_WITH_WAITS} ticks, at {rate_hz:.0f} "
+                "Hz: the device that sets its pace returns at once, or is faster than the loop. Let read() "
+                "block until there is a new reading, or pass rate_hz=..."
+            )
+        return waits
+
+
+class _PreciseClock(MonotonicClock):
+    """The monotonic clock with waits that end on time, the last ``spin_ns`` of them without sleep.
+
+    A sleep of the system takes no locks after it has ended, as the wait for an event does. In the last part
+    this thread holds the interpreter lock, which another one may need some time to release.
+    """
+
+    def __init__(self, spin_ns: int) -> None:
+        self._spin_ns = spin_ns
+
+    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
+        while (left_ns := stamp - self._spin_ns - time.monotonic_ns()) > 0 and not stop.is_set():
+            time.sleep(min(left_ns, _LONGEST_SLEEP_NS) * 1e-9)
+        while time.monotonic_ns() < stamp and not stop.is_set():
+            pass
+        return not stop.is_set()
+
+
+@contextmanager
+def control_loop_pace(
+    rate_hz: float | None, realtime: Realtime | None, stop: threading.Event, seconds: float | None
+) -> Generator[Rate | DevicePace, None, None]:
+    """The ticks of a control loop in this thread; a device sets its pace if ``rate_hz`` is None.
+
+    With ``realtime`` the thread has SCHED_FIFO at priority 50 inside the block, the memory of the process is
+    locked, and its garbage collector skips the objects that exist already. "spin" also does not sleep in the
+    last 200 us before a deadline: at 1 kHz the loop occupies a quarter of a processor for that. Raises
+    InvalidInput, with what to do, if the system does not permit it.
+    """
+    with ExitStack() as restoring:
+        clock = MonotonicClock() if realtime is None else _use_realtime(realtime, restoring)
+        if rate_hz is None:
+            yield DevicePace(clock, stop, seconds)
+        else:
+            yield Rate(rate_hz, clock, stop, seconds, catch_up=False)
+
+
+def check_pace(rate_hz: float | None, realtime: Realtime | None) -> None:
+    """Raise InvalidInput for a rate or a kind of scheduling that no control loop has on this system."""
+    if rate_hz is not None:
+        check_rate(rate_hz)
+    if realtime not in (None, "fifo", "spin"):
+        raise InvalidInput(f"realtime is None, 'fifo' or 'spin', not {realtime!r}")
+    if realtime is not None and sys.platform != "linux":
+        raise InvalidInput(f"realtime={realtime!r} needs Linux; this is {sys.platform}")
+    if realtime == "spin" and rate_hz is None:
+        raise InvalidInput("realtime='spin' waits for deadlines, which a device has not: use 'fifo'")
+
+
+def _use_realtime(realtime: Realtime, restoring: ExitStack) -> Clock:
+    """Schedule this thread as ``realtime``; returns the clock for its deadlines."""
+    _use_fifo(realtime, restoring)
+    _lock_memory(realtime, restoring)
+    if not gc.get_freeze_count():
+        gc.collect()
+        gc.freeze()
+        restoring.callback(gc.unfreeze)
+    restoring.callback(sys.setswitchinterval, sys.getswitchinterval())
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    return _PreciseClock(_SPIN_NS if realtime == "spin" else 0)
+
+
+def _use_fifo(realtime: Realtime, restoring: ExitStack) -> None:
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        # Threads and processes that this one starts do not inherit it.
+        fifo = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, fifo, os.sched_param(_FIFO_PRIORITY))
+    except PermissionError:
+        raise InvalidInput(
+            f"realtime={realtime!r} needs priority {_FIFO_PRIORITY} of SCHED_FIFO, which this system does "
+            f"not permit: allow it by `ulimit -r {_FIFO_PRIORITY}` (rtprio in /etc/security/limits.conf), or "
+            "by the capability CAP_SYS_NICE (`docker run --cap-add SYS_NICE`)"
+        ) from None
+    restoring.callback(os.sched_setscheduler, 0, policy | os.SCHED_RESET_ON_FORK, parameters)
+
+
+def _lock_memory(realtime: Realtime, restoring: ExitStack) -> None:
+    """Keep the pages of this process in memory once they are used."""
+    import ctypes  # noqa: PLC0415  # only control loops need it
+
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_LOCK_CURRENT | _LOCK_FUTURE | _LOCK_ON_FAULT):
+        raise InvalidInput(
+            f"realtime={realtime!r} locks the memory of this process, which this system does not permit "
+            f"({os.strerror(ctypes.get_errno())}): allow it by `ulimit -l unlimited` (memlock in "
+            "/etc/security/limits.conf), or by the capability CAP_IPC_LOCK (`docker run --cap-add IPC_LOCK`)"
+        )
+    restoring.callback(libc.munlockall)
+
+
+def _count_waits() -> int | None:
+    """How often this thread has waited since it started; None where the system does not count that."""
+    if sys.platform != "linux":
+        return None
+    import resource  # noqa: PLC0415  # not on every system
+
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_nvcsw
+
+
+def _achieved_hz(ticks: int, first: int | None, last: int) -> float:
+    span_ns = 0 if first is None else last - first
+    return (ticks - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
+
+
+def _check_seconds(seconds: float | None) -> float:
+    """``seconds``, or infinity for None. Raises InvalidInput unless it is positive and finite."""
+    if seconds is None:
+        return math.inf
+    if not (math.isfinite(seconds) and seconds > 0.0):
+        raise InvalidInput(f"seconds is a positive number, or None for ever; got {seconds!r}")
+    return seconds
 
 
 def check_rate(rate_hz: float) -> float:

@@ -84,7 +84,8 @@ class RecordingDriver(SimulatedDriver):
 def running(session: Session, driver: SimulatedDriver, **options: object) -> Iterator[DriverHost]:
     """A host whose loop runs in a thread; its exception is raised at the end."""
     failure: list[BaseException] = []
-    with DriverHost(session, driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS, **options) as host:
+    options = {"rate_hz": RATE_HZ, "limits": LIMITS, **options}
+    with DriverHost(session, driver, RRBOT, "arm", **options) as host:
 
         def run() -> None:
             try:
@@ -1043,3 +1044,60 @@ def test_a_ros_node_that_commanded_a_stopped_robot_does_not_move_it_after_the_re
 def test_a_controller_needs_the_wire_of_ros_nodes(sessions):
     with pytest.raises(InvalidInput, match=r"pass wires=\('native', 'ros2'\)"):
         DriverHost(sessions[0], RecordingDriver(), RRBOT, "arm", ros2_controller="arm_controller")
+
+
+# The pace of the loop
+
+
+class DevicePaced(RecordingDriver):
+    """A mirror whose ``read`` waits for the next of its ``pulses``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pulses = threading.Semaphore(0)
+
+    def read(self, stamp: int) -> JointReading | None:
+        return super().read(stamp) if self.pulses.acquire(timeout=0.05) else None
+
+
+def test_a_device_sets_the_pace_and_no_joint_moves_for_longer_than_the_time_that_passes(sessions):
+    driver = DevicePaced()
+    with running(sessions[0], driver, rate_hz=None, ttl_s=10.0) as host, Commander(sessions[1], "arm") as arm:
+        assert arm.wait_for_driver().state == "ready"
+
+        def pulsed() -> int:
+            arm.send({"shoulder": 99.0})
+            driver.pulses.release()
+            return len(driver.written())
+
+        until(lambda: pulsed() > 50)
+        before = len(driver.written())
+        threading.Event().wait(0.2)  # the device is silent
+        until(lambda: pulsed() > before)
+        report = host.report()
+    writes = [(at, value[0]) for name, at, value in driver.calls if name == "write"]
+    (first_at, first), (last_at, last) = writes[0], writes[-1]
+    assert 0.0 < last - first <= 2.0 * (last_at - first_at) * 1e-9
+    assert report.rate.ticks >= len(writes)
+    assert (report.rate.commanded_hz, report.lateness_us.max) == (0.0, 0.0)
+
+
+def test_a_device_that_returns_at_once_is_refused_as_the_pace_of_the_loop(sessions):
+    driver = RecordingDriver()
+    with (
+        DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=None, limits=LIMITS) as host,
+        pytest.raises(InvalidInput, match=r"returns at once.*pass rate_hz"),
+    ):
+        host.run(seconds=DEADLINE_S)
+    assert host.state == "off"
+
+
+def test_a_real_time_loop_moves_the_joints_and_ends_with_close(sessions):
+    driver = RecordingDriver()
+    with (
+        running(sessions[0], driver, realtime="spin") as host,
+        Commander(sessions[1], "arm") as arm,
+    ):
+        if host.state == "off":
+            pytest.skip("this system does not permit real-time scheduling")
+        send_until(arm, {"elbow": 0.1}, lambda: driver.written().size and driver.written()[-1, 1] == 0.1)

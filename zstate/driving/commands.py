@@ -179,6 +179,7 @@ class Targets:
     def __init__(self, count: int) -> None:
         self._positions = np.zeros(count)
         self._deadlines = np.full(count, NO_DEADLINE, dtype=np.int64)
+        self._first_deadline = self._last_deadline = NO_DEADLINE
         self._last_seqs: BoundedDict[int, int] = BoundedDict()
         self.session = 0
         """The session of the newest command; 0 before the first."""
@@ -191,7 +192,7 @@ class Targets:
         """Joints without a command that is valid at ``now`` stay at ``positions``."""
         resting = self._deadlines <= now
         self._positions[resting] = positions[resting]
-        self._deadlines[resting] = NO_DEADLINE
+        self._set_deadlines(resting, NO_DEADLINE)
 
     def check_order(self, command: Command) -> None:
         """Raise MessageError for a command that is older than the newest one of its session."""
@@ -221,7 +222,7 @@ class Targets:
         self._last_seqs[command.session] = max(last, command.seq)
         self.session, self.arrived = command.session, command.arrived
         self.ttl_ns = command.deadline - command.arrived
-        self._deadlines[columns] = command.deadline
+        self._set_deadlines(columns, command.deadline)
 
     def place(self, columns: NDArray[np.intp], positions: Floats) -> None:
         """Move the joints at ``columns`` to ``positions`` as long as their command is valid."""
@@ -229,19 +230,25 @@ class Targets:
 
     def is_live(self, now: int) -> bool:
         """Whether any joint has a command that is valid at ``now``."""
-        return bool((self._deadlines > now).any())
+        return self._last_deadline > now
 
-    def current(self, now: int, resting: Floats) -> Floats:
-        """The target of each joint at ``now``: (n,); one whose command expires now stays at ``resting``."""
-        expired = (self._deadlines <= now) & (self._deadlines != NO_DEADLINE)
-        if expired.any():
-            self._positions[expired] = resting[expired]
-            self._deadlines[expired] = NO_DEADLINE
+    def current(self, now: int, resting: Callable[[], Floats]) -> Floats:
+        """The target of each joint at ``now``: (n,); one whose command expires now stays at ``resting()``."""
+        if NO_DEADLINE < self._first_deadline <= now:
+            expired = (self._deadlines <= now) & (self._deadlines != NO_DEADLINE)
+            self._positions[expired] = resting()[expired]
+            self._set_deadlines(expired, NO_DEADLINE)
         return self._positions
 
     def clear(self) -> None:
         """Forget all commands."""
-        self._deadlines[:] = NO_DEADLINE
+        self._set_deadlines(np.ones(len(self._deadlines), dtype=np.bool_), NO_DEADLINE)
+
+    def _set_deadlines(self, columns: NDArray[np.intp] | NDArray[np.bool_], deadline: int) -> None:
+        self._deadlines[columns] = deadline
+        valid = self._deadlines[self._deadlines != NO_DEADLINE].tolist()
+        self._first_deadline = min(valid, default=NO_DEADLINE)
+        self._last_deadline = max(valid, default=NO_DEADLINE)
 
 
 def check_named_positions(positions: dict[str, float]) -> None:

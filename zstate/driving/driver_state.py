@@ -1,4 +1,4 @@
-"""What a driver host reports: state, setpoints and figures of its control loop; and a listener of its state."""
+"""What a driver host reports: state, setpoints, figures of its control loop; and a listener of its state."""
 
 from __future__ import annotations
 
@@ -40,10 +40,11 @@ _MOST_DURATIONS = 60_000
 
 
 class Spread(NamedTuple):
-    """Median, 99th percentile and maximum of durations [us]; zero without any."""
+    """Median, 99th and 99.9th percentile, and maximum of durations [us]; zero without any."""
 
     p50: float
     p99: float
+    p999: float
     max: float
 
 
@@ -60,17 +61,18 @@ class Durations:
 
     def spread(self) -> Spread:
         if not self._newest:
-            return Spread(0.0, 0.0, 0.0)
-        p50, p99 = np.percentile(np.array(self._newest), (50, 99)) / 1e3
-        return Spread(float(p50), float(p99), self._max / 1e3)
+            return Spread(0.0, 0.0, 0.0, 0.0)
+        p50, p99, p999 = (np.percentile(np.array(self._newest), (50, 99, 99.9)) / 1e3).tolist()
+        return Spread(p50, p99, p999, self._max / 1e3)
 
 
 @dataclass(frozen=True, slots=True)
 class DriverReport:
     """The figures of a driver host since it opened; ``rate`` and ``lateness_us`` of its last ``run``.
 
-    ``lateness_us`` is how long ticks began after their deadlines; ``read_us`` and ``write_us`` are what the
-    driver's own calls took. ``faults`` counts those that raised. ``refused`` counts commands by reason.
+    ``lateness_us`` is how long ticks began after their deadlines, zero if a device sets the pace; ``read_us``
+    and ``write_us`` are what the driver's own calls took. ``faults`` counts those that raised. ``refused``
+    counts commands by reason.
     """
 
     rate: RateReport | None

@@ -8,6 +8,7 @@ too many failures in a row, which ends the loop. Not a safety-rated channel.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import secrets
 import threading
@@ -24,7 +25,6 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable, held_back_signals
 from zstate._util.fork_safe import fork_safe
 from zstate._util.refusals import Refusals
-from zstate.clock import MonotonicClock
 from zstate.driving.commands import Command, CommandReceiver, Targets
 from zstate.driving.driver import Driver, Setpoint, StopMode
 from zstate.driving.driver_state import (
@@ -54,7 +54,7 @@ from zstate.net.queryable import check_timeout
 from zstate.net.session import Session
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
-from zstate.rate import Rate, check_rate
+from zstate.rate import DevicePace, Rate, Realtime, check_pace, control_loop_pace
 from zstate.sources import JointReading
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import check_robot
@@ -77,13 +77,17 @@ class _State(NamedTuple):
 class DriverHost(Closeable):
     """Owns ``driver``, publishes its joints as the state of ``robot``, and writes what a ``Commander`` sends.
 
-    ``rate_hz`` is that of the loop. A command is valid for its own ttl or for ``ttl_s`` [s], which is also
-    the longest that is granted, counted from its arrival on the monotonic clock. When the last one has
-    expired, ``on_silence`` "hold" brakes the joints and keeps writing that position, "relax" switches their
-    torque off. ``limits`` are those of the model by default: positions outside them are refused, and faster
-    motion is slowed; a ``Commander.move`` that is too fast is refused. The first setpoint after any change of
-    state is at the measured joints, or at the last setpoint where one was written, so that no step is longer
-    than a tick's motion at the velocity limits.
+    ``rate_hz`` is that of the loop; with None the device sets its pace by ``driver.read``, which blocks until
+    there is a new reading. Commands and stops wait for it, too: without a reading it returns None after some
+    milliseconds. ``realtime`` "fifo" and "spin" are described in ``zstate.rate.control_loop_pace``.
+
+    A command is valid for its own ttl or for ``ttl_s`` [s], which is also the longest that is granted,
+    counted from its arrival on the monotonic clock. When the last one has expired, ``on_silence`` "hold"
+    brakes the joints and keeps writing that position, "relax" switches their torque off. ``limits`` are those
+    of the model by default: positions outside them are refused, and faster motion is slowed; a
+    ``Commander.move`` that is too fast is refused. The first setpoint after any change of state is at the
+    measured joints, or at the last setpoint where one was written, so that no step is longer than a tick's
+    motion at the velocity limits.
 
     A call of the driver that raises is counted, and the loop continues. After ``faults_allowed`` ticks in a
     row with such a failure the driver is stopped as after silence, and ``run`` raises DriverFault. It is
@@ -112,7 +116,7 @@ class DriverHost(Closeable):
         model: RobotModel,
         robot: str | None = None,
         *,
-        rate_hz: float = 100.0,
+        rate_hz: float | None = 100.0,
         ttl_s: float = 0.25,
         limits: Limits | None = None,
         on_silence: StopMode = "hold",
@@ -120,22 +124,22 @@ class DriverHost(Closeable):
         following_error: float = 0.2,
         wires: str | Sequence[str] = ("native",),
         ros2_controller: str = "",
+        realtime: Realtime | None = None,
         program: str = "",
     ) -> None:
         self.robot = check_robot(robot or model.name)
         self._wires = as_wire_names(wires)
         self._driver = SupervisedDriver(driver, self.robot)
-        self._rate_hz = check_rate(rate_hz)
+        check_pace(rate_hz, realtime)
+        self._pace = partial(control_loop_pace, rate_hz, realtime)
         self._ttl_ns = round(check_timeout(ttl_s) * 1e9)
-        names = model.part(driver.joint_names).joint_names
-        limits = limits or Limits.of(model, names)
+        self._names = names = model.part(driver.joint_names).joint_names
+        self._limits = limits = limits or Limits.of(model, names)
         check_arguments(driver, limits, names, on_silence, faults_allowed)
-        self._names = names
-        self._limits = limits
         self._limiter = SetpointLimiter(limits)
         self._on_silence: StopMode = on_silence
         self._faults_allowed = faults_allowed
-        oldest_ns = max(self._ttl_ns, round(faults_allowed * 1e9 / self._rate_hz))
+        oldest_ns = max(self._ttl_ns, round(faults_allowed * 1e9 / (rate_hz or math.inf)))
         self._following = FollowingCheck(limits, following_error, oldest_ns)
         self._writer = local_writer(secrets.randbits(32), program)
         self._refusals = Refusals(f"command for {self.robot!r}")
@@ -147,12 +151,13 @@ class DriverHost(Closeable):
         self._measured_at = 0
         self._setpoint: Limited | None = None
         """The last one that was written since the joints were enabled; None otherwise."""
+        self._wrote_at = 0
         self._obeyed = LatchedStops()
         self._barred: BoundedDict[int, None] = BoundedDict()
         """Sessions that have commanded a stopped robot: a release by another does not move it for them."""
         self._faults = self._faults_in_row = 0
         self._lateness = Durations()
-        self._rate: Rate | None = None
+        self._rate: Rate | DevicePace | None = None
         self._stop = fork_safe(threading.Event())
         self._is_ending = False
         self._running = fork_safe(threading.RLock())
@@ -181,7 +186,7 @@ class DriverHost(Closeable):
 
     def _open_publisher(
         self, session: Session, model: RobotModel, opening: ExitStack
-    ) -> tuple[StatePublisher | PartialStatePublisher, NDArray[np.intp]]:
+    ) -> tuple[StatePublisher | PartialStatePublisher, NDArray[np.intp] | slice]:
         """The publisher of the driver's joints, and their columns in its order."""
         wires, program = self._wires, self._writer.program
         if set(self._names) == set(model.joint_names):
@@ -190,7 +195,8 @@ class DriverHost(Closeable):
         else:
             order = list(range(len(self._names)))
             publisher = PartialStatePublisher(session, model, self._names, self.robot, wires, program=program)
-        return opening.enter_context(publisher), np.array(order, dtype=np.intp)
+        is_same = order == list(range(len(order)))
+        return opening.enter_context(publisher), slice(None) if is_same else np.array(order, dtype=np.intp)
 
     def _open_inputs(
         self, session: Session, ros2_controller: str, opening: ExitStack
@@ -249,7 +255,8 @@ class DriverHost(Closeable):
 
         If it ends while the joints are commanded or held, the driver is stopped as after silence. In the main
         thread of a program that does not handle SIGTERM and SIGHUP, they end the loop and close this host
-        before they end the process. Raises DriverFault, SecondWriter and Closed.
+        before they end the process. Raises DriverFault, SecondWriter, Closed, and InvalidInput if the system
+        refuses ``realtime``, or if a device that sets the pace returns at once.
         """
         if os.getpid() != self._pid:
             raise Closed(forked_text(f"this driver host belongs to process {self._pid}"))
@@ -282,22 +289,23 @@ class DriverHost(Closeable):
                 self._runner = None
 
     def _loop(self, seconds: float | None, signals: list[int]) -> None:
-        self._rate = rate = Rate(self._rate_hz, MonotonicClock(), self._stop, seconds, catch_up=False)
         latched = self._stops.current
         # Stops that are still latched are obeyed once more.
         self._obeyed = LatchedStops((), latched.arrived - len(latched.stops))
         if not latched.stops:  # the last one may have been released since the last loop
             self._barred.pop(self._stops.releaser, None)
-        self._change("ready", "")
-        try:
-            for _ in rate:
-                if self._is_ending or signals:
-                    return
-                self._lateness.add(rate.lateness_ns)
-                self._tick()
-        except Closed:
-            if not self._stop.is_set():
-                raise
+        with self._pace(self._stop, seconds) as rate:
+            self._rate = rate
+            self._change("ready", "")
+            try:
+                for _ in rate:
+                    if self._is_ending or signals:
+                        return
+                    self._lateness.add(rate.lateness_ns)
+                    self._tick()
+            except Closed:
+                if not self._stop.is_set():
+                    raise
 
     # One tick, in the thread of run()
 
@@ -456,13 +464,15 @@ class DriverHost(Closeable):
 
     def _move(self, now: int) -> Exception | None:
         """Write the next setpoint on the way to the targets, or to rest. Where that fails, nothing moves."""
-        dt_s = 1.0 / self._rate_hz  # also after a tick that was missed: slower, never further
+        assert self._rate is not None, "the loop runs"
+        dt_s = self._rate.step_s(self._wrote_at, now)
         if self._state.name == "holding":
             limited = self._limiter.brake(dt_s)
         else:
-            target, velocities = self._motions.next_target(self._targets.current(now, self._resting()), dt_s)
+            target, velocities = self._motions.next_target(self._targets.current(now, self._resting), dt_s)
             limited = self._limiter.step(target, dt_s, velocities)
         setpoint = Setpoint(time.time_ns(), limited.positions, limited.velocities)
+        self._wrote_at = time.monotonic_ns()
         failure = self._driver.write(setpoint)
         if failure is None:
             self._setpoint = limited
