@@ -64,9 +64,16 @@ def test_a_lag_falls_by_e_in_its_time_constant():
     assert math.isclose(run(driver, 0.05)[-1, 0], 1.0 - math.exp(-1.0), rel_tol=1e-9)
 
 
+def relaxed(driver: SimulatedDriver) -> SimulatedDriver:
+    """``driver`` with its brakes released, without torque."""
+    driver.enable(True)
+    driver.stop("relax")
+    return driver
+
+
 @pytest.mark.parametrize("kind", ["revolute", "continuous"])
 def test_a_small_swing_without_torque_has_the_period_of_a_mathematical_pendulum(kind: str):
-    driver = SimulatedDriver(pendulum(kind), "dynamics", start=np.array([0.01]))
+    driver = relaxed(SimulatedDriver(pendulum(kind), "dynamics", start=np.array([0.01])))
     period = math.tau * math.sqrt(0.5 / GRAVITY)
     path = run(driver, 1.5 * period)[:, 0]
     # It is at the bottom after a quarter of a period, and then each half.
@@ -76,7 +83,7 @@ def test_a_small_swing_without_torque_has_the_period_of_a_mathematical_pendulum(
 
 
 def test_damping_takes_the_energy_away():
-    driver = SimulatedDriver(pendulum(damping=1.0), "dynamics", start=np.array([0.5]))
+    driver = relaxed(SimulatedDriver(pendulum(damping=1.0), "dynamics", start=np.array([0.5])))
     assert abs(run(driver, 10.0)[-1, 0]) < 1e-3
 
 
@@ -101,6 +108,25 @@ def test_a_stop_holds_and_relax_lets_fall():
     for tick in range(501, 6000):
         reading = driver.read(tick * MS)
     assert abs(reading.positions[0]) < 0.05
+
+
+def test_brakes_hold_joints_that_are_not_enabled():
+    driver = SimulatedDriver(pendulum(), "dynamics", start=np.array([1.0]))
+    assert run(driver, 0.5)[-1, 0] == 1.0
+    relaxed(driver)
+    fallen = run(driver, 0.2)[-1, 0]
+    assert fallen < 0.9
+    driver.enable(False)
+    assert run(driver, 0.2)[-1, 0] == fallen
+
+
+def test_a_falling_joint_stops_at_the_end_of_its_range():
+    text = PENDULUM.format(kind="revolute", effort=100, damping=0).replace('lower="-10"', 'lower="0.5"')
+    driver = relaxed(SimulatedDriver(load_model(text), "dynamics", start=np.array([1.0])))
+    path = run(driver, 2.0)[:, 0]
+    step = 1e-3 * math.sqrt(2.0 * GRAVITY / 0.5)  # from the speed of a fall by less than the length
+    assert 0.5 - step <= path[-1] <= 0.5
+    assert path[-1] == path[-500]
 
 
 def test_a_setpoint_for_joints_without_power_is_refused():

@@ -79,6 +79,9 @@ class _Dynamics:
     def __init__(self, model: RobotModel) -> None:
         self._dynamics = ForwardDynamics(model)
         self.efforts: Floats | None = np.zeros(len(model.joint_names))
+        limits = [joint.limits for joint in model.driven_joints]
+        self._lower = np.array([one.lower for one in limits])
+        self._upper = np.array([one.upper for one in limits])
 
     def advance(self, joints: _Joints, target: Setpoint | None, dt_s: float) -> None:
         steps = math.ceil(dt_s / _STEP_S)
@@ -94,6 +97,7 @@ class _Dynamics:
             efforts = self._dynamics.limited(self._dynamics.efforts_to_hold(q, v, wanted))
         # Semi-implicit Euler, which is stable where the explicit one gains energy.
         v += dt_s * self._dynamics.accelerations(q, v, efforts)
+        v[((q <= self._lower) & (v < 0.0)) | ((q >= self._upper) & (v > 0.0))] = 0.0
         q += dt_s * v
         self.efforts = efforts
 
@@ -103,8 +107,8 @@ class SimulatedDriver:
 
     The joints of ``plant`` "mirror" are at the last setpoint, those of "lag" follow it with a time constant
     of 50 ms, and those of "dynamics" are moved by Pinocchio's articulated-body algorithm with gravity,
-    friction and the effort limits of the URDF; without torque they fall. Time is that of the stamps of
-    ``read``. Raises InvalidInput as ``ForwardDynamics``, for an unknown plant, and for joints with several
+    friction and the effort limits of the URDF, up to the ends of their ranges. Brakes hold them until they
+    are enabled; after ``stop("relax")`` they fall. Time is that of the stamps of ``read``. Raises InvalidInput as ``ForwardDynamics``, for an unknown plant, and for joints with several
     positions.
     """
 
@@ -124,15 +128,17 @@ class SimulatedDriver:
         """Does nothing."""
 
     def enable(self, on: bool) -> None:
-        """Hold the joints where they are, or switch their torque off."""
+        """Release the brakes and hold the joints where they are, or brake them and switch their torque off."""
         self._is_enabled = on
         self.stop("hold" if on else "relax")
+        if not on:
+            self._joints.velocities[:] = 0.0
 
     def read(self, stamp: int) -> JointReading:
         """The joints at ``stamp`` [ns]; a stamp before the last one changes nothing."""
         past = 0 if self._read_at is None else stamp - self._read_at
         self._read_at = stamp
-        if past > 0:
+        if past > 0 and self._is_enabled:
             self._plant.advance(self._joints, self._target, min(past * 1e-9, _LONGEST_STEP_S))
         efforts = self._plant.efforts
         return JointReading(
@@ -155,7 +161,7 @@ class SimulatedDriver:
         self._target = Setpoint(self._read_at or 0, positions, resting) if how == "hold" else None
 
     def close(self) -> None:
-        """Switches the torque off."""
+        """Brakes the joints, and switches their torque off."""
         self.enable(False)
 
 
