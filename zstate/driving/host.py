@@ -148,10 +148,9 @@ class DriverHost(Closeable):
         """Announced commanders by session."""
         self._state = _State("off", "the loop does not run yet")
         self._measured: NDArray[np.float64] | None = None
-        self._measured_at = 0
+        self._measured_at = self._wrote_at = 0
         self._setpoint: Limited | None = None
         """The last one that was written since the joints were enabled; None otherwise."""
-        self._wrote_at = 0
         self._obeyed = LatchedStops()
         self._barred: BoundedDict[int, None] = BoundedDict()
         """Sessions that have commanded a stopped robot: a release by another does not move it for them."""

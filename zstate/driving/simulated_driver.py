@@ -108,8 +108,8 @@ class SimulatedDriver:
     The joints of ``plant`` "mirror" are at the last setpoint, those of "lag" follow it with a time constant
     of 50 ms, and those of "dynamics" are moved by Pinocchio's articulated-body algorithm with gravity,
     friction and the effort limits of the URDF, up to the ends of their ranges. Brakes hold them until they
-    are enabled; after ``stop("relax")`` they fall. Time is that of the stamps of ``read``. Raises InvalidInput as ``ForwardDynamics``, for an unknown plant, and for joints with several
-    positions.
+    are enabled; after ``stop("relax")`` they fall. Time is that of the stamps of ``read``. Raises
+    InvalidInput as ``ForwardDynamics``, for an unknown plant, and for joints with several positions.
     """
 
     modes: frozenset[Mode] = frozenset({"position"})
@@ -128,7 +128,7 @@ class SimulatedDriver:
         """Does nothing."""
 
     def enable(self, on: bool) -> None:
-        """Release the brakes and hold the joints where they are, or brake them and switch their torque off."""
+        """Release the brakes and hold the joints where they are; or brake them, without torque."""
         self._is_enabled = on
         self.stop("hold" if on else "relax")
         if not on:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import failure, published_robot, zstate
+from helpers.cli_runner import Spawn, failure, published_robot, started, zstate
 from helpers.processes import until
 
 pytestmark = pytest.mark.processes
@@ -50,6 +50,13 @@ def test_announced_robots_are_offered():
     with published_robot("left"), published_robot("right"):
         assert offered("tree", "le") == ["plain,left"]
         assert offered("snapshot", "save", "a.toml", "r") == ["plain,right"]
+
+
+def test_drivers_and_the_joints_of_a_driver_are_offered(spawn: Spawn):
+    assert offered("drive", "s") == ["plain,sim"]
+    assert offered("drive", "sim", "rr") == ["plain,rrbot"]
+    assert started(spawn, "drive", "sim", "rrbot").line().startswith("driving 'rrbot'")
+    until(lambda: offered("move", "rrbot", "sh") == ["plain,shoulder="])
 
 
 def test_completion_without_robots_offers_and_prints_nothing():

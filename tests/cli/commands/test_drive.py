@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from zstate.driving import Commander
 pytestmark = pytest.mark.processes
 
 ARM = """
-import os
+import time
 from pathlib import Path
 from zstate.driving import SimulatedDriver
 
@@ -38,6 +39,11 @@ class Arm(SimulatedDriver):
 class Unreachable(Arm):
     def open(self):
         raise ConnectionError("/dev/ttyUSB0 is gone")
+
+class Paced(Arm):
+    def read(self, stamp):
+        time.sleep(0.01)
+        return super().read(stamp)
 
 class Nothing:
     pass
@@ -92,6 +98,14 @@ def test_driver_of_a_file_gets_its_parameters_and_is_closed_at_the_end(
     child.process.send_signal(signal.SIGTERM)
     assert child.wait() == 128 + signal.SIGTERM
     assert log.read_text() == "shoulder elbow closed"
+
+
+def test_device_sets_the_pace_of_the_loop(spawn: Spawn, arm: str, tmp_path: Path):
+    given = ("drive", f"{arm}:Paced", "rrbot", "--param", f"log={tmp_path / 'log.txt'}")
+    child = started(spawn, *given, "--rate", "device", "--seconds", "0.5")
+    assert " at the pace of the device; " in child.line()
+    assert child.wait() == 0
+    assert re.match(r"\d+ samples at the pace of the device, [\d.]+ Hz$", line_with(child, "samples"))
 
 
 def test_driver_that_fails_three_times_in_a_row_ends_the_command_stopped(

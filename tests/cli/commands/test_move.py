@@ -3,29 +3,108 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers.cli_runner import Spawn, failure, started, zstate
-from helpers.processes import DEADLINE_S, Child
+from helpers.cli_runner import Spawn, failure, interrupted, started, zstate
+from helpers.processes import DEADLINE_S, Child, until
 
-from zstate import connect
+from zstate import TransformListener, connect
 from zstate.driving import Commander
 
 pytestmark = pytest.mark.processes
 
 
 def driven(spawn: Spawn, name: str = "rrbot") -> Child:
-    """A simulated driver of ``name`` that is ready."""
-    child = started(spawn, "drive", "sim", "rrbot", "--name", name)
+    """A simulated driver of ``name`` that is ready; on a busy machine a commander may pause."""
+    child = started(spawn, "drive", "sim", "rrbot", "--name", name, "--ttl", "10")
     assert child.line().startswith(f"driving {name!r}")
     assert child.line() == "ready"
     return child
+
+
+def line_with(child: Child, text: str) -> str:
+    while text not in (line := child.line()):
+        pass
+    return line
 
 
 def printed(*arguments: str) -> str:
     ended = zstate(*arguments)
     assert ended.returncode == 0, ended.stderr
     return ended.stdout.decode()
+
+
+def test_joints_are_moved_and_the_outcome_is_awaited(spawn: Spawn):
+    host = driven(spawn)
+    assert re.fullmatch(r"reached in \d+\.\d s\n", printed("move", "rrbot", "shoulder=0.3", "elbow=-0.2"))
+    assert host.line().startswith("active by zstate-move@")
+    with connect() as session, TransformListener(session, "rrbot") as listener:
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
+        until(lambda: np.allclose(listener.buffer.joint_positions("rrbot")[0], [0.3, -0.2], atol=0.02))
+
+
+def test_motion_beyond_the_limits_is_refused_with_all_findings_and_stretched_on_request(spawn: Spawn):
+    driven(spawn)
+    fast = ("move", "rrbot", "shoulder=1", "elbow=-1", "--seconds", "0.3")
+    # A cubic at rest at both ends has its largest speed, 1.5 times the mean, half-way: 1.5 * 1 / 0.3.
+    *_, shoulder, elbow = failure(*fast).splitlines()
+    assert "'shoulder' moves at 5 rad/s, above 2.5" in shoulder
+    assert "'elbow' moves at -5 rad/s, above 3.5" in elbow
+    refused = zstate(*fast, "--json")
+    document = json.loads(refused.stdout)
+    assert (refused.returncode, document["outcome"], len(document["findings"])) == (1, "refused", 2)
+    assert json.loads(printed(*fast, "--stretch", "--json"))["outcome"] == "reached"
+
+
+def test_points_of_a_file_are_followed(spawn: Spawn, tmp_path: Path):
+    driven(spawn)
+    points = tmp_path / "wave.csv"
+    points.write_text("time, elbow\n0.4, 0.2\n0.8, -0.1\n")
+    assert printed("move", "rrbot", "--file", str(points)).startswith("reached in ")
+    points.write_text("time,elbow\n0.4,0.2,1\n")
+    assert "wave.csv, line 2 has 3 numbers, and the first line 2" in failure(
+        "move", "rrbot", "--file", str(points)
+    )
+    points.write_text("elbow,time\n")
+    assert "starts with 'elbow,time', not with time,JOINT,..." in failure(
+        "move", "rrbot", "--file", str(points)
+    )
+
+
+def test_ctrl_c_cancels_a_motion_and_the_joints_brake(spawn: Spawn):
+    host = driven(spawn)
+    child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
+    assert host.line().startswith("active by zstate-move@")
+    until(lambda: "moving" in child.stderr)
+    interrupted(child)
+    assert "cancelled: the joints of 'rrbot' brake" in child.stderr
+
+
+def test_motion_ends_with_the_stop_of_another_program(spawn: Spawn):
+    host = driven(spawn)
+    child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
+    assert host.line().startswith("active by zstate-move@")
+    printed("stop", "rrbot", "--reason", "door open")
+    assert child.wait() == 1
+    assert "the motion of 'rrbot' was stopped: " in child.stderr
+    assert "door open" in child.stderr
+    assert "door open" in failure("move", "rrbot", "shoulder=0")
+
+
+def test_motions_without_a_driver_or_joints_are_refused(tmp_path: Path):
+    assert "no driver of 'rrbot' has published its state within 0.3 s" in failure(
+        "move", "rrbot", "elbow=1", "--timeout", "0.3"
+    )
+    for arguments, error in (
+        ((), "give JOINT=VALUE for some joints"),
+        (("elbow",), "'elbow' is not JOINT=VALUE with a number"),
+        (("elbow=1", "elbow=2"), "a joint is given twice"),
+        (("--file", __file__, "--seconds", "1"), "--file has its own times"),
+    ):
+        assert error in failure("move", "rrbot", *arguments, code=2)
 
 
 def test_stop_is_latched_over_a_restart_of_the_driver_until_the_release(spawn: Spawn):
@@ -36,10 +115,9 @@ def test_stop_is_latched_over_a_restart_of_the_driver_until_the_release(spawn: S
     assert stopped.endswith(": door open")
     host.kill()
     again = started(spawn, "drive", "sim", "rrbot")
-    again.line()
-    assert again.line() == stopped
+    line_with(again, stopped)
     assert printed("stop", "rrbot", "--release").startswith("rrbot: ready: released by zstate-stop@")
-    assert again.line().startswith("ready: released by zstate-stop@")
+    line_with(again, "ready: released by zstate-stop@")
 
 
 def test_all_drivers_are_stopped_and_reported_as_json(spawn: Spawn):

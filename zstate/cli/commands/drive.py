@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from zstate.wire.protocol import SerializedSample
 
 _SIMULATED = "sim"
+_DEVICE = "device"
 _MODULE = "zstate_driver"
 """The name of the module that a driver's file becomes."""
 
@@ -77,6 +78,11 @@ def _parse_limit(text: str) -> _Limit:
     raise InvalidInput(f"{text!r} is neither a number for all joints nor JOINT=NUMBER for one")
 
 
+def _parse_rate(value: str | float) -> float | None:
+    return None if value == _DEVICE else options.RATE.convert(value, None, None)
+
+
+_RATE = options.Checked("HZ|device", _parse_rate)
 _PARAMETER = options.Checked("KEY=VALUE", _parse_parameter)
 _LIMIT = options.Checked("[JOINT=]V", _parse_limit)
 
@@ -98,7 +104,19 @@ _LIMIT = options.Checked("[JOINT=]V", _parse_limit)
     help="Of sim: joints are at their setpoints, follow with a lag of 50 ms, or are rigid bodies with the "
     "inertias and effort limits of the URDF; default: lag.",
 )
-@options.rate_option
+@click.option(
+    "--rate",
+    type=_RATE,
+    default=100.0,
+    show_default=True,
+    help="Rate of the loop; with `device` it is that of the driver's read, which waits for a new reading.",
+)
+@click.option(
+    "--realtime",
+    type=click.Choice(["fifo", "spin"]),
+    help="fifo: schedule the loop before other programs, with locked memory; spin: also wait for each tick "
+    "without sleep, which takes a quarter of a processor at 1000 Hz. Needs permission.",
+)
 @click.option(
     "--ttl",
     type=options.SECONDS,
@@ -137,7 +155,8 @@ def drive_command(
     xacro_args: dict[str, str],
     parameters: tuple[tuple[str, Any], ...],
     plant: str | None,
-    rate: float,
+    rate: float | None,
+    realtime: Literal["fifo", "spin"] | None,
     ttl: float,
     on_silence: Literal["hold", "relax"],
     velocities: tuple[_Limit, ...],
@@ -163,6 +182,7 @@ def drive_command(
     zstate drive sim panda
     zstate drive sim arm.urdf --plant dynamics --rate 500
     zstate drive servos.py:ServoBus arm.urdf --param port=/dev/ttyUSB0 --param ids=[1,2,3]
+    zstate drive arm.py:Arm arm.urdf --rate 1000 --realtime fifo
     zstate drive servos.py:ServoBus arm.urdf --velocity 0.5 --acceleration elbow=4 --acceleration wrist=8
     """
     from zstate.driving import DriverHost
@@ -182,12 +202,14 @@ def drive_command(
                     ttl_s=ttl,
                     limits=limits,
                     on_silence=on_silence,
+                    realtime=realtime,
                 )
             )
         joints = count_text(len(hardware.joint_names), "joint")
+        pace = "the pace of the device" if rate is None else f"{rate:g} Hz"
         then = "hold" if on_silence == "hold" else "lose their torque"
         print_wrapped(
-            f"driving {robot_name!r} ({joints}, {driver}) at {rate:g} Hz; the joints {then} after "
+            f"driving {robot_name!r} ({joints}, {driver}) at {pace}; the joints {then} after "
             f"{format_duration(round(ttl * 1e9))} without a command"
         )
         opened.enter_context(_StateLines(session, robot_name))
@@ -223,7 +245,7 @@ def _report_lines(report: DriverReport) -> Iterator[str]:
 
 
 def _spread_text(spread: Spread) -> str:
-    p50, p99, most = (format_duration(round(microseconds * 1e3)) for microseconds in spread)
+    p50, p99, _, most = (format_duration(round(microseconds * 1e3)) for microseconds in spread)
     return f"{p50} (median), {p99} (p99), {most} (max)"
 
 
@@ -291,9 +313,9 @@ def _by_joint(limits: Sequence[_Limit], option: str) -> float | Mapping[str, flo
 
 def _new_driver(text: str, model: RobotModel, parameters: Mapping[str, Any]) -> Driver:
     """The driver that ``text`` names, called with ``parameters``, and what it takes of ``model``."""
-    from zstate.driving import Driver, SimulatedDriver
+    from zstate.driving import Driver
 
-    factory: Callable[..., Any] = SimulatedDriver if text == _SIMULATED else _load_class(text)
+    factory = _driver_class(text)
     signature = inspect.signature(factory)
     offered = {"model": model, "joint_names": model.joint_names}
     arguments = {name: value for name, value in offered.items() if name in signature.parameters}
@@ -310,8 +332,12 @@ def _new_driver(text: str, model: RobotModel, parameters: Mapping[str, Any]) -> 
     return driver
 
 
-def _load_class(text: str) -> Callable[..., Any]:
+def _driver_class(text: str) -> Callable[..., Any]:
     """The class in ``FILE.py:CLASS``; the file may import modules of its folder, as a script may."""
+    if text == _SIMULATED:
+        from zstate.driving import SimulatedDriver
+
+        return SimulatedDriver
     file, _, name = text.rpartition(":")
     sys.path.insert(0, str(Path(file).resolve().parent))
     spec = spec_from_file_location(_MODULE, file)

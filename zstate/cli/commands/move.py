@@ -102,6 +102,7 @@ def move_command(
                     {"robot": robot, "outcome": "refused", "reason": None, "findings": refusal.findings}
                 )
             raise
+        print_status(f"moving {', '.join(points)} of {robot!r}; Ctrl-C cancels", event="moving", robot=robot)
         outcome = _outcome(commander, motion)
     if as_json:
         _print_outcome(robot, *outcome)

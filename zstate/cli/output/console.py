@@ -127,8 +127,11 @@ def files_text(files: Sequence[Path]) -> str:
 
 def report_text(report: RateReport) -> str:
     """The commanded and the achieved rate."""
-    achieved = f"{count_text(report.ticks, 'sample')}; commanded {report.commanded_hz:g} Hz"
-    return f"{achieved}, achieved {report.rate_hz:.2f} Hz, skipped {report.skipped}"
+    samples = count_text(report.ticks, "sample")
+    if not report.commanded_hz:
+        return f"{samples} at the pace of the device, {report.rate_hz:.2f} Hz"
+    rates = f"commanded {report.commanded_hz:g} Hz, achieved {report.rate_hz:.2f} Hz"
+    return f"{samples}; {rates}, skipped {report.skipped}"
 
 
 def keep_showing(text: Callable[[], str], every_s: float = 0.5) -> NoReturn:
