@@ -1,7 +1,6 @@
 """Dynamixel servos of the X series on a serial bus, by Robotis' SDK: pip install dynamixel-sdk."""
 
 import dynamixel_sdk as dxl
-import numpy as np
 
 from zstate import JointReading
 from zstate.driving import Calibration
@@ -29,12 +28,13 @@ class SerialServos:
             self._check(*reply)
 
     def read(self, stamp):
+        self._port.is_using = False  # the SDK leaves it set when the port raises
         group = dxl.GroupSyncRead(self._port, self._bus, POSITION, 4)
         for one in self._ids:
             group.addParam(one)
         self._check(group.txRxPacket())
-        counts = np.array([group.getData(one, POSITION, 4) for one in self._ids], np.uint32)
-        return JointReading(self._encoders.to_positions(counts.view(np.int32)))
+        counts = [(group.getData(one, POSITION, 4) ^ 2**31) - 2**31 for one in self._ids]  # signed
+        return JointReading(self._encoders.to_positions(counts))
 
     def write(self, setpoint):
         group = dxl.GroupSyncWrite(self._port, self._bus, GOAL, 4)

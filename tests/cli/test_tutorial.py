@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 from helpers.cli_runner import Spawn, failure, started, zstate
 from helpers.processes import Child
-from helpers.tutorial_terminal import FILES, FOLDER, blocks, masked, terminal, terminal_steps
+from helpers.tutorial_terminal import FOLDER, TutorialPage, check_page, masked
 
 pytestmark = pytest.mark.processes
 
@@ -95,9 +96,16 @@ def test_the_driver_is_a_dozen_lines():
     assert len(SWING.splitlines()) <= 12
 
 
-def test_the_document_shows_the_files_of_its_folder():
-    for language, name in FILES.items():
-        assert blocks(language) == [(FOLDER / name).read_text()]
+@pytest.mark.parametrize(
+    ("page", "files"),
+    [
+        ("README.md", {"xml": "arm.urdf", "python": "swing.py", "toml": "cell.toml"}),
+        ("DRIVING.md", {"xml": "arm.urdf", "python": "wave.py"}),
+    ],
+)
+def test_the_pages_show_the_files_of_their_folder(page: str, files: dict[str, str]):
+    for language, name in files.items():
+        assert TutorialPage(page).blocks(language) == [(FOLDER / name).read_text()]
 
 
 @pytest.mark.parametrize("uptime_s", [1, 59, 3_600, 9_999, 10_000, 86_400 * 400])
@@ -106,12 +114,14 @@ def test_a_stamp_is_masked_whatever_the_uptime_of_the_machine(uptime_s: int):
 
 
 def test_the_terminal_blocks_match_real_output(folder: Path, without_xacro: None):
-    with terminal(folder) as shell:
-        for one in terminal_steps():
-            output, expected = masked(shell.run(one)), masked(one.lines)
-            assert output == expected or (one.is_background and sorted(output) == sorted(expected)), (
-                one.command
-            )
+    check_page(TutorialPage("README.md"), folder)
+
+
+def test_the_terminals_of_driving_match_real_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("tutorial", "drivers"):
+        shutil.copytree(FOLDER.parent / name, tmp_path / name)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    check_page(TutorialPage("DRIVING.md"), tmp_path / "tutorial")
 
 
 def test_the_robot_runs_and_can_be_inspected(cell: Child, driver):

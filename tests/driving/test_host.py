@@ -420,6 +420,20 @@ def test_a_driver_that_keeps_failing_is_stopped_and_the_stop_outlives_the_host(s
         until(lambda: host.state == "stopped")
 
 
+def test_the_first_failure_of_a_tick_is_reported_as_the_cause(sessions):
+    driver = RecordingDriver()
+    with (
+        pytest.raises(DriverFault, match="unplugged"),
+        running(sessions[0], driver, ttl_s=10.0) as host,
+        Commander(sessions[1], "arm") as arm,
+    ):
+        arm.wait_for_driver()
+        send_until(arm, {"elbow": 0.1}, lambda: host.state == "active")
+        driver.failures += [OSError("unplugged")] * 1000
+        driver.write_failures += [OSError("busy")] * 1000
+        until(lambda: host.state == "fault")
+
+
 def test_no_writes_follow_each_other_at_once_after_a_read_that_blocked(sessions):
     class SlowOnce(RecordingDriver):
         is_slow = False

@@ -1,4 +1,4 @@
-"""The tutorial's page: its files, and the commands and output of its terminal."""
+"""A page of the tutorial: its files, and the commands and output of its terminals."""
 
 from __future__ import annotations
 
@@ -6,16 +6,13 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import NamedTuple
 
 from helpers.processes import until
 
 FOLDER = Path(__file__).parents[2] / "models" / "tutorial"
-TEXT = (FOLDER / "README.md").read_text()
-FILES = {"xml": "arm.urdf", "python": "swing.py", "toml": "cell.toml"}
 
 _DONE = "exercise done: "
 
@@ -29,12 +26,16 @@ _MASKS = {
     r"\(\d+\.\d{9}\)": "(STAMP)",
     # Ten digits are 1 s: in one exercise, the stamp is the machine's uptime [ns].
     r"\d+\.\d{9}|\b\d{10,}\b": "STAMP",
-    r"\d+\.\d Hz": "RATE",
+    r"\d+\.\d+ Hz": "RATE",
     r"-?\d+(\.\d+)? (ns|us|ms|s|days)\b": "TIME",
     r"-?\d+\.\d{3}\b": "NUMBER",
     r"(ahead of|behind) this": "BESIDE this",
     r"(/\S+)+/arm\.urdf": "PATH/arm.urdf",
     r"kernel \w+": "kernel KIND",
+    r"-USR1 \d+": "-USR1 N",
+    r"(?<=skipped )\d+|\d+(?= (samples|setpoints|stopped)\b)": "COUNT",
+    # An unplugged cable is noticed while the driver reads, or while it writes.
+    r"\w*([Ee]rror|Exception)\(.*?\)(?=;|$)": "EXCEPTION",
     r"that of [\w-]+@": "that of WRITER@",
     r"(?<=\S) +": " ",
     r" (0|\+?TIME) ([\w-]+@HOST)": r" CLOCK \2",
@@ -42,27 +43,53 @@ _MASKS = {
 
 
 class TerminalStep(NamedTuple):
-    """A command, and the output below it on the page."""
+    """A command in a terminal of the page, and the output below it.
 
+    Without a command: what the last program that runs on in that terminal prints then.
+    """
+
+    terminal: str
     command: str
     lines: list[str]
-
-    @property
-    def is_background(self) -> bool:
-        """Whether it runs in the background; its lines may come in another order."""
-        return self.command.endswith(" &")
+    runs_on: bool
+    """Whether it is a program that goes on; its lines may come in another order."""
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+class TutorialPage:
+    """The blocks of a page. In those of terminals, ``$ `` or ``2$ `` is before a command.
+
+    ``2> `` is before a line that a program prints which was started in terminal 2 before.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._text = (FOLDER / name).read_text()
+
+    def blocks(self, language: str) -> list[str]:
+        return re.findall(rf"^```{language}\n(.*?)^```$", self._text, re.MULTILINE | re.DOTALL)
+
+    def steps(self) -> list[TerminalStep]:
+        """All commands of the page, in order, and the output between them."""
+        found: list[TerminalStep] = []
+        for line in "".join(self.blocks("console")).splitlines():
+            prompt = re.match(r"(\d?)\$ |(\d)> ", line)
+            text = line[prompt.end() :] if prompt else line
+            if not prompt:
+                found[-1].lines.append(text)
+            elif prompt[2] is None:
+                found.append(TerminalStep(prompt[1], text, [], text.endswith(" &")))
+            elif (found[-1].terminal, found[-1].command) == (prompt[2], ""):
+                found[-1].lines.append(text)
+            else:
+                _let_run_on(found, prompt[2])
+                found.append(TerminalStep(prompt[2], "", [text], runs_on=True))
+        return found
 
 
-def terminal_steps() -> Iterator[TerminalStep]:
-    """All commands of the page, in order."""
-    for block in blocks("console"):
-        for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
-            command, *lines = part.splitlines()
-            yield TerminalStep(command, lines)
+def _let_run_on(steps: list[TerminalStep], terminal: str) -> None:
+    """The program that prints more in ``terminal`` runs on: one in the background, or the last one."""
+    commands = [n for n, step in enumerate(steps) if step.terminal == terminal and step.command]
+    if not any(steps[n].command.endswith(" &") for n in commands):
+        steps[commands[-1]] = steps[commands[-1]]._replace(runs_on=True)
 
 
 def masked(lines: list[str]) -> list[str]:
@@ -79,12 +106,29 @@ def masked(lines: list[str]) -> list[str]:
     ]
 
 
-class Terminal:
-    """A bash process in the folder of the exercise."""
+def check_page(page: TutorialPage, folder: Path) -> None:
+    """Runs all commands of ``page`` in ``folder``, and compares their output."""
+    with ExitStack() as opened:
+        terminals: dict[str, Terminal] = {}
+        for step in page.steps():
+            if step.terminal not in terminals:
+                terminals[step.terminal] = opened.enter_context(
+                    closing(Terminal(folder, f".terminal{step.terminal}-"))
+                )
+            output, expected = masked(terminals[step.terminal].run(step)), masked(step.lines)
+            same = output == expected or (step.runs_on and sorted(output) == sorted(expected))
+            assert same, (step.command, output, expected)
 
-    def __init__(self, folder: Path) -> None:
+
+class Terminal:
+    """A bash process in the folder of the exercise; ``log`` begins the names of its files there."""
+
+    def __init__(self, folder: Path, log: str) -> None:
         self._folder = folder
-        self._background = 0
+        self._log = log
+        self._logs: list[Path] = []
+        self._lines_read = 0
+        self._in_foreground = False
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         self._bash = subprocess.Popen(
             ["bash"],
@@ -97,17 +141,27 @@ class Terminal:
             start_new_session=True,
         )
 
-    def run(self, one: TerminalStep) -> list[str]:
-        """The output of a command; of a background program, once it has the expected number of lines."""
-        command = one.command.removesuffix(" &")
-        if not one.is_background:
-            return self._done(f"{{ {command}; }} </dev/null")
-        self._background += 1
-        log = self._folder / f".log{self._background}"
-        log.touch()
-        self._done(f"{command} >{log} 2>&1 </dev/null &")
-        until(lambda: len(log.read_text().splitlines()) >= len(one.lines))
-        return log.read_text().splitlines()[: len(one.lines)]
+    def run(self, step: TerminalStep) -> list[str]:
+        """The output of a command; of a program that runs on, once it has the expected number of lines."""
+        if not step.command:
+            return self._next_lines(len(step.lines))
+        end = "wait $!; " if self._in_foreground else ""
+        self._in_foreground = step.runs_on and not step.command.endswith(" &")
+        if not step.runs_on:
+            return self._done(f"{end}{{ {step.command}; }} </dev/null")
+        self._logs.append(self._folder / f"{self._log}{len(self._logs)}")
+        self._logs[-1].touch()
+        self._lines_read = 0
+        self._done(f"{end}{step.command.removesuffix(' &')} >{self._logs[-1]} 2>&1 </dev/null &")
+        return self._next_lines(len(step.lines))
+
+    def _next_lines(self, count: int) -> list[str]:
+        """The next ``count`` lines of the last program that runs on."""
+        first, end = self._lines_read, self._lines_read + count
+        log = self._logs[-1]
+        until(lambda: len(log.read_text().splitlines()) >= end)
+        self._lines_read = end
+        return log.read_text().splitlines()[first:end]
 
     def _done(self, command: str) -> list[str]:
         assert self._bash.stdin
@@ -120,12 +174,3 @@ class Terminal:
         """Kills bash and all processes that it has started."""
         os.killpg(self._bash.pid, 9)
         self._bash.communicate()
-
-
-@contextmanager
-def terminal(folder: Path) -> Iterator[Terminal]:
-    opened = Terminal(folder)
-    try:
-        yield opened
-    finally:
-        opened.close()

@@ -295,7 +295,8 @@ class DriverHost(Closeable):
             self._barred.pop(self._stops.releaser, None)
         with self._pace(self._stop, seconds) as rate:
             self._rate = rate
-            self._change("ready", "")
+            if not latched.stops:
+                self._change("ready", "")
             try:
                 for _ in rate:
                     if self._is_ending or signals:
@@ -309,20 +310,20 @@ class DriverHost(Closeable):
     # One tick, in the thread of run()
 
     def _tick(self) -> None:
-        fault = self._read()
+        failures = [self._read()]
         now = time.monotonic_ns()
         if self._measured is not None:
             reason = self._following.deviation(self._measured, self._measured_at, now)
             if reason:
                 self._stop_and_latch(reason)
-        fault = self._obey_stops(now) or fault
+        failures.append(self._obey_stops(now))
         self._accept_commands(now)
         if self._measured is not None:
             self._motions.supervise(now, self._measured, self._measured_at)
         has_new_stop = self._stops.current is not self._obeyed  # obeyed in the next tick
         if self._state.name != "stopped" and not has_new_stop:
-            fault = self._advance(now, is_fresh=fault is None) or fault
-        self._count_fault(fault)
+            failures.append(self._advance(now, is_fresh=not any(failures)))
+        self._count_fault(next(filter(None, failures), None))
 
     def _read(self) -> Exception | None:
         """Read the joints and publish them. Returns what failed; the last state stays then."""
@@ -514,7 +515,8 @@ class DriverHost(Closeable):
         self._stop_and_latch(reason)
         self._change("fault", reason)
         raise DriverFault(
-            f"{self.robot!r} is stopped: {reason}; mend it, restart, then release the stop with a Commander",
+            f"{self.robot!r} is stopped: {reason}; mend it, restart, then release the "
+            f"stop: `zstate stop {self.robot} --release`",
             robot=self.robot,
         ) from fault
 

@@ -77,8 +77,13 @@ class SupervisedDriver:
     def stop(self, how: StopMode) -> Exception | None:
         """Stop the hardware; "relax" if the joints are relaxed already, or a stop with "relax" is pending."""
         self.is_enabled = False
+        is_new = self._pending is None
         self._pending = "relax" if self._is_relaxed or self._pending == "relax" else how
-        return self.repeat_stop()
+        failure = self.repeat_stop()
+        if is_new and failure is not None:
+            text = "stop(%r) of the driver of %r failed, and is called until it succeeds: %r"
+            _LOG.error(text, self._pending, self._robot, failure)
+        return failure
 
     def repeat_stop(self) -> Exception | None:
         """Call the stop that is pending, if any."""
@@ -87,7 +92,6 @@ class SupervisedDriver:
         try:
             self._driver.stop(self._pending)
         except Exception as error:
-            _LOG.error("stop(%r) of the driver of %r failed: %r", self._pending, self._robot, error)
             return error
         self._is_relaxed = self._pending == "relax"
         self._pending = None
