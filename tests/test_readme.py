@@ -153,7 +153,7 @@ def test_a_simulated_robot_is_driven_stopped_and_released(
     teleop = spawn(PROGRAMS["teleop.py"])
     assert teleop.line() == "('shoulder', 'elbow')"
     lines = iter(host.stdout.readline, "")
-    assert any(line.startswith("active by ") for line in lines)
+    assert any(line.startswith("active, commanded by ") for line in lines)
 
 
 @pytest.mark.robots

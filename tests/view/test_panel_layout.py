@@ -27,7 +27,7 @@ def test_empty_layout_gets_its_first_frame(page):
     buffer = TransformBuffer()
     with (
         ViewSource(None, buffer=buffer) as source,
-        PanelLayout(page.server, source, Scene(page.server)) as layout,
+        PanelLayout(page, source, Scene(page.server)) as layout,
     ):
         snapshot = source.snapshot(layout.stamp)
         layout.update(snapshot)
@@ -41,7 +41,7 @@ def test_empty_layout_gets_its_first_frame(page):
 def test_paused_recording_is_shown_at_the_cursor_and_not_at_its_end(page, buffer):
     with (
         ViewSource(None, buffer=buffer) as source,
-        PanelLayout(page.server, source, Scene(page.server)) as layout,
+        PanelLayout(page, source, Scene(page.server)) as layout,
     ):
         layout.cursor.pause()
         assert layout.stamp == 0
@@ -57,7 +57,7 @@ def test_update_without_changes_sends_nothing(page, buffer, monkeypatch):
     sent: list[object] = []
     with (
         ViewSource(None, buffer=buffer) as source,
-        PanelLayout(page.server, source, Scene(page.server)) as layout,
+        PanelLayout(page, source, Scene(page.server)) as layout,
     ):
         layout.cursor.pause()
         layout.update(source.snapshot(layout.stamp))

@@ -113,6 +113,20 @@ def test_beyond_loopback_page_and_websocket_need_the_token():
             assert socket.recv(timeout=10)
 
 
+def test_browser_that_is_cut_off_is_noticed_while_another_answers():
+    with ViewServer(port=0) as page:
+        address = f"ws://127.0.0.1:{page.port}"
+        with connect(address, subprotocols=PROTOCOL, compression=None, max_queue=None):
+            until(lambda: page.is_answering(0))
+            with socket.create_connection(("127.0.0.1", page.port), timeout=10.0) as cut_off:
+                host = f"Host: 127.0.0.1:{page.port}"
+                cut_off.sendall("\r\n".join(["GET / HTTP/1.1", host, *WEBSOCKET, "", ""]).encode())
+                until(lambda: page.is_answering(1))
+                until(lambda: not page.is_answering(1))
+            until(lambda: page.is_answering(0))
+        until(lambda: not page.is_answering(0))
+
+
 def test_server_closes_soon_with_an_unresponsive_browser():
     page = ViewServer(port=0)
     with socket.create_connection(("127.0.0.1", page.port), timeout=10.0) as vanished:

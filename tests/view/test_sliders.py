@@ -212,18 +212,27 @@ def test_panda_has_one_slider_for_each_joint():
     assert tuple(spec.name for spec in SliderMapping(panda).specs) == panda.joint_names
 
 
+BROWSER, OTHER_BROWSER = 1, 2
+
+
 @pytest.fixture
-def commander(sessions, host_driver) -> Iterator[SliderCommander]:
+def browsers() -> set[int]:
+    """The browsers that answer."""
+    return {BROWSER, OTHER_BROWSER}
+
+
+@pytest.fixture
+def commander(sessions, host_driver, browsers) -> Iterator[SliderCommander]:
     """The sliders of a driver, which has published its state."""
     with (
         DriverStateListener(sessions[1], "arm") as states,
-        SliderCommander(sessions[1], "arm", states) as sliders,
+        SliderCommander(sessions[1], "arm", states, browsers.__contains__) as sliders,
     ):
         yield sliders
 
 
 def in_control(sliders: SliderCommander) -> SliderCommander:
-    until(sliders.take_control)  # the driver's state may not have arrived yet
+    until(lambda: sliders.take_control(BROWSER))  # the driver's state may not have arrived yet
     return sliders
 
 
@@ -231,12 +240,12 @@ def test_a_driver_is_commanded_from_the_first_move_of_a_slider_until_control_is_
     sessions, host_driver, commander
 ):
     host: DriverHost = host_driver()
-    commander.set("elbow", 0.5)
+    commander.set(BROWSER, "elbow", 0.5)
     in_control(commander)
     assert commander.targets == {}
     with TransformListener(sessions[1], "arm") as listener:
         listener.buffer.wait("base", "lower", timeout_s=DEADLINE_S)
-        commander.set("elbow", 0.25)
+        commander.set(BROWSER, "elbow", 0.25)
         until(lambda: listener.buffer.joint_positions("arm")[0].tolist() == [0.0, 0.25])
     assert host.state == "active"
     commander.release_control()
@@ -249,13 +258,13 @@ def test_a_stop_ends_control_and_after_its_release_nothing_moves_before_a_slider
     sessions, host_driver, commander
 ):
     host: DriverHost = host_driver()
-    in_control(commander).set("elbow", 3.0)
+    in_control(commander).set(BROWSER, "elbow", 3.0)
     until(lambda: host.state == "active")
     stop(sessions[0], "arm", "door open", timeout_s=DEADLINE_S)
     until(lambda: not commander.has_control)
     assert re.match("control has ended: stopped by .*: door open", commander.problem)
-    in_control(commander).set("elbow", 3.0)  # ignored while the driver is stopped
-    commander.release_stops()
+    in_control(commander).set(BROWSER, "elbow", 3.0)  # ignored while the driver is stopped
+    commander.release_stops(BROWSER)
     until(lambda: host.state == "ready")
     assert commander.has_control
     assert commander.targets == {}
@@ -268,7 +277,7 @@ def test_control_is_refused_while_another_program_commands_the_robot(sessions, h
     host_driver()
     with Commander(sessions[0], "arm", program="teleop") as teleop:
         teleop.wait_for_driver(DEADLINE_S)
-        assert not commander.take_control()
+        assert not commander.take_control(BROWSER)
         assert "teleop@" in commander.problem
         assert not commander.has_control
 
@@ -279,3 +288,43 @@ def test_control_ends_when_the_driver_ends(host_driver, commander):
     host.close()
     until(lambda: not commander.has_control)
     assert commander.problem == "control has ended: off: the loop has ended"
+
+
+def test_only_the_browser_that_has_taken_control_commands_and_releases_a_stop(
+    sessions, host_driver, commander
+):
+    host: DriverHost = host_driver()
+    in_control(commander)
+    assert not commander.take_control(OTHER_BROWSER)
+    commander.set(OTHER_BROWSER, "elbow", 0.5)
+    assert commander.targets == {}
+    commander.stop()
+    in_control(commander)
+    until(lambda: host.state == "stopped")
+    commander.release_stops(OTHER_BROWSER)
+    assert host.state == "stopped"
+
+
+def test_control_ends_when_its_browser_does_not_answer(host_driver, commander, browsers):
+    host: DriverHost = host_driver()
+    in_control(commander).set(BROWSER, "elbow", 3.0)
+    until(lambda: host.state == "active")
+    browsers.remove(BROWSER)
+    until(lambda: host.state == "holding")
+    assert not commander.has_control
+    assert "has left the page or does not answer" in commander.problem
+
+
+def test_control_ends_when_its_thread_fails(sessions, host_driver):
+    host_driver()
+
+    def fails(client: int) -> bool:
+        raise RuntimeError(f"no browser {client}")
+
+    with (
+        DriverStateListener(sessions[1], "arm") as states,
+        SliderCommander(sessions[1], "arm", states, fails) as sliders,
+    ):
+        until(lambda: sliders.take_control(BROWSER) or sliders.problem)
+        until(lambda: not sliders.has_control)
+        assert sliders.problem == "control has ended: RuntimeError: no browser 1"

@@ -168,6 +168,15 @@ def check_only_host(session: Session, robot: str) -> None:
             )
 
 
+def state_text(state: DriverState) -> str:
+    """The state of a driver and its commander or reason, in one line."""
+    if state.state == "active":
+        return f"active, commanded by {state.commander}"
+    if not state.reason or state.reason.startswith(f"{state.state} by "):
+        return state.reason or state.state
+    return f"{state.state}: {state.reason}"
+
+
 class ReceivedState(NamedTuple):
     """The newest state of a driver, and the time since it arrived [s]."""
 
@@ -188,14 +197,9 @@ class ReceivedState(NamedTuple):
         return f"{newest.name}: {newest.reason}" if newest.reason else newest.name
 
     def __str__(self) -> str:
-        state, text = self.state, self.state.state
-        if state.state == "active":
-            text += f", commanded by {state.commander}"
-            text += f", motion {state.progress:.0%} done" if state.motion is not None else ""
-        elif state.reason.startswith(f"{text} by "):
-            text = state.reason
-        elif state.reason:
-            text += f": {state.reason}"
+        state, text = self.state, state_text(self.state)
+        if state.state == "active" and state.motion is not None:
+            text += f", motion {state.progress:.0%} done"
         if self.is_live or state.state == "off":  # it has been closed
             return text
         return f"silent for {format_duration(round(self.age_s * 1e9))}, was {text}"

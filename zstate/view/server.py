@@ -5,11 +5,13 @@ Neither connects to the internet.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import functools
 import io
 import logging
+import math
 import os
 import shutil
 import socket
@@ -25,6 +27,7 @@ import numpy as np
 import viser
 import websockets.asyncio.server
 from numpy.typing import NDArray
+from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from zstate._util.closeable import Closeable
@@ -37,6 +40,9 @@ PORT = 8080
 _PORTS_TRIED = 100
 # A browser that has vanished (a suspended laptop, a lost network) does not answer the closing handshake.
 _CLOSE_TIMEOUT_S = 0.3
+_PING_PERIOD_S = 0.5
+_ANSWER_WITHIN_S = 3.0
+"""A browser without an answer to a ping for so long is cut off, suspended, or has too much to draw."""
 
 # websockets logs a traceback for each connection that a browser opens and drops.
 _SILENT = logging.getLogger("zstate.view.http")
@@ -96,6 +102,7 @@ class ViewServer(Closeable):
         self.access = AccessCheck.at(host, self.port)
         self.connected = threading.Event()
         """Set while at least one browser shows the page."""
+        self._answered_at: dict[websockets.asyncio.server.ServerConnection, float] = {}
         try:
             with _opening, _no_output(), self._guarded_serve() as opened:
                 self.server = _Server(host, self.port, "zstate", verbose=False)
@@ -116,6 +123,17 @@ class ViewServer(Closeable):
         query = "" if self.access.token is None else f"/?token={self.access.token}"
         is_any = self.host in ("", "0.0.0.0", "::")
         return f"http://{socket.gethostname() if is_any else format_host(self.host)}:{self.port}{query}"
+
+    def is_answering(self, client_id: int) -> bool:
+        """Whether the browser ``client_id`` shows the page, and has answered a ping in the last 3 s.
+
+        viser closes the connection to a browser that is cut off after 20 to 40 s, and not sooner: a ping may
+        wait for the meshes on a slow network.
+        """
+        connection = self.server._websock_server._live_connections.get(client_id)  # pyright: ignore[reportPrivateUsage]
+        if connection is None:
+            return False
+        return time.monotonic() - self._answered_at.get(connection, -math.inf) < _ANSWER_WITHIN_S
 
     def close(self) -> None:
         """Stop the server. A second call does nothing."""
@@ -141,7 +159,7 @@ class ViewServer(Closeable):
         ) -> websockets.asyncio.server.serve:
             opened.append(port)
             return original(
-                handler,
+                functools.partial(self._handle, handler),
                 sock=self._socket,
                 process_request=functools.partial(self._process_request, process_request),
                 logger=_SILENT,
@@ -154,6 +172,26 @@ class ViewServer(Closeable):
             yield opened
         finally:
             websockets.asyncio.server.serve = original
+
+    async def _handle(
+        self, viser_handler: Any, connection: websockets.asyncio.server.ServerConnection
+    ) -> None:
+        self._answered_at[connection] = time.monotonic()
+        pings = asyncio.create_task(self._ping(connection))
+        try:
+            await viser_handler(connection)
+        finally:
+            pings.cancel()
+            await asyncio.gather(pings, return_exceptions=True)
+            del self._answered_at[connection]
+
+    async def _ping(self, connection: websockets.asyncio.server.ServerConnection) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                pong = await connection.ping()
+                await pong
+                self._answered_at[connection] = time.monotonic()
+                await asyncio.sleep(_PING_PERIOD_S)
 
     def _process_request(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -310,11 +310,12 @@ def _conflict_text(error: SecondWriter) -> str:
 
 @dataclass(eq=False)
 class _Control:
-    """The time from taking control to its end; ``stops`` are those that were latched before it.
+    """The time from taking control by the browser ``client`` to its end.
 
-    Commands are sent every ``period_s`` [s].
+    Commands are sent every ``period_s`` [s]. ``stops`` are those that were latched before.
     """
 
+    client: int
     commander: Commander
     period_s: float
     driver_session: int
@@ -324,21 +325,29 @@ class _Control:
 
 
 class SliderCommander(Closeable):
-    """Sends slider values to the driver of ``robot`` while a user has control of it.
+    """Sends slider values to the driver of ``robot`` while one browser has control of it.
 
-    Control begins with ``take_control``, and nothing is sent until ``set``: from then on that joint's
-    position is sent, again and again, and no other's. Control ends with ``release_control`` or ``stop``, and
-    by itself if the driver is stopped, ends, restarts or is silent, or a command cannot be sent; ``problem``
-    is why. However it ends, the driver brakes, and holds the joints once the last command has expired. Any
-    thread may call. Not a safety-rated channel.
+    Browsers have numbers, as in viser. Control begins with ``take_control``, and nothing is sent until that
+    browser calls ``set``: from then on that joint's position is sent, again and again, and no other's.
+    Control ends with ``release_control`` or ``stop``, which are open to every browser, and by itself once
+    ``is_answering(client)`` is False, if the driver is stopped, ends, restarts or is silent, or a command
+    cannot be sent; ``problem`` is why. However it ends, the driver brakes, and holds the joints once the last
+    command has expired. Any thread may call. Not a safety-rated channel.
     """
 
-    def __init__(self, session: Session, robot: str, states: DriverStateListener) -> None:
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        states: DriverStateListener,
+        is_answering: Callable[[int], bool],
+    ) -> None:
         self.robot = robot
         self.problem = ""
         """Why control has ended, or could not be taken or a stop not be confirmed; else empty."""
         self._session = session
         self._states = states
+        self._is_answering = is_answering
         self._lock = fork_safe_lock()
         self._control: _Control | None = None
         self._thread: threading.Thread | None = None
@@ -356,15 +365,18 @@ class SliderCommander(Closeable):
         control = self._control
         return {} if control is None or control.ended.is_set() else control.targets
 
-    def take_control(self) -> bool:
-        """Become the robot's commander; whether that is so now. Waits up to some seconds."""
+    def take_control(self, client: int) -> bool:
+        """Become the robot's commander for ``client``; whether it has control now. Waits up to some seconds.
+
+        Does nothing while another browser has control.
+        """
         with self._lock:
             if self.has_control or self._closed:
-                return self.has_control
+                return self._control_of(client) is not None
             self._join()
             self.problem = ""
             try:
-                control = self._control = self._open_control()
+                control = self._control = self._open_control(client)
             except ZStateError as error:
                 self.problem = str(error)
                 return False
@@ -374,28 +386,34 @@ class SliderCommander(Closeable):
             self._thread.start()
             return True
 
-    def _open_control(self) -> _Control:
+    def _control_of(self, client: int) -> _Control | None:
+        """The control that ``client`` has now."""
+        control = self._control
+        has_control = control is not None and control.client == client and not control.ended.is_set()
+        return control if has_control else None
+
+    def _open_control(self, client: int) -> _Control:
         with ExitStack() as opening:
             commander = opening.enter_context(Commander(self._session, self.robot, program="zstate view"))
             state = commander.wait_for_driver()
             opening.pop_all()
         period_s = min(_SEND_PERIOD_S, 0.25e-9 * state.ttl)
-        return _Control(commander, period_s, state.session, set(state.stops))
+        return _Control(client, commander, period_s, state.session, set(state.stops))
 
-    def set(self, name: str, value: float) -> None:
+    def set(self, client: int, name: str, value: float) -> None:
         """Send the position ``value`` [rad] or [m] of the joint ``name`` from now on.
 
-        Does nothing without control, and while the driver is stopped.
+        Does nothing unless ``client`` has control, and while the driver is stopped.
         """
-        control, received = self._control, self._states.get(self.robot)
+        control, received = self._control_of(client), self._states.get(self.robot)
         if control is not None and received is not None and received.state.state != "stopped":
             control.targets = {**control.targets, name: value}
 
-    def release_control(self, problem: str = "") -> None:
-        """Send no more, because of ``problem`` unless a user wants it. Does not wait for the driver."""
+    def release_control(self) -> None:
+        """Send no more. Does not wait for the driver."""
         control = self._control
         if control is not None and not control.ended.is_set():
-            self.problem = problem
+            self.problem = ""
             control.ended.set()
 
     def stop(self) -> None:
@@ -407,13 +425,13 @@ class SliderCommander(Closeable):
         except ZStateError as error:
             self.problem = str(error)
 
-    def release_stops(self) -> None:
+    def release_stops(self, client: int) -> None:
         """Release the stops of the driver. Nothing moves by that. Waits up to some seconds.
 
-        Does nothing without control.
+        Does nothing unless ``client`` has control.
         """
-        control = self._control
-        if control is not None and not control.ended.is_set():
+        control = self._control_of(client)
+        if control is not None:
             try:
                 control.commander.release()
             except ZStateError as error:
@@ -432,15 +450,22 @@ class SliderCommander(Closeable):
 
     def _run(self, control: _Control) -> None:
         with control.commander:
-            while not control.ended.is_set():
-                problem = self._send(control)
-                if problem:
-                    self.problem = f"control has ended: {problem}"
-                    control.ended.set()
-                control.ended.wait(control.period_s)
+            try:
+                while not control.ended.is_set():
+                    problem = self._send(control)
+                    if problem:
+                        self.problem = f"control has ended: {problem}"
+                        control.ended.set()
+                    control.ended.wait(control.period_s)
+            except Exception as error:  # whatever fails here, the page must not show that it is in control
+                self.problem = f"control has ended: {type(error).__name__}: {error}"
+            finally:
+                control.ended.set()
 
     def _send(self, control: _Control) -> str:
-        """Send the targets, if the driver is as it was when control began. Returns why control ends."""
+        """Send the targets, if browser and driver are as when control began. Returns why control ends."""
+        if not self._is_answering(control.client):
+            return "the browser that had taken control has left the page or does not answer"
         received = self._states.get(self.robot)
         problem = _problem_of(received, control)
         if problem or received is None or received.state.state == "stopped" or not control.targets:

@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-import viser
 
 from zstate._util.closeable import Closeable
 from zstate.buffer.snapshot import FramePoses, Poses
@@ -80,9 +79,7 @@ class View(Closeable):
         self._rate_hz = rate_hz
         self._folders = folders or {}
         self.scene = Scene(page.server)
-        self.layout = PanelLayout(
-            page.server, source, self.scene, sliders, fixed_frame, can_command=can_command
-        )
+        self.layout = PanelLayout(page, source, self.scene, sliders, fixed_frame, can_command=can_command)
         self._camera = camera
         self._aspect = aspect
         self._version = -1
@@ -236,7 +233,7 @@ class View(Closeable):
 
 
 class PanelLayout(Closeable):
-    """Adds the panels to the page of ``server``; ``sliders`` belong to the robots that are moved from it.
+    """Adds the panels to ``page``; ``sliders`` belong to the robots that are moved from it.
 
     With ``can_command`` drivers can be commanded from it, too. ``fixed_frame`` is selected at first. The
     drawing thread reads ``stamp`` and ``fixed`` for each picture, and calls ``update`` with the snapshot on
@@ -245,7 +242,7 @@ class PanelLayout(Closeable):
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        page: ViewServer,
         source: ViewSource,
         scene: Scene,
         sliders: Sequence[SliderPublisher] = (),
@@ -253,7 +250,7 @@ class PanelLayout(Closeable):
         *,
         can_command: bool = False,
     ) -> None:
-        gui = server.gui
+        gui = page.server.gui
         self._source = source
         self.fixed = FixedFrame(fixed_frame)
         self._resources = ExitStack()
@@ -277,7 +274,7 @@ class PanelLayout(Closeable):
                 with gui.add_folder(f"Move {publisher.robot}"):
                     self._panels.append(SlidersPanel(gui, publisher))
             if source.session is not None:
-                panel = DriversPanel(server, source, source.session, drivers, can_command=can_command)
+                panel = DriversPanel(page, source, source.session, drivers, can_command=can_command)
                 self._panels.append(self._resources.enter_context(panel))
             with gui.add_folder("Plot"):
                 self._panels.append(PlotsPanel(gui, source))

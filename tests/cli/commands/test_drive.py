@@ -73,7 +73,7 @@ def test_changes_of_state_are_lines_and_the_end_is_a_report(spawn: Spawn):
     with connect() as session, Commander(session, "rrbot", program="teleop") as commander:
         commander.wait_for_driver(DEADLINE_S)
         until(lambda: _is_moved(commander))
-        assert child.line().startswith("active by teleop@")
+        assert child.line().startswith("active, commanded by teleop@")
         assert child.line().startswith("holding: nothing from teleop@")
         with TransformListener(session, "rrbot") as listener:
             assert listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)

@@ -40,7 +40,7 @@ def printed(*arguments: str) -> str:
 def test_joints_are_moved_and_the_outcome_is_awaited(spawn: Spawn):
     host = driven(spawn)
     assert re.fullmatch(r"reached in \d+\.\d s\n", printed("move", "rrbot", "shoulder=0.3", "elbow=-0.2"))
-    assert host.line().startswith("active by zstate-move@")
+    assert host.line().startswith("active, commanded by zstate-move@")
     with connect() as session, TransformListener(session, "rrbot") as listener:
         listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         until(lambda: np.allclose(listener.buffer.joint_positions("rrbot")[0], [0.3, -0.2], atol=0.02))
@@ -77,7 +77,7 @@ def test_points_of_a_file_are_followed(spawn: Spawn, tmp_path: Path):
 def test_ctrl_c_cancels_a_motion_and_the_joints_brake(spawn: Spawn):
     host = driven(spawn)
     child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
-    assert host.line().startswith("active by zstate-move@")
+    assert host.line().startswith("active, commanded by zstate-move@")
     until(lambda: "moving" in child.stderr)
     interrupted(child)
     assert "cancelled: the joints of 'rrbot' brake" in child.stderr
@@ -86,7 +86,7 @@ def test_ctrl_c_cancels_a_motion_and_the_joints_brake(spawn: Spawn):
 def test_motion_ends_with_the_stop_of_another_program(spawn: Spawn):
     host = driven(spawn)
     child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
-    assert host.line().startswith("active by zstate-move@")
+    assert host.line().startswith("active, commanded by zstate-move@")
     printed("stop", "rrbot", "--reason", "door open")
     assert child.wait() == 1
     assert "the motion of 'rrbot' was stopped: " in child.stderr

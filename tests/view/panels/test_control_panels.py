@@ -1,8 +1,12 @@
-"""Rows of a plot: few, and the same ones while it scrolls."""
+"""Rows of a plot: few, and the same ones while it scrolls; a stop that fails."""
 
 import numpy as np
 
-from zstate.view.panels.control_panels import plotted_rows
+from zstate.driving.driver_state import DriverStateListener, ReceivedState
+from zstate.view.panels import html
+from zstate.view.panels.control_panels import _DriverPanel, plotted_rows
+from zstate.view.sliders import SliderCommander
+from zstate.wire.messages import DriverState
 
 S = 1_000_000_000
 
@@ -22,3 +26,18 @@ def test_consecutive_plots_choose_the_same_samples():
     common = range(int(second[0]), int(first[-1]) + 1)
     # The first row of a plot may be in the middle of an interval.
     assert {one for one in after ^ before if one in common} <= {int(second[0])}
+
+
+def test_failed_stop_is_shown_in_the_color_of_alarms_without_sliders(page, sessions):
+    ready = DriverState(0, 5, "host", "ready", "", ("elbow",), 10**8)
+    gui = page.server.gui
+    with (
+        DriverStateListener(sessions[0], "arm") as states,
+        SliderCommander(sessions[0], "arm", states, lambda _: True) as commander,
+    ):
+        panel = _DriverPanel(gui, commander, gui.add_folder("Drivers"))
+        commander.stop()  # of no driver
+        assert "no driver" in commander.problem
+        panel.update(ReceivedState(ready, 0.0))
+        shown = html.paragraph(commander.problem, color=html.ALARM)
+        assert shown in {getattr(handle, "content", "") for handle in vars(panel).values()}

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from zstate.driving.driver_state import Spread
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
-    from zstate.wire.messages import DriverState
     from zstate.wire.protocol import SerializedSample
 
 _SIMULATED = "sim"
@@ -263,6 +262,7 @@ class _StateLines(Closeable):
         self._subscriber.close()
 
     def _on_state(self, sample: SerializedSample) -> None:
+        from zstate.driving.driver_state import state_text
         from zstate.wire.messages import DriverState
         from zstate.wire.native import decode
 
@@ -272,15 +272,6 @@ class _StateLines(Closeable):
             if state.state != "off" and text != self._newest:
                 print_wrapped(text)
             self._newest = text
-
-
-def state_text(state: DriverState) -> str:
-    """The state of a driver and its reason, in one line."""
-    if state.state == "active":
-        return f"active by {state.commander}"
-    if not state.reason or state.reason.startswith(f"{state.state} by "):
-        return state.reason or state.state
-    return f"{state.state}: {state.reason}"
 
 
 def _limits(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli import options
-from zstate.cli.commands.drive import parse_joint_value, state_text
+from zstate.cli.commands.drive import parse_joint_value
 from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import MotionRefused, MotionTimeout, Unreachable, ZStateError
@@ -176,6 +176,7 @@ def stop_command(
     if release and (relax or reason):
         raise click.UsageError("--release ends stops; leave out --relax and --reason")
     from zstate.cli.processes import BackgroundCall  # loads numpy, which --help does not need
+    from zstate.driving.driver_state import state_text
 
     act = partial(_release, timeout_s=timeout)
     if not release:

@@ -25,6 +25,7 @@ from zstate.view.data_source import ViewSource
 from zstate.view.panels import html
 from zstate.view.panels.html import format_number
 from zstate.view.panels.panel import BoundWidget, PanelContext
+from zstate.view.server import ViewServer
 from zstate.view.sliders import SliderCommander, SliderMapping, SliderPublisher, SliderSpec
 from zstate.wire.keys import ANY
 from zstate.wire.messages import DriverState
@@ -107,18 +108,25 @@ class SlidersPanel:
 
     def _new_sliders(self) -> list[_JointSlider]:
         publisher, unit = self._publisher, self._unit.value
+
+        def set_value(_: int, name: str, value: float) -> None:
+            publisher.set(name, value)
+
         with self._folder:
             specs = zip(publisher.mapping.specs, publisher.values.tolist(), strict=True)
-            return [_JointSlider(self._gui, publisher.set, spec, value, unit) for spec, value in specs]
+            return [_JointSlider(self._gui, set_value, spec, value, unit) for spec, value in specs]
 
 
 class _JointSlider:
-    """One slider, in the unit on display; ``set_value(name, value)`` is called when the user moves it."""
+    """One slider, in the unit on display.
+
+    ``set_value(client_id, name, value)`` is called when the user of a browser moves it.
+    """
 
     def __init__(
         self,
         gui: viser.GuiApi,
-        set_value: Callable[[str, float], None],
+        set_value: Callable[[int, str, float], None],
         spec: SliderSpec,
         value: float,
         angle_unit: str = "rad",
@@ -148,10 +156,10 @@ class _JointSlider:
     async def _set(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
         # A coroutine, because viser runs them in order; plain callbacks run in a thread each.
         value = event.target.value
-        if event.client is not None and math.isfinite(value):
+        if event.client_id is not None and math.isfinite(value):
             # A limit is rounded for display, maybe to a value beyond it.
             limited = float(np.clip(value / self._scale, self._spec.lower, self._spec.upper))
-            self._set_value(self._spec.name, limited)
+            self._set_value(event.client_id, self._spec.name, limited)
 
 
 class DriversPanel(Closeable):
@@ -162,24 +170,23 @@ class DriversPanel(Closeable):
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        page: ViewServer,
         source: ViewSource,
         session: Session,
         top: viser.GuiFolderHandle,
         *,
         can_command: bool,
     ) -> None:
-        self._server = server
+        self._page = page
         self._source = source
         self._session = session
         self._top = top
         self._can_command = can_command
-        self._folder = server.gui.add_folder(None)
+        self._folder = page.server.gui.add_folder(None)
         self._drivers: dict[str, _DriverPanel] = {}
         self._sliders: dict[str, _DriverSliders] = {}
         self._resources = ExitStack()
         self._states = self._resources.enter_context(DriverStateListener(session, ANY))
-        server.on_client_disconnect(self._on_left)
 
     def update(self, context: PanelContext) -> None:
         models = self._source.models
@@ -192,17 +199,13 @@ class DriversPanel(Closeable):
                 self._sliders[robot].update(received.state, context)
 
     def _add(self, robot: str, model: RobotModel, state: DriverState) -> None:
-        gui = self._server.gui
-        commander = SliderCommander(self._session, robot, self._states)
+        gui = self._page.server.gui
+        commander = SliderCommander(self._session, robot, self._states, self._page.is_answering)
         self._resources.enter_context(commander)
         with self._folder, gui.add_folder(f"Driver of {robot}"):
             self._drivers[robot] = _DriverPanel(gui, commander, self._top)
             if self._can_command:
-                self._sliders[robot] = _DriverSliders(self._server, commander, model, state.joint_names)
-
-    def _on_left(self, client: viser.ClientHandle) -> None:
-        for sliders in list(self._sliders.values()):
-            sliders.release_if_of(client.client_id)
+                self._sliders[robot] = _DriverSliders(gui, commander, model, state.joint_names)
 
     def close(self) -> None:
         """End control of all drivers. A second call does nothing."""
@@ -213,9 +216,11 @@ class _DriverPanel:
     """The state of one driver and the button that stops it, in ``top``, and its figures."""
 
     def __init__(self, gui: viser.GuiApi, commander: SliderCommander, top: viser.GuiFolderHandle) -> None:
+        self._commander = commander
         self._robot = commander.robot
         with top:
             self._state = gui.add_html("")
+            self._problem = gui.add_html("")
             hint = "Stops its driver until the stop is released. An emergency stop is wired to the power."
             stop = gui.add_button(f"STOP {self._robot}", color="red", hint=hint)
         self._figures = gui.add_html("")
@@ -230,6 +235,8 @@ class _DriverPanel:
         is_alarm = not received.is_live or state.state in ("stopped", "fault")
         text = f"Driver of {self._robot}: {received}"
         self._state.content = html.paragraph(text, color=html.ALARM if is_alarm else "")
+        problem = self._commander.problem
+        self._problem.content = html.paragraph(problem, color=html.ALARM) if problem else ""
         refused = ", ".join(f"{reason} {count}" for reason, count in state.refused.items())
         rows = [("program", state.program), ("loop", f"{state.rate_hz:.1f} Hz, {state.skipped} skipped")]
         if state.command_age is not None:
@@ -254,15 +261,12 @@ class _DriverSliders:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        gui: viser.GuiApi,
         commander: SliderCommander,
         model: RobotModel,
         joint_names: Sequence[str],
     ) -> None:
-        gui = server.gui
-        self._server = server
         self._commander = commander
-        self._client: int | None = None
         self._columns = model.columns
         self._positions = model.neutral
         self._text = gui.add_html("")
@@ -271,23 +275,19 @@ class _DriverSliders:
         self._release_stops = gui.add_button("Release the stop", color="orange", visible=False)
         self._take.on_click(self._on_take)
         self._release.on_click(lambda _: commander.release_control())
-        self._release_stops.on_click(lambda _: commander.release_stops())
+        self._release_stops.on_click(self._on_release_stops)
         specs = {spec.name: spec for spec in SliderMapping(model).specs}
         self._sliders = {
             name: _JointSlider(gui, commander.set, specs[name], 0.0) for name in joint_names if name in specs
         }
 
     def _on_take(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-        if self._commander.has_control:
-            return
-        self._client = event.client_id
-        if self._commander.take_control() and event.client_id not in self._server.get_clients():
-            self.release_if_of(event.client_id)
+        if event.client_id is not None:
+            self._commander.take_control(event.client_id)
 
-    def release_if_of(self, client: int | None) -> None:
-        """End control if the browser ``client``, which has left, had taken it."""
-        if client == self._client:
-            self._commander.release_control("the browser that had taken control has left the page")
+    def _on_release_stops(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        if event.client_id is not None:
+            self._commander.release_stops(event.client_id)
 
     def update(self, state: DriverState, context: PanelContext) -> None:
         commander, targets = self._commander, self._commander.targets
@@ -301,15 +301,13 @@ class _DriverSliders:
         for name, slider in self._sliders.items():
             value = targets.get(name, float(self._positions[self._columns[name]]))
             slider.show(value, disabled=not (has_control and is_known) or is_stopped)
-        if commander.problem:
-            self._text.content = html.paragraph(commander.problem, color=html.ALARM)
-        elif has_control and is_stopped:
+        if has_control and is_stopped:
             self._text.content = html.paragraph(
-                "In control of a stopped driver. Nothing moves before its release."
+                "One browser is in control of a stopped driver. Nothing moves before its release."
             )
         elif has_control:
             sent = f"sending {', '.join(targets)}" if targets else "nothing is sent until a slider is moved"
-            self._text.content = html.paragraph(f"In control: {sent}.")
+            self._text.content = html.paragraph(f"One browser is in control: {sent}.")
         else:
             self._text.content = html.paragraph("The sliders follow the joints, and command nothing.")
 
