@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import math
 import os
 import sys
@@ -15,6 +16,8 @@ from typing import Literal, TypeAlias
 
 from zstate.clock import MONOTONIC, SYSTEM, Clock, MonotonicClock
 from zstate.errors import InvalidInput
+
+_LOG = logging.getLogger("zstate")
 
 Realtime: TypeAlias = Literal["fifo", "spin"]
 """How a control loop waits: with SCHED_FIFO, and also without sleeping right before a deadline."""
@@ -48,12 +51,21 @@ _SHORTEST_PERIOD_NS = 100_000
 _PERIODS = 16
 """The period of a device is the mean of about so many."""
 
+_LONGEST_DEVICE_STEP_NS = 50_000_000
+"""A device that is slower than 20 Hz moves its joints slower than their limits, but never by a leap."""
+
 _TICKS_WITH_WAITS = 1000
 """Ticks of a device after which it is checked that at least half of them have waited for it."""
 
 _FIFO_PRIORITY = 50
 _SPIN_NS = 200_000
+_FASTEST_SPIN_HZ = 2_000.0
+"""Above it, a loop would hardly sleep between two spins."""
+
 _LONGEST_SLEEP_NS = 50_000_000
+_SHORTEST_SLEEP_NS = 50_000
+"""The time that a loop leaves to other threads at each tick, even if it is late."""
+
 _SWITCH_INTERVAL_S = 5e-4
 """For how long another thread of Python may delay a tick: above the spin and the work of a tick, which it
 must not interrupt.
@@ -147,8 +159,10 @@ class Rate:
 class DevicePace:
     """Iterate to get the stamp [ns] of each tick of a loop whose body waits for a device.
 
-    The next tick begins when the body has ended. Ends when ``stop`` is set, or after ``seconds``. Raises
-    InvalidInput if fewer than half of 1000 ticks have waited, which would occupy a processor (Linux only).
+    The next tick begins when the body has ended. Ends when ``stop`` is set, or after ``seconds``. If fewer
+    than half of 1000 ticks have waited, the loop would occupy a processor: after the first 1000 that raises
+    InvalidInput, unless the robot has moved. Later there is a warning, and each tick sleeps for 50 us (Linux
+    only).
     """
 
     lateness_ns = 0
@@ -162,7 +176,9 @@ class DevicePace:
         self._first: int | None = None
         self._last = 0
         self._period_ns = float(_SHORTEST_PERIOD_NS)
-        """The mean of the last periods; longer pauses of the device count as two periods."""
+        """The mean of the last periods, which grows from the shortest; longer pauses count as two periods."""
+        self._has_moved = False
+        self._is_overloaded = False
 
     def __iter__(self) -> Iterator[int]:
         waits = _count_waits()
@@ -172,54 +188,67 @@ class DevicePace:
                 self._first = now
             elif now - self._first >= self._longest_ns:
                 return
-            elif self._ticks == 1:
-                self._period_ns = float(now - self._first)
             else:
-                elapsed = min(now - self._last, 2.0 * self._period_ns)
+                elapsed = self._bounded(now - self._last)
                 self._period_ns += (elapsed - self._period_ns) / _PERIODS
             self._last = now
             self._ticks += 1
             yield now
-            if self._ticks % _TICKS_WITH_WAITS == 0:
+            if self._is_overloaded:
+                time.sleep(_SHORTEST_SLEEP_NS * 1e-9)
+            elif self._ticks % _TICKS_WITH_WAITS == 0:
                 waits = self._check_waits(waits)
 
     def step_s(self, since: int, now: int) -> float:
         """For how long a robot moves at ``now`` that moved last at ``since`` [ns]: until ``now``, in s.
 
-        After a pause of the device it moves for two of its periods at most: slower, never further.
+        After a pause of the device it moves for two of its periods at most, and for 50 ms: slower, never
+        further.
         """
-        return min(now - since, 2.0 * self._period_ns) * 1e-9
+        self._has_moved = True
+        return self._bounded(now - since) * 1e-9
+
+    def _bounded(self, elapsed_ns: int) -> float:
+        return min(elapsed_ns, 2.0 * self._period_ns, _LONGEST_DEVICE_STEP_NS)
 
     def report(self) -> RateReport:
         """Statistics so far."""
         return RateReport(0.0, _achieved_hz(self._ticks, self._first, self._last), self._ticks, 0, 0)
 
     def _check_waits(self, before: int | None) -> int | None:
-        """The count of waits. Raises InvalidInput if there were hardly any after ``before``."""
+        """The count of waits. Raises InvalidInput, or warns, if there were hardly any after ``before``."""
         waits = _count_waits()
-        if before is not None and waits is not None and waits - before < _TICKS_WITH_WAITS // 2:
-            rate_hz = 1e9 / self._period_ns
-            raise InvalidInput(
-                f"the loop has waited {waits - before} times in {_TICKS_WITH_WAITS} ticks, at {rate_hz:.0f} "
-                "Hz: the device that sets its pace returns at once, or is faster than the loop. Let read() "
-                "block until there is a new reading, or pass rate_hz=..."
-            )
+        if before is None or waits is None or waits - before >= _TICKS_WITH_WAITS // 2:
+            return waits
+        text = (
+            f"the loop has waited {waits - before} times in {_TICKS_WITH_WAITS} ticks, at "
+            f"{1e9 / self._period_ns:.0f} Hz: the device that sets its pace returns at once, or is faster "
+            "than the loop. Let read() block until there is a new reading, or pass rate_hz=..."
+        )
+        if self._ticks == _TICKS_WITH_WAITS and not self._has_moved:
+            raise InvalidInput(text)
+        self._is_overloaded = True
+        _LOG.warning("%s. The loop sleeps for %d us at each tick now", text, _SHORTEST_SLEEP_NS // 1000)
         return waits
 
 
 class _PreciseClock(MonotonicClock):
     """The monotonic clock with waits that end on time, the last ``spin_ns`` of them without sleep.
 
-    A sleep of the system takes no locks after it has ended, as the wait for an event does. In the last part
-    this thread holds the interpreter lock, which another one may need some time to release.
+    Each wait sleeps for 50 us at least, also after its deadline: a thread with SCHED_FIFO that never sleeps
+    would stop all others of its processor. A sleep of the system takes no locks after it has ended, as the
+    wait for an event does. In the last part this thread holds the interpreter lock, which another one may
+    need some time to release.
     """
 
     def __init__(self, spin_ns: int) -> None:
         self._spin_ns = spin_ns
 
     def wait_until(self, stamp: int, stop: threading.Event) -> bool:
-        while (left_ns := stamp - self._spin_ns - time.monotonic_ns()) > 0 and not stop.is_set():
+        left_ns = max(stamp - self._spin_ns - time.monotonic_ns(), _SHORTEST_SLEEP_NS)
+        while left_ns > 0 and not stop.is_set():
             time.sleep(min(left_ns, _LONGEST_SLEEP_NS) * 1e-9)
+            left_ns = stamp - self._spin_ns - time.monotonic_ns()
         while time.monotonic_ns() < stamp and not stop.is_set():
             pass
         return not stop.is_set()
@@ -233,8 +262,9 @@ def control_loop_pace(
 
     With ``realtime`` the thread has SCHED_FIFO at priority 50 inside the block, the memory of the process is
     locked, and its garbage collector skips the objects that exist already. "spin" also does not sleep in the
-    last 200 us before a deadline: at 1 kHz the loop occupies a quarter of a processor for that. Raises
-    InvalidInput, with what to do, if the system does not permit it.
+    last 200 us before a deadline: at 1 kHz the loop occupies a quarter of a processor for that. A tick that
+    is late sleeps for 50 us first, as other threads need some of the processor. Raises InvalidInput, with
+    what to do, if the system does not permit it.
     """
     with ExitStack() as restoring:
         clock = MonotonicClock() if realtime is None else _use_realtime(realtime, restoring)
@@ -254,6 +284,11 @@ def check_pace(rate_hz: float | None, realtime: Realtime | None) -> None:
         raise InvalidInput(f"realtime={realtime!r} needs Linux; this is {sys.platform}")
     if realtime == "spin" and rate_hz is None:
         raise InvalidInput("realtime='spin' waits for deadlines, which a device has not: use 'fifo'")
+    if realtime == "spin" and rate_hz is not None and rate_hz > _FASTEST_SPIN_HZ:
+        raise InvalidInput(
+            f"realtime='spin' stays awake for {_SPIN_NS // 1000} us before each tick, which leaves too "
+            f"little of a processor above {_FASTEST_SPIN_HZ:g} Hz; got rate_hz={rate_hz!r}: use 'fifo'"
+        )
 
 
 def _use_realtime(realtime: Realtime, restoring: ExitStack) -> Clock:
@@ -287,11 +322,18 @@ def _use_fifo(realtime: Realtime, restoring: ExitStack) -> None:
 def _lock_memory(realtime: Realtime, restoring: ExitStack) -> None:
     """Keep the pages of this process in memory once they are used."""
     import ctypes  # noqa: PLC0415  # only control loops need it
+    import resource  # noqa: PLC0415  # not on every system
 
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_LOCK_CURRENT | _LOCK_FUTURE | _LOCK_ON_FAULT):
+    soft, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft != resource.RLIM_INFINITY:
+        # With a limit of 0 this needs the capability. Without it, later allocations would fail at the limit.
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (0, hard))
+    failed = libc.mlockall(_LOCK_CURRENT | _LOCK_FUTURE | _LOCK_ON_FAULT)
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (soft, hard))
+    if failed:
         raise InvalidInput(
-            f"realtime={realtime!r} locks the memory of this process, which this system does not permit "
+            f"realtime={realtime!r} locks all memory of this process, which this system does not permit "
             f"({os.strerror(ctypes.get_errno())}): allow it by `ulimit -l unlimited` (memlock in "
             "/etc/security/limits.conf), or by the capability CAP_IPC_LOCK (`docker run --cap-add IPC_LOCK`)"
         )

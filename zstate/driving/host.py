@@ -255,7 +255,7 @@ class DriverHost(Closeable):
         If it ends while the joints are commanded or held, the driver is stopped as after silence. In the main
         thread of a program that does not handle SIGTERM and SIGHUP, they end the loop and close this host
         before they end the process. Raises DriverFault, SecondWriter, Closed, and InvalidInput if the system
-        refuses ``realtime``, or if a device that sets the pace returns at once.
+        refuses ``realtime``, or if a device that sets the pace returns at once before any joint moves.
         """
         if os.getpid() != self._pid:
             raise Closed(forked_text(f"this driver host belongs to process {self._pid}"))
@@ -453,11 +453,14 @@ class DriverHost(Closeable):
         return self._driver.enable()
 
     def _start(self, now: int) -> Exception | None:
-        """Write the first setpoint after a change of state."""
+        """Write the measured joints as the first setpoint after a change of state.
+
+        The first step follows at the next tick, and takes the time since then.
+        """
         assert self._measured is not None
         self._limiter.start(self._measured)
         self._targets.start(now, self._measured)
-        failure = self._move(now)
+        failure = self._write(Limited(self._measured.copy(), np.zeros(len(self._measured)), ()))
         if failure is None:
             self._change("active", "")
         return failure
@@ -471,17 +474,22 @@ class DriverHost(Closeable):
         else:
             target, velocities = self._motions.next_target(self._targets.current(now, self._resting), dt_s)
             limited = self._limiter.step(target, dt_s, velocities)
+        failure = self._write(limited)
+        if failure is None:
+            self._motions.written(time.monotonic_ns())
+        elif self._setpoint is not None:
+            self._limiter.start(self._setpoint.positions, self._setpoint.velocities)
+        return failure
+
+    def _write(self, limited: Limited) -> Exception | None:
+        """Write ``limited`` as the setpoint, and publish it. Returns what failed."""
         setpoint = Setpoint(time.time_ns(), limited.positions, limited.velocities)
         self._wrote_at = time.monotonic_ns()
         failure = self._driver.write(setpoint)
         if failure is None:
             self._setpoint = limited
-            written_at = time.monotonic_ns()
-            self._following.written(limited.positions, written_at)
-            self._motions.written(written_at)
+            self._following.written(limited.positions, time.monotonic_ns())
             self._setpoints.publish(setpoint)
-        elif self._setpoint is not None:
-            self._limiter.start(self._setpoint.positions, self._setpoint.velocities)
         return failure
 
     def _resting(self) -> NDArray[np.float64]:
