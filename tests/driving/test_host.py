@@ -325,6 +325,15 @@ def test_a_stop_is_latched_and_released_by_the_commander(sessions):
         assert np.abs(driver.written()[before] - stopped_at).max() <= STEP * (1 + 1e-9)
 
 
+def test_a_stop_is_released_at_once_after_it_by_the_same_program(sessions):
+    with running(sessions[0], RecordingDriver()), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver(DEADLINE_S)
+        for _ in range(20):  # the state may reach the commander later than the sender of the stop
+            stop(sessions[0], "arm", timeout_s=DEADLINE_S)
+            state = arm.release(DEADLINE_S)
+            assert (state.state, state.stops) == ("ready", ())
+
+
 def test_a_commander_that_did_not_release_the_stop_does_not_move_the_robot_by_a_release(sessions):
     driver = RecordingDriver()
     with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
@@ -916,6 +925,26 @@ def test_commands_from_before_a_release_do_not_move_the_robot_after_it(sessions)
         until(lambda: host.report().rate.ticks > ticks + 5)
         assert host.report().refused["stopped"] >= 32
     assert driver.written().size == 0
+
+
+def test_a_command_from_before_the_release_that_arrives_after_it_is_refused(sessions):
+    driver = RecordingDriver()
+    releaser = local_writer(7)  # the session of ``command``
+    key = release_key("arm", releaser.identity)
+    with (
+        running(sessions[0], driver) as host,
+        raw_commands(sessions[1]) as put,
+        StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
+    ):
+        wait_for_reader(sessions[1], key)
+        stopped = stop(sessions[1], "arm", timeout_s=DEADLINE_S)
+        releases.put(encode(Release(0, 5, 7, stopped.stops)))
+        until(lambda: host.state == "ready")
+        put(command(4, elbow=1.0))
+        until(lambda: host.report().refused == {"old": 1})
+        put(command(6, elbow=-0.1))
+        until(lambda: driver.written().size)
+    assert driver.written().max() <= 0.0
 
 
 def test_a_stop_that_is_released_before_the_next_tick_is_obeyed(sessions):

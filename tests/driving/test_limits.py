@@ -64,6 +64,8 @@ def test_a_part_of_limits_has_the_order_of_its_joints():
     assert (part.joint_names, part.units) == (("c", "a"), ("rad", "m"))
     bounds = np.array([part.lower, part.upper, part.velocity, part.acceleration])
     assert bounds.tolist() == [[3, 1], [6, 4], [9, 7], [12, 10]]
+    with pytest.raises(InvalidInput, match="no limits of 'd', 'e', 'f' and 2 more"):
+        whole.part(["d", "e", "f", "g", "h"])
     with pytest.raises(InvalidInput, match="no limits of 'd'"):
         whole.part(["a", "d"])
 

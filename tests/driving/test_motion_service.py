@@ -13,8 +13,8 @@ import pytest
 from helpers.access_routers import router_with_users
 from helpers.manual_cdr import rosbags_trajectory
 from helpers.processes import DEADLINE_S, until
-from helpers.raw_ros_nodes import TRAJECTORY, RosPublisher, announced_publisher, tokens
-from helpers.robots import RRBOT
+from helpers.raw_ros_nodes import COMMANDS, TRAJECTORY, RosPublisher, announced_publisher, tokens
+from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.driving import Commander, DriverHost, Limits, Motion, SimulatedDriver, stop
 from zstate.driving.stops import wait_for_state
@@ -23,7 +23,15 @@ from zstate.errors import InvalidInput, MotionRefused, MotionTimeout
 from zstate.net.queryable import query
 from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session, connect
-from zstate.wire.messages import JointTrajectory, MotionCancel, MotionReply, to_block
+from zstate.net.streams import StreamPublisher
+from zstate.wire.messages import (
+    JointCommand,
+    JointTrajectory,
+    MotionCancel,
+    MotionReply,
+    order_digest,
+    to_block,
+)
 from zstate.wire.native import ENCODINGS, decode, encode
 
 RATE_HZ = 200.0
@@ -82,12 +90,6 @@ def arm_of(sessions, driver: Written, **options: object) -> Iterator[Commander]:
         arm.wait_for_driver(DEADLINE_S)
         yield arm
     driver.assert_steps_within_limits()
-
-
-def release(arm: Commander) -> None:
-    """Releases the stops of a driver, once its commander has received its state."""
-    until(lambda: arm.wait_for_driver(DEADLINE_S).state == "stopped")
-    arm.release(DEADLINE_S)
 
 
 def wait_until_under_way(motion: Motion) -> None:
@@ -155,11 +157,76 @@ def test_each_end_of_a_motion_is_an_outcome_and_no_step_is_too_long(sessions):
         assert "door open" in outcome.reason
         with pytest.raises(MotionRefused, match="door open"):
             arm.move({"elbow": [1.0]}, [5.0])
-        release(arm)
+        arm.release(DEADLINE_S)
         fifth = arm.move({"elbow": [1.0]}, [5.0])
         wait_until_under_way(fifth)
         with pytest.raises(MotionTimeout, match=r"has not ended within 0\.01 s"):
             fifth.wait(0.01)
+
+
+class Gated(Written):
+    """A mirror whose writes wait for ``gate``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gate, self.is_waiting = threading.Event(), threading.Event()
+        self.gate.set()
+
+    def write(self, setpoint) -> None:
+        if not self.gate.is_set():
+            self.is_waiting.set()
+            assert self.gate.wait(DEADLINE_S)
+        super().write(setpoint)
+
+
+def test_a_cancellation_that_a_blocked_driver_delays_is_repeated_until_it_is_carried_out(sessions):
+    driver = Gated()
+    with hosted(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        motion = arm.move({"elbow": [1.0]}, [20.0])
+        wait_until_under_way(motion)
+        driver.gate.clear()
+        assert driver.is_waiting.wait(DEADLINE_S)
+        cancelling = threading.Thread(target=motion.cancel)
+        cancelling.start()
+        until(lambda: host.report().refused.get("no tick"))
+        assert cancelling.is_alive()
+        driver.gate.set()
+        cancelling.join()
+        assert motion.wait(DEADLINE_S).name == "cancelled"
+
+
+def test_a_request_whose_commander_has_gone_moves_nothing(sessions):
+    driver = Written()
+    request = JointTrajectory(0, 3, 7, ("elbow",), to_block([0.2]), to_block([0.1]))
+    with hosted(sessions[0], driver, ttl_s=0.3):
+        until(
+            lambda: [one.findings for one in replies_to(sessions[1], "zstate/arm/@motion", request)] == [()]
+        )
+        ended = wait_for_state(sessions[1], "arm", lambda state: len(state.outcomes) > 0, DEADLINE_S)
+    assert ended is not None
+    assert ended.outcomes[0].name == "aborted"
+    assert driver.setpoints
+    assert not np.any(driver.setpoints)
+
+
+HOST = """
+    from zstate import connect, load_model
+    from zstate.driving import DriverHost, SimulatedDriver
+    model = load_model("rrbot")
+    with connect() as session, DriverHost(session, SimulatedDriver(model), model, "arm", ttl_s=0.1) as host:
+        print("open", flush=True)
+        host.run()
+"""
+
+
+def test_a_motion_of_a_killed_host_ends_for_its_commander(sessions, spawn):
+    host = spawn(HOST)
+    assert host.line() == "open"
+    with Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver(DEADLINE_S)
+        motion = arm.move({"elbow": [1.0]}, [60.0])
+        host.kill()
+        assert motion.wait(DEADLINE_S) == ("aborted", "the driver is silent for more than 1 s")
 
 
 def test_a_joint_that_does_not_follow_ends_the_motion(sessions):
@@ -210,25 +277,37 @@ def test_a_motion_of_a_dead_or_frozen_commander_is_braked_and_held(sessions, spa
     driver.assert_steps_within_limits()
 
 
-def test_a_motion_starts_at_its_stamp_and_not_in_the_past(sessions):
-    driver = Written()
+class Slow(Written):
+    """A mirror that takes at least four periods of the loop for a setpoint."""
+
+    def write(self, setpoint) -> None:
+        super().write(setpoint)
+        threading.Event().wait(4.0 / RATE_HZ)
+
+
+def test_a_motion_starts_at_its_stamp_also_if_ticks_are_missed_and_not_in_the_past(sessions):
+    driver = Slow()
     with arm_of(sessions, driver) as arm:
         with pytest.raises(MotionRefused, match="the first point is due"):
             arm.move({"elbow": [0.2]}, [0.3], start=time.time_ns() - 10**9)
         with pytest.raises(MotionRefused, match="give the first point a time above zero"):
             arm.move({"elbow": [0.2]}, [0.0])
+        start = time.monotonic_ns() + 10**9
         motion = arm.move({"elbow": [0.1]}, [0.2], start=time.time_ns() + 10**9)
         assert motion.wait(DEADLINE_S).name == "reached"
-    resting = int(np.flatnonzero(driver.path[:, 1])[0])
-    # Ticks that were missed delay it further; planning takes less than half a second.
-    assert resting > 0.5 * RATE_HZ
+    resting = int(np.flatnonzero(driver.path[:, 1])[0]) - 1
+    # A setpoint is that of the end of its step: the first that moves is at most one period early.
+    assert driver.written_at[resting] > start - 1e9 / RATE_HZ - 1e6
+    # One second has 200 periods, and at most 40 setpoints of which each takes five of them.
+    assert resting < 0.5 * RATE_HZ
 
 
 def test_a_request_of_another_session_is_refused_while_a_motion_is_valid(sessions):
     driver = Written()
     with arm_of(sessions, driver) as arm:
         motion = arm.move({"elbow": [1.0]}, [5.0])
-        request = JointTrajectory(0, 0, 7, ("elbow",), to_block([1.0]), to_block([0.0]))
+        # It is not even planned, which would find that there is no such joint.
+        request = JointTrajectory(0, 0, 7, ("elbw",), to_block([1.0]), to_block([0.0]))
         (reply,) = replies_to(sessions[1], "zstate/arm/@motion", request)
         assert "while that of another session is valid" in reply.findings[0]
         cancel = MotionCancel(0, 0, 7, 0)
@@ -236,15 +315,40 @@ def test_a_request_of_another_session_is_refused_while_a_motion_is_valid(session
         wait_until_under_way(motion)
 
 
-def test_a_repeated_request_is_the_same_motion(sessions):
+def test_a_request_for_more_than_the_joints_of_the_driver_is_refused(sessions):
+    with hosted(sessions[0], Written()):
+        for count, text in (
+            (3, "a motion of 3 joints, where the driver has 2: shoulder, elbow"),
+            (70_000, "bytes, where motions of this driver take"),
+        ):
+            names = tuple(f"joint_{number}" for number in range(count))
+            request = JointTrajectory(0, 0, 7, names, to_block([1.0]), to_block([0.0] * count))
+            found: list[MotionReply] = []
+
+            def is_answered(request=request, found=found) -> bool:
+                found[:] = replies_to(sessions[1], "zstate/arm/@motion", request)
+                return bool(found)
+
+            until(is_answered)
+            assert text in found[0].findings[0]
+
+
+def test_a_repeated_request_is_the_same_motion_and_an_older_one_is_refused(sessions):
     request = JointTrajectory(0, 3, 7, ("elbow",), to_block([0.2]), to_block([0.1]))
+    renewal = encode(JointCommand(0, 4, 7, order_digest(()), names=(), motion=3))
+    key = "zstate/arm/joint_commands"
     driver = Written()
-    with hosted(sessions[0], driver):
+    with (
+        hosted(sessions[0], driver),
+        StreamPublisher(sessions[1], key, ENCODINGS[JointCommand]) as commands,
+    ):
+        wait_for_reader(sessions[1], key)
 
         def findings() -> list[tuple[str, ...]]:
             return [reply.findings for reply in replies_to(sessions[1], "zstate/arm/@motion", request)]
 
         until(lambda: findings() == [()])
+        commands.put(renewal)
         reached = wait_for_state(sessions[1], "arm", lambda state: len(state.outcomes) > 0, DEADLINE_S)
         assert reached is not None
         assert [outcome.name for outcome in reached.outcomes] == ["reached"]
@@ -254,6 +358,9 @@ def test_a_repeated_request_is_the_same_motion(sessions):
         still = wait_for_state(sessions[1], "arm", lambda state: state.ticks > reached.ticks, DEADLINE_S)
         assert still is not None
         assert (still.motion, still.outcomes) == (None, reached.outcomes)
+        older = JointTrajectory(0, 2, 7, ("elbow",), to_block([0.2]), to_block([0.0]))
+        (reply,) = replies_to(sessions[1], "zstate/arm/@motion", older)
+        assert reply.findings == ("the motion 2 comes after a newer one",)
 
 
 def replies_to(session: Session, selector: str, message: JointTrajectory | MotionCancel) -> list[MotionReply]:
@@ -323,7 +430,7 @@ def test_random_motions_commands_stops_and_takeovers_make_no_step_too_long(sessi
                 motions[-1].cancel()
             elif action == 6:
                 stop(sessions[0], "arm", timeout_s=DEADLINE_S)
-                release(arm)
+                arm.release(DEADLINE_S)
             elif action == 7:
                 arm.close()
                 arm = opened.enter_context(Commander(sessions[1], "arm"))
@@ -331,7 +438,8 @@ def test_random_motions_commands_stops_and_takeovers_make_no_step_too_long(sessi
                 arm.wait_for_driver(DEADLINE_S)
             count = len(driver.setpoints) + int(random.integers(1, 30))
             until(lambda count=count: len(driver.setpoints) >= count or host.state != "active")
-    assert len(motions) > 20, host.report().refused
+    assert motions
+    assert np.ptp(driver.path, axis=0).min() > 0.0
     driver.assert_steps_within_limits()
 
 
@@ -383,6 +491,30 @@ def test_a_trajectory_ends_with_its_ros_node_or_by_one_without_points(sessions):
                 name, reason = outcome_of(arm)
                 assert name == "aborted"
                 assert reason.startswith("nothing from /planner for ")
+
+
+def test_after_a_stop_no_publisher_of_the_active_ros_node_moves_the_robot(sessions):
+    driver = Written()
+    with (
+        hosted(sessions[0], driver, ttl_s=1.0, **CONTROLLED) as host,
+        announced_publisher(sessions[1], "planner", COMMANDS) as commands,
+        planner_of(sessions) as planner,
+        Commander(sessions[1], "arm") as arm,
+    ):
+
+        def published(condition) -> bool:
+            commands.numbers([0.0, 0.0])
+            return bool(condition())
+
+        until(lambda: published(lambda: arm.wait_for_driver(DEADLINE_S).commander == "/planner"))
+        until(lambda: host.state == "holding")
+        planner.put(rosbags_trajectory(0, RRBOT.joint_names, (60.0, ([1.0, 1.0],))))
+        until(lambda: np.any(driver.path))
+        stop(sessions[0], "arm", timeout_s=DEADLINE_S)
+        arm.release(DEADLINE_S)
+        written = len(driver.setpoints)
+        until(lambda: published(lambda: host.report().refused.get("not released")))
+        assert len(driver.setpoints) == written
 
 
 def test_trajectories_of_ros_nodes_are_checked_as_all_motions_are(sessions):

@@ -10,6 +10,7 @@ from zstate.wire.messages import (
     MAX_BYTES,
     SCAN_RAYS,
     JointState,
+    JointTrajectory,
     LaserScan,
     OccupancyGrid,
     StaticTransforms,
@@ -174,3 +175,11 @@ def test_messages_are_frozen():
     state = JointState(0, 0, 1, order_digest([]), b"")
     with pytest.raises(AttributeError):
         state.stamp = 1  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("tolerances", [(np.nan, 0.1), (0.1, np.nan), (0.0, 0.1)])
+def test_a_motion_without_tolerances_above_zero_is_refused(tolerances: tuple[float, float]):
+    with pytest.raises(InvalidInput, match="above zero"):
+        JointTrajectory(
+            0, 0, 7, ("elbow",), to_block([1.0]), to_block([0.0]), None, None, None, False, *tolerances
+        )

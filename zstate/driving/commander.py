@@ -16,6 +16,7 @@ from zstate.checks import real_numbers
 from zstate.driving.commands import check_named_positions
 from zstate.driving.driver_state import SILENT_S
 from zstate.driving.motion import Motion, Points, rows_block
+from zstate.driving.stops import wait_for_state
 from zstate.errors import (
     Closed,
     InvalidInput,
@@ -52,6 +53,10 @@ from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 
 _RELEASE_PERIOD_S = 0.1
+
+_SILENT_TTLS = 10
+_SHORTEST_SILENCE_S = 1.0
+"""A motion ends for its commander without a state of the driver for that many ttls, and that long."""
 
 _REPLY_WITHIN_S = 5.0
 _REQUEST_PERIOD_S = 0.05
@@ -186,18 +191,20 @@ class Commander(Closeable):
         return self._started(request.seq, reply)
 
     def release(self, timeout_s: float = 2.0) -> DriverState:
-        """Release the stops of the driver that are known here, and return its state after that.
+        """Release the stops that the driver has now, and return its state after that.
 
         The driver moves again with the next ``send`` of this commander, from where the joints are then. A
         stop that arrives at the same time stays. Raises Unreachable if the driver has not confirmed it within
         ``timeout_s`` [s]; SecondWriter; and Closed.
         """
         deadline = time.monotonic() + check_timeout(timeout_s)
-        known = self.wait_for_driver(timeout_s)
+        # Not the newest state that has arrived here, which may be from before a stop that is confirmed.
+        present = wait_for_state(self._session, self.robot, lambda _: True, timeout_s)
+        known = present or self.wait_for_driver(timeout_s)
         while True:
             state = self.wait_for_driver(timeout_s)
-            left = set(known.stops).intersection(state.stops)
-            if not left and (state.stops or state.state != "stopped"):  # not between the two
+            is_new = state.stamp >= known.stamp and not set(known.stops).intersection(state.stops)
+            if is_new and (state.stops or state.state != "stopped"):  # not between the two
                 return state
             if time.monotonic() > deadline:
                 raise Unreachable(
@@ -206,7 +213,7 @@ class Commander(Closeable):
                     endpoints=(),
                 )
             with self._lock:
-                self._releases.put(encode(Release(*self._next_head(), tuple(left))))
+                self._releases.put(encode(Release(*self._next_head(), known.stops)))
             with self._has_changed:
                 self._has_changed.wait(_RELEASE_PERIOD_S)
 
@@ -229,16 +236,29 @@ class Commander(Closeable):
         return time.time_ns(), self._seq - 1, self._session_id
 
     def _request(self, message: JointTrajectory | MotionCancel) -> MotionReply:
-        """The reply of the driver. A request that has not reached it is repeated."""
+        """The reply of the driver. A request that has not reached it is repeated.
+
+        So is a cancellation that the driver has not carried out.
+        """
         key, deadline = motion_key(self.robot), time.monotonic() + _REPLY_WITHIN_S
         payload, encoding = encode(message), ENCODINGS[type(message)]
+        refused = ""
         while (left_s := deadline - time.monotonic()) > 0.0:
             for reply in query(self._session.zenoh, key, left_s, payload=payload, encoding=encoding):
                 if reply.ok is not None:
                     with suppress(MessageError):
-                        return decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), MotionReply)
+                        answer = decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), MotionReply)
+                        if not (answer.findings and isinstance(message, MotionCancel)):
+                            return answer
+                        refused = "; ".join(answer.findings)
             if self._is_closing.wait(_REQUEST_PERIOD_S):
                 raise Closed(f"the commander of {self.robot!r} is closed")
+        if refused:
+            raise Unreachable(
+                f"the driver of {self.robot!r} has not cancelled the motion within {_REPLY_WITHIN_S:g} s: "
+                f"{refused}; it brakes when its ttl has passed without a renewal",
+                endpoints=(),
+            )
         raise Unreachable(
             f"no driver of {self.robot!r} has replied within {_REPLY_WITHIN_S:g} s; is it running, and may "
             "this program command it (`zstate acl --commander`)?",
@@ -262,12 +282,18 @@ class Commander(Closeable):
         return motion
 
     def _renew(self, motion: Motion, number: int, ttl: int) -> None:
+        started_at = time.monotonic()
+        silent_s = max(_SILENT_TTLS * ttl * 1e-9, _SHORTEST_SILENCE_S)
         with suppress(ZStateError):  # without renewals the motion ends
-            while motion.outcome is None:
-                with self._lock:
-                    head = (*self._next_head(), order_digest(()))
-                    self._writer.write(encode(JointCommand(*head, names=(), motion=number)))
+            while motion.outcome is None and not self._is_closing.is_set():
+                if not motion.is_cancelled:
+                    with self._lock:
+                        head = (*self._next_head(), order_digest(()))
+                        self._writer.write(encode(JointCommand(*head, names=(), motion=number)))
                 self._is_closing.wait(ttl / 3e9)
+                state_at = started_at if self._state is None else max(started_at, self._state[1])
+                if time.monotonic() - state_at > silent_s:
+                    motion.abort(f"the driver is silent for more than {silent_s:g} s")
 
     def _cancel(self, number: int) -> None:
         with self._lock:

@@ -100,9 +100,10 @@ class DriverHost(Closeable):
     controller, ROS nodes on the wire "ros2" may command the joints as well, as in ros2_control: by
     ``<ros2_controller>/commands`` (std_msgs/Float64MultiArray), positions of all joints in the order of
     ``driver.joint_names``, each valid for ``ttl_s``; and by ``<ros2_controller>/joint_trajectory``
-    (trajectory_msgs/JointTrajectory), a motion that is valid while its publisher is announced. A ROS node
-    owns nothing: the first that sends is the commander until it is silent, and the others are refused. It
-    cannot release a stop.
+    (trajectory_msgs/JointTrajectory), a motion that is valid while its publisher is announced: the motion of
+    a node that is frozen or cut off goes on until Zenoh closes the link, after 10 s by default and 60 s with
+    the router ``rmw_zenohd``. A ROS node owns nothing: the first that sends is the commander until it is
+    silent, and the others are refused. It cannot release a stop.
 
     A robot has one host. Raises InvalidInput for unusable arguments, SecondWriter if another program hosts a
     driver of the robot or publishes these joints, and what ``driver.open`` raises. A context manager. Not a
@@ -292,7 +293,7 @@ class DriverHost(Closeable):
         # Stops that are still latched are obeyed once more.
         self._obeyed = LatchedStops((), latched.arrived - len(latched.stops))
         if not latched.stops:  # the last one may have been released since the last loop
-            self._barred.pop(self._stops.releaser, None)
+            self._barred.pop(self._stops.released_by[0], None)
         with self._pace(self._stop, seconds) as rate:
             self._rate = rate
             if not latched.stops:
@@ -360,7 +361,7 @@ class DriverHost(Closeable):
         reason = "; ".join(map(str, latched.stops))
         if latched.newest is not None and latched.arrived != self._obeyed.arrived:
             reason = reason or f"{latched.newest}, and released already"
-            self._barred[self._targets.session] = None
+            self._bar_active()
             self._motions.finish("stopped", reason)
             self._targets.clear()
             hows = {one.how for one in (*latched.stops, latched.newest)}
@@ -372,10 +373,18 @@ class DriverHost(Closeable):
             self._change("stopped", reason)
         if not latched.stops and self._state.name == "stopped":
             self._accept_commands(now)  # those from before the release are refused
-            self._barred.pop(self._stops.releaser, None)
-            self._change("ready", f"released by {self._name_of(self._stops.releaser)}")
+            releaser, _ = self._stops.released_by
+            self._barred.pop(releaser, None)
+            self._change("ready", f"released by {self._name_of(releaser)}")
         self._obeyed = latched
         return None
+
+    def _bar_active(self) -> None:
+        """Bar the active commander. A ROS node has a session for each of its publishers: bar them all."""
+        active = self._targets.session
+        name = self._name_of(active)
+        for session in (active, *(node for node in self._motions.nodes if self._name_of(node) == name)):
+            self._barred[session] = None
 
     def _accept_commands(self, now: int) -> None:
         for command in self._commands.drain():
@@ -385,7 +394,7 @@ class DriverHost(Closeable):
     def _accept(self, command: Command, now: int) -> None:
         """Take the targets of ``command``, or count the reason against it."""
         try:
-            self._check_commander(command.session, now)
+            self._check_commander(command.session, command.seq, now)
             self._targets.check_order(command)
             if command.motion is not None:
                 self._motions.renew(command)
@@ -397,10 +406,11 @@ class DriverHost(Closeable):
             self._motions.replace(command)
             self._targets.accept(command)
 
-    def _check_commander(self, session: int, now: int) -> None:
+    def _check_commander(self, session: int, seq: int, now: int) -> None:
         """Raise MessageError while stopped, and for a commander that has not released the stop itself.
 
-        And for another one than that whose targets are valid at ``now``.
+        And for another one than that whose targets are valid at ``now``, and for a message ``seq`` from
+        before the release: releases travel on another key, and may overtake it.
         """
         if self._state.name == "stopped":
             self._barred[session] = None
@@ -410,6 +420,9 @@ class DriverHost(Closeable):
                 "it came from a commander that did not release the last stop; release with it, or reopen it"
             )
             raise MessageError(text, reason="not released")
+        releaser, release = self._stops.released_by
+        if session == releaser and seq < release:
+            raise MessageError(f"the command {seq} was sent before the release of the stop", reason="old")
         self._targets.check_session(session, now)
 
     def _check_limits(self, command: Command) -> None:
@@ -472,7 +485,8 @@ class DriverHost(Closeable):
         if self._state.name == "holding":
             limited = self._limiter.brake(dt_s)
         else:
-            target, velocities = self._motions.next_target(self._targets.current(now, self._resting), dt_s)
+            target = self._targets.current(now, self._resting)
+            target, velocities = self._motions.next_target(target, dt_s, now)
             limited = self._limiter.step(target, dt_s, velocities)
         failure = self._write(limited)
         if failure is None:

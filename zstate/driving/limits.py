@@ -17,11 +17,15 @@ from zstate._util.format import suggestion_text
 from zstate.checks import real_numbers
 from zstate.errors import InvalidInput
 from zstate.model.robot import POSITION_COUNTS, Joint, RobotModel, near_joint
+from zstate.wire.keys import shortened
 
 Floats = NDArray[np.float64]
 
 ROUNDING = 1e-9
 """[rad] or [m], and as a ratio for rates: rounding of interpolated values, far below any encoder."""
+
+_SHOWN = 3
+"""Unknown joints in an error: near names take time, and names may come from the network."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -116,8 +120,10 @@ class Limits:
         """The limits of ``joint_names``, in that order. Raises InvalidInput for unknown or repeated ones."""
         unknown = [name for name in joint_names if name not in self.joint_names]
         if unknown:
-            texts = (f"{name!r}{suggestion_text(near_joint(name, self.joint_names))}" for name in unknown)
-            raise InvalidInput(f"there are no limits of {', '.join(texts)}")
+            shown = [shortened(name) for name in unknown[:_SHOWN]]
+            texts = [f"{name!r}{suggestion_text(near_joint(name, self.joint_names))}" for name in shown]
+            rest = f" and {len(unknown) - _SHOWN} more" if len(unknown) > _SHOWN else ""
+            raise InvalidInput(f"there are no limits of {', '.join(texts)}{rest}")
         rows = [self.joint_names.index(name) for name in check_joint_names(joint_names)]
         return Limits(
             tuple(joint_names),

@@ -43,6 +43,8 @@ class Motion:
         self._progress = 0.0
         self._outcome: Outcome | None = None
         self._has_ended = fork_safe(threading.Event())
+        self.is_cancelled = False
+        """Whether ``cancel`` was called: the motion is not renewed any more."""
 
     def __repr__(self) -> str:
         state = f"{self._progress:.0%}" if self._outcome is None else self._outcome.name
@@ -75,21 +77,27 @@ class Motion:
     def cancel(self) -> None:
         """Brake the joints of the motion; its outcome is "cancelled". Does nothing once it has ended.
 
-        Raises Unreachable if the driver has not confirmed it within 5 s.
+        Raises Unreachable if the driver has not confirmed it within 5 s. The motion is not renewed any more
+        in any case, so that it ends as "aborted" after the driver's ttl.
         """
         if self._outcome is None:
+            self.is_cancelled = True
             self._cancel()
 
     def update(self, state: DriverState) -> None:
         """Take progress and outcome from a state of the driver."""
         if state.session != self._host_session:
-            self._end(Outcome("aborted", "the driver's host has restarted"))
+            self.abort("the driver's host has restarted")
         elif state.motion == self._identity:
             self._progress = state.progress
         for ended in state.outcomes:
             if (ended.session, ended.seq) == self._identity:
                 self._progress = 1.0 if ended.name == "reached" else self._progress
                 self._end(Outcome(ended.name, ended.reason))
+
+    def abort(self, reason: str) -> None:
+        """End this motion, about which the driver reports nothing any more."""
+        self._end(Outcome("aborted", reason))
 
     def _end(self, outcome: Outcome) -> None:
         if self._outcome is None:

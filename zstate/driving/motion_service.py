@@ -6,7 +6,8 @@ adopts it at its next tick, and replies by that thread.
 
 The time of a motion advances by one period at each tick that writes a setpoint. A tick that was missed delays
 the motion; no step becomes longer by it. A motion is valid for the host's ttl, unless its commander renews
-it: then the joints brake, as they do after commands.
+it: then the joints brake, as they do after commands. It rests until its commander is known to be alive, by a
+first renewal or by an earlier command that is valid: a request that was delivered late moves nothing.
 
 A ROS node does not renew what it sends: its motion is valid while the node is announced, by its liveliness
 token. As in ros2_control, points that are due already are left out, and a trajectory without points ends the
@@ -27,6 +28,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
@@ -39,6 +41,7 @@ from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.keys import motion_key
 from zstate.wire.messages import (
+    MOTION_POINTS,
     JointTrajectory,
     MotionCancel,
     MotionOutcome,
@@ -56,6 +59,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 _TICK_WITHIN_S = 1.0
+_NAMES_BYTES = 64_000
 _MOST_OUTCOMES = 16
 _MAX_REASON_LENGTH = 300
 _MOST_FINDINGS = 400
@@ -97,6 +101,11 @@ def plan(request: JointTrajectory, limits: Limits, present: Present, stamp: int)
     One that starts later rests until then. Raises InvalidInput for a request that is no motion at all.
     """
     planned_at = time.monotonic_ns()
+    if len(request.names) > len(limits.joint_names):
+        raise InvalidInput(
+            f"a motion of {len(request.names)} joints, where the driver has {len(limits.joint_names)}: "
+            f"{', '.join(limits.joint_names)}"
+        )
     part = limits.part(request.names)
     columns = np.array([limits.joint_names.index(name) for name in request.names], dtype=np.intp)
     wait_s = 0.0 if request.start is None else (request.start - stamp) * 1e-9
@@ -134,14 +143,19 @@ def _after(first: Floats, block: bytes) -> Floats:
 
 @dataclass(slots=True)
 class _Underway:
-    """The motion under way. ``planned`` is what was written last, at ``written_at`` [ns, monotonic]."""
+    """The motion under way. ``planned`` is what was written last, at ``written_at`` [ns, monotonic].
+
+    Its time is zero at ``start_at`` [ns, monotonic]. It rests until ``is_renewed``.
+    """
 
     request: JointTrajectory
     columns: NDArray[np.intp]
     trajectory: Trajectory
     time_s: float
+    start_at: int
     renewed_at: int
     deadline: int
+    is_renewed: bool
     next_time_s: float = 0.0
     next_positions: Floats | None = None
     planned: Floats | None = None
@@ -156,10 +170,10 @@ class MotionService(Closeable):
     """Takes requests for motions of the driver of ``robot``, and makes one at a time.
 
     ``present()`` returns the joints now, for any thread; it raises MessageError if that is not known.
-    ``check(session, now)`` raises MessageError if that commander may not move the robot now; ``name_of`` is
-    its program; ``on_change`` is called when a motion has started or ended: these three, and all methods
-    without another note, are for the thread of the loop. ROS nodes send their motions to the ``controller``,
-    if there is one.
+    ``check(session, seq, now)`` raises MessageError if that message of a commander may not move the robot
+    now; ``name_of`` is its program; ``on_change`` is called when a motion has started or ended: these three,
+    and all methods without another note, are for the thread of the loop. ROS nodes send their motions to the
+    ``controller``, if there is one.
     """
 
     def __init__(
@@ -173,7 +187,7 @@ class MotionService(Closeable):
         ttl_ns: int,
         refusals: Refusals,
         present: Callable[[], Present],
-        check: Callable[[int, int], None],
+        check: Callable[[int, int, int], None],
         name_of: Callable[[int], str],
         on_change: Callable[[], None],
         controller: Ros2Controller | None = None,
@@ -192,6 +206,9 @@ class MotionService(Closeable):
         self._waiting: tuple[Future[None], Callable[[int], None]] | None = None
         """What the loop is to do at its next tick, with the present instant."""
         self._motion: _Underway | None = None
+        self._newest: BoundedDict[int, int] = BoundedDict()
+        """The number of the last motion that was started, by session."""
+        self._most_bytes = 8 * MOTION_POINTS * (1 + 3 * len(limits.joint_names)) + _NAMES_BYTES
         self.outcomes: tuple[MotionOutcome, ...] = ()
         """Of the last motions, newest last; a new tuple after each. May be read from any thread."""
         with ExitStack() as opening:
@@ -208,6 +225,11 @@ class MotionService(Closeable):
     def set_announced(self, session: int, alive: bool) -> None:
         """The ROS node of ``session`` is announced, or not any more; for any thread."""
         (self._nodes.add if alive else self._nodes.discard)(session)
+
+    @property
+    def nodes(self) -> tuple[int, ...]:
+        """The sessions of announced ROS nodes, one for each of their publishers; for any thread."""
+        return tuple(self._nodes)
 
     @property
     def underway(self) -> tuple[tuple[int, int] | None, float]:
@@ -247,6 +269,9 @@ class MotionService(Closeable):
             cancel = decode(payload, encoding, MotionCancel)
             self._call_in_loop(lambda _: self._cancel(cancel))
             return ()
+        if len(payload) > self._most_bytes:
+            text = f"a request of {len(payload)} bytes, where motions of this driver take {self._most_bytes}"
+            raise MessageError(text, reason="too large")
         return self._plan_and_start(decode(payload, encoding, JointTrajectory))
 
     def _take_from_ros(self, controller: Ros2Controller, sample: SerializedSample) -> tuple[str, ...]:
@@ -258,19 +283,21 @@ class MotionService(Closeable):
         return self._plan_and_start(without_past(request, time.time_ns()))
 
     def _plan_and_start(self, request: JointTrajectory) -> tuple[str, ...]:
-        planned = plan(request, self._limits, self._present_after_start(), time.time_ns())
+        if self._is_known(request):
+            return ()
+        self._check_in_loop(request)  # first: to plan takes time from the control loop
+        planned = plan(request, self._limits, self._present(), time.time_ns())
         if not planned.findings:
             self._call_in_loop(lambda now: self._start(planned, now))
         return planned.findings
 
-    def _present_after_start(self) -> Present:
-        """The joints now; of a loop that has just started, after its first tick. Raises MessageError."""
+    def _check_in_loop(self, request: JointTrajectory) -> None:
+        """Raise MessageError if ``request`` must not start now, or if the joints are not known."""
         try:
-            return self._present()
+            self._call_in_loop(lambda now: self._check_request(request, now))
         except MessageError:
-            with suppress(MessageError):
-                self._call_in_loop(lambda _: None)
-            return self._present()
+            self._present()  # its reason is the better one
+            raise
 
     def _call_in_loop(self, action: Callable[[int], None]) -> None:
         """Let the loop call ``action`` at its next tick. Raises MessageError, also that of ``action``."""
@@ -318,7 +345,7 @@ class MotionService(Closeable):
         self._renew(motion, command)
 
     def _renew(self, motion: _Underway, command: Command) -> None:
-        motion.renewed_at, motion.deadline = command.arrived, command.deadline
+        motion.renewed_at, motion.deadline, motion.is_renewed = command.arrived, command.deadline, True
         self._targets.renew(command, motion.columns)
 
     def replace(self, command: Command) -> None:
@@ -346,10 +373,15 @@ class MotionService(Closeable):
         head = (request.session, request.seq, NO_COLUMNS, NO_POSITIONS)
         return Command(*head, now, deadline, request.seq)
 
-    def next_target(self, resting: Floats, dt_s: float) -> tuple[Floats, Floats | None]:
+    def next_target(self, resting: Floats, dt_s: float, now: int) -> tuple[Floats, Floats | None]:
         """Positions and velocities at the end of the next step of ``dt_s``; ``resting`` are other joints'."""
         motion = self._motion
         if motion is None:
+            return resting, None
+        if motion.time_s < 0.0:  # by the clock: ticks that are missed before the start do not delay it
+            motion.time_s = min(0.0, (now - motion.start_at) * 1e-9)
+        if not motion.is_renewed:
+            motion.next_time_s = motion.time_s
             return resting, None
         motion.next_time_s = motion.time_s + dt_s
         at, rates, _ = motion.trajectory.sample(motion.next_time_s)
@@ -382,7 +414,7 @@ class MotionService(Closeable):
         request = planned.request
         if self._is_known(request):
             return
-        self._check(request.session, now)
+        self._check_request(request, now)
         present = self._present()
         if present.stops is not planned.present.stops:
             text = "a stop or its release arrived together with the motion; send it again"
@@ -390,15 +422,25 @@ class MotionService(Closeable):
         self.finish("replaced", f"by a motion of {self._name_of(request.session)}")
         is_timed = planned.time_s < 0.0 or planned.present.velocities.any()
         passed_s = (now - planned.planned_at) * 1e-9 if is_timed else 0.0
+        time_s = planned.time_s + passed_s
+        start_at = now - round(time_s * 1e9)
         deadline = now + self._ttl_ns
+        is_alive = self._targets.session == request.session and self._targets.is_live(now)
         at = present.resting[planned.columns]
         self._targets.accept(Command(request.session, request.seq, planned.columns, at, now, deadline))
-        time_s = planned.time_s + passed_s
-        self._motion = _Underway(request, planned.columns, planned.trajectory, time_s, now, deadline)
+        head = (request, planned.columns, planned.trajectory)
+        self._motion = _Underway(*head, time_s, start_at, now, deadline, is_alive)
+        self._newest[request.session] = request.seq
         self._on_change()
 
+    def _check_request(self, request: JointTrajectory, now: int) -> None:
+        """Raise MessageError if ``request`` must not move the robot at ``now``."""
+        self._check(request.session, request.seq, now)
+        if request.seq <= self._newest.get(request.session, -1):
+            raise MessageError(f"the motion {request.seq} comes after a newer one", reason="old")
+
     def _is_known(self, request: JointTrajectory) -> bool:
-        """Whether ``request`` is repeated, because the commander has not received the reply."""
+        """Whether ``request`` is repeated, as without a reply; for any thread."""
         ended = {(outcome.session, outcome.seq) for outcome in self.outcomes}
         return (request.session, request.seq) in {*ended, self.underway[0]}
 

@@ -163,8 +163,8 @@ class StopLatch(Closeable):
         """The last released stop of each session, which its program may still cache."""
         self.current = LatchedStops()
         """Another object after each change; may be read from any thread."""
-        self.releaser = 0
-        """The session of the commander that released the last stop."""
+        self.released_by = (0, 0)
+        """Session and ``seq`` of the last release of a stop."""
         with ExitStack() as opening:
             opening.enter_context(HostLock(robot))
             self._read_file()
@@ -251,7 +251,7 @@ class StopLatch(Closeable):
         while len(self._released) > _MOST_STOPS:
             del self._released[next(iter(self._released))]
         if ended:
-            self.releaser = release.session
+            self.released_by = (release.session, release.seq)
             self._write_file()  # first: a release that is confirmed holds for the next host as well
             self.current = self.current._replace(stops=tuple(self._by_session.values()))
 

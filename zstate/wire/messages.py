@@ -248,7 +248,7 @@ class JointTrajectory(StampedMessage, frozen=True, array_like=True, gc=False):
                     f"{count} points of {len(self.names)} joints have {numbers} numbers, not "
                     f"{len(block) / 8:g}"
                 )
-        if not min(self.path_tolerance, self.goal_tolerance) > 0.0:
+        if not (self.path_tolerance > 0.0 and self.goal_tolerance > 0.0):  # NaN as well
             tolerances = f"{self.path_tolerance} and {self.goal_tolerance}"
             raise InvalidInput(f"path_tolerance and goal_tolerance are above zero, not {tolerances}")
         if not 0.0 <= self.goal_time < inf:
