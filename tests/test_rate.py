@@ -205,7 +205,7 @@ def test_a_loop_that_becomes_slower_than_its_device_goes_on_with_a_warning_and_s
             before = count_waits()
         elif ticks == 4000:
             break
-    assert count_waits() - before >= 2000
+    assert count_waits() - before >= 1000  # a sleep whose time is over before the switch does not count
     (record,) = caplog.records
     assert re.search(r"has waited \d+ times in 1000 ticks.*sleeps for 50 us at each tick", record.message)
 

@@ -288,6 +288,15 @@ def test_departed_static_writer_yields_to_an_announced_one():
     assert network.edges == {("r1/base", "r1/camera")}
 
 
+def test_edge_of_a_departed_writer_stays_also_if_an_earlier_departed_one_placed_the_frame_elsewhere():
+    network = Network()
+    network.statics("r1", "old", ("base", "camera"), session=3)
+    network.statics("r1", "new", ("tool", "camera"), session=4)
+    network.ownership.remove_writer("r1", 3)
+    network.ownership.remove_writer("r1", 4)
+    assert network.edges == {("r1/tool", "r1/camera")}
+
+
 def test_transforms_of_another_robot_neither_insert_nor_drop_edges_of_this_one():
     network = Network(TransformIngest)
     network.ownership.live |= {("r1", 7): "driver@arm pid 4", ("r2", 8): "driver@arm pid 4"}

@@ -428,9 +428,10 @@ class FrameOwnership:
             accepted, roots = self._caller_edges()
             claims = [claim for claims in self._claims.values() for claim in claims]
 
-            def precedence(claim: EdgeClaim) -> tuple[int, bool, bool, bool, int]:
+            def precedence(claim: EdgeClaim) -> tuple[int, bool, bool, bool, bool, int]:
                 is_departed, is_static = self._is_departed(claim), claim.pose is not None
-                return self._rank(claim), claim.child in roots, is_departed, is_static, claim.order
+                is_over = is_departed and not claim.is_accepted  # of departed writers the last one counts
+                return self._rank(claim), claim.child in roots, is_departed, is_over, is_static, claim.order
 
             claims.sort(key=precedence)
             refusals: dict[EdgeClaim, InsertRefused] = {}
