@@ -239,6 +239,7 @@ def in_thread(function: Callable[[], None]) -> None:
         raise failure
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("realtime", ["fifo", "spin"])
 def test_a_real_time_loop_has_its_scheduling_inside_the_block_only(realtime: Realtime):
     def loop() -> None:
@@ -257,6 +258,7 @@ def test_a_real_time_loop_has_its_scheduling_inside_the_block_only(realtime: Rea
     in_thread(loop)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("realtime", ["fifo", "spin"])
 def test_a_real_time_loop_sleeps_at_each_tick_even_if_its_work_takes_too_long(realtime: Realtime):
     def loop() -> None:
@@ -270,6 +272,7 @@ def test_a_real_time_loop_sleeps_at_each_tick_even_if_its_work_takes_too_long(re
     in_thread(loop)
 
 
+@pytest.mark.realtime
 def test_a_stop_ends_a_real_time_loop_that_waits_for_its_next_tick():
     stop = threading.Event()
 
@@ -281,6 +284,7 @@ def test_a_stop_ends_a_real_time_loop_that_waits_for_its_next_tick():
     in_thread(loop)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("capability", "limit"), [("sys_nice", "ulimit -r 50"), ("ipc_lock", "ulimit -l")])
 def test_real_time_scheduling_that_the_system_refuses_is_an_error_with_what_to_do(
     capability: str, limit: str

@@ -1136,6 +1136,7 @@ def test_a_device_that_returns_at_once_is_refused_as_the_pace_of_the_loop(sessio
     assert host.state == "off"
 
 
+@pytest.mark.realtime
 def test_a_real_time_loop_moves_the_joints_and_ends_with_close(sessions):
     driver = RecordingDriver()
     with (
