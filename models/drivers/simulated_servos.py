@@ -1,7 +1,7 @@
 """Simulated Dynamixel servos of the X series on a pseudo-terminal, for drivers without hardware.
 
-``python simulated_servos.py /tmp/servos`` simulates two servos on one cable, with IDs 1 and 2 and the joints
-in the middle. Programs open /tmp/servos like /dev/ttyUSB0. The signal SIGUSR1 unplugs the cable, which the
+``python simulated_servos.py ./servos`` simulates two servos on one cable, with IDs 1 and 2 and the joints
+in the middle. Programs open ./servos like /dev/ttyUSB0. The signal SIGUSR1 unplugs the cable, which the
 programs notice as an I/O error, and plugs it in again; the servos keep their state.
 
 The bytes are those of Robotis' Protocol 2.0 (https://emanual.robotis.com/docs/en/dxl/protocol2/): ping, read,
