@@ -205,7 +205,7 @@ def test_a_loop_that_becomes_slower_than_its_device_goes_on_with_a_warning_and_s
             before = count_waits()
         elif ticks == 4000:
             break
-    assert count_waits() - before >= 1000  # a sleep whose time is over before the switch does not count
+    assert count_waits() - before >= 1500  # a sleep whose time is over before the switch does not count
     (record,) = caplog.records
     assert re.search(r"has waited \d+ times in 1000 ticks.*sleeps for 50 us at each tick", record.message)
 
@@ -267,7 +267,7 @@ def test_a_real_time_loop_sleeps_at_each_tick_even_if_its_work_takes_too_long(re
             for now in pace:
                 while time.monotonic_ns() < now + 1_500_000:
                     pass
-            assert count_waits() - before >= pace.report().ticks // 2 > 1
+            assert count_waits() - before >= 3 * pace.report().ticks // 4 > 1
 
     in_thread(loop)
 

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
 import pytest
-from helpers.access_routers import router_with_users
+from helpers.access_routers import join, router_with_users
 from helpers.manual_cdr import rosbags_trajectory
 from helpers.processes import DEADLINE_S, until
 from helpers.raw_ros_nodes import COMMANDS, TRAJECTORY, RosPublisher, announced_publisher, tokens
@@ -22,7 +22,7 @@ from zstate.driving.trajectory import Trajectory
 from zstate.errors import InvalidInput, MotionRefused, MotionTimeout
 from zstate.net.queryable import query
 from zstate.net.security.acl import AclRoles
-from zstate.net.session import Session, connect
+from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.wire.messages import (
     JointCommand,
@@ -391,21 +391,15 @@ def test_only_commanders_may_request_motions(tmp_path):
     fleet = AclRoles(("arm",), viewers=("desk",), commanders=("teleop",))
     with router_with_users(tmp_path, fleet, fleet.identities) as endpoint, ExitStack() as opened:
 
-        def join(user: str) -> Session:
-            settings = {
-                "mode": "client",
-                "connect": {"endpoints": [endpoint], "timeout_ms": 5000},
-                "scouting": {"multicast": {"enabled": False}},
-                "transport": {"auth": {"usrpwd": {"user": user, "password": "secret"}}},
-            }
-            return opened.enter_context(connect(settings))
+        def session_of(user: str) -> Session:
+            return opened.enter_context(join(endpoint, user))
 
         driver = Written()
-        opened.enter_context(hosted(join("arm"), driver))
-        arm = opened.enter_context(Commander(join("teleop"), "arm"))
+        opened.enter_context(hosted(session_of("arm"), driver))
+        arm = opened.enter_context(Commander(session_of("teleop"), "arm"))
         assert arm.move({"elbow": [0.1]}, [0.2]).wait(DEADLINE_S).name == "reached"
         request = JointTrajectory(0, 0, 7, ("elbow",), to_block([1.0]), to_block([0.0]))
-        desk = join("desk")
+        desk = session_of("desk")
         for selector in ("zstate/arm/@motion", "zstate/*/@motion", "zstate/**"):
             assert replies_to(desk, selector, request) == []
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 import pytest
-from helpers.access_routers import router_with_users
+from helpers.access_routers import join, router_with_users
 from helpers.processes import DEADLINE_S, SOON_S, repeated, until
 from helpers.robots import RRBOT, wait_for_reader
 
@@ -23,7 +23,7 @@ from zstate.errors import AccessDenied, ConfigError, SecondWriter, Unreachable
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.presence import local_writer
 from zstate.net.security.acl import AclRoles
-from zstate.net.session import Session, connect
+from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher, StreamSubscriber
 from zstate.wire.keys import driver_key, release_expression, release_key, stop_expression
 from zstate.wire.messages import DriverState, Release, Stop
@@ -60,16 +60,10 @@ def test_every_name_may_stop_and_only_a_commander_may_release(tmp_path):
     fleet = AclRoles(("arm",), viewers=("desk",), commanders=("teleop",))
     with router_with_users(tmp_path, fleet, fleet.identities) as endpoint, ExitStack() as opened:
 
-        def join(user: str) -> Session:
-            settings = {
-                "mode": "client",
-                "connect": {"endpoints": [endpoint], "timeout_ms": 5000},
-                "scouting": {"multicast": {"enabled": False}},
-                "transport": {"auth": {"usrpwd": {"user": user, "password": "secret"}}},
-            }
-            return opened.enter_context(connect(settings))
+        def session_of(user: str) -> Session:
+            return opened.enter_context(join(endpoint, user))
 
-        robot, desk, teleop = map(join, ("arm", "desk", "teleop"))
+        robot, desk, teleop = map(session_of, ("arm", "desk", "teleop"))
         host = opened.enter_context(hosted(robot))
         assert "seen smoke" in stop(desk, "arm", "seen smoke").reason
         with pytest.raises(AccessDenied):
