@@ -78,7 +78,6 @@ HOMES = {
     "click": "cli",
     "matplotlib": "cli",  # `zstate plot`
     "rich": "cli",
-    "tomli": "cli",  # a part of Python from 3.11 on, as tomllib
     "tomli_w": "cli",  # `zstate snapshot save`
     "tomllib": "cli",
     "yaml": "cli",

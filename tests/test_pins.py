@@ -12,6 +12,7 @@ import re
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
@@ -440,8 +441,7 @@ def test_keys_of_a_snapshot_in_toml(tmp_path: Path):
     with standing_robot():
         command = [sys.executable, "-m", "zstate", "snapshot", "save", str(path)]
         subprocess.run(command, check=True, capture_output=True, timeout=30.0)
-    toml = pytest.importorskip("tomllib" if sys.version_info >= (3, 11) else "tomli")
-    check_pin("toml_snapshot", sorted(key_paths(toml.loads(path.read_text()))))
+    check_pin("toml_snapshot", sorted(key_paths(tomllib.loads(path.read_text()))))
 
 
 @pytest.mark.processes

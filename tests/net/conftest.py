@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from datetime import datetime, timedelta, timezone
+from datetime import UTC, datetime, timedelta
 
 import pytest
 from helpers.access_routers import ROUTERS_PROGRAM, AccessRouters
@@ -15,7 +15,7 @@ from zstate.net.security.certificates import issue_identities
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AccessRouters]:
     pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
-    now, two_days = datetime.now(timezone.utc), timedelta(days=2)
+    now, two_days = datetime.now(UTC), timedelta(days=2)
     folder, strangers = tmp_path_factory.mktemp("fleet"), tmp_path_factory.mktemp("strangers")
     issue_identities(folder, ["router", "r1"])
     issue_identities(folder, ["expired"], days=1, valid_from=now - two_days)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from difflib import get_close_matches
 
 _SECOND_NS = 1_000_000_000
@@ -29,7 +29,7 @@ def format_time(stamp: int) -> str:
     """A stamp [ns] as date and time, or as seconds if it is within ten years of zero."""
     if counts_from_start(stamp):
         return f"{stamp / _SECOND_NS:.3f} s"
-    return f"{datetime.fromtimestamp(stamp // _SECOND_NS, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"
+    return f"{datetime.fromtimestamp(stamp // _SECOND_NS, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def counts_from_start(stamp: int) -> bool:

@@ -291,7 +291,7 @@ class RobotBridge(Closeable):
             for reading in readings:
                 try:
                     publisher.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
-                except InvalidInput as error:  # noqa: PERF203 - the next reading may be good
+                except InvalidInput as error:
                     self._counters.count_refusal("joint state", f"{self.robot!r}: {error}")
 
     def close(self) -> None:

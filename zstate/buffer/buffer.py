@@ -252,7 +252,7 @@ class TransformBuffer(BufferCore):
                     return outcome
                 try:
                     await asyncio.wait_for(event.wait(), deadline - loop.time())
-                except (TimeoutError, asyncio.TimeoutError):
+                except TimeoutError:
                     raise as_timeout(outcome, timeout_s) from None
 
     def _wait(self, query: Query, timeout_s: float) -> Transform:

@@ -252,7 +252,7 @@ class TransformWatch(Closeable):
                 if transform is not None and (not self._has_thresholds or self._has_moved(transform)):
                     self._last = transform
                     self._callback(transform)
-            except Exception as error:  # noqa: PERF203 - the loop runs once, unless threads meet
+            except Exception as error:
                 # It belongs to the author of the callback, not to the caller of the insert.
                 self.failures += 1
                 self.last_failure = error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from typing import Any, cast
 
 from zstate import __version__
@@ -58,7 +58,7 @@ def capture(
         for one in captures:
             for text in one.missing():
                 print_status(f"{one.info.name}: {text} within {timeout_s:g} s", robot=one.info.name)
-        saved = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+        saved = datetime.now(UTC).isoformat(timespec="milliseconds")
         config = network.config if isinstance(network.config, str) else None
         endpoints = (network.connect, network.listen, config)
         return Snapshot(

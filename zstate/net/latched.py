@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
+from datetime import UTC, datetime, timedelta
 from functools import partial
 
 import zenoh
@@ -119,7 +119,7 @@ class _LargeValuePublisher:
         self._key = key
         self._encoding = encoding
         self._id = secrets.token_bytes(16)
-        self._stamp = datetime.fromtimestamp(0, timezone.utc)
+        self._stamp = datetime.fromtimestamp(0, UTC)
         self._lock = fork_safe_lock()
         self._value: Reply | None = None
         self._publisher = session.zenoh.declare_publisher(
@@ -144,7 +144,7 @@ class _LargeValuePublisher:
 
     def _next_timestamp(self, payload: bytes, attachment: bytes | None) -> zenoh.Timestamp:
         """The timestamp of a new value, which is cached before it is sent: late joiners then miss none."""
-        self._stamp = max(datetime.now(timezone.utc), self._stamp + timedelta(microseconds=1))
+        self._stamp = max(datetime.now(UTC), self._stamp + timedelta(microseconds=1))
         timestamp = zenoh.Timestamp(self._stamp, self._id)
         self._value = Reply(
             payload, self._encoding, key=self._key, attachment=attachment, timestamp=timestamp

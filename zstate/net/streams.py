@@ -146,7 +146,7 @@ def call_for_each(batch: Iterable[T], function: Callable[[T], object]) -> None:
     for item in batch:
         try:
             function(item)
-        except Exception as error:  # noqa: PERF203 - the other items still get their call
+        except Exception as error:
             failure = error
     if failure is not None:
         raise failure

@@ -38,7 +38,7 @@ def decode_samples(
             name = wire.robot_from_key(sample.key) if robot == ANY else robot
             for message in wire.decode(stream, sample, name):
                 yield Received(name, sample.key, message)
-        except (MessageError, InvalidInput) as error:  # noqa: PERF203 - the other samples are still decoded
+        except (MessageError, InvalidInput) as error:
             if on_error is not None:
                 reason = error.reason if isinstance(error, MessageError) else "foreign"
                 on_error(reason, f"{shortened(sample.key)}: {error}")

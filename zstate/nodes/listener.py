@@ -317,7 +317,7 @@ class TransformListener(Closeable):
                         if not earliest <= sample.stamp <= latest:
                             writer = self._names.get((robot, sample.session))
                             self._stamp_check.check(robot, writer, sample)
-            except InvalidInput as error:  # noqa: PERF203 - not a function of its own: runs for each sample
+            except InvalidInput as error:
                 self._count_foreign(arrival.key, error)
             except Exception as error:  # raised below, after the other samples
                 failure = error

@@ -56,7 +56,7 @@ def read_metadata(path: Path) -> MapMetadata:
     for key in _CONVERTERS.keys() & entries.keys():
         try:
             values[key] = _CONVERTERS[key](path.parent, entries[key].value)
-        except ValueError as error:  # noqa: PERF203 - every finding of the file
+        except ValueError as error:
             findings.append((entries[key].line, f"{key} {error}"))
     free, occupied = values.get("free_thresh"), values.get("occupied_thresh")
     if free is not None and occupied is not None and free >= occupied:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import textwrap
 import time
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, started
@@ -34,7 +34,7 @@ def instant(text: object) -> float:
     """Seconds since the epoch of an RFC 3339 time in UTC, to the microsecond."""
     match = re.fullmatch(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)\.(\d{9})Z", str(text))
     assert match, text
-    whole = datetime.strptime(match[1], "%Y-%m-%dT%H:%M:%S").replace(tzinfo=timezone.utc)
+    whole = datetime.strptime(match[1], "%Y-%m-%dT%H:%M:%S").replace(tzinfo=UTC)
     return whole.timestamp() + int(match[2]) * 1e-9
 
 

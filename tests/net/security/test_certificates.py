@@ -6,7 +6,7 @@ import stat
 import subprocess
 import sys
 from contextlib import suppress
-from datetime import datetime, timedelta, timezone
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -81,7 +81,7 @@ def test_refused_call_overwrites_and_creates_no_file(tmp_path: Path):
 
 
 def test_certificate_is_valid_for_the_requested_days(tmp_path: Path):
-    start = datetime(2026, 3, 1, tzinfo=timezone.utc)
+    start = datetime(2026, 3, 1, tzinfo=UTC)
     files = issue_identities(tmp_path, ["r1"], days=30, valid_from=start)["r1"]
     certificate = read(files.certificate)
     assert certificate.not_valid_before_utc == start
@@ -89,7 +89,7 @@ def test_certificate_is_valid_for_the_requested_days(tmp_path: Path):
 
 
 def test_a_certificate_begins_an_hour_ago_for_machines_whose_clocks_are_behind(tmp_path: Path):
-    before = datetime.now(timezone.utc)
+    before = datetime.now(UTC)
     certificate = read(issue_identities(tmp_path, ["r1"], days=1)["r1"].certificate)
     # certificates count whole seconds
     assert certificate.not_valid_before_utc <= before - timedelta(minutes=59)

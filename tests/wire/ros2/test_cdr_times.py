@@ -1,4 +1,4 @@
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 
 import pytest
 from hypothesis import given
@@ -42,7 +42,7 @@ def test_stamp_outside_the_seconds_of_ros_2_is_refused_by_name(stamp: int):
 
 
 def test_the_years_named_are_those_where_an_int32_ends():
-    years = [datetime.fromtimestamp(stamp // SECOND, timezone.utc).year for stamp in (FIRST, LAST)]
+    years = [datetime.fromtimestamp(stamp // SECOND, UTC).year for stamp in (FIRST, LAST)]
     assert years == [1901, 2038]
 
 

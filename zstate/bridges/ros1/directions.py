@@ -117,7 +117,7 @@ class NativeToRos1(Closeable):
                     self._publish_statics(self._wire.edge_writer_name(key), message)
                 elif isinstance(message, RobotDescription):
                     self._set_model(message)
-            except (MessageError, InvalidInput) as error:  # noqa: PERF203 - the other messages may be good
+            except (MessageError, InvalidInput) as error:
                 self._refusals.count(refusal_reason(error), f"{key}: {error}")
 
     def _on_withdrawn(self, key: str) -> None:

@@ -112,7 +112,7 @@ put_part(char *at, PyObject *part)
 static char *
 put_spread(const RosJointStateEncoder *self, char *at, const Row *row)
 {
-    const double unknown = NAN; /* Py_NAN is negative in Python 3.10 */
+    const double unknown = NAN;
     if (row->values == NULL)
         return at;
     if (self->velocities != self->positions) {

@@ -224,7 +224,7 @@ def _invalid_settings(context: click.Context) -> Iterator[str]:
     for check in checks:
         try:
             check()
-        except ZStateError as error:  # noqa: PERF203 - three checks
+        except ZStateError as error:
             yield str(error)
         except click.ClickException as error:
             yield error.format_message()

@@ -12,7 +12,7 @@ import threading
 import time
 import traceback
 from contextlib import suppress
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from typing import TextIO, cast
 
 import click
@@ -174,4 +174,4 @@ def _log_crash(error: BaseException | None) -> None:
 def _time_text() -> str:
     """The current time in RFC 3339, with nanoseconds."""
     seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
-    return f"{datetime.fromtimestamp(seconds, timezone.utc):%Y-%m-%dT%H:%M:%S}.{nanoseconds:09d}Z"
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{nanoseconds:09d}Z"

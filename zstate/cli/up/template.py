@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-import sys
+import tomllib
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,11 +16,6 @@ from typing import Any, Generic, TypeVar, cast
 
 from zstate._util.format import did_you_mean
 from zstate.errors import ConfigError, InvalidInput
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 SINGLE = ("router", "network")
 LISTS = ("robot", "static", "map", "scan", "program")

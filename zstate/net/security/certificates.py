@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from zstate.errors import ConfigError, InvalidInput, LibraryMissing
@@ -57,7 +57,7 @@ def issue_identities(
                 f"there is an identity {name!r} already: {existing}; nothing is overwritten: choose another "
                 "name, or remove these files to replace it"
             )
-    start = valid_from or datetime.now(timezone.utc)
+    start = valid_from or datetime.now(UTC)
     first, last = start - (timedelta() if valid_from else _CLOCK_DIFFERENCE), start + timedelta(days=days)
     authority = CertificateAuthority.in_folder(Path(folder))
     authority.check_outlives(last)
@@ -134,7 +134,7 @@ class CertificateAuthority:
         # A unique name: two authorities of one name look like one with a bad signature.
         name = f"zstate test authority {os.urandom(4).hex()}"
         key = _new_key()
-        now = datetime.now(timezone.utc)
+        now = datetime.now(UTC)
         # From long ago: tests need certificates of the past.
         valid = (now - timedelta(days=AUTHORITY_DAYS), now + timedelta(days=AUTHORITY_DAYS))
         builder = (
