@@ -12,10 +12,12 @@ import statistics
 import subprocess
 import sys
 import tokenize
+import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -73,14 +75,13 @@ HOMES = {
     "websockets": "view",  # what viser's server is made of
     "trimesh": "view",
     "collada": "view",
-    "imageio": "view",  # comes with viser
     "PIL": "view",
     "click": "cli",
     "matplotlib": "cli",  # `zstate plot`
     "rich": "cli",
     "tomli_w": "cli",  # `zstate snapshot save`
     "tomllib": "cli",
-    "yaml": "cli",
+    "yaml": "recording",
 }
 EVERYWHERE = {"numpy"}
 GUESTS = {
@@ -88,8 +89,23 @@ GUESTS = {
     ("cli/snapshot_file.py", "msgspec"),
     ("cli/up/cell.py", "msgspec"),
     ("scans/map_files.py", "PIL"),
+    # each reads one kind of file in YAML
+    ("cli/up/static_edges.py", "yaml"),
     ("scans/map_metadata.py", "yaml"),
 }
+
+# Distributions, for the names of imports that differ.
+DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "collada": "pycollada",
+    "pinocchio": "pin",
+    "yaml": "pyyaml",
+    "zenoh": "eclipse-zenoh",
+}
+OF_ROS = {"rospy", "geometry_msgs", "rosgraph_msgs", "sensor_msgs", "std_msgs", "tf2_msgs"}
+NOT_FOR_USERS = {"test", "lint", "mujoco"}
+# Libraries that pin's wheel links, and files with robots.
+WITHOUT_IMPORTS = {"cmeel-urdfdom", "cmeel-tinyxml2", "cmeel-console-bridge", "example-robot-data"}
 
 PURE = {"model", "buffer", "wire"}
 # The loader and the catalog find and read model files.
@@ -256,6 +272,17 @@ def test_scans_and_maps_load_no_library_for_files():
 def test_following_transforms_loads_no_kinematics():
     code = "from zstate import TransformListener, connect\nTransformListener, connect"
     assert loaded_by(code) == {"msgspec", "zenoh"}
+
+
+def test_each_imported_library_is_declared_and_each_declared_one_imported():
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    users = {name: requirements for name, requirements in extras.items() if name not in NOT_FOR_USERS}
+    requirements = [*project["dependencies"], *chain.from_iterable(users.values())]
+    declared = {re.match(r"[\w-]+", requirement)[0].lower() for requirement in requirements} - {"zstate"}
+    imported = {top for source in modules().values() for top, *_ in source.imports()} - OF_ROS
+    foreign = imported - sys.stdlib_module_names - {"zstate"}
+    assert {DISTRIBUTIONS.get(name, name.replace("_", "-")) for name in foreign} == declared - WITHOUT_IMPORTS
 
 
 # Ratchets

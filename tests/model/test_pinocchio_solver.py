@@ -32,7 +32,11 @@ def broken_pinocchio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             "libgomp.so.1: cannot open shared object file: No such file or directory",
             "apt-get install libgomp1",
         ),
-        ("liburdfdom_sensor.so.6.0: cannot open shared object file", "pip install --force-reinstall pin"),
+        (
+            "liburdfdom_sensor.so.6.0: cannot open shared object file",
+            "pip install --force-reinstall 'cmeel-urdfdom>=6,<7'",
+        ),
+        ("libcoal.so: cannot open shared object file", "pip install --force-reinstall pin"),
     ],
 )
 def test_the_command_that_mends_pinocchio_depends_on_what_is_missing(

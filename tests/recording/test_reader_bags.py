@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -93,6 +94,13 @@ def test_path_that_leads_out_of_the_bag_is_not_followed(tmp_path: Path):
 
 
 GOOD = BY_ROSBAG2.format(version=9, storage="mcap", first="a_0.mcap", second="a_1.mcap")
+AS_JSON = {
+    "rosbag2_bagfile_information": {
+        "version": 9,
+        "storage_identifier": "mcap",
+        "relative_file_paths": ["a_0.mcap", "a_1.mcap"],
+    }
+}
 
 
 @pytest.mark.parametrize(
@@ -102,23 +110,15 @@ GOOD = BY_ROSBAG2.format(version=9, storage="mcap", first="a_0.mcap", second="a_
         ("version: 9", "version: nine", "version is 'nine'"),
         ("  version: 9\n", "", "'version' is not one word"),
         ("storage_identifier: mcap", "storage_identifier: rocksdb", "storage is 'rocksdb'"),
-        (
-            "storage_identifier: mcap",
-            "storage_identifier: *anchor",
-            "'*anchor' is YAML that is not supported",
-        ),
+        ("storage_identifier: mcap", "storage_identifier: *anchor", "undefined alias"),
         ('compression_mode: ""', "compression_mode: FILE", "compressed by file"),
-        (
-            "relative_file_paths:\n    - a_0.mcap\n    - a_1.mcap",
-            "relative_file_paths: [a_0.mcap]",
-            "one a line",
-        ),
-        ("    - a_1.mcap\n", "    - a_1\n      .mcap\n", "'.mcap' is YAML that is not supported"),
-        ("relative_file_paths:", "relative_files:", "'relative_file_paths', one a line"),
+        ("relative_file_paths:", "relative_files:", "no list 'relative_file_paths'"),
+        ("    - a_0.mcap\n", "    - [a_0.mcap]\n", "a path in its 'relative_file_paths' is not one word"),
+        ("custom_data: ~", f"custom_data: {'[' * 60}{']' * 60}", "nested more than 50 deep"),
         ("  version: 9\n", "  version: 9\n  version: 9\n", "the key 'version' twice"),
-        ("rosbag2_bagfile_information:", "something: else", "does not begin with"),
+        ("rosbag2_bagfile_information:", "something:", "with the key 'rosbag2_bagfile_information'"),
         ("a_1.mcap", "a_7.mcap", "files that are not there"),
-        (GOOD, "", "does not begin with"),
+        (GOOD, "", "it is not a mapping"),
     ],
 )
 def test_unsupported_metadata_is_refused_with_the_reason(
@@ -130,6 +130,28 @@ def test_unsupported_metadata_is_refused_with_the_reason(
         bag_files(folder)
     assert reason in str(caught.value)
     assert caught.value.path == str(folder / "metadata.yaml")
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("  version: 9", "  # by hand\n  version: 9  # the newest"),
+        ("  version: 9", '  "version": "9"'),
+        ("storage_identifier: mcap", "storage_identifier: &storage mcap"),
+        (
+            "relative_file_paths:\n    - a_0.mcap\n    - a_1.mcap",
+            "relative_file_paths: [a_0.mcap, 'a_1.mcap']",
+        ),
+        ("    - a_1.mcap\n", "    - >-\n      a_1.mcap\n"),
+        (GOOD, f"%YAML 1.1\n---\n{GOOD}..."),
+        (GOOD, json.dumps(AS_JSON)),
+    ],
+    ids=["comments", "quotes", "anchor", "flow list", "folded", "document", "json"],
+)
+def test_any_spelling_of_yaml_is_read(tmp_path: Path, before: str, after: str):
+    assert before in GOOD
+    folder = bag(tmp_path / "bag", GOOD.replace(before, after), "a_0.mcap", "a_1.mcap")
+    assert bag_files(folder) == [folder / "a_0.mcap", folder / "a_1.mcap"]
 
 
 def test_binary_metadata_is_refused(tmp_path: Path):

@@ -305,12 +305,6 @@ def test_a_file_that_is_no_image_is_refused(tmp_path: Path):
         load_map(write_yaml(tmp_path))
 
 
-def test_without_pyyaml_the_error_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "yaml", None)
-    with pytest.raises(LibraryMissing, match=r"map files need PyYAML: pip install 'zstate\[maps\]'"):
-        load_map(write_yaml(tmp_path))
-
-
 def test_without_pillow_trinary_maps_are_saved_and_the_error_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import threading
 import warnings
@@ -60,10 +61,10 @@ class BrowserTab:
 
     def pixels(self) -> NDArray[np.uint8]:
         """A screenshot: (H, W, 3)."""
-        import imageio.v3
+        from PIL import Image
 
         shot = self.tab.screenshot(timeout=TIMEOUT_MS)
-        return imageio.v3.imread(shot, extension=".png")[:, :, :3]
+        return np.asarray(Image.open(io.BytesIO(shot)))[:, :, :3]
 
     def save_screenshot(self, name: str) -> None:
         """Save a screenshot in the folder ZSTATE_SCREENSHOTS, for inspection by a person."""

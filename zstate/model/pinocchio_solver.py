@@ -7,6 +7,7 @@ Python costs more than ten times what computing them does.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,6 +26,14 @@ if TYPE_CHECKING or kernel == "c":
 Indices = NDArray[np.int64]
 
 _SUPPORTED = "pip install 'pin>=4.1,<5'"
+_REINSTALL = "pip install --force-reinstall"
+_COMMANDS = {
+    "gomp": "apt-get install libgomp1",
+    "urdfdom": f"{_REINSTALL} 'cmeel-urdfdom>=6,<7'",
+    "tinyxml2": f"{_REINSTALL} 'cmeel-tinyxml2>=11,<12'",
+    "console_bridge": f"{_REINSTALL} 'cmeel-console-bridge>=1.0.2,<2'",
+}
+"""What installs a library that Pinocchio's wheel links; pyproject.toml has the same bounds."""
 
 
 class Engine(NamedTuple):
@@ -61,14 +70,18 @@ def load_pinocchio() -> Any:
     try:
         import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs] - readers do not need it
     except ImportError as error:
-        command = "pip install --force-reinstall pin"
-        if "libgomp" in str(error):
-            command = "apt-get install libgomp1"
-        elif isinstance(error, ModuleNotFoundError) and error.name == "pinocchio":
-            command = "pip install pin"
+        command = _install_command(error)
         text = f"Pinocchio cannot be loaded: {error}; `{command}` installs what is missing"
         raise LibraryMissing(text, command=command) from error
     return pinocchio
+
+
+def _install_command(error: ImportError) -> str:
+    """The command that installs the library that the loader did not find."""
+    if isinstance(error, ModuleNotFoundError) and error.name == "pinocchio":
+        return "pip install pin"
+    missing = re.search(r"lib(gomp|urdfdom|tinyxml2|console_bridge)\w*\.so", str(error))
+    return _COMMANDS[missing[1]] if missing else f"{_REINSTALL} pin"
 
 
 class PinocchioSolver:

@@ -1,14 +1,11 @@
 """Reads the records of a recording, in MCAP files or a ROS 2 bag, in the order of their log times.
 
 The folder of a rosbag2 recording lists its files in metadata.yaml. Only that list is read from the YAML
-(https://github.com/ros2/rosbag2, versions 1 to 9 of the format); the rest is in the files. Written by
-yaml-cpp or ruamel, it has one form: the keys of a bag are indented once below
-``rosbag2_bagfile_information``, the paths are a block list. Any other form is an error.
+(https://github.com/ros2/rosbag2, versions 1 to 9 of the format); the rest is in the files.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import sqlite3
@@ -38,11 +35,10 @@ from zstate.recording.storage import (
 FORMATS: dict[str, Format] = {".mcap": "mcap", ".db3": "sqlite3"}
 METADATA = "metadata.yaml"
 
-_TOP = "rosbag2_bagfile_information:"
-_KEY = re.compile(r"( *)([A-Za-z_]\w*):(?: +(.*?))? *$")
-_ITEM = re.compile(r" *- +(.*?) *$")
-_PLAIN = re.compile(r"[^\s\"'\[\]{}&*!|>%@`#,?:-](?:[^:#]|:(?! )|(?<! )#)*")
+_TOP = "rosbag2_bagfile_information"
 _NEWEST = 9
+_MAX_DEPTH = 50
+"""Of YAML: libyaml composes nodes recursively, so deeper ones could overflow the stack of the process."""
 
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _OPTIONAL = {"offered_qos_profiles": "offered_qos_profiles", "type_description_hash": "topic_type_hash"}
@@ -265,14 +261,11 @@ def _numbered_files(folder: Path) -> list[Path]:
 
 
 def _listed_files(text: str) -> list[str]:
-    """The files that a metadata.yaml lists. Raises ValueError for a form that is not supported."""
-    keys = _metadata_keys(text)
+    """The files that a metadata.yaml lists. Raises ValueError if they cannot be read."""
+    keys = _keys(_keys(_yaml_node(text), "it").get(_TOP), f"its {_TOP!r}")
 
     def word(key: str) -> str:
-        value, *rest = keys.get(key, ("", "?"))
-        if rest:
-            raise ValueError(f"its {key!r} is not one word")
-        return _scalar(value)
+        return _scalar(keys.get(key), f"its {key!r}")
 
     version, storage = word("version"), word("storage_identifier")
     if not version.isdecimal() or not 1 <= int(version) <= _NEWEST:
@@ -285,46 +278,43 @@ def _listed_files(text: str) -> list[str]:
             f"it is compressed by {mode}, on top of its storage; `ros2 bag convert` writes it "
             "without (a .zstd file alone: `zstd -d`)"
         )
-    value, *lines = keys.get("relative_file_paths", ("",))
-    names: list[str] = []
-    for line in lines:
-        match = _ITEM.match(line)
-        if not match:
-            raise ValueError(f"{line.strip()!r} is YAML that is not supported here")
-        names.append(_scalar(match[1]))
-    if value or not names:
-        raise ValueError("it does not list 'relative_file_paths', one a line")
-    return names
+    paths: Any = keys.get("relative_file_paths")
+    if getattr(paths, "id", "") != "sequence" or not paths.value:
+        raise ValueError("it has no list 'relative_file_paths'")
+    return [_scalar(path, "a path in its 'relative_file_paths'") for path in paths.value]
 
 
-def _metadata_keys(text: str) -> dict[str, list[str]]:
-    """Each key, with the rest of its line and the lines below it."""
-    keys: dict[str, list[str]] = {}
-    lines = [line.rstrip() for line in text.splitlines() if line.strip() not in {"", "---"}]
-    if not lines or lines[0] != _TOP:
-        raise ValueError(f"it does not begin with {_TOP!r}")
-    step, current = "", []
-    for line in lines[1:]:
-        match = _KEY.match(line)
-        step = step or (match[1] if match else "")
-        if not match or match[1] != step or not step:
-            current.append(line)
-        elif match[2] in keys:
-            raise ValueError(f"it has the key {match[2]!r} twice")
-        else:
-            current = keys[match[2]] = [match[3] or ""]
+def _yaml_node(text: str) -> Any:
+    """The root node of the one document in ``text``; None if it is empty."""
+    import yaml  # noqa: PLC0415 - only bags need it
+
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    library: Any = yaml
+    try:
+        depth = 0
+        for event in library.parse(text, loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _MAX_DEPTH:
+                raise ValueError(f"its YAML is nested more than {_MAX_DEPTH} deep")
+        return library.compose(text, loader)
+    except yaml.YAMLError as error:
+        raise ValueError(f"it is not YAML: {' '.join(str(error).split())}") from None
+
+
+def _keys(node: Any, what: str) -> dict[str, Any]:
+    """The values of a mapping's node by their keys. Raises ValueError for another node."""
+    if getattr(node, "id", "") != "mapping":
+        raise ValueError(f"{what} is not a mapping; a bag's metadata is one with the key {_TOP!r}")
+    keys: dict[str, Any] = {}
+    for key, value in node.value:
+        name = _scalar(key, "a key")
+        if name in keys:
+            raise ValueError(f"it has the key {name!r} twice")
+        keys[name] = value
     return keys
 
 
-def _scalar(text: str) -> str:
-    try:
-        value = json.loads(text) if text.startswith('"') else None
-    except ValueError:
-        value = None
-    if isinstance(value, str):
-        return value
-    if len(text) > 1 and text[0] == text[-1] == "'":
-        return text[1:-1].replace("''", "'")
-    if not _PLAIN.fullmatch(text):
-        raise ValueError(f"{text!r} is YAML that is not supported here")
-    return text
+def _scalar(node: Any, what: str) -> str:
+    if getattr(node, "id", "") != "scalar":
+        raise ValueError(f"{what} is not one word")
+    return node.value

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.errors import InvalidInput
-from zstate.scans.map_metadata import MODES, MapMetadata, Mode, library_missing
+from zstate.errors import InvalidInput, LibraryMissing
+from zstate.scans.map_metadata import MODES, MapMetadata, Mode
 
 MAX_CELLS = 2**27
 """The largest map: for instance 8192 x 16384 cells. Pillow refuses images a little larger than that."""
@@ -183,5 +183,6 @@ def _pillow() -> Any:
     try:
         from PIL import Image  # noqa: PLC0415 - loaded when it is needed
     except ImportError:
-        raise library_missing("images of maps need Pillow") from None
+        command = "pip install 'zstate[maps]'"
+        raise LibraryMissing(f"images of maps need Pillow: {command}", command=command) from None
     return Image

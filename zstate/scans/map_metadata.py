@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from zstate._util.format import did_you_mean
-from zstate.errors import InvalidInput, LibraryMissing, printable
+from zstate.errors import InvalidInput, printable
 
 Mode = Literal["trinary", "scale", "raw"]
 _Value = str | list[str] | None
@@ -40,8 +40,7 @@ class MapMetadata:
 def read_metadata(path: Path) -> MapMetadata:
     """The metadata in a YAML file. Relative paths of images start at its folder.
 
-    Other keys are ignored, as map_server does. Raises InvalidInput with every finding and its line, and
-    LibraryMissing without PyYAML.
+    Other keys are ignored, as map_server does. Raises InvalidInput with every finding and its line.
     """
     findings: list[tuple[int, str]] = []
     entries: dict[str, _Entry] = {}
@@ -215,15 +214,6 @@ _CONVERTERS = {
 
 
 def _pyyaml() -> Any:
-    """PyYAML's module. Raises LibraryMissing."""
-    try:
-        import yaml  # noqa: PLC0415 - loaded when it is needed
-    except ImportError:
-        raise library_missing("map files need PyYAML") from None
+    import yaml  # noqa: PLC0415 - loaded when it is needed
+
     return yaml
-
-
-def library_missing(text: str) -> LibraryMissing:
-    """``text`` and the command that installs what map files need."""
-    command = "pip install 'zstate[maps]'"
-    return LibraryMissing(f"{text}: {command}", command=command)

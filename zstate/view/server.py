@@ -302,12 +302,10 @@ def save_screenshot(
                 difference = np.abs(before.astype(np.int16) - pixels.astype(np.int16)).max(axis=2)
                 if float((difference > 16).mean()) < _MAX_CHANGED:
                     break
-    import imageio.v3  # noqa: PLC0415 - only screenshots need it
+    from PIL import Image  # noqa: PLC0415 - only screenshots need it
 
     try:
-        out = io.BytesIO()
-        imageio.v3.imwrite(out, pixels, extension=".png")  # pyright: ignore[reportUnknownMemberType]
-        path.write_bytes(out.getvalue())
+        Image.fromarray(pixels).save(path, "png")
     except OSError as error:
         raise InvalidInput(f"the picture cannot be written: {error}") from None
 

@@ -12,7 +12,7 @@ from typing import Any, cast
 from zstate.buffer.buffer import TransformBuffer
 from zstate.cli.up.cell import Cell, StaticSection, as_tuple
 from zstate.cli.up.template import Located
-from zstate.errors import ConfigError, InvalidInput, LibraryMissing
+from zstate.errors import ConfigError, InvalidInput
 from zstate.transform import Transform
 from zstate.wire.keys import check_robot, full_name
 
@@ -120,12 +120,8 @@ def _document(path: Path) -> Any:
         raise InvalidInput(f"it cannot be read: {error.strerror}") from None
     if path.suffix == ".json":
         return json.loads(text)
-    try:
-        import yaml
-    except ImportError:
-        raise LibraryMissing(
-            "calibrations in YAML need PyYAML: pip install 'zstate[yaml]'; JSON and TOML do without"
-        ) from None
+    import yaml
+
     try:
         # `ros2 topic echo` ends a document with a line of dashes, after which there is nothing.
         return next((one for one in yaml.safe_load_all(text) if one is not None), None)
