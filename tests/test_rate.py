@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from helpers.processes import SteppingClock
+from helpers.processes import DEADLINE_S, SteppingClock
 
 from zstate.clock import ManualClock, MonotonicClock, SystemClock
 from zstate.errors import InvalidInput
@@ -239,6 +239,13 @@ def in_thread(function: Callable[[], None]) -> None:
         raise failure
 
 
+def test_other_threads_give_up_the_interpreter_sooner_while_a_control_loop_runs():
+    before = sys.getswitchinterval()
+    with control_loop_pace(100.0, None, threading.Event(), 1.0):
+        assert sys.getswitchinterval() == pytest.approx(5e-4)
+    assert sys.getswitchinterval() == before
+
+
 @pytest.mark.realtime
 @pytest.mark.parametrize("realtime", ["fifo", "spin"])
 def test_a_real_time_loop_has_its_scheduling_inside_the_block_only(realtime: Realtime):
@@ -270,6 +277,22 @@ def test_a_real_time_loop_sleeps_at_each_tick_even_if_its_work_takes_too_long(re
             assert count_waits() - before >= 3 * pace.report().ticks // 4 > 1
 
     in_thread(loop)
+
+
+@pytest.mark.realtime
+def test_a_loop_that_would_starve_other_programs_leaves_real_time_scheduling(caplog):
+    def loop() -> None:
+        with control_loop_pace(1000.0, "fifo", threading.Event(), DEADLINE_S) as pace:
+            for now in pace:
+                while time.monotonic_ns() < now + 3_000_000:
+                    pass
+                if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER:
+                    return
+        pytest.fail("still SCHED_FIFO")
+
+    in_thread(loop)
+    assert "more than 90 % of a processor for a second" in caplog.text
+    assert "lower rate_hz" in caplog.text
 
 
 @pytest.mark.realtime

@@ -9,9 +9,10 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, TypeAlias
 
 from zstate.clock import MONOTONIC, SYSTEM, Clock, MonotonicClock
@@ -65,6 +66,10 @@ _FASTEST_SPIN_HZ = 2_000.0
 _LONGEST_SLEEP_NS = 50_000_000
 _SHORTEST_SLEEP_NS = 50_000
 """The time that a loop leaves to other threads at each tick, even if it is late."""
+
+_MOST_LOAD = 0.9
+_LOAD_WINDOW_NS = 1_000_000_000
+"""A loop that uses more of a processor than that for so long leaves SCHED_FIFO."""
 
 _SWITCH_INTERVAL_S = 5e-4
 """For how long another thread of Python may delay a tick: above the spin and the work of a tick, which it
@@ -238,20 +243,32 @@ class _PreciseClock(MonotonicClock):
     Each wait sleeps for 50 us at least, also after its deadline: a thread with SCHED_FIFO that never sleeps
     would stop all others of its processor. A sleep of the system takes no locks after it has ended, as the
     wait for an event does. In the last part this thread holds the interpreter lock, which another one may
-    need some time to release.
+    need some time to release. ``on_overload()`` is called after each second in which this thread has used
+    more than 90 % of a processor.
     """
 
-    def __init__(self, spin_ns: int) -> None:
+    def __init__(self, spin_ns: int, on_overload: Callable[[], object]) -> None:
         self._spin_ns = spin_ns
+        self._on_overload = on_overload
+        self._checked_at, self._used_ns = time.monotonic_ns(), time.thread_time_ns()
 
     def wait_until(self, stamp: int, stop: threading.Event) -> bool:
-        left_ns = max(stamp - self._spin_ns - time.monotonic_ns(), _SHORTEST_SLEEP_NS)
+        now = time.monotonic_ns()
+        if now - self._checked_at > _LOAD_WINDOW_NS:
+            self._check_load(now)
+        left_ns = max(stamp - self._spin_ns - now, _SHORTEST_SLEEP_NS)
         while left_ns > 0 and not stop.is_set():
             time.sleep(min(left_ns, _LONGEST_SLEEP_NS) * 1e-9)
             left_ns = stamp - self._spin_ns - time.monotonic_ns()
         while time.monotonic_ns() < stamp and not stop.is_set():
             pass
         return not stop.is_set()
+
+    def _check_load(self, now: int) -> None:
+        used_ns = time.thread_time_ns()
+        if used_ns - self._used_ns > _MOST_LOAD * (now - self._checked_at):
+            self._on_overload()
+        self._checked_at, self._used_ns = now, used_ns
 
 
 @contextmanager
@@ -260,13 +277,16 @@ def control_loop_pace(
 ) -> Generator[Rate | DevicePace, None, None]:
     """The ticks of a control loop in this thread; a device sets its pace if ``rate_hz`` is None.
 
-    With ``realtime`` the thread has SCHED_FIFO at priority 50 inside the block, the memory of the process is
-    locked, and its garbage collector skips the objects that exist already. "spin" also does not sleep in the
-    last 200 us before a deadline: at 1 kHz the loop occupies a quarter of a processor for that. A tick that
-    is late sleeps for 50 us first, as other threads need some of the processor. Raises InvalidInput, with
-    what to do, if the system does not permit it.
+    Inside the block, other threads of Python give up the interpreter after 0.5 ms. With ``realtime`` the
+    thread has SCHED_FIFO at priority 50, the memory of the process is locked, and its garbage collector skips
+    the objects that exist already. "spin" also does not sleep in the last 200 us before a deadline: at 1 kHz
+    the loop occupies a quarter of a processor for that. A tick that is late sleeps for 50 us first, as other
+    threads need some of the processor; a loop that uses more than 90 % of one for a second goes on without
+    SCHED_FIFO, and logs an error. Raises InvalidInput, with what to do, if the system does not permit it.
     """
     with ExitStack() as restoring:
+        restoring.callback(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(_SWITCH_INTERVAL_S)
         clock = MonotonicClock() if realtime is None else _use_realtime(realtime, restoring)
         if rate_hz is None:
             yield DevicePace(clock, stop, seconds)
@@ -293,18 +313,28 @@ def check_pace(rate_hz: float | None, realtime: Realtime | None) -> None:
 
 def _use_realtime(realtime: Realtime, restoring: ExitStack) -> Clock:
     """Schedule this thread as ``realtime``; returns the clock for its deadlines."""
-    _use_fifo(realtime, restoring)
+    leave_fifo = _use_fifo(realtime, restoring)
     _lock_memory(realtime, restoring)
     if not gc.get_freeze_count():
         gc.collect()
         gc.freeze()
         restoring.callback(gc.unfreeze)
-    restoring.callback(sys.setswitchinterval, sys.getswitchinterval())
-    sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    return _PreciseClock(_SPIN_NS if realtime == "spin" else 0)
+
+    def on_overload() -> None:
+        if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO:
+            leave_fifo()
+            _LOG.error(
+                "the control loop has used more than %.0f %% of a processor for a second, and would leave no "
+                "time for other programs: it goes on without SCHED_FIFO. Its work takes longer than its "
+                "period: lower rate_hz",
+                100.0 * _MOST_LOAD,
+            )
+
+    return _PreciseClock(_SPIN_NS if realtime == "spin" else 0, on_overload)
 
 
-def _use_fifo(realtime: Realtime, restoring: ExitStack) -> None:
+def _use_fifo(realtime: Realtime, restoring: ExitStack) -> Callable[[], object]:
+    """Give this thread SCHED_FIFO; returns what takes it away."""
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         # Threads and processes that this one starts do not inherit it.
@@ -316,7 +346,9 @@ def _use_fifo(realtime: Realtime, restoring: ExitStack) -> None:
             f"not permit: allow it by `ulimit -r {_FIFO_PRIORITY}` (rtprio in /etc/security/limits.conf), or "
             "by the capability CAP_SYS_NICE (`docker run --cap-add SYS_NICE`)"
         ) from None
-    restoring.callback(os.sched_setscheduler, 0, policy | os.SCHED_RESET_ON_FORK, parameters)
+    leave_fifo = partial(os.sched_setscheduler, 0, policy | os.SCHED_RESET_ON_FORK, parameters)
+    restoring.callback(leave_fifo)
+    return leave_fifo
 
 
 def _lock_memory(realtime: Realtime, restoring: ExitStack) -> None:

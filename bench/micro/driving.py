@@ -258,6 +258,8 @@ def moved_after_ms(how: str, host: DriverHost, driver: TimedDriver, port: int) -
         with other_process("mover", link.port) as mover:
             wait_for(lambda: host.state == "active")
             time.sleep(random.uniform(0.2, 0.25))
+            # Not at rest at the end of its range, where it would seem to be held at once.
+            wait_for(lambda: time.monotonic_ns() - driver.moved_at < 3e6 * PERIOD_MS)
             ended_at = time.monotonic_ns()
             if how == "link cut":
                 link.cut()

@@ -20,7 +20,7 @@ from helpers.robots import RRBOT, wait_for_reader
 
 from zstate import JointReading, StatePublisher, load_model
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
-from zstate.driving.driver import StopMode
+from zstate.driving.driver import Setpoint, StopMode
 from zstate.driving.stops import stops_file, wait_for_state
 from zstate.errors import DriverFault, InvalidInput, SecondWriter
 from zstate.net.presence import local_writer
@@ -33,6 +33,7 @@ from zstate.wire.messages import DriverState, JointCommand, Release, order_diges
 from zstate.wire.native import ENCODINGS, encode
 
 LIMITS = Limits.of(RRBOT, velocity=2.0)
+ELBOW = order_digest(("elbow",))
 RATE_HZ = 200.0
 STEP = 2.0 / RATE_HZ
 """The longest step of a tick at the velocity limit [rad]."""
@@ -172,8 +173,10 @@ def test_a_dead_or_frozen_commander_leaves_the_joints_held_within_ttl_and_one_ti
         until(lambda: host.state == "holding")
         until(lambda: len(driver.written()) and (driver.written()[-5:] == driver.written()[-1]).all())
         report = host.report()
-        program = f"pid {killed.process.pid}"
-        assert f"nothing from teleop@{socket.gethostname()} {program} for" in state_of(sessions[1]).reason
+        name, reason = f"teleop@{socket.gethostname()} pid {killed.process.pid}", state_of(sessions[1]).reason
+        # The death of a process may be known when its last command expires.
+        has_ended = end is signal.SIGKILL and reason == f"{name} has ended"
+        assert has_ended or f"nothing from {name} for" in reason
     writes = [(at, value) for name, at, value in driver.calls if name == "write"]
     moved = [at for (at, one), (_, before) in zip(writes[1:], writes, strict=False) if (one != before).any()]
     # Counted from arrival, which is not after the death; the last motion is in the tick of the expiry.
@@ -258,11 +261,18 @@ def command(seq: int = 0, ttl: int = 0, **positions: float) -> bytes:
         (command(elbow=float("inf")), "not finite"),
         (command(elbw=0.0), "unknown joint"),
         (command(elbow=0.0, ttl=10**10), "ttl"),
-        (encode(JointCommand(0, 0, 7, order_digest(("elbow",)), to_block([0.0]))), "no names"),
+        (encode(JointCommand(0, 0, 7, ELBOW, to_block([0.0]))), "no names"),
         (
-            encode(JointCommand(0, 0, 7, order_digest(("elbow",)), None, to_block([1.0]), names=("elbow",))),
+            encode(JointCommand(0, 0, 7, ELBOW, None, None, to_block([1.0]), names=("elbow",))),
             "mode",
         ),
+        (
+            encode(JointCommand(0, 0, 7, ELBOW, to_block([1.0]), to_block([1.0]), names=("elbow",))),
+            "mode",
+        ),
+        (encode(JointCommand(0, 0, 7, ELBOW, None, to_block([np.nan]), names=("elbow",))), "not finite"),
+        (encode(JointCommand(0, 0, 7, ELBOW, None, to_block([np.inf]), names=("elbow",))), "not finite"),
+        (encode(JointCommand(0, 0, 7, ELBOW, names=("elbow",))), "not finite"),
         (
             encode(
                 JointCommand(0, 0, 7, order_digest(("elbow",) * 2), to_block([0, 1]), names=("elbow",) * 2)
@@ -270,6 +280,7 @@ def command(seq: int = 0, ttl: int = 0, **positions: float) -> bytes:
             "repeated joint",
         ),
         (command(elbow=0.0)[:-3], "truncated"),
+        (command(**{f"joint_{number}": 0.0 for number in range(100)}), "too large"),
         (b"\xff\x00garbage", "malformed"),
     ],
 )
@@ -1046,15 +1057,14 @@ def test_bad_commands_of_ros_nodes_are_refused_and_move_nothing(sessions):
     narrow = Limits(RRBOT.joint_names, [-1.0, -0.5], [1.0, 0.5], [2.0, 2.0], [np.inf, np.inf])
     driver = RecordingDriver()
     with (
-        DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=narrow, **CONTROLLED) as host,
+        running(sessions[0], driver, limits=narrow, **CONTROLLED) as host,
         announced_publisher(sessions[1], "teleop", COMMANDS) as node,
     ):
         for numbers in ([0.1], [0.1, 0.1, 0.1], [], [0.1, np.nan], [np.inf, 0.1], [0.0, 0.6]):
             node.numbers(numbers)
         node.put(rosbags_numbers([0.1, 0.1])[:-1])
         node.put(rosbags_numbers([0.1, 0.1]), None)
-        until(lambda: sum(host.report().refused.values()) == 7)
-        host.run(seconds=2 / RATE_HZ)
+        until(lambda: sum(host.report().refused.values()) == 8)
         assert host.report().refused == {
             "joint count": 3,
             "not finite": 2,
@@ -1082,6 +1092,23 @@ def test_a_ros_node_that_commanded_a_stopped_robot_does_not_move_it_after_the_re
         assert len(driver.written()) == written
         with announced_publisher(sessions[1], "restarted", COMMANDS) as restarted:
             publish_until(restarted, [50.0, 0.0], lambda: len(driver.written()) > written)
+
+
+def test_a_ros_node_commands_velocities_of_a_velocity_controller(sessions):
+    wheels = Wheels()
+    with (
+        running(sessions[0], wheels, **CONTROLLED, ros2_mode="velocity") as host,
+        announced_publisher(sessions[1], "teleop", COMMANDS) as node,
+    ):
+        wanted = [0.5, -0.5]
+        publish_until(
+            node, wanted, lambda: wheels.setpoints and wheels.setpoints[-1].velocities.tolist() == wanted
+        )
+        until(lambda: host.state == "holding" and not wheels.setpoints[-1].velocities.any())
+    with pytest.raises(
+        InvalidInput, match=r"ros2_mode='position' is none of the driver's modes, \['velocity'\]"
+    ):
+        DriverHost(sessions[0], Wheels(), RRBOT, "arm", limits=LIMITS, **CONTROLLED)
 
 
 def test_a_controller_needs_the_wire_of_ros_nodes(sessions):
@@ -1146,3 +1173,145 @@ def test_a_real_time_loop_moves_the_joints_and_ends_with_close(sessions):
         if host.state == "off":
             pytest.skip("this system does not permit real-time scheduling")
         send_until(arm, {"elbow": 0.1}, lambda: driver.written().size and driver.written()[-1, 1] == 0.1)
+
+
+def turned_until(commander: Commander, velocities: dict[str, float], condition) -> None:
+    def sent() -> bool:
+        commander.send(velocities=velocities)
+        return bool(condition())
+
+    until(sent)
+
+
+def test_a_commanded_velocity_is_reached_by_a_ramp_and_ends_with_the_commands(sessions):
+    limits = Limits.of(RRBOT, velocity=2.0, acceleration=8.0)
+    setpoints: list[Setpoint] = []
+    readings: list[JointReading] = []
+
+    class Wheels(RecordingDriver):
+        def write(self, setpoint) -> None:
+            setpoints.append(setpoint)
+            super().write(setpoint)
+
+    with (
+        running(sessions[0], Wheels(), limits=limits, ttl_s=0.2) as host,
+        Commander(sessions[1], "arm") as arm,
+        JointStateListener(sessions[1], "arm", RRBOT, on_reading=readings.append),
+    ):
+        assert arm.wait_for_driver().modes == ("position", "velocity")
+        turned_until(arm, {"elbow": 1.0}, lambda: setpoints and setpoints[-1].velocities[1] == 1.0)
+        turned_until(arm, {"elbow": 1.0}, lambda: readings and readings[-1].velocities[1] == 1.0)
+        turned_until(arm, {"elbow": 3.0}, lambda: setpoints[-1].velocities[1] == 2.0)
+        limited = ("elbow",)
+        turned_until(arm, {"elbow": 3.0}, lambda: arm.driver is not None and arm.driver.limited == limited)
+        until(lambda: host.state == "holding")
+        until(lambda: setpoints[-1].velocities[1] == 0.0)
+        send_until(arm, {"elbow": 0.0}, lambda: setpoints[-1].modes == ("position", "position"))
+    velocities = np.array([one.velocities[1] for one in setpoints])
+    modes = [one.modes for one in setpoints]
+    assert ("position", "velocity") in modes
+    assert all(one.modes[0] == "position" and one.positions[0] == 0.0 for one in setpoints)
+    assert np.abs(np.diff(velocities)).max() <= 8.0 / RATE_HZ * (1 + 1e-9)
+    assert velocities.max() == 2.0
+
+
+def test_a_commander_that_was_closed_is_the_reason_why_the_joints_are_held(sessions):
+    with running(sessions[0], RecordingDriver()) as host:
+        with Commander(sessions[1], "arm", program="teleop") as arm:
+            arm.wait_for_driver()
+            send_until(arm, {"elbow": 0.1}, lambda: host.state == "active")
+        until(lambda: host.state == "holding")
+        state = wait_for_state(sessions[1], "arm", lambda state: state.state == "holding", DEADLINE_S)
+    assert state is not None
+    assert re.fullmatch(r"teleop@.* has ended", state.reason)
+
+
+class Wheels(SimulatedDriver):
+    """Takes velocities only."""
+
+    def __init__(self) -> None:
+        super().__init__(RRBOT, "mirror")
+        self.modes = frozenset({"velocity"})
+        self.setpoints: list[Setpoint] = []
+
+    def write(self, setpoint: Setpoint) -> None:
+        self.setpoints.append(setpoint)
+        super().write(setpoint)
+
+
+def test_a_driver_without_positions_turns_only_the_joints_that_are_commanded(sessions):
+    wheels = Wheels()
+    with running(sessions[0], wheels) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        turned_until(
+            arm, {"elbow": 0.5}, lambda: wheels.setpoints and wheels.setpoints[-1].velocities[1] == 0.5
+        )
+        with pytest.raises(
+            InvalidInput, match=r"commanded in mode velocity, .* mode position is not one of them"
+        ):
+            arm.send({"elbow": 0.5})
+        with raw_commands(sessions[1]) as put:
+            put(command(elbow=0.5))
+            until(lambda: host.report().refused.get("mode"))
+            assert str(host.report().refused) == "{'mode': 1}"
+        until(lambda: host.state == "holding" and wheels.setpoints[-1].velocities[1] == 0.0)
+    assert {one.modes for one in wheels.setpoints} == {("velocity", "velocity")}
+    assert all(one.velocities[0] == 0.0 for one in wheels.setpoints)
+
+
+def test_one_command_moves_joints_in_several_modes(sessions):
+    driver = Wheels()
+    driver.modes = frozenset({"position", "velocity"})
+    with running(sessions[0], driver), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+
+        def is_there() -> bool:
+            arm.send({"shoulder": 0.3}, velocities={"elbow": -0.5})
+            return bool(driver.setpoints) and driver.setpoints[-1].positions[0] == 0.3
+
+        until(is_there)
+        with pytest.raises(InvalidInput, match="several are given for 'elbow'"):
+            arm.send({"elbow": 0.0}, velocities={"elbow": 0.0})
+    last = driver.setpoints[-1]
+    assert last.modes == ("position", "velocity")
+    assert last.velocities[1] == -0.5
+
+
+class Pushed(Wheels):
+    """Takes positions and efforts; a joint in mode effort moves at 1 rad/s."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.modes = frozenset({"position", "effort"})
+
+    def read(self, stamp: int) -> JointReading:
+        pushed = [one == "effort" for one in self.setpoints[-1].modes] if self.setpoints else [False] * 2
+        self._joints.positions[pushed] += 1.0 / RATE_HZ
+        return super().read(stamp)
+
+    def write(self, setpoint: Setpoint) -> None:
+        super().write(setpoint)
+        self._target = setpoint if "effort" not in setpoint.modes else None
+
+
+def test_a_joint_that_leaves_its_range_by_an_effort_is_held_with_the_reason(sessions):
+    limits = Limits(RRBOT.joint_names, [-0.1, -0.1], [0.1, 0.1], [2.0, 2.0], [20.0, 20.0], effort=5.0)
+    driver = Pushed()
+    with running(sessions[0], driver, limits=limits) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+
+        def is_braked() -> bool:
+            arm.send(efforts={"elbow": 20.0})
+            return arm.driver is not None and "braked" in arm.driver.refused
+
+        until(is_braked)
+        assert arm.driver is not None
+        assert re.match(
+            r"'elbow' in mode effort is at 0.10\d+ rad, of -0.1 to 0.1, and", arm.driver.last_refusal
+        )
+        until(lambda: is_braked() and driver.setpoints[-1].velocities[1] == 0.0)
+        assert host.report().refused == {"braked": 1}
+    pushed = [one for one in driver.setpoints if one.modes[1] == "effort"]
+    assert max(one.efforts[1] for one in pushed) == 5.0
+    # It has left its range by a tick's motion, and brakes from 1 rad/s by 20 rad/s^2 for 25 ms.
+    assert driver.setpoints[-1].positions[1] <= 0.1 + 1.0 / RATE_HZ + 0.025

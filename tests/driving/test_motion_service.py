@@ -20,10 +20,12 @@ from zstate.driving import Commander, DriverHost, Limits, Motion, SimulatedDrive
 from zstate.driving.stops import wait_for_state
 from zstate.driving.trajectory import Trajectory
 from zstate.errors import InvalidInput, MotionRefused, MotionTimeout
+from zstate.net.presence import local_writer
 from zstate.net.queryable import query
 from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
+from zstate.net.writer import WireWriter
 from zstate.wire.messages import (
     JointCommand,
     JointTrajectory,
@@ -33,6 +35,7 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.registry import get_wire
 
 RATE_HZ = 200.0
 LIMITS = Limits.of(RRBOT, velocity=2.0, acceleration=20.0)
@@ -199,7 +202,7 @@ def test_a_cancellation_that_a_blocked_driver_delays_is_repeated_until_it_is_car
 def test_a_request_whose_commander_has_gone_moves_nothing(sessions):
     driver = Written()
     request = JointTrajectory(0, 3, 7, ("elbow",), to_block([0.2]), to_block([0.1]))
-    with hosted(sessions[0], driver, ttl_s=0.3):
+    with hosted(sessions[0], driver, ttl_s=0.3), announced(sessions[1]):
         until(
             lambda: [one.findings for one in replies_to(sessions[1], "zstate/arm/@motion", request)] == [()]
         )
@@ -208,6 +211,15 @@ def test_a_request_whose_commander_has_gone_moves_nothing(sessions):
     assert ended.outcomes[0].name == "aborted"
     assert driver.setpoints
     assert not np.any(driver.setpoints)
+
+
+@contextmanager
+def announced(session: Session, number: int = 7) -> Iterator[None]:
+    """The token of a commander whose session is ``number``."""
+    writer = WireWriter(session, get_wire("native"), "arm", local_writer(number))
+    with writer:
+        writer.open_stream("joint_commands")
+        yield
 
 
 HOST = """
@@ -309,15 +321,29 @@ def test_a_request_of_another_session_is_refused_while_a_motion_is_valid(session
         motion = arm.move({"elbow": [1.0]}, [5.0])
         # It is not even planned, which would find that there is no such joint.
         request = JointTrajectory(0, 0, 7, ("elbw",), to_block([1.0]), to_block([0.0]))
-        (reply,) = replies_to(sessions[1], "zstate/arm/@motion", request)
-        assert "while that of another session is valid" in reply.findings[0]
+        replies: list[MotionReply] = []
+        with announced(sessions[1]):
+            until(lambda: replies.extend(replies_to(sessions[1], "zstate/arm/@motion", request)) or replies)
+        assert "while that of another session is valid" in replies[0].findings[0]
         cancel = MotionCancel(0, 0, 7, 0)
         assert replies_to(sessions[1], "zstate/arm/@motion", cancel)[0].findings == ()
         wait_until_under_way(motion)
 
 
+def test_a_request_of_a_program_that_is_not_announced_as_a_commander_is_not_planned(sessions):
+    request = JointTrajectory(0, 0, 7, ("elbw",), to_block([1.0]), to_block([0.0]))
+    with hosted(sessions[0], Written()) as host:
+
+        def is_refused() -> bool:
+            assert replies_to(sessions[1], "zstate/arm/@motion", request) == []
+            return host.report().refused.get("no claim", 0) > 0
+
+        until(is_refused)
+        assert set(host.report().refused) == {"no claim"}
+
+
 def test_a_request_for_more_than_the_joints_of_the_driver_is_refused(sessions):
-    with hosted(sessions[0], Written()):
+    with hosted(sessions[0], Written()), announced(sessions[1]):
         for count, text in (
             (3, "a motion of 3 joints, where the driver has 2: shoulder, elbow"),
             (70_000, "bytes, where motions of this driver take"),
@@ -341,6 +367,7 @@ def test_a_repeated_request_is_the_same_motion_and_an_older_one_is_refused(sessi
     driver = Written()
     with (
         hosted(sessions[0], driver),
+        announced(sessions[1]),
         StreamPublisher(sessions[1], key, ENCODINGS[JointCommand]) as commands,
     ):
         wait_for_reader(sessions[1], key)
@@ -535,3 +562,38 @@ def test_trajectories_of_ros_nodes_are_checked_as_all_motions_are(sessions):
         planner.put(rosbags_trajectory(0, ["elbow"], (1.0, ([0.1],))))
         until(lambda: host.report().refused.get("second commander") == 1)
         assert not np.any(driver.setpoints)
+
+
+def test_a_velocity_replaces_the_motion_of_its_joint(sessions):
+    driver = Written()
+    with arm_of(sessions, driver) as arm:
+        motion = arm.move({"elbow": [1.0]}, [3.0])
+        until(lambda: driver.path[-1, 1] > 0.05)
+        arm.send(velocities={"elbow": -0.5})
+        assert motion.wait(DEADLINE_S).name == "replaced"
+        until(lambda: driver.path[-1, 1] < 0.0)
+
+
+def test_a_driver_without_positions_refuses_motions(sessions):
+    driver = Written()
+    driver.modes = frozenset({"velocity"})
+    with hosted(sessions[0], driver), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver(DEADLINE_S)
+        with pytest.raises(InvalidInput, match="mode position is not one of them"):
+            arm.move({"elbow": [1.0]}, [3.0])
+        payload = encode(JointTrajectory(0, 0, 7, ("elbow",), to_block([1.0]), to_block([1.0])))
+        encoding, findings = ENCODINGS[JointTrajectory], []
+
+        def is_answered() -> bool:
+            for reply in query(
+                sessions[1].zenoh, "zstate/arm/motion", 1.0, payload=payload, encoding=encoding
+            ):
+                assert reply.ok is not None
+                findings.extend(
+                    decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), MotionReply).findings
+                )
+            return bool(findings)
+
+        until(is_answered)
+        assert findings[0] == "a motion needs mode position; this driver has mode velocity"
+    assert not driver.setpoints

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from zstate.driving.driver import Mode
 from zstate.driving.limits import Limits
-from zstate.driving.setpoint_limiter import SetpointLimiter
+from zstate.driving.setpoint_limiter import Rate, SetpointLimiter
 from zstate.driving.trajectory import Trajectory
 from zstate.errors import InvalidInput
 
@@ -67,7 +69,7 @@ def test_ten_thousand_take_overs_replacements_stops_and_restarts_never_step_abov
             worst_change = max(worst_change, (changes / (limits.acceleration[finite] * dt)).max())
             assert (limited.positions >= allowed.lower).all()
             assert (limited.positions <= allowed.upper).all()
-            positions, velocities, _ = limited
+            positions, velocities = limited[:2]
     assert 1.0 - EXACT < worst_step <= 1.0 + EXACT
     assert 1.0 - EXACT < worst_change <= 1.0 + EXACT
 
@@ -233,3 +235,138 @@ def test_returned_vectors_are_the_callers_own():
     limiter = started()
     limiter.step([1.0], DT).positions[0] = 9.0
     assert limiter.step([0.0], DT).positions[0] < 0.1
+
+
+# Other modes than positions
+
+ALL_MODES: tuple[Mode, ...] = ("position", "velocity", "effort")
+
+
+def in_modes(
+    modes: tuple[Mode, ...] = ALL_MODES, position: float = 0.0, **limits: float
+) -> tuple[SetpointLimiter, Limits]:
+    of_elbow = replace(limits_of_elbow(**limits), effort=np.array([5.0]))
+    limiter = SetpointLimiter(of_elbow, modes)
+    limiter.start([position])
+    return limiter, of_elbow
+
+
+@pytest.mark.parametrize("acceleration", [4.0, 50.0, math.inf])
+@pytest.mark.parametrize("lag_s", [0.0, 0.01, 0.05])
+def test_a_velocity_towards_a_limit_ends_there_at_rest_also_if_the_joint_follows_with_a_lag(
+    acceleration: float, lag_s: float
+):
+    limiter, _ = in_modes(acceleration=acceleration, velocity=2.0)
+    position = velocity = 0.0
+    path: list[float] = []
+    for tick in range(3_000):
+        limiter.observe(np.array([position]), None, tick * 2_000_000)
+        setpoint = limiter.step([0.0], DT, rates={0: Rate("velocity", 5.0)}).velocities[0]
+        assert setpoint <= 2.0
+        assert abs(setpoint - velocity) <= acceleration * DT * (1 + EXACT) or lag_s
+        velocity = setpoint + (velocity - setpoint) * math.exp(-DT / lag_s) if lag_s else setpoint
+        position += velocity * DT
+        path.append(position)
+    assert max(path) <= 2.0 + 1e-9
+    assert path[-1] == pytest.approx(2.0, abs=1e-3)
+    assert abs(velocity) < 1e-3
+
+
+def test_a_joint_outside_its_limits_turns_inwards_only():
+    limiter, _ = in_modes(position=2.1, acceleration=math.inf)
+    limiter.observe(np.array([2.1]), None, 0)
+    outwards = limiter.step([0.0], DT, rates={0: Rate("velocity", 1.0)})
+    assert (outwards.velocities[0], outwards.limited) == (0.0, ("elbow",))
+    assert limiter.step([0.0], DT, rates={0: Rate("velocity", -1.0)}).velocities[0] == -1.0
+
+
+def test_after_a_velocity_the_joint_brakes_in_that_mode_and_then_holds_its_position():
+    limiter, _ = in_modes()
+    for _ in range(500):
+        turning = limiter.step([0.0], DT, rates={0: Rate("velocity", 1.0)})
+    assert turning.velocities[0] == 1.0
+    braking = [limiter.brake(DT) for _ in range(130)]
+    assert braking[0].modes == ("velocity",)
+    at_rest = next(one for one in braking if one.velocities[0] == 0.0)
+    assert at_rest.modes == ("velocity",)
+    assert braking[-1].modes == ("position",)
+    assert braking[-1].positions == at_rest.positions
+
+
+@pytest.mark.parametrize("modes", [ALL_MODES, ("velocity",)])
+def test_a_wheel_has_zero_velocity_after_its_commands(modes: tuple[Mode, ...]):
+    limiter, _ = in_modes(modes, lower=-math.inf, upper=math.inf)
+    for _ in range(500):
+        limiter.step([0.0], DT, rates={0: Rate("velocity", 1.0)})
+    at_rest = [limiter.step([0.0], DT, rates={0: None}) for _ in range(200)][-1]
+    assert (at_rest.modes, at_rest.velocities[0]) == (("velocity",), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("modes", "mode"),
+    [(ALL_MODES, "position"), (("velocity", "effort"), "velocity"), (("effort",), "effort")],
+)
+def test_after_an_effort_the_joint_brakes_from_the_measured_velocity_by_what_the_driver_has(
+    modes: tuple[Mode, ...], mode: Mode
+):
+    limiter, limits = in_modes(modes)
+    for tick in range(200):  # measured at 0.5 rad/s
+        limiter.observe(np.array([0.5 * tick * DT]), None, tick * 2_000_000)
+        pushed = limiter.step([0.0], DT, rates={0: Rate("effort", 9.0)})
+    assert pushed.efforts is not None
+    assert (pushed.modes, pushed.efforts.tolist(), pushed.limited) == (("effort",), [5.0], ("elbow",))
+    assert pushed.velocities[0] == pytest.approx(0.5, abs=1e-3)  # after ten time constants of the filter
+    resting = limiter.brake(DT)
+    assert resting.modes == (mode,)
+    if mode == "effort":
+        assert resting.efforts is not None
+        assert resting.efforts.tolist() == [0.0]
+    else:
+        assert resting.efforts is None
+        assert resting.velocities[0] == pytest.approx(pushed.velocities[0] - limits.acceleration[0] * DT)
+        assert abs(resting.positions[0] - 0.5 * 199 * DT) <= limits.velocity[0] * DT
+
+
+@pytest.mark.parametrize(("at", "speed"), [(2.01, 0.0), (-2.01, 0.0), (0.0, 1.1), (0.0, -1.1)])
+def test_a_joint_that_leaves_its_range_or_is_too_fast_in_mode_effort_is_held_until_its_efforts_end(
+    at: float, speed: float
+):
+    limiter, _ = in_modes()
+    pushing = {0: Rate("effort", 1.0)}
+    assert limiter.step([0.0], DT, rates=pushing).modes == ("effort",)
+    limiter.observe(np.array([at]), np.array([speed]), 0)
+    (text,) = (held := limiter.step([0.0], DT, rates=pushing)).braked
+    assert (
+        f"'elbow' in mode effort is at {at:.4g} rad, of -2 to 2, and moves at {speed:.3g} rad/s, of 1" in text
+    )
+    assert (held.modes, held.limited) == (("position",), ("elbow",))
+    still = [limiter.step([0.0], DT, rates=pushing) for _ in range(300)]
+    assert {one.modes for one in still} == {("position",)}
+    assert still[-1].velocities[0] == 0.0
+    assert not any(one.braked for one in still)
+    assert limiter.step([0.0], DT, rates={0: None}).modes == ("position",)
+    again = limiter.step([0.0], DT, rates=pushing)
+    assert again.modes == (("position",) if abs(at) > 2.0 else ("effort",))
+
+
+def test_a_driver_with_efforts_only_gets_them_inwards_and_against_the_motion():
+    limiter, _ = in_modes(("effort",))
+
+    def effort(at: float, speed: float, asked: float) -> float:
+        limiter.observe(np.array([at]), np.array([speed]), 0)
+        limited = limiter.step([0.0], DT, rates={0: Rate("effort", asked)})
+        assert limited.efforts is not None
+        return limited.efforts[0]
+
+    assert [effort(2.1, 0.0, asked) for asked in (1.0, -1.0)] == [0.0, -1.0]
+    assert [effort(-2.1, 0.0, asked) for asked in (1.0, -1.0)] == [1.0, 0.0]
+    assert [effort(0.0, 1.1, asked) for asked in (1.0, -1.0)] == [0.0, -1.0]
+    assert [effort(0.0, 0.0, asked) for asked in (9.0, -9.0)] == [5.0, -5.0]
+
+
+@pytest.mark.parametrize("effort", [0.0, math.inf])
+def test_efforts_of_joints_without_an_effort_limit_are_refused(effort: float):
+    limiter = SetpointLimiter(replace(limits_of_elbow(), effort=np.array([effort])), ALL_MODES)
+    with pytest.raises(InvalidInput, match=rf"have not: 'elbow' \({effort:g}\); start the driver with"):
+        limiter.check_rates({0: Rate("effort", 1.0)})
+    limiter.check_rates({0: Rate("velocity", 1.0)})

@@ -64,6 +64,47 @@ def test_a_lag_falls_by_e_in_its_time_constant():
     assert math.isclose(run(driver, 0.05)[-1, 0], 1.0 - math.exp(-1.0), rel_tol=1e-9)
 
 
+def turning(*velocities: float) -> Setpoint:
+    count = len(velocities)
+    return Setpoint(0, np.full(count, np.nan), np.array(velocities), None, ("velocity",) * count)
+
+
+def test_a_mirror_turns_with_its_velocities_beside_positions():
+    driver = SimulatedDriver(RRBOT, "mirror")
+    driver.enable(True)
+    driver.read(0)
+    driver.write(Setpoint(0, np.array([0.25, 9.0]), np.array([0.0, 2.0]), None, ("position", "velocity")))
+    reading = driver.read(50 * MS)
+    assert reading.positions.tolist() == [0.25, 0.1]
+    assert reading.velocities.tolist() == [0.0, 2.0]
+
+
+def test_the_velocity_of_a_lag_approaches_its_setpoint_by_e_in_its_time_constant():
+    driver = SimulatedDriver(RRBOT, "lag")
+    driver.enable(True)
+    driver.read(0)
+    driver.write(turning(2.0, 0.0))
+    position = run(driver, 0.05)[-1, 0]
+    reading = driver.read(50 * MS)
+    assert math.isclose(reading.velocities[0], 2.0 * (1.0 - math.exp(-1.0)), rel_tol=1e-9)
+    assert math.isclose(position, 2.0 * 0.05 * math.exp(-1.0), rel_tol=1e-9)  # 2 (t - tau (1 - 1/e)) at tau
+
+
+def test_dynamics_keep_a_velocity_against_gravity_and_apply_efforts_as_they_are():
+    driver = SimulatedDriver(pendulum(), "dynamics")
+    driver.enable(True)
+    driver.read(0)
+    driver.write(turning(0.5))
+    assert run(driver, 1.0)[-1, 0] == pytest.approx(0.5, abs=0.02)  # less what it takes to speed up
+    driver = SimulatedDriver(pendulum(), "dynamics")
+    driver.enable(True)
+    driver.read(0)
+    driver.write(Setpoint(0, np.zeros(1), np.zeros(1), np.array([0.5]), ("effort",)))
+    # m l^2 a = tau - m g l sin q: from rest 0.5 Nm on 2 kg at 0.5 m accelerates by 1 rad/s^2.
+    assert run(driver, 0.02)[-1, 0] == pytest.approx(0.5 * 1.0 * 0.02**2, rel=0.1)
+    assert driver.read(21 * MS).efforts == pytest.approx([0.5])
+
+
 def relaxed(driver: SimulatedDriver) -> SimulatedDriver:
     """``driver`` with its brakes released, without torque."""
     driver.enable(True)

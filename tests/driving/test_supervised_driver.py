@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from zstate.driving.limits import Limits
+from zstate.driving.setpoint_limiter import Limited
 from zstate.driving.supervised_driver import FollowingCheck
 from zstate.errors import InvalidInput
 
@@ -15,7 +16,7 @@ SECOND = 1_000_000_000
 
 def written(positions: list[float], now: int = 10 * SECOND) -> FollowingCheck:
     check = FollowingCheck(LIMITS, 0.2, SECOND)
-    check.written(np.array(positions), now)
+    check.written(Limited(np.array(positions), np.zeros(len(positions)), ()), now)
     return check
 
 
@@ -45,3 +46,56 @@ def test_joints_that_are_not_commanded_may_be_anywhere():
 def test_the_distance_is_above_zero(most: float):
     with pytest.raises(InvalidInput, match="following_error is a distance above zero"):
         FollowingCheck(LIMITS, most, SECOND)
+
+
+TICK = SECOND // 100
+
+
+def turned(speeds: list[float], ratio: float, lag_s: float = 0.0) -> str:
+    """What is found within 3 s if 'elbow' moves by ``ratio`` times its velocities, each for 0.5 s."""
+    check = FollowingCheck(LIMITS, 0.2, SECOND)
+    position = velocity = 0.0
+    for tick in range(300):
+        speed = speeds[tick // 50 % len(speeds)]
+        setpoint = Limited(
+            np.array([0.0, position]), np.array([0.0, speed]), (), None, ("position", "velocity")
+        )
+        check.written(setpoint, tick * TICK)
+        velocity = speed if not lag_s else velocity + (speed - velocity) * 0.01 / (lag_s + 0.01)
+        position += ratio * velocity * 0.01
+        if text := check.deviation(np.array([0.0, position]), (tick + 1) * TICK, (tick + 1) * TICK):
+            return text
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("speeds", "ratio", "text"),
+    [
+        ([1.0], 0.0, "'elbow' has moved by 0 rad in 1.0 s, where its velocities add up to 1"),  # no power
+        ([1.0], -1.0, "do its encoder and its motor turn the same way?"),
+        ([1.0], 1.7, "'elbow' has moved by 1.7"),
+        ([0.0], 1.0, ""),
+        ([20.0], 0.9, ""),
+    ],
+)
+def test_a_joint_in_mode_velocity_moves_as_far_as_its_velocities_add_up_to(
+    speeds: list[float], ratio: float, text: str
+):
+    found = turned(speeds, ratio)
+    assert text in found
+    assert bool(text) == bool(found)
+
+
+@pytest.mark.parametrize("speeds", [[20.0, -20.0], [0.0, 50.0], [0.3]])
+def test_the_lag_of_a_joint_in_mode_velocity_is_no_deviation(speeds: list[float]):
+    assert turned(speeds, 1.0, lag_s=0.05) == ""
+
+
+def test_a_joint_that_falls_at_zero_velocity_is_noticed():
+    check = FollowingCheck(LIMITS, 0.2, SECOND)
+    texts: list[str] = []
+    for tick in range(210):
+        at = np.array([-0.3 * tick / 100, 0.0])
+        texts.append(check.deviation(at, tick * TICK, tick * TICK))
+        check.written(Limited(at, np.zeros(2), (), None, ("velocity", "velocity")), tick * TICK)
+    assert any("'lift' has moved by -0.3" in text for text in texts)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
 from helpers.processes import SOON_S, until
 
-from zstate.net.queryable import Queryable, Reply, parse_parameters
+from zstate.net.queryable import Queryable, Reply, RequestQueryable, parse_parameters, query
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher, StreamSubscriber
 
@@ -57,6 +58,26 @@ def test_query_without_a_reply_ends_at_once(sessions: tuple[Session, Session]):
         start = time.monotonic()
         assert replies(sessions[1], KEY, timeout_s=30.0) == []
         assert time.monotonic() - start < 15.0
+
+
+def test_a_request_whose_answer_is_not_done_delays_no_other_one(sessions: tuple[Session, Session]):
+    slow: Future[Reply | None] = Future()
+
+    def answer(payload: bytes, encoding: str) -> Reply | Future[Reply | None]:
+        return slow if payload == b"slow" else Reply(payload, encoding)
+
+    def ask(payload: bytes) -> list[bytes]:
+        found = query(sessions[1].zenoh, KEY, 10.0, payload=payload, encoding="text/plain")
+        return [reply.ok.payload.to_bytes() for reply in found if reply.ok is not None]
+
+    with RequestQueryable(sessions[0], KEY, answer) as service:
+        until(lambda: ask(b"quick") == [b"quick"])
+        waiting = query(sessions[1].zenoh, KEY, 10.0, payload=b"slow")
+        answered_before = service.answered
+        assert ask(b"quick") == [b"quick"]
+        assert service.answered > answered_before
+        slow.set_result(Reply(b"done", ""))
+        assert [reply.ok.payload.to_bytes() for reply in waiting if reply.ok is not None] == [b"done"]
 
 
 def test_failing_answer_is_counted_and_reported_once_and_the_next_query_is_answered(

@@ -6,7 +6,7 @@ from helpers.processes import SOON_S, until
 
 from zstate.errors import Closed
 from zstate.net.session import connect
-from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.net.streams import StreamInbox, StreamPublisher, StreamSubscriber
 from zstate.wire.protocol import SerializedSample
 
 KEY = "zstate/r/joint_states"
@@ -180,3 +180,25 @@ def test_put_after_close_raises_closed(sessions):
     with pytest.raises(Closed, match="session is closed"):
         other.put(b"")
     other.close()
+
+
+def test_an_inbox_keeps_the_newest_samples_with_their_arrivals_and_reports_each_that_is_lost(sessions):
+    lost: list[None] = []
+    with (
+        StreamInbox(sessions[0], "test/inbox", 3, lambda: lost.append(None)) as inbox,
+        StreamPublisher(sessions[1], "test/inbox", "text/plain") as publisher,
+    ):
+        until(lambda: publisher.has_readers)
+        assert inbox.drain() == []
+        before = time.monotonic_ns()
+        for number in range(5):
+            publisher.put(str(number).encode(), b"attached")
+        until(lambda: len(lost) == 2)
+        drained = inbox.drain()
+        assert [sample.payload for _, sample in drained] == [b"2", b"3", b"4"]
+        assert {(one.key, one.encoding, one.attachment) for _, one in drained} == {
+            ("test/inbox", "text/plain", b"attached")
+        }
+        arrivals = [before, *(arrived for arrived, _ in drained), time.monotonic_ns()]
+        assert arrivals == sorted(arrivals)
+        assert inbox.drain() == []

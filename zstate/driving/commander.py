@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import threading
 import time
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.checks import real_numbers
-from zstate.driving.commands import check_named_positions
+from zstate.driving.commands import check_named
 from zstate.driving.driver_state import SILENT_S
 from zstate.driving.motion import Motion, Points, rows_block
 from zstate.driving.stops import wait_for_state
@@ -42,6 +43,7 @@ from zstate.wire.messages import (
     DriverState,
     JointCommand,
     JointTrajectory,
+    Mode,
     MotionCancel,
     MotionReply,
     Release,
@@ -121,28 +123,51 @@ class Commander(Closeable):
         assert state is not None
         return state
 
-    def send(self, positions: Mapping[str, float], ttl_s: float | None = None) -> None:
-        """Send positions [rad] or [m] by joint; returns at once.
+    def send(
+        self,
+        positions: Mapping[str, float] | None = None,
+        ttl_s: float | None = None,
+        *,
+        velocities: Mapping[str, float] | None = None,
+        efforts: Mapping[str, float] | None = None,
+    ) -> None:
+        """Send positions [rad] or [m], velocities per s, or efforts [Nm] or [N] by joint; returns at once.
 
-        They are valid for ``ttl_s`` [s] after their arrival, by default and at most for the driver's own
-        limit: then the driver holds the joints. Send again before. The driver refuses positions outside
-        limits, and moves no faster than these allow: ``driver`` has the counts and the newest reason.
+        Each joint has one of them; others keep their commands. They are valid for ``ttl_s`` [s] after their
+        arrival, by default and at most for the driver's own limit: then the driver holds the joints, wheels
+        at zero velocity. Send again before. The driver refuses positions outside limits, and modes that it
+        does not have, and exceeds no limit of position, velocity, acceleration and effort: a joint in mode
+        "velocity" arrives at its position limit at rest, one in mode "effort" that leaves its range or
+        exceeds its velocity limit is held, see ``SetpointLimiter``. ``driver`` has the counts and the newest
+        reason.
 
-        Raises InvalidInput for no joints, for numbers that are not finite, for an unknown joint and a ttl
-        that is too long if the driver's state is known; SecondWriter; and Closed. If it raises, nothing was
-        sent.
+        Raises InvalidInput for no joints, for numbers that are not finite, for a joint with several of them,
+        and, if the driver's state is known, for an unknown joint, a mode that it does not have, and a ttl
+        that is too long; SecondWriter; and Closed. If it raises, nothing was sent.
         """
-        numbers = {name: float(value) for name, value in positions.items()}
-        check_named_positions(numbers)
+        given: tuple[tuple[Mode, Mapping[str, float] | None], ...] = (
+            ("position", positions),
+            ("velocity", velocities),
+            ("effort", efforts),
+        )
+        numbers: dict[Mode, dict[str, float]] = {
+            mode: {name: float(value) for name, value in values.items()} for mode, values in given if values
+        }
+        check_named(numbers)
         if ttl_s is not None:
             check_timeout(ttl_s)
         ttl = 0 if ttl_s is None else max(1, round(ttl_s * 1e9))
-        self._check_against_driver(numbers, ttl)
-        names = tuple(numbers)
-        block = to_block(list(numbers.values()))
+        names = tuple(name for values in numbers.values() for name in values)
+        self._check_against_driver(names, tuple(numbers), ttl)
+        blocks = [
+            to_block([values.get(name, math.nan) for name in names])
+            if (values := numbers.get(mode))
+            else None
+            for mode, _ in given
+        ]
         with self._lock:
             head = (*self._next_head(), order_digest(names))
-            self._writer.write(encode(JointCommand(*head, block, names=names, ttl=ttl)))
+            self._writer.write(encode(JointCommand(*head, *blocks, names=names, ttl=ttl)))
 
     def move(
         self,
@@ -181,7 +206,7 @@ class Commander(Closeable):
         )
         blocks = (to_block(times), rows_block(points, names, times, "points"), rates, changes)
         tolerances = (float(path_tolerance), float(goal_tolerance), float(goal_time_s))
-        self._check_against_driver(dict.fromkeys(names, 0.0), 0)
+        self._check_against_driver(names, ("position",), 0)
         with self._lock:
             head = self._next_head()
         request = JointTrajectory(*head, names, *blocks, start, stretch, *tolerances)
@@ -300,11 +325,16 @@ class Commander(Closeable):
             head = self._next_head()
         self._request(MotionCancel(*head, number))
 
-    def _check_against_driver(self, positions: Mapping[str, float], ttl: int) -> None:
+    def _check_against_driver(self, names: Sequence[str], modes: Sequence[Mode], ttl: int) -> None:
         state = self.driver
         if state is None:
             return
-        unknown = [name for name in positions if name not in state.joint_names]
+        if other := set(modes).difference(state.modes):
+            raise InvalidInput(
+                f"the joints of {self.robot!r} are commanded in mode {' or '.join(state.modes)}, which its "
+                f"driver has; mode {' and '.join(sorted(other))} is not one of them"
+            )
+        unknown = [name for name in names if name not in state.joint_names]
         if unknown:
             raise InvalidInput(
                 f"the driver of {self.robot!r} has no joint {', '.join(map(repr, unknown))}; it has "

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -16,15 +15,15 @@ from numpy.typing import NDArray
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
-from zstate._util.format import suggestion_text
 from zstate._util.refusals import Refusals
+from zstate.driving.driver import Mode
+from zstate.driving.setpoint_limiter import Rate, Rates
 from zstate.errors import InvalidInput, MessageError, format_duration, printable
-from zstate.model.robot import near_joint
 from zstate.net.presence import announce
 from zstate.net.session import Session
-from zstate.net.streams import StreamSubscriber
+from zstate.net.streams import StreamInbox
 from zstate.wire.keys import shortened, stream_key
-from zstate.wire.messages import JointCommand, check_size, from_block
+from zstate.wire.messages import JointCommand, from_block
 from zstate.wire.native import decode
 from zstate.wire.protocol import SerializedSample
 
@@ -36,9 +35,15 @@ Floats = NDArray[np.float64]
 _WAITING = 32
 """Commands that wait for a tick, of which each takes time to check; of more, the oldest are refused."""
 
+_SLACK_BYTES = 1024
+"""Above what the numbers and names of the joints take: for what later versions append to a command."""
+
 NO_DEADLINE = -1
+NO_RATES: Mapping[int, Rate] = {}
 NO_COLUMNS = np.array([], dtype=np.intp)
 NO_POSITIONS = np.array([], dtype=np.float64)
+
+_PLURALS: dict[Mode, str] = {"position": "positions", "velocity": "velocities", "effort": "efforts"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +51,7 @@ class Command:
     """Positions (k,) [rad] or [m] for the joints at ``columns`` (k,), valid until ``deadline``.
 
     ``arrived`` and ``deadline`` are on the monotonic clock [ns]. With a ``motion`` it has no positions: the
-    motion of that number stays valid.
+    motion of that number stays valid. ``rates`` are the velocities and efforts of other joints.
     """
 
     session: int
@@ -56,17 +61,24 @@ class Command:
     arrived: int
     deadline: int
     motion: int | None = None
+    rates: Mapping[int, Rate] = field(default_factory=lambda: NO_RATES)
+
+    @property
+    def joints(self) -> NDArray[np.intp]:
+        """The columns of all joints that it commands."""
+        return np.append(self.columns, list(self.rates)).astype(np.intp) if self.rates else self.columns
 
 
-_Reader: TypeAlias = "Callable[[SerializedSample, int], Command]"
+_Decoder: TypeAlias = "Callable[[SerializedSample, int], Command]"
 
 
 class CommandReceiver(Closeable):
     """Receives the commands of ``robot`` for ``joint_names``; ``drain`` returns those that can be used.
 
     A command counts from its arrival, for its own ttl or for ``ttl_ns``, which is also the longest that is
-    granted. ROS nodes send them to the ``controller``, if there is one, in the order of ``joint_names`` and
-    without a ttl. ``refusals`` counts the others by reason.
+    granted. ``modes`` are those of the driver. ROS nodes send commands to the ``controller``, if there is
+    one, in the order of ``joint_names``, all in mode ``ros2_mode`` and without a ttl. ``refusals`` counts the
+    commands that cannot be used by reason.
     """
 
     def __init__(
@@ -77,49 +89,65 @@ class CommandReceiver(Closeable):
         ttl_ns: int,
         refusals: Refusals,
         *,
+        modes: Collection[Mode] = ("position",),
         controller: Ros2Controller | None = None,
+        ros2_mode: Mode = "position",
     ) -> None:
+        self._modes = frozenset(modes)
+        self._ros2_mode: Mode = ros2_mode
         self._columns = {name: column for column, name in enumerate(joint_names)}
+        self._names_text = ", ".join(joint_names)
+        self._most_bytes = _SLACK_BYTES + 100 * len(joint_names) + 2 * len(self._names_text.encode())
         self._ttl_ns = ttl_ns
         self._refusals = refusals
-        self._arrived: deque[Command] = deque(maxlen=_WAITING)
+        self._inboxes: list[tuple[StreamInbox, _Decoder]] = []
         with ExitStack() as opening:
-            key = stream_key(robot, "joint_commands")
-            on_samples = partial(self._on_samples, self._read)
-            opening.enter_context(StreamSubscriber(session, key, on_samples))
+            self._subscribe(session, stream_key(robot, "joint_commands"), self._read, opening)
             if controller is not None:
-                on_samples = partial(self._on_samples, partial(self._read_from_ros, controller))
-                opening.enter_context(StreamSubscriber(session, controller.commands, on_samples))
+                read = partial(self._read_from_ros, controller)
+                self._subscribe(session, controller.commands, read, opening)
                 for token in controller.reader_tokens(session.zid, session.next_number):
                     opening.enter_context(announce(session, token))
             self._opened = opening.pop_all()
 
     def drain(self) -> list[Command]:
         """The newest commands since the last call, oldest first."""
-        return [self._arrived.popleft() for _ in range(len(self._arrived))]
+        return [
+            command
+            for inbox, decode_sample in self._inboxes
+            for arrived, sample in inbox.drain()
+            if (command := self._decoded(decode_sample, sample, arrived)) is not None
+        ]
 
     def close(self) -> None:
         self._opened.close()
 
-    def _on_samples(self, read: _Reader, samples: list[SerializedSample]) -> None:
-        now = time.monotonic_ns()
-        for sample in samples:
-            self._on_sample(read, sample, now)
+    def _subscribe(self, session: Session, key: str, decode_sample: _Decoder, opening: ExitStack) -> None:
+        inbox = StreamInbox(session, key, _WAITING, self._on_overrun)
+        self._inboxes.append((opening.enter_context(inbox), decode_sample))
 
-    def _on_sample(self, read: _Reader, sample: SerializedSample, now: int) -> None:
+    def _on_overrun(self) -> None:
+        text = f"more than {_WAITING} commands arrived within one tick; the newest are used"
+        self._refusals.count("overrun", text)
+
+    def _decoded(self, decode_sample: _Decoder, sample: SerializedSample, arrived: int) -> Command | None:
+        """The command in ``sample``; None if it is refused, which is counted."""
         try:
-            command = read(sample, now)
+            self._check_size(sample.size or len(sample.payload))
+            return decode_sample(sample, arrived)
         except MessageError as error:
             self._refusals.count(error.reason, error)
-            return
-        if len(self._arrived) == _WAITING:
-            text = f"more than {_WAITING} commands arrived within one tick; the newest are used"
-            self._refusals.count("overrun", text)
-        self._arrived.append(command)
+        except Exception as error:  # nothing that is received ends the control loop
+            self._refusals.count("malformed", repr(error))
+        return None
+
+    def _check_size(self, size: int) -> None:
+        if size > self._most_bytes:
+            text = f"{size} bytes, where a command for these joints takes {self._most_bytes} at most"
+            raise MessageError(text, reason="too large")
 
     def _read(self, sample: SerializedSample, now: int) -> Command:
         """The command in ``sample``. Raises MessageError with the reason why it is refused."""
-        check_size("joint_commands", sample.size or len(sample.payload))
         message = decode(sample.payload, sample.encoding, JointCommand)
         if message.ttl > self._ttl_ns:
             text = f"a ttl of {format_duration(message.ttl)} is longer than {format_duration(self._ttl_ns)}"
@@ -130,42 +158,88 @@ class CommandReceiver(Closeable):
             return Command(*head, now, deadline, message.motion)
         if not message.names:
             raise MessageError("a command has the names of its joints; this one has none", reason="no names")
-        if message.positions is None or message.velocities is not None or message.efforts is not None:
-            text = "a command has positions and nothing else; velocities and efforts are not supported"
-            raise MessageError(text, reason="mode")
-        positions = from_block(message.positions)
         columns = self._columns_of(message.names)
-        _check_finite(message.names, positions)
-        return Command(message.session, message.seq, columns, positions, now, deadline)
+        if message.positions is None or message.velocities is not None or message.efforts is not None:
+            commanded = _rates_of(message, message.names)
+            is_moved = np.array([rate.mode == "position" for rate in commanded])
+            positions = np.array([rate.value for rate in commanded])[is_moved]
+            pairs = zip(columns.tolist(), commanded, strict=True)
+            rates = {column: rate for column, rate in pairs if rate.mode != "position"}
+            columns = columns[is_moved]
+        else:
+            positions, rates = from_block(message.positions), {}
+            _check_finite(message.names, positions)
+        self._check_modes(columns, rates)
+        return Command(message.session, message.seq, columns, positions, now, deadline, rates=rates)
 
     def _read_from_ros(self, controller: Ros2Controller, sample: SerializedSample, now: int) -> Command:
         """The command of a ROS node in ``sample``. Raises MessageError with the reason why it is refused."""
-        session, seq, positions = controller.decode_command(sample)
-        names = tuple(self._columns)
-        if len(positions) != len(names):
+        session, seq, numbers = controller.decode_command(sample)
+        names, mode = tuple(self._columns), self._ros2_mode
+        if len(numbers) != len(names):
             raise MessageError(
-                f"a command of {len(positions)} numbers; this driver takes {len(names)}, the positions of "
-                f"{', '.join(names)} in this order",
+                f"a command of {len(numbers)} numbers; this driver takes {len(names)}, the {_PLURALS[mode]} "
+                f"of {', '.join(names)} in this order",
                 reason="joint count",
             )
-        _check_finite(names, positions)
-        return Command(session, seq, np.arange(len(names)), positions, now, now + self._ttl_ns)
+        _check_finite(names, numbers, mode)
+        deadline = now + self._ttl_ns
+        if mode == "position":
+            return Command(session, seq, np.arange(len(names)), numbers, now, deadline)
+        rates = {column: Rate(mode, value) for column, value in enumerate(numbers.tolist())}
+        return Command(session, seq, NO_COLUMNS, NO_POSITIONS, now, deadline, rates=rates)
+
+    def _check_modes(self, columns: NDArray[np.intp], rates: Mapping[int, Rate]) -> None:
+        """Raise MessageError for a mode that the driver does not take."""
+        used: set[Mode] = {rate.mode for rate in rates.values()}
+        if columns.size:
+            used.add("position")
+        if other := used - self._modes:
+            asked, taken = (
+                " and ".join(_PLURALS[mode] for mode in sorted(some)) for some in (other, self._modes)
+            )
+            raise MessageError(f"this driver takes {taken}, not {asked}", reason="mode")
 
     def _columns_of(self, names: Sequence[str]) -> NDArray[np.intp]:
         for name in names:
             if name not in self._columns:
-                near = near_joint(name, list(self._columns))
-                text = f"this driver has no joint {printable(shortened(name))!r}{suggestion_text(near)}"
+                # No suggestion: to search for one takes longer than a tick.
+                text = f"this driver has no joint {printable(shortened(name))!r}; it has {self._names_text}"
                 raise MessageError(text, reason="unknown joint")
         if len(set(names)) < len(names):
             raise MessageError("a joint is named twice in one command", reason="repeated joint")
         return np.array([self._columns[name] for name in names], dtype=np.intp)
 
 
-def _check_finite(names: Sequence[str], positions: Floats) -> None:
-    for name, value in zip(names, positions.tolist(), strict=True):
+def _rates_of(message: JointCommand, names: Sequence[str]) -> list[Rate]:
+    """Mode and number of each joint. Raises MessageError unless each has one, which is finite."""
+    commanded: list[Rate | None] = [None] * len(names)
+    blocks: tuple[tuple[Mode, bytes | None], ...] = (
+        ("position", message.positions),
+        ("velocity", message.velocities),
+        ("effort", message.efforts),
+    )
+    for mode, block in blocks:
+        for row, value in enumerate([] if block is None else from_block(block).tolist()):
+            if math.isnan(value):
+                continue
+            if not math.isfinite(value):
+                raise MessageError(f"the {mode} of {names[row]!r} is {value}", reason="not finite")
+            if (first := commanded[row]) is not None:
+                text = f"{names[row]!r} has a {first.mode} and a {mode}; a joint is commanded by one of them"
+                raise MessageError(text, reason="mode")
+            commanded[row] = Rate(mode, value)
+    found = [rate for rate in commanded if rate is not None]
+    if len(found) < len(names):
+        bad = next(name for name, rate in zip(names, commanded, strict=True) if rate is None)
+        raise MessageError(f"the command of {bad!r} is not a number", reason="not finite")
+    return found
+
+
+def _check_finite(names: Sequence[str], numbers: Floats, mode: Mode = "position") -> None:
+    for name, value in zip(names, numbers.tolist(), strict=True):
         if not math.isfinite(value):
-            raise MessageError(f"the position of {name!r} is {value}", reason="not finite")
+            raise MessageError(f"the {mode} of {name!r} is {value}", reason="not finite")
 
 
 class Targets:
@@ -173,7 +247,8 @@ class Targets:
 
     Joints without a command stay where they were at ``start``, or came to rest after their last one, also
     after a change of the session. While commands of one session are valid, those of others are refused, and
-    so is an older one of that session.
+    so is an older one of that session. ``rates`` are the velocities and efforts of the joints that are not
+    commanded by positions, None for those whose command has expired.
     """
 
     def __init__(self, count: int) -> None:
@@ -181,6 +256,7 @@ class Targets:
         self._deadlines = np.full(count, NO_DEADLINE, dtype=np.int64)
         self._first_deadline = self._last_deadline = NO_DEADLINE
         self._last_seqs: BoundedDict[int, int] = BoundedDict()
+        self._rates: dict[int, Rate | None] = {}
         self.session = 0
         """The session of the newest command; 0 before the first."""
         self.arrived = 0
@@ -188,11 +264,15 @@ class Targets:
         self.ttl_ns = 0
         """For how long the newest command is valid."""
 
+    @property
+    def rates(self) -> Rates:
+        return self._rates
+
     def start(self, now: int, positions: Floats) -> None:
         """Joints without a command that is valid at ``now`` stay at ``positions``."""
         resting = self._deadlines <= now
         self._positions[resting] = positions[resting]
-        self._set_deadlines(resting, NO_DEADLINE)
+        self._rest(resting)
 
     def check_order(self, command: Command) -> None:
         """Raise MessageError for a command that is older than the newest one of its session."""
@@ -212,9 +292,10 @@ class Targets:
         return positions
 
     def accept(self, command: Command) -> None:
-        """Move the joints of ``command`` to its positions until its deadline."""
+        """Move the joints of ``command`` as it commands until its deadline."""
         self.place(command.columns, command.positions)
-        self.renew(command, command.columns)
+        self._rates.update(command.rates)
+        self.renew(command, command.joints)
 
     def renew(self, command: Command, columns: NDArray[np.intp]) -> None:
         """Keep the targets of the joints at ``columns`` until the deadline of ``command``."""
@@ -227,6 +308,9 @@ class Targets:
     def place(self, columns: NDArray[np.intp], positions: Floats) -> None:
         """Move the joints at ``columns`` to ``positions`` as long as their command is valid."""
         self._positions[columns] = positions
+        if self._rates:
+            for column in columns.tolist():
+                self._rates.pop(column, None)
 
     def is_live(self, now: int) -> bool:
         """Whether any joint has a command that is valid at ``now``."""
@@ -237,12 +321,20 @@ class Targets:
         if NO_DEADLINE < self._first_deadline <= now:
             expired = (self._deadlines <= now) & (self._deadlines != NO_DEADLINE)
             self._positions[expired] = resting()[expired]
-            self._set_deadlines(expired, NO_DEADLINE)
+            self._rest(expired)
         return self._positions
 
     def clear(self) -> None:
         """Forget all commands."""
+        self._rates.clear()
         self._set_deadlines(np.ones(len(self._deadlines), dtype=np.bool_), NO_DEADLINE)
+
+    def _rest(self, columns: NDArray[np.bool_]) -> None:
+        """The commands of the joints at ``columns`` have expired."""
+        for column in self._rates:
+            if columns[column]:
+                self._rates[column] = None
+        self._set_deadlines(columns, NO_DEADLINE)
 
     def _set_deadlines(self, columns: NDArray[np.intp] | NDArray[np.bool_], deadline: int) -> None:
         self._deadlines[columns] = deadline
@@ -251,10 +343,18 @@ class Targets:
         self._last_deadline = max(valid, default=NO_DEADLINE)
 
 
-def check_named_positions(positions: dict[str, float]) -> None:
-    """Raise InvalidInput unless ``positions`` are finite numbers of at least one joint."""
-    if not positions:
+def check_named(numbers: Mapping[Mode, Mapping[str, float]]) -> None:
+    """Raise InvalidInput unless ``numbers`` of at least one joint are finite, and each has one mode."""
+    count = Counter(name for values in numbers.values() for name in values)
+    if not count:
         raise InvalidInput("a command has the position of at least one joint: {'elbow': 0.4}")
-    bad = [f"{name!r} ({value})" for name, value in positions.items() if not math.isfinite(value)]
-    if bad:
-        raise InvalidInput(f"commanded positions must be finite; not so: {', '.join(bad)}")
+    repeated = [name for name, times in count.items() if times > 1]
+    if repeated:
+        raise InvalidInput(
+            f"a joint is commanded by a position, a velocity or an effort; several are given for "
+            f"{', '.join(map(repr, repeated))}"
+        )
+    for mode, values in numbers.items():
+        bad = [f"{name!r} ({value})" for name, value in values.items() if not math.isfinite(value)]
+        if bad:
+            raise InvalidInput(f"commanded {_PLURALS[mode]} must be finite; not so: {', '.join(bad)}")

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.checks import real_numbers
 from zstate.errors import InvalidInput
 from zstate.sources import JointReading
+from zstate.wire.messages import Mode
 
-Mode: TypeAlias = Literal["position", "velocity", "effort"]
 StopMode: TypeAlias = Literal["hold", "relax"]
 """How a driver stops: it holds its joints where they are, or switches their torque off."""
 
@@ -23,21 +23,36 @@ StopMode: TypeAlias = Literal["hold", "relax"]
 class Setpoint:
     """What a driver writes to its joints at one tick, in the order of its ``joint_names``.
 
-    ``positions`` [rad] or [m], (n,), are at most one tick's motion from those before; ``velocities`` per
-    second, (n,), are the rates at which they move, for devices that take them as feed-forward. ``stamp`` [ns]
-    is the present instant of the system clock.
+    ``modes`` has the mode of each joint, of those that the driver takes; "position" for all if left out.
+
+    - "position": ``positions`` [rad] or [m], (n,), are at most one tick's motion from those before, and
+      ``velocities`` per second, (n,), are the rates at which they move, for devices that take them as
+      feed-forward.
+    - "velocity": ``velocities`` are to be kept until the next setpoint, or for a watchdog's time.
+    - "effort": ``efforts`` [Nm] or [N], (n,), are to be applied; zero for other joints.
+
+    A joint in another mode than "position" is expected at its ``positions``, which are not to be written.
+    ``stamp`` [ns] is the present instant of the system clock.
     """
 
     stamp: int
     positions: NDArray[np.float64]
     velocities: NDArray[np.float64]
+    efforts: NDArray[np.float64] | None = None
+    modes: tuple[Mode, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.modes:
+            object.__setattr__(self, "modes", ("position",) * len(self.positions))
 
 
 class Driver(Protocol):
     """Interface of programs that own hardware; a ``DriverHost`` calls all methods from one thread.
 
     ``joint_names`` are the joints that the driver owns, all or a part of those of its robot, and the order of
-    all numbers. ``modes`` are the kinds of setpoints that it takes.
+    all numbers. ``modes`` are those of the setpoints that it takes: with one, all setpoints have that mode;
+    with several, each joint may be in any of them, and changes it between two setpoints. A device in mode
+    "velocity" or "effort" moves on when its program has died: let it stop by a watchdog of its own.
     """
 
     @property

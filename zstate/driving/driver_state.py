@@ -125,7 +125,8 @@ class DriverStatePublisher(Closeable):
 class SetpointPublisher(Closeable):
     """Publishes the setpoints of ``joint_names`` that ``writer`` writes to hardware, while they are read.
 
-    They are joint states with names: positions, and the velocities of the step. For one thread.
+    They are joint states with names: positions, the velocities of the step, and efforts while a joint is in
+    mode "effort". For one thread.
     """
 
     def __init__(self, session: Session, robot: str, joint_names: tuple[str, ...], writer: WriterId) -> None:
@@ -144,7 +145,8 @@ class SetpointPublisher(Closeable):
         if not self._stream.has_readers:
             return
         head = (setpoint.stamp, self._seq, self._session_id, self._order)
-        blocks = to_block(setpoint.positions), to_block(setpoint.velocities)
+        efforts = None if setpoint.efforts is None else to_block(setpoint.efforts)
+        blocks = to_block(setpoint.positions), to_block(setpoint.velocities), efforts
         self._stream.write(encode(JointState(*head, *blocks, names=self._names)))
         self._seq += 1
 

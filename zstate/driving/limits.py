@@ -1,6 +1,6 @@
-"""Limits of driven joints: positions, velocities and accelerations.
+"""Limits of driven joints: positions, velocities, accelerations and efforts.
 
-A URDF states positions and velocities; accelerations come from the manual of the actuators.
+A URDF states positions, velocities and efforts; accelerations come from the manual of the actuators.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,9 +33,10 @@ class Limits:
     """Limits of the joints ``joint_names``, one number each, (n,); infinite where there is none.
 
     ``lower`` and ``upper`` are positions [rad] or [m]; ``velocity`` and ``acceleration`` are bounds of the
-    absolute value, per s and per s^2. ``units`` are "rad" or "m"; "rad" for each joint if left out. The
-    arrays are read-only copies. Raises InvalidInput for no or repeated joints, other shapes, NaN, a lower
-    limit above the upper one, and rates that are not above zero, with all joints and values.
+    absolute value, per s and per s^2, and so is ``effort`` [Nm] or [N], infinite if left out. ``units`` are
+    "rad" or "m"; "rad" for each joint if left out. The arrays are read-only copies. Raises InvalidInput for
+    no or repeated joints, other shapes, NaN, a lower limit above the upper one, rates that are not above
+    zero, and efforts below it, with all joints and values.
     """
 
     joint_names: tuple[str, ...]
@@ -44,14 +45,17 @@ class Limits:
     velocity: Floats
     acceleration: Floats
     units: tuple[str, ...] = ()
+    effort: Floats = field(default_factory=lambda: np.array(np.inf))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "joint_names", check_joint_names(self.joint_names))
         object.__setattr__(self, "units", tuple(self.units) or ("rad",) * len(self.joint_names))
         if len(self.units) != len(self.joint_names) or not {"rad", "m"}.issuperset(self.units):
             raise InvalidInput(f"units are 'rad' or 'm' for each of {self.joint_names}; got {self.units}")
-        for name in ("lower", "upper", "velocity", "acceleration"):
+        for name in ("lower", "upper", "velocity", "acceleration", "effort"):
             values = real_numbers(getattr(self, name), f"{name} limits").copy()
+            if name == "effort" and values.shape == ():
+                values = np.full(len(self.joint_names), values)
             if values.shape != (len(self.joint_names),):
                 raise InvalidInput(
                     f"{name} limits of {len(self.joint_names)} joints have shape "
@@ -75,6 +79,11 @@ class Limits:
                 for name, value in zip(self.joint_names, values.tolist(), strict=True)
                 if not value > 0.0
             ]
+        problems += [
+            f"the effort limit of {name!r} is {value:g}; it must not be below zero"
+            for name, value in zip(self.joint_names, self.effort.tolist(), strict=True)
+            if not value >= 0.0
+        ]
         return problems
 
     @classmethod
@@ -85,14 +94,15 @@ class Limits:
         *,
         velocity: float | Mapping[str, float] | None = None,
         acceleration: float | Mapping[str, float] | None = None,
+        effort: float | Mapping[str, float] | None = None,
     ) -> Limits:
         """The limits that the URDF of ``model`` states for ``joints``, which are all if left out.
 
         All are the driven joints with one position each: floating and planar joints have no limits in a URDF.
-        Continuous joints have no position limits. ``velocity`` and ``acceleration`` are one number for all
-        joints, or numbers by joint. A velocity may be lower than that of the URDF, never higher, unless that
-        is zero, as exporters write for an unknown one. Raises InvalidInput for other joints, NaN, and rates
-        that are not above zero, with the joint and the value.
+        Continuous joints have no position limits. ``velocity``, ``acceleration`` and ``effort`` are one
+        number for all joints, or numbers by joint. A velocity or an effort may be lower than that of the
+        URDF, never higher, unless that is zero, as exporters write for an unknown one. Raises InvalidInput
+        for other joints, NaN, and numbers that are not above zero, with the joint and the value.
         """
         chosen = _driven_joints(model, joints)
         names = tuple(joint.name for joint in chosen)
@@ -105,8 +115,15 @@ class Limits:
             for name, asked, limit in zip(names, velocities.tolist(), stated.tolist(), strict=True)
             if asked > limit > 0.0 or asked <= 0.0
         ]
+        stated_efforts = np.array([max(joint.limits.effort, 0.0) for joint in chosen])
+        efforts = _rates(effort, names, stated_efforts, "effort")
+        problems += [
+            f"effort {asked:g} of {name!r} is above {limit:g}, the limit in the URDF"
+            for name, asked, limit in zip(names, efforts.tolist(), stated_efforts.tolist(), strict=True)
+            if asked > limit > 0.0
+        ]
         if problems:
-            raise InvalidInput(f"{'; '.join(problems)}; pass another velocity=..., or correct the URDF")
+            raise InvalidInput(f"{'; '.join(problems)}; pass other limits, or correct the URDF")
         return cls(
             names,
             np.array([joint.limits.lower for joint in chosen]),
@@ -114,6 +131,7 @@ class Limits:
             velocities,
             _rates(acceleration, names, np.full(len(names), np.inf), "acceleration"),
             tuple("m" if joint.type == "prismatic" else "rad" for joint in chosen),
+            efforts,
         )
 
     def part(self, joint_names: Sequence[str]) -> Limits:
@@ -132,6 +150,7 @@ class Limits:
             self.velocity[rows],
             self.acceleration[rows],
             tuple(self.units[row] for row in rows),
+            self.effort[rows],
         )
 
     def check_positions(self, positions: ArrayLike) -> Floats:

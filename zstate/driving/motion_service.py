@@ -1,8 +1,8 @@
 """Motions at the host of a driver: requests, their checks, and the one motion that is under way.
 
-A request is planned in the thread of a queryable: a trajectory from the present setpoint, or from the
-measured joints if none is written, which is checked against the limits in closed form. The control loop
-adopts it at its next tick, and replies by that thread.
+A request of an announced commander is planned in a thread of its own: a trajectory from the present setpoint,
+or from the measured joints if none is written, which is checked against the limits in closed form. The
+control loop adopts it at its next tick. A cancellation does not wait for a plan.
 
 The time of a motion advances by one period at each tick that writes a setpoint. A tick that was missed delays
 the motion; no step becomes longer by it. A motion is valid for the host's ttl, unless its commander renews
@@ -16,14 +16,15 @@ motion.
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import Future
+from collections.abc import Callable, Collection
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotDone
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +37,14 @@ from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
 from zstate.driving.limits import Limits
 from zstate.driving.trajectory import Trajectory
 from zstate.errors import InvalidInput, MessageError, format_duration
-from zstate.net.queryable import Reply, RequestQueryable
+from zstate.net.queryable import Reply, RequestAnswer, RequestQueryable
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.keys import motion_key
 from zstate.wire.messages import (
     MOTION_POINTS,
     JointTrajectory,
+    Mode,
     MotionCancel,
     MotionOutcome,
     MotionReply,
@@ -58,8 +60,12 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+_Findings: TypeAlias = tuple[str, ...]
+
 _TICK_WITHIN_S = 1.0
 _NAMES_BYTES = 64_000
+_MOST_PLANS = 8
+"""Requests that wait for their plan. More get no reply, and are repeated by their commanders."""
 _MOST_OUTCOMES = 16
 _MAX_REASON_LENGTH = 300
 _MOST_FINDINGS = 400
@@ -166,38 +172,33 @@ class _Underway:
         return min(max(self.time_s / self.trajectory.duration_s, 0.0), 1.0)
 
 
-class MotionService(Closeable):
-    """Takes requests for motions of the driver of ``robot``, and makes one at a time.
+class MotionExecutor:
+    """Makes one motion at a time of the joints of ``limits``, whose targets are ``targets``.
 
     ``present()`` returns the joints now, for any thread; it raises MessageError if that is not known.
     ``check(session, seq, now)`` raises MessageError if that message of a commander may not move the robot
     now; ``name_of`` is its program; ``on_change`` is called when a motion has started or ended: these three,
-    and all methods without another note, are for the thread of the loop. ROS nodes send their motions to the
-    ``controller``, if there is one.
+    and all methods without another note, are for the thread of the loop.
     """
 
     def __init__(
         self,
-        session: Session,
-        robot: str,
-        host_session: int,
         targets: Targets,
         *,
         limits: Limits,
+        modes: Collection[Mode],
         ttl_ns: int,
-        refusals: Refusals,
         present: Callable[[], Present],
         check: Callable[[int, int, int], None],
         name_of: Callable[[int], str],
-        on_change: Callable[[], None],
-        controller: Ros2Controller | None = None,
+        on_change: Callable[[], object],
     ) -> None:
-        self._host_session = host_session
-        self._limits = limits
-        self._ttl_ns = ttl_ns
+        self.limits = limits
+        self.modes = modes
+        self.ttl_ns = ttl_ns
+        self.present = present
         self._targets = targets
-        self._refusals = refusals
-        self._present, self._check, self._name_of, self._on_change = present, check, name_of, on_change
+        self._check, self._name_of, self._on_change = check, name_of, on_change
         self._nodes: set[int] = set()
         """The sessions of announced ROS nodes."""
         self._requests = fork_safe_lock()
@@ -208,19 +209,8 @@ class MotionService(Closeable):
         self._motion: _Underway | None = None
         self._newest: BoundedDict[int, int] = BoundedDict()
         """The number of the last motion that was started, by session."""
-        self._most_bytes = 8 * MOTION_POINTS * (1 + 3 * len(limits.joint_names)) + _NAMES_BYTES
         self.outcomes: tuple[MotionOutcome, ...] = ()
         """Of the last motions, newest last; a new tuple after each. May be read from any thread."""
-        with ExitStack() as opening:
-            opening.enter_context(RequestQueryable(session, motion_key(robot), self._answer))
-            if controller is not None:
-                on_samples = partial(self._on_ros_samples, controller)
-                opening.enter_context(StreamSubscriber(session, controller.trajectories, on_samples))
-            self._opened = opening.pop_all()
-
-    def close(self) -> None:
-        """Take no further requests."""
-        self._opened.close()
 
     def set_announced(self, session: int, alive: bool) -> None:
         """The ROS node of ``session`` is announced, or not any more; for any thread."""
@@ -239,67 +229,7 @@ class MotionService(Closeable):
             return None, 0.0
         return (motion.request.session, motion.request.seq), motion.progress
 
-    # Requests, in the threads of the queryable and of the subscriber
-
-    def _answer(self, payload: bytes, encoding: str) -> Reply:
-        findings = self._counted(lambda: self._take(payload, encoding))
-        texts = tuple(text[:_MAX_FINDING_LENGTH] for text in findings[:_MOST_FINDINGS])
-        reply = MotionReply(self._host_session, self._ttl_ns, texts)
-        return Reply(encode(reply), ENCODINGS[MotionReply])
-
-    def _on_ros_samples(self, controller: Ros2Controller, samples: list[SerializedSample]) -> None:
-        for sample in samples:
-            self._counted(lambda sample=sample: self._take_from_ros(controller, sample))
-
-    def _counted(self, take: Callable[[], tuple[str, ...]]) -> tuple[str, ...]:
-        """The findings of ``take()``, which are counted, or its error as one."""
-        try:
-            findings = take()
-        except (MessageError, InvalidInput) as error:
-            findings = (str(error),)
-            self._refusals.count(getattr(error, "reason", "motion"), error)
-        else:
-            if findings:
-                self._refusals.count("motion", "; ".join(findings))
-        return findings
-
-    def _take(self, payload: bytes, encoding: str) -> tuple[str, ...]:
-        """Hand the request to the loop, or return the findings. Raises MessageError and InvalidInput."""
-        if encoding == ENCODINGS[MotionCancel]:
-            cancel = decode(payload, encoding, MotionCancel)
-            self._call_in_loop(lambda _: self._cancel(cancel))
-            return ()
-        if len(payload) > self._most_bytes:
-            text = f"a request of {len(payload)} bytes, where motions of this driver take {self._most_bytes}"
-            raise MessageError(text, reason="too large")
-        return self._plan_and_start(decode(payload, encoding, JointTrajectory))
-
-    def _take_from_ros(self, controller: Ros2Controller, sample: SerializedSample) -> tuple[str, ...]:
-        """The same for a message of a ROS node."""
-        session, request = controller.decode_trajectory(sample)
-        if request is None:
-            self._call_in_loop(lambda _: self._cancel_of(session))
-            return ()
-        return self._plan_and_start(without_past(request, time.time_ns()))
-
-    def _plan_and_start(self, request: JointTrajectory) -> tuple[str, ...]:
-        if self._is_known(request):
-            return ()
-        self._check_in_loop(request)  # first: to plan takes time from the control loop
-        planned = plan(request, self._limits, self._present(), time.time_ns())
-        if not planned.findings:
-            self._call_in_loop(lambda now: self._start(planned, now))
-        return planned.findings
-
-    def _check_in_loop(self, request: JointTrajectory) -> None:
-        """Raise MessageError if ``request`` must not start now, or if the joints are not known."""
-        try:
-            self._call_in_loop(lambda now: self._check_request(request, now))
-        except MessageError:
-            self._present()  # its reason is the better one
-            raise
-
-    def _call_in_loop(self, action: Callable[[int], None]) -> None:
+    def call(self, action: Callable[[int], None]) -> None:
         """Let the loop call ``action`` at its next tick. Raises MessageError, also that of ``action``."""
         done: Future[None] = Future()
         with self._requests:
@@ -312,8 +242,6 @@ class MotionService(Closeable):
                     text = f"the control loop has not begun a tick within {_TICK_WITHIN_S:g} s"
                     raise MessageError(text, reason="no tick") from None
                 done.result()
-
-    # The loop
 
     def adopt(self, now: int) -> None:
         """Start or cancel what was requested since the last tick."""
@@ -350,7 +278,7 @@ class MotionService(Closeable):
 
     def replace(self, command: Command) -> None:
         """End a motion of the joints of ``command``, whose targets are new."""
-        if self._motion is not None and np.isin(command.columns, self._motion.columns).any():
+        if self._motion is not None and np.isin(command.joints, self._motion.columns).any():
             self.finish("replaced", f"by a command of {self._name_of(command.session)}")
 
     def supervise(self, now: int, measured: Floats, measured_at: int) -> None:
@@ -369,7 +297,7 @@ class MotionService(Closeable):
 
     def _renewal(self, request: JointTrajectory, now: int) -> Command:
         """What a commander sends to keep the motion of ``request`` valid."""
-        deadline = now + self._ttl_ns
+        deadline = now + self.ttl_ns
         head = (request.session, request.seq, NO_COLUMNS, NO_POSITIONS)
         return Command(*head, now, deadline, request.seq)
 
@@ -402,20 +330,20 @@ class MotionService(Closeable):
         if motion is None:
             return
         with suppress(MessageError):  # nothing moves while the joints are not known
-            at = self._present().resting[motion.columns] if positions is None else positions
+            at = self.present().resting[motion.columns] if positions is None else positions
             self._targets.place(motion.columns, at)
         request = motion.request
         outcome = MotionOutcome(request.session, request.seq, name, reason[:_MAX_REASON_LENGTH])
         self.outcomes = (*self.outcomes, outcome)[-_MOST_OUTCOMES:]
         self._on_change()
 
-    def _start(self, planned: Plan, now: int) -> None:
+    def start(self, planned: Plan, now: int) -> None:
         """Make the motion ``planned`` in place of the last one. Raises MessageError if it must not start."""
         request = planned.request
-        if self._is_known(request):
+        if self.is_known(request):
             return
-        self._check_request(request, now)
-        present = self._present()
+        self.check_request(request, now)
+        present = self.present()
         if present.stops is not planned.present.stops:
             text = "a stop or its release arrived together with the motion; send it again"
             raise MessageError(text, reason="stopped")
@@ -424,7 +352,7 @@ class MotionService(Closeable):
         passed_s = (now - planned.planned_at) * 1e-9 if is_timed else 0.0
         time_s = planned.time_s + passed_s
         start_at = now - round(time_s * 1e9)
-        deadline = now + self._ttl_ns
+        deadline = now + self.ttl_ns
         is_alive = self._targets.session == request.session and self._targets.is_live(now)
         at = present.resting[planned.columns]
         self._targets.accept(Command(request.session, request.seq, planned.columns, at, now, deadline))
@@ -433,22 +361,22 @@ class MotionService(Closeable):
         self._newest[request.session] = request.seq
         self._on_change()
 
-    def _check_request(self, request: JointTrajectory, now: int) -> None:
+    def check_request(self, request: JointTrajectory, now: int) -> None:
         """Raise MessageError if ``request`` must not move the robot at ``now``."""
         self._check(request.session, request.seq, now)
         if request.seq <= self._newest.get(request.session, -1):
             raise MessageError(f"the motion {request.seq} comes after a newer one", reason="old")
 
-    def _is_known(self, request: JointTrajectory) -> bool:
+    def is_known(self, request: JointTrajectory) -> bool:
         """Whether ``request`` is repeated, as without a reply; for any thread."""
         ended = {(outcome.session, outcome.seq) for outcome in self.outcomes}
         return (request.session, request.seq) in {*ended, self.underway[0]}
 
-    def _cancel_of(self, session: int) -> None:
+    def cancel_of(self, session: int) -> None:
         if self._motion is not None and self._motion.request.session == session:
             self.finish("cancelled", f"by {self._name_of(session)}")
 
-    def _cancel(self, cancel: MotionCancel) -> None:
+    def cancel(self, cancel: MotionCancel) -> None:
         if self.underway[0] == (cancel.session, cancel.motion):
             self.finish("cancelled", f"by {self._name_of(cancel.session)}")
 
@@ -458,7 +386,7 @@ class MotionService(Closeable):
         row = int(errors.argmax())
         request, late_s = motion.request, motion.time_s - motion.trajectory.duration_s
         name = request.names[row]
-        text = f"{name!r} is {errors[row]:.3g} {self._limits.units[motion.columns[row]]} from its"
+        text = f"{name!r} is {errors[row]:.3g} {self.limits.units[motion.columns[row]]} from its"
         if errors[row] > request.path_tolerance:
             self.finish("aborted", f"{text} path, more than path_tolerance={request.path_tolerance:g}")
         elif late_s >= 0.0 and errors[row] <= request.goal_tolerance:
@@ -468,3 +396,133 @@ class MotionService(Closeable):
             self.finish(
                 "aborted", f"{text} goal {request.goal_time:g} s after the end, more than {tolerance}"
             )
+
+
+class MotionService(Closeable):
+    """Takes requests for motions of the driver of ``robot``, for ``executor``.
+
+    ROS nodes send their motions to the ``controller``, if there is one. ``refusals`` counts the others by
+    reason.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        host_session: int,
+        executor: MotionExecutor,
+        refusals: Refusals,
+        *,
+        controller: Ros2Controller | None = None,
+    ) -> None:
+        self._host_session = host_session
+        self._executor = executor
+        self._refusals = refusals
+        self._most_bytes = 8 * MOTION_POINTS * (1 + 3 * len(executor.limits.joint_names)) + _NAMES_BYTES
+        self._commanders: set[int] = set()
+        """The sessions of announced commanders."""
+        self._planner = ThreadPoolExecutor(1, "zstate planner")
+        self._places = threading.BoundedSemaphore(_MOST_PLANS)
+        with ExitStack() as opening:
+            opening.callback(self._planner.shutdown, wait=False, cancel_futures=True)
+            opening.enter_context(RequestQueryable(session, motion_key(robot), self._answer))
+            if controller is not None:
+                on_samples = partial(self._on_ros_samples, controller)
+                opening.enter_context(StreamSubscriber(session, controller.trajectories, on_samples))
+            self._opened = opening.pop_all()
+
+    def close(self) -> None:
+        """Take no further requests."""
+        self._opened.close()
+
+    def set_commander(self, session: int, alive: bool) -> None:
+        """The commander of ``session`` is announced, or not any more; for any thread."""
+        (self._commanders.add if alive else self._commanders.discard)(session)
+
+    # Requests, in the threads of the queryable, of the planner and of the subscriber
+
+    def _answer(self, payload: bytes, encoding: str) -> RequestAnswer:
+        """The reply to a request; a cancellation does not wait for the plan of another one."""
+        if encoding == ENCODINGS[MotionCancel]:
+            return self._reply(self._counted(lambda: self._cancel(payload)) or ())
+        if not self._places.acquire(blocking=False):
+            self._refusals.count("overrun", f"{_MOST_PLANS} motions wait to be planned")
+            return None
+        planned = self._planner.submit(self._plan_and_reply, payload, encoding)
+        planned.add_done_callback(lambda _: self._places.release())
+        return planned
+
+    def _plan_and_reply(self, payload: bytes, encoding: str) -> Reply | None:
+        """The reply to a request for a motion; None if it is not from a commander that is announced."""
+        findings = self._counted(lambda: self._take(payload, encoding))
+        return None if findings is None else self._reply(findings)
+
+    def _reply(self, findings: _Findings) -> Reply:
+        texts = tuple(text[:_MAX_FINDING_LENGTH] for text in findings[:_MOST_FINDINGS])
+        reply = MotionReply(self._host_session, self._executor.ttl_ns, texts)
+        return Reply(encode(reply), ENCODINGS[MotionReply])
+
+    def _on_ros_samples(self, controller: Ros2Controller, samples: list[SerializedSample]) -> None:
+        for sample in samples:
+            self._counted(lambda sample=sample: self._take_from_ros(controller, sample))
+
+    def _counted(self, take: Callable[[], _Findings | None]) -> _Findings | None:
+        """The findings of ``take()``, which are counted, or its error as one."""
+        try:
+            findings = take()
+        except (MessageError, InvalidInput) as error:
+            findings = (str(error),)
+            self._refusals.count(getattr(error, "reason", "motion"), error)
+        else:
+            if findings:
+                self._refusals.count("motion", "; ".join(findings))
+        return findings
+
+    def _cancel(self, payload: bytes) -> _Findings:
+        cancel = decode(payload, ENCODINGS[MotionCancel], MotionCancel)
+        self._executor.call(lambda _: self._executor.cancel(cancel))
+        return ()
+
+    def _take(self, payload: bytes, encoding: str) -> _Findings | None:
+        """Hand the request to the loop, or return the findings; None if its commander is not announced.
+
+        The token of a new commander may arrive after its request, which is repeated without a reply. Raises
+        MessageError and InvalidInput.
+        """
+        if len(payload) > self._most_bytes:
+            text = f"a request of {len(payload)} bytes, where motions of this driver take {self._most_bytes}"
+            raise MessageError(text, reason="too large")
+        request = decode(payload, encoding, JointTrajectory)
+        if request.session not in self._commanders:
+            text = f"a motion of session {request.session:x}, which is not announced as a commander"
+            self._refusals.count("no claim", text)
+            return None
+        return self._plan_and_start(request)
+
+    def _take_from_ros(self, controller: Ros2Controller, sample: SerializedSample) -> _Findings:
+        """The same for a message of a ROS node."""
+        session, request = controller.decode_trajectory(sample)
+        if request is None:
+            self._executor.call(lambda _: self._executor.cancel_of(session))
+            return ()
+        return self._plan_and_start(without_past(request, time.time_ns()))
+
+    def _plan_and_start(self, request: JointTrajectory) -> _Findings:
+        if self._executor.is_known(request):
+            return ()
+        if "position" not in (modes := self._executor.modes):
+            has = " and ".join(sorted(modes))
+            raise MessageError(f"a motion needs mode position; this driver has mode {has}", reason="mode")
+        self._check_in_loop(request)  # first: to plan takes time from the control loop
+        planned = plan(request, self._executor.limits, self._executor.present(), time.time_ns())
+        if not planned.findings:
+            self._executor.call(lambda now: self._executor.start(planned, now))
+        return planned.findings
+
+    def _check_in_loop(self, request: JointTrajectory) -> None:
+        """Raise MessageError if ``request`` must not start now, or if the joints are not known."""
+        try:
+            self._executor.call(lambda now: self._executor.check_request(request, now))
+        except MessageError:
+            self._executor.present()  # its reason is the better one
+            raise

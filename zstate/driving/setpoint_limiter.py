@@ -1,4 +1,4 @@
-"""Setpoints on the way to a target that keep velocities, accelerations and positions within limits.
+"""Setpoints on the way to a target that keep velocities, accelerations, positions and efforts within limits.
 
 Each joint has a setpoint p and a velocity v, that of its last step. A step of dt moves it by v' dt. While v'
 falls by a dt in every later step, of any length, the setpoint travels at most v'^2 / (2 a) until it rests,
@@ -8,17 +8,27 @@ a position limit, if
     v' dt + v'^2 / (2 a) <= d,  that is  v' <= 2 d / (dt + sqrt(dt^2 + 2 d / a))
 
 which later steps can fulfil again without a change of velocity above a dt, whatever their lengths are.
+
+In mode "velocity" p is measured, and the joint follows v with a lag, of a time constant t up to 50 ms. There
+
+    v' (dt + s) + g(v') <= d,  g(v) = v T up to v = a T, and v^2 / (2 a) + a T^2 / 2 above it,  T = 0.2 s
+
+so that v falls in proportion to the distance from a position limit, unless a is too low for that. p + t p' of
+such a joint moves with v, and p' is at most v (1 + t / T) while it brakes: with s = t (1 + t / T) the joint
+arrives at its limit at rest. If its host pauses for T it does not pass the limit.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping, Sequence
 from itertools import compress
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate.driving.driver import Mode
 from zstate.driving.limits import ROUNDING, Limits
 from zstate.errors import InvalidInput
 
@@ -28,27 +38,61 @@ _UNBOUNDED = 1e100
 """In place of infinity, whose product with zero is NaN."""
 
 
+_ARRIVAL_S = 0.2
+_LAG_S = 0.05 * (1.0 + 0.05 / _ARRIVAL_S)
+"""T and s of the rule for velocities near a position limit."""
+
+_FILTER_S = 0.02
+"""Time constant of velocities that are derived from measured positions."""
+
+_LONGEST_GAP_S = 0.1
+"""After a longer time between two readings, no velocity is derived from them."""
+
+
+class Rate(NamedTuple):
+    """The command of a joint in mode "velocity", per s, or "effort" [Nm] or [N]."""
+
+    mode: Mode
+    value: float
+
+
+Rates: TypeAlias = Mapping[int, Rate | None]
+"""Commands by the column of the joint; None where one has expired, and the joint is to rest."""
+
+_TO_TARGET = Rate("position", 0.0)
+_NO_RATES: Rates = {}
+
+
 class Limited(NamedTuple):
     """The next setpoint: ``positions`` (n,) [rad] or [m] and ``velocities`` (n,) of the step, per s.
 
-    ``limited`` are the joints that are short of the target because a limit slowed them.
+    ``limited`` are the joints that are short of their commands because a limit slowed them. ``efforts`` (n,)
+    [Nm] or [N] are None while no joint is in mode "effort"; ``modes`` has that of each joint, "position" if
+    empty. ``braked`` has a text for each joint that was taken out of mode "effort" by this step.
     """
 
     positions: Floats
     velocities: Floats
     limited: tuple[str, ...]
+    efforts: Floats | None = None
+    modes: tuple[Mode, ...] = ()
+    braked: tuple[str, ...] = ()
 
 
 class _Joint:
     """The limits of one joint, none of which is infinite."""
 
-    def __init__(self, lower: float, upper: float, velocity: float, acceleration: float) -> None:
+    def __init__(
+        self, lower: float, upper: float, velocity: float, acceleration: float, effort: float
+    ) -> None:
         self._lower, self._upper = lower, upper
         self._velocity, self._acceleration = velocity, acceleration
+        self._effort = effort
+        self.has_range = lower > -_UNBOUNDED or upper < _UNBOUNDED
 
     def closing(self, gap: float, dt_s: float) -> float:
         """The greatest velocity of a step after which the joint can stop at the end of ``gap``."""
-        return math.copysign(self._braking_velocity(abs(gap), dt_s), gap)
+        return math.copysign(self._braking_velocity(abs(gap), dt_s), gap) if gap else 0.0
 
     def following(self, distance: float, velocity: float, dt_s: float) -> float:
         """The velocity of a step towards a target that moves: its own, and that which closes the gap.
@@ -81,6 +125,34 @@ class _Joint:
             return (following if following > self._lower or room <= 0.0 else self._lower), velocity
         return position, 0.0
 
+    def turn(self, position: float, before: float, wanted: float, dt_s: float) -> tuple[float, float]:
+        """The same in mode "velocity", from the measured ``position``.
+
+        The velocity never changes by more than the acceleration allows, also where the joint was pushed.
+        """
+        change = self._acceleration * dt_s
+        least, most = max(before - change, -self._velocity), min(before + change, self._velocity)
+        velocity = min(max(wanted, least), most)
+        if velocity > 0.0:
+            velocity = max(min(velocity, self._arriving(self._upper - position, dt_s)), least)
+        elif velocity < 0.0:
+            velocity = min(max(velocity, -self._arriving(position - self._lower, dt_s)), most)
+        return position + velocity * dt_s, velocity
+
+    def push(self, position: float, velocity: float, wanted: float) -> float:
+        """The allowed effort nearest to ``wanted``: inwards if outside, against the motion if too fast."""
+        least, most = -self._effort, self._effort
+        if velocity > self._velocity or position > self._upper:
+            most = 0.0
+        if velocity < -self._velocity or position < self._lower:
+            least = 0.0
+        return min(max(wanted, least), most)
+
+    def is_exceeded(self, position: float, velocity: float) -> bool:
+        """Whether the joint is outside its range, or too fast."""
+        is_inside = self._lower - ROUNDING <= position <= self._upper + ROUNDING
+        return not is_inside or abs(velocity) > self._velocity * (1.0 + ROUNDING)
+
     def stoppable(self, position: float, velocity: float) -> float:
         """The velocity nearest to ``velocity`` from which the joint can stop within its limits."""
         room = self._upper - position if velocity > 0.0 else position - self._lower
@@ -92,6 +164,16 @@ class _Joint:
         doubled = 2.0 * distance
         return doubled / (dt_s + math.sqrt(dt_s**2 + doubled / self._acceleration))
 
+    def _arriving(self, room: float, dt_s: float) -> float:
+        """The greatest speed of a step in mode "velocity" at the distance ``room`` from a position limit."""
+        if room <= 0.0:
+            return 0.0
+        steepest = self._acceleration * _ARRIVAL_S
+        speed = room / (dt_s + _LAG_S + _ARRIVAL_S)
+        if speed <= steepest:
+            return speed
+        return self._braking_velocity(room - 0.5 * steepest * _ARRIVAL_S, dt_s + _LAG_S)
+
 
 class SetpointLimiter:
     """Moves the joints of ``limits`` towards targets, step by step; for one thread.
@@ -99,22 +181,41 @@ class SetpointLimiter:
     A step is never longer than ``velocity * dt_s``, and never changes a velocity by more than
     ``acceleration * dt_s``. Joints brake in time for the target and for their position limits; a joint that
     is outside its limits never moves further out. Vectors are (n,), in the order of ``limits.joint_names``.
+
+    ``modes`` are those of the driver, and ``step`` takes ``Rates`` of joints in mode "velocity" or "effort",
+    which ``observe`` follows. Another mode starts where the joint is then, with its velocity. A joint whose
+    command has expired comes to rest: from mode "velocity" in that mode, and then holds its position if it
+    has a range and the driver has mode "position"; from mode "effort" in mode "position", or else "velocity",
+    or else without effort. The same happens to a joint in mode "effort" that leaves its range or exceeds its
+    velocity limit, until its command has expired or has another mode; a driver that has mode "effort" only
+    gets efforts inwards, or against the motion.
     """
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: Limits, modes: Collection[Mode] = ("position",)) -> None:
         self._limits = limits
-        bounds = (limits.lower, limits.upper, limits.velocity, limits.acceleration)
+        bounds = (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.effort)
         self._joints = [_Joint(*row) for row in zip(*(_bounded(bound) for bound in bounds), strict=True)]
         # Numbers, not arrays: numpy takes longer for a call than for the arithmetic of 30 joints.
         self._positions: list[float] | None = None
         self._velocities = [0.0] * len(self._joints)
+        self._efforts = [0.0] * len(self._joints)
+        ranked: tuple[Mode, ...] = ("position", "velocity", "effort")
+        self._resting_mode: Mode = next(mode for mode in ranked if mode in modes)
+        self._all_resting = (self._resting_mode,) * len(self._joints)
+        self._modes = list(self._all_resting)
+        self._has_positions_only = self._resting_mode == "position"
+        """Whether all joints are in mode "position" now."""
+        self._braked: dict[int, str] = {}
+        """Why joints are held that are commanded in mode "effort"."""
+        self._observed: tuple[list[float], int] | None = None
 
-    def start(self, positions: ArrayLike, velocities: ArrayLike | None = None) -> None:
+    def start(self, positions: ArrayLike, velocities: ArrayLike | None = None) -> Limited:
         """Sets the setpoint to what is there now, after any change of state; at rest without ``velocities``.
 
         A joint outside its limits is accepted. Velocities are reduced to the velocity limits, and to those
-        from which the joints can stop within their position limits. Raises InvalidInput for other shapes and
-        for numbers that are not finite; nothing changes then.
+        from which the joints can stop within their position limits. All joints are in mode "position" if the
+        driver has it, or else in "velocity", or else in "effort" without any. Returns the setpoint. Raises
+        InvalidInput for other shapes and for numbers that are not finite; nothing changes then.
         """
         start = self._limits.vector(positions, "positions").tolist()
         given = [0.0] * len(start)
@@ -123,6 +224,57 @@ class SetpointLimiter:
         moving = zip(self._joints, start, given, strict=True)
         self._velocities = [joint.stoppable(position, velocity) for joint, position, velocity in moving]
         self._positions = start
+        self._efforts = [0.0] * len(start)
+        self._set_modes(self._all_resting)
+        self._braked.clear()
+        return self._limited(start, [False] * len(start))
+
+    def resume(self, last: Limited, dt_s: float) -> None:
+        """Goes back to ``last``, of this limiter, as no later setpoint was written for ``dt_s`` [s].
+
+        Joints in other modes than "position" have moved on with their velocities, unless they are observed.
+        """
+        moving = zip(last.positions.tolist(), last.velocities.tolist(), last.modes, strict=True)
+        self._positions = [here if mode == "position" else here + rate * dt_s for here, rate, mode in moving]
+        self._velocities = last.velocities.tolist()
+        self._efforts = [0.0] * len(self._joints) if last.efforts is None else last.efforts.tolist()
+        self._set_modes(last.modes)
+
+    def observe(self, positions: Floats, velocities: Floats | None, now: int) -> None:
+        """The joints were measured at ``positions`` (n,), at ``now`` [ns, monotonic].
+
+        Joints in other modes than "position" are there now. Velocities of joints in mode "effort" are derived
+        from the positions if not given.
+        """
+        before, self._observed = self._observed, (positions.tolist(), now)
+        if self._has_positions_only or self._positions is None:
+            return
+        found = self._observed[0]
+        dt_s = 0.0 if before is None else (now - before[1]) * 1e-9
+        for column, mode in enumerate(self._modes):
+            if mode == "position":
+                continue
+            self._positions[column] = found[column]
+            if mode != "effort":
+                continue
+            if velocities is not None:
+                self._velocities[column] = float(velocities[column])
+            elif before is not None and 0.0 < dt_s < _LONGEST_GAP_S:
+                rate = (found[column] - before[0][column]) / dt_s
+                self._velocities[column] += (rate - self._velocities[column]) * dt_s / (dt_s + _FILTER_S)
+
+    def check_rates(self, rates: Rates) -> None:
+        """Raises InvalidInput for efforts of joints that have no effort limit."""
+        unlimited = [
+            f"{self._limits.joint_names[column]!r} ({self._limits.effort[column]:g})"
+            for column, rate in rates.items()
+            if rate is not None and rate.mode == "effort" and not 0.0 < self._limits.effort[column] < math.inf
+        ]
+        if unlimited:
+            raise InvalidInput(
+                f"efforts are commanded within limits, which these joints have not: {', '.join(unlimited)}; "
+                "start the driver with limits=Limits.of(model, effort=...)"
+            )
 
     def check(self, positions: ArrayLike) -> Floats:
         """``positions`` as a vector, if they may be a target.
@@ -141,13 +293,16 @@ class SetpointLimiter:
             raise InvalidInput("; ".join((*findings, *self._outside_texts(self._positions))))
         return vector
 
-    def step(self, target: ArrayLike, dt_s: float, velocities: ArrayLike | None = None) -> Limited:
+    def step(
+        self, target: ArrayLike, dt_s: float, velocities: ArrayLike | None = None, rates: Rates = _NO_RATES
+    ) -> Limited:
         """The setpoint after ``dt_s`` [s] towards the positions ``target``, which ``check`` has accepted.
 
         The target is at rest: a joint overshoots it only if it is too fast to stop there when the target
         changes. With ``velocities`` it moves, and passes its positions at the end of the step; one that keeps
-        the limits of velocity and acceleration is followed without a lag, once it is reached. Raises
-        InvalidInput for other shapes, for numbers that are not finite, and before ``start``.
+        the limits of velocity and acceleration is followed without a lag, once it is reached. Joints of
+        ``rates`` follow these instead. Raises InvalidInput for other shapes, for numbers that are not finite,
+        and before ``start``.
         """
         start = self._started(dt_s)
         goal = self._limits.vector(target, "target positions").tolist()
@@ -159,6 +314,8 @@ class SetpointLimiter:
                 self._joints, gaps, self._limits.vector(velocities, "velocities").tolist(), strict=True
             )
             wanted = [joint.following(gap, velocity, dt_s) for joint, gap, velocity in moving]
+        if rates or not self._has_positions_only:
+            return self._step_in_modes(goal, wanted, rates, dt_s)
         positions = self._move(start, wanted, dt_s)
         left = [abs(there - here) > ROUNDING for there, here in zip(goal, positions, strict=True)]
         return self._limited(positions, left)
@@ -170,8 +327,69 @@ class SetpointLimiter:
         and before ``start``.
         """
         start = self._started(dt_s)
+        if not self._has_positions_only:
+            return self._step_in_modes(start, start, dict.fromkeys(range(len(start))), dt_s)
         positions = self._move(start, [0.0] * len(start), dt_s)
         return self._limited(positions, [velocity != 0.0 for velocity in self._velocities])
+
+    def _step_in_modes(self, goal: list[float], wanted: list[float], rates: Rates, dt_s: float) -> Limited:
+        """The same step, of joints whose modes differ."""
+        positions, velocities = list(self._started(dt_s)), self._velocities
+        at_target = _TO_TARGET if self._resting_mode == "position" else None
+        slowed: list[bool] = []
+        known = set(self._braked)
+        for column, joint in enumerate(self._joints):
+            here = positions[column]
+            rate = self._enter_mode(column, here, rates.get(column, at_target))
+            mode, before, wish = self._modes[column], velocities[column], 0.0 if rate is None else rate.value
+            if mode == "effort":
+                self._efforts[column] = joint.push(here, before, wish)
+                left = wish - self._efforts[column]
+            elif mode == "velocity":
+                positions[column], velocities[column] = joint.turn(here, before, wish, dt_s)
+                left = wish - velocities[column]
+            else:
+                wish = 0.0 if rate is None else wanted[column]
+                positions[column], velocities[column] = joint.step(here, before, wish, dt_s)
+                left = velocities[column] if rate is None else goal[column] - positions[column]
+            slowed.append(abs(left) > ROUNDING or column in self._braked)
+        self._positions = positions
+        self._set_modes(self._modes)
+        braked = tuple(text for column, text in self._braked.items() if column not in known)
+        return self._limited(positions, slowed)._replace(braked=braked)
+
+    def _enter_mode(self, column: int, here: float, rate: Rate | None) -> Rate | None:
+        """Sets the mode of a joint for its next setpoint; returns its command, None if it is to rest."""
+        joint, before = self._joints[column], self._modes[column]
+        if rate is None or rate.mode != "effort":
+            self._braked.pop(column, None)
+        elif self._resting_mode != "effort" and joint.is_exceeded(here, self._velocities[column]):
+            self._braked.setdefault(column, self._excess_text(column, here))
+        if column in self._braked:
+            rate = None
+        mode = self._modes[column] = self._mode_at_rest(column) if rate is None else rate.mode
+        if before == "effort" != mode:
+            self._velocities[column] = joint.stoppable(here, self._velocities[column])
+            self._efforts[column] = 0.0
+        return rate
+
+    def _mode_at_rest(self, column: int) -> Mode:
+        """The mode in which a joint comes to rest, or stays at rest."""
+        mode = self._modes[column]
+        holds = self._velocities[column] == 0.0 and self._joints[column].has_range
+        return self._resting_mode if mode == "effort" or (mode == "velocity" and holds) else mode
+
+    def _excess_text(self, column: int, here: float) -> str:
+        limits, velocity = self._limits, self._velocities[column]
+        name, unit = limits.joint_names[column], limits.units[column]
+        return (
+            f"{name!r} in mode effort is at {here:.4g} {unit}, of {limits.range_text(column)}, and moves at "
+            f"{velocity:.3g} {unit}/s, of {limits.velocity[column]:g}: it is held until its efforts end"
+        )
+
+    def _set_modes(self, modes: Sequence[Mode]) -> None:
+        self._modes = list(modes)
+        self._has_positions_only = all(mode == "position" for mode in modes)
 
     def _move(self, start: list[float], wanted: list[float], dt_s: float) -> list[float]:
         """Makes a step with the velocities nearest to ``wanted`` that the limits allow; the new positions."""
@@ -191,7 +409,8 @@ class SetpointLimiter:
 
     def _limited(self, positions: list[float], slowed: list[bool]) -> Limited:
         limited = tuple(compress(self._limits.joint_names, slowed))
-        return Limited(np.array(positions), np.array(self._velocities), limited)
+        efforts = np.array(self._efforts) if "effort" in self._modes else None
+        return Limited(np.array(positions), np.array(self._velocities), limited, efforts, tuple(self._modes))
 
     def _outside_texts(self, positions: list[float]) -> tuple[str, ...]:
         return tuple(

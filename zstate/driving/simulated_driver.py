@@ -49,18 +49,21 @@ class _Joints:
 
 
 class _Mirror:
-    """Joints are where they are commanded to be; without torque they rest."""
+    """Joints are where, or as fast as, they are commanded to be; without torque they rest."""
 
     efforts = None
 
     def advance(self, joints: _Joints, target: Setpoint | None, dt_s: float) -> None:
         joints.velocities[:] = 0.0
         if target is not None:
-            joints.positions[:] = target.positions
+            is_turning = _in_mode(target, "velocity")
+            joints.velocities[is_turning] = target.velocities[is_turning]
+            moved = joints.positions + dt_s * joints.velocities
+            joints.positions[:] = np.where(is_turning, moved, target.positions)
 
 
 class _Lag:
-    """First-order lag: the distance to the setpoint falls by a factor e in 50 ms."""
+    """First-order lag: the distance to the setpoint, or to its velocity, falls by a factor e in 50 ms."""
 
     efforts = None
 
@@ -68,13 +71,20 @@ class _Lag:
         if target is None or dt_s <= 0.0:
             joints.velocities[:] = 0.0
             return
-        step = (target.positions - joints.positions) * -math.expm1(-dt_s / _LAG_S)
-        joints.positions += step
-        joints.velocities[:] = step / dt_s
+        share = -math.expm1(-dt_s / _LAG_S)
+        is_turning = _in_mode(target, "velocity")
+        step = (target.positions - joints.positions) * share
+        short = target.velocities - joints.velocities
+        turned = target.velocities * dt_s - short * share * _LAG_S
+        joints.positions += np.where(is_turning, turned, step)
+        joints.velocities[:] = np.where(is_turning, joints.velocities + short * share, step / dt_s)
 
 
 class _Dynamics:
-    """Rigid bodies under gravity, friction and a position controller (computed torque), in steps of 1 ms."""
+    """Rigid bodies under gravity, friction and controllers, in steps of 1 ms.
+
+    They control position or velocity by computed torque; efforts act as they are.
+    """
 
     def __init__(self, model: RobotModel) -> None:
         self._dynamics = ForwardDynamics(model)
@@ -93,8 +103,12 @@ class _Dynamics:
         efforts = np.zeros(len(q))
         if target is not None:
             gain = _NATURAL_FREQUENCY
-            wanted = gain**2 * (target.positions - q) + 2.0 * gain * (target.velocities - v)
-            efforts = self._dynamics.limited(self._dynamics.efforts_to_hold(q, v, wanted))
+            wanted = np.where(_in_mode(target, "position"), gain**2 * (target.positions - q), 0.0)
+            wanted += 2.0 * gain * (target.velocities - v)
+            efforts = self._dynamics.efforts_to_hold(q, v, wanted)
+            if target.efforts is not None:
+                efforts = np.where(_in_mode(target, "effort"), target.efforts, efforts)
+            efforts = self._dynamics.limited(efforts)
         # Semi-implicit Euler, which is stable where the explicit one gains energy.
         v += dt_s * self._dynamics.accelerations(q, v, efforts)
         v[((q <= self._lower) & (v < 0.0)) | ((q >= self._upper) & (v > 0.0))] = 0.0
@@ -102,17 +116,21 @@ class _Dynamics:
         self.efforts = efforts
 
 
+def _in_mode(setpoint: Setpoint, mode: Mode) -> NDArray[np.bool_]:
+    """Which joints are in ``mode``: (n,)."""
+    return np.array([one == mode for one in setpoint.modes])
+
+
 class SimulatedDriver:
     """A ``Driver`` without hardware; starts at ``model.neutral``, or at ``start`` (n,) [rad] or [m].
 
     The joints of ``plant`` "mirror" are at the last setpoint, those of "lag" follow it with a time constant
     of 50 ms, and those of "dynamics" are moved by Pinocchio's articulated-body algorithm with gravity,
-    friction and the effort limits of the URDF, up to the ends of their ranges. Brakes hold them until they
-    are enabled; after ``stop("relax")`` they fall. Time is that of the stamps of ``read``. Raises
-    InvalidInput as ``ForwardDynamics``, for an unknown plant, and for joints with several positions.
+    friction and the effort limits of the URDF, up to the ends of their ranges. All take positions and
+    velocities, and "dynamics" efforts. Brakes hold the joints until they are enabled; after ``stop("relax")``
+    they fall. Time is that of the stamps of ``read``. Raises InvalidInput as ``ForwardDynamics``, for an
+    unknown plant, and for joints with several positions.
     """
-
-    modes: frozenset[Mode] = frozenset({"position"})
 
     def __init__(self, model: RobotModel, plant: Plant = "lag", *, start: Floats | None = None) -> None:
         if model.position_count != len(model.joint_names):
@@ -120,6 +138,8 @@ class SimulatedDriver:
         self.joint_names = model.joint_names
         self._joints = _Joints(model.neutral if start is None else model.check_positions(start))
         self._plant = _new_plant(model, plant)
+        kinematic: frozenset[Mode] = frozenset({"position", "velocity"})
+        self.modes = kinematic if self._plant.efforts is None else kinematic | {"effort"}
         self._target: Setpoint | None = None
         self._is_enabled = False
         self._read_at: int | None = None

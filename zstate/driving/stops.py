@@ -144,8 +144,74 @@ class LatchedStops(NamedTuple):
     newest: ActiveStop | None = None
 
 
-class StopLatch(Closeable):
-    """The stops of the driver of ``robot`` that are not released.
+class StopRegister:
+    """The stops of a driver that are not released. Safe from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = fork_safe_lock()
+        self._by_session: dict[int, ActiveStop] = {}
+        self._released: dict[int, int] = {}
+        """The last released stop of each session, which its program may still cache."""
+        self.current = LatchedStops()
+        """Another object after each change."""
+        self.released_by = (0, 0)
+        """Session and ``seq`` of the last release of a stop."""
+
+    def latch(self, reason: str, writer: WriterId, how: StopMode = "hold") -> None:
+        """Latch a stop of this host itself, after those that it has latched before."""
+        with self._lock:
+            session = writer.session
+            known = self._by_session.get(session)
+            seq = 1 + (self._released.get(session, -1) if known is None else known.seq)
+            self._add(ActiveStop(session, seq, how, reason, str(writer)))
+
+    def add(self, one: ActiveStop) -> None:
+        """Latch ``one``, unless it is older than the last stop of its session, or released."""
+        with self._lock:
+            known = self._by_session.get(one.session)
+            is_old = known is not None and known.seq >= one.seq
+            if not is_old and self._released.get(one.session, -1) < one.seq:
+                self._add(one)
+
+    def release(self, release: Release) -> None:
+        """End the stops of ``release``, and older ones of their sessions."""
+        with self._lock:
+            ended = [
+                session
+                for session, seq in release.stops
+                if session in self._by_session and self._by_session[session].seq <= seq
+            ]
+            for session in ended:
+                # Newest last, so that the oldest is forgotten first.
+                self._released.pop(session, None)
+                self._released[session] = self._by_session.pop(session).seq
+            while len(self._released) > _MOST_STOPS:
+                del self._released[next(iter(self._released))]
+            if ended:
+                self.released_by = (release.session, release.seq)
+                self._save()  # first: a release that is confirmed holds for the next host as well
+                self.current = self.current._replace(stops=tuple(self._by_session.values()))
+
+    def _add(self, one: ActiveStop) -> None:
+        """Latch ``one`` in place of the last stop of its session, or of the oldest one of too many.
+
+        If that has switched the torque off, it stays off.
+        """
+        replaced = [self._by_session.pop(one.session, None)]
+        if len(self._by_session) == _MOST_STOPS:
+            replaced.append(self._by_session.pop(next(iter(self._by_session))))
+        if any(old is not None and old.how == "relax" for old in replaced):
+            one = replace(one, how="relax")
+        self._by_session[one.session] = one
+        self.current = LatchedStops(tuple(self._by_session.values()), self.current.arrived + 1, one)
+        self._save()
+
+    def _save(self) -> None:
+        """Called with the lock, after a stop is latched, and before its release holds."""
+
+
+class StopLatch(StopRegister, Closeable):
+    """The stops of the driver of ``robot`` that are not released, from the network.
 
     They are kept in ``stops_file``, which a restarted host reads, and are read from the caches of programs
     that have sent them. A file that cannot be read counts as a stop; one that cannot be written raises
@@ -154,17 +220,10 @@ class StopLatch(Closeable):
     """
 
     def __init__(self, session: Session, robot: str, refusals: Refusals) -> None:
+        super().__init__()
         self._robot = robot
         self._path = stops_file(robot)
         self._refusals = refusals
-        self._lock = fork_safe_lock()
-        self._by_session: dict[int, ActiveStop] = {}
-        self._released: dict[int, int] = {}
-        """The last released stop of each session, which its program may still cache."""
-        self.current = LatchedStops()
-        """Another object after each change; may be read from any thread."""
-        self.released_by = (0, 0)
-        """Session and ``seq`` of the last release of a stop."""
         with ExitStack() as opening:
             opening.enter_context(HostLock(robot))
             self._read_file()
@@ -180,14 +239,6 @@ class StopLatch(Closeable):
     def latched(self) -> tuple[ActiveStop, ...]:
         """The stops that are not released."""
         return self.current.stops
-
-    def latch(self, reason: str, writer: WriterId, how: StopMode = "hold") -> None:
-        """Latch a stop of this host itself, after those that it has latched before."""
-        with self._lock:
-            session = writer.session
-            known = self._by_session.get(session)
-            seq = 1 + (self._released.get(session, -1) if known is None else known.seq)
-            self._add(ActiveStop(session, seq, how, reason, str(writer)))
 
     def close(self) -> None:
         """Follow no further stops. Those that are latched stay in the file."""
@@ -206,27 +257,8 @@ class StopLatch(Closeable):
         if message.session != writer.session:
             self._refusals.count("foreign", f"the Stop of another program on {sample.key!r}")
             return
-        one = ActiveStop(message.session, message.seq, message.how, printable(message.reason), str(writer))
-        with self._lock:
-            known = self._by_session.get(one.session)
-            is_old = known is not None and known.seq >= one.seq
-            if is_old or self._released.get(one.session, -1) >= one.seq:
-                return
-            self._add(one)
-
-    def _add(self, one: ActiveStop) -> None:
-        """Latch ``one`` in place of the last stop of its session, or of the oldest one of too many.
-
-        If that has switched the torque off, it stays off.
-        """
-        replaced = [self._by_session.pop(one.session, None)]
-        if len(self._by_session) == _MOST_STOPS:
-            replaced.append(self._by_session.pop(next(iter(self._by_session))))
-        if any(old is not None and old.how == "relax" for old in replaced):
-            one = replace(one, how="relax")
-        self._by_session[one.session] = one
-        self.current = LatchedStops(tuple(self._by_session.values()), self.current.arrived + 1, one)
-        self._write_file()
+        reason = printable(message.reason)
+        self.add(ActiveStop(message.session, message.seq, message.how, reason, str(writer)))
 
     def _on_releases(self, samples: list[SerializedSample]) -> None:
         for sample in samples:
@@ -235,25 +267,7 @@ class StopLatch(Closeable):
             except MessageError as error:
                 self._refusals.count(error.reason, error)
                 continue
-            with self._lock:
-                self._release(release)
-
-    def _release(self, release: Release) -> None:
-        ended = [
-            session
-            for session, seq in release.stops
-            if session in self._by_session and self._by_session[session].seq <= seq
-        ]
-        for session in ended:
-            # Newest last, so that the oldest is forgotten first.
-            self._released.pop(session, None)
-            self._released[session] = self._by_session.pop(session).seq
-        while len(self._released) > _MOST_STOPS:
-            del self._released[next(iter(self._released))]
-        if ended:
-            self.released_by = (release.session, release.seq)
-            self._write_file()  # first: a release that is confirmed holds for the next host as well
-            self.current = self.current._replace(stops=tuple(self._by_session.values()))
+            self.release(release)
 
     def _read_file(self) -> None:
         try:
@@ -262,6 +276,9 @@ class StopLatch(Closeable):
             stops = [ActiveStop(0, 0, "hold", f"{self._path} cannot be read: {error}", "this host")]
         self._by_session = {one.session: one for one in stops}
         self.current = LatchedStops(tuple(stops), len(stops), stops[-1] if stops else None)
+
+    def _save(self) -> None:
+        self._write_file()
 
     def _write_file(self, *, is_opening: bool = False) -> None:
         try:

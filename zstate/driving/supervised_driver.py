@@ -8,13 +8,19 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.driving.driver import Driver, Setpoint, StopMode
+from zstate.driving.driver import Driver, Mode, Setpoint, StopMode
 from zstate.driving.driver_state import Durations
 from zstate.driving.limits import Limits
+from zstate.driving.setpoint_limiter import Limited
 from zstate.errors import InvalidInput, format_duration
 from zstate.sources import JointReading
 
 _LOG = logging.getLogger("zstate")
+
+_TRAVEL_NS = 1_000_000_000
+_TRAVEL_SHARE = 0.25
+_LAG_S = 0.1
+"""Joints in mode "velocity" are compared each second; they may differ by a share of the way, and a lag."""
 
 
 class SupervisedDriver:
@@ -27,6 +33,7 @@ class SupervisedDriver:
     def __init__(self, driver: Driver, robot: str) -> None:
         self._driver = driver
         self._robot = robot
+        self.modes = driver.modes
         self._is_relaxed = False
         self._pending: StopMode | None = None
         self.is_enabled = False
@@ -110,7 +117,9 @@ class SupervisedDriver:
 class FollowingCheck:
     """Compares setpoints of the joints of ``limits`` with readings; instants are monotonic [ns].
 
-    A joint may be ``most`` [rad] or [m] from its setpoint, and a reading ``oldest_ns`` old. Raises
+    A joint in mode "position" may be ``most`` [rad] or [m] from its setpoint, and a reading ``oldest_ns``
+    old. A joint in mode "velocity" moves each second as far as its setpoints, give or take ``most``, a
+    quarter of the way, and 0.1 s of the highest speed, for its lag: without power it does not. Raises
     InvalidInput unless ``most`` is above zero.
     """
 
@@ -120,26 +129,43 @@ class FollowingCheck:
         self._limits = limits
         self._most = most
         self._oldest_ns = oldest_ns
-        self._setpoint: NDArray[np.float64] | None = None
+        self._setpoint: Limited | None = None
         self._written_at = 0
+        self._travel: _Travel | None = None
+        """Of the joints in mode "velocity", since the last comparison."""
 
-    def written(self, positions: NDArray[np.float64], now: int) -> None:
-        """``positions``, (n,), have been written at ``now``."""
-        self._setpoint, self._written_at = positions, now
+    def written(self, setpoint: Limited, now: int) -> None:
+        """``setpoint`` has been written at ``now``."""
+        before = self._setpoint
+        if before is not None and self._travel is not None:
+            self._travel.add(before.velocities, (now - self._written_at) * 1e-9)
+        if before is None or before.modes != setpoint.modes:
+            self._travel = None
+        self._setpoint, self._written_at = setpoint, now
 
     def stopped(self) -> None:
         """The joints are not commanded any more."""
-        self._setpoint = None
+        self._setpoint = self._travel = None
 
     def deviation(self, measured: NDArray[np.float64], measured_at: int, now: int) -> str:
         """Why the joints, which were ``measured`` last, do not follow; empty if they do."""
-        if self._setpoint is None:
+        setpoint = self._setpoint
+        if setpoint is None:
             return ""
         if now - measured_at > self._oldest_ns:
             return f"there is no new reading of the joints for {format_duration(now - measured_at)}"
         if measured_at < self._written_at:
             return ""
-        errors = np.abs(measured - self._setpoint)
+        errors = measured - setpoint.positions
+        if setpoint.modes and set(setpoint.modes) != {"position"}:
+            errors[[mode != "position" for mode in setpoint.modes]] = 0.0
+            if text := self._travel_text(setpoint, measured, now):
+                return text
+        # Where the norm is within the limit, so is each joint; in a third of the time.
+        return "" if errors @ errors <= self._most**2 else self._distance_text(np.abs(errors))
+
+    def _distance_text(self, errors: NDArray[np.float64]) -> str:
+        """Which joint is too far from its setpoint, if any."""
         row = int(errors.argmax())
         if errors[row] <= self._most:
             return ""
@@ -149,14 +175,60 @@ class FollowingCheck:
             f"following_error={self._most:g}; has it power, and is it free to move?"
         )
 
+    def _travel_text(self, setpoint: Limited, measured: NDArray[np.float64], now: int) -> str:
+        """Why a joint in mode "velocity" does not follow, once a second."""
+        travel = self._travel
+        if travel is None or now - travel.since > _TRAVEL_NS:
+            self._travel = _Travel(now, measured)
+        if travel is None or now - travel.since <= _TRAVEL_NS:
+            return ""
+        moved = measured - travel.start
+        allowed = self._most + _TRAVEL_SHARE * travel.path + _LAG_S * travel.fastest
+        errors = np.abs(moved - travel.commanded) - allowed
+        errors[[mode != "velocity" for mode in setpoint.modes]] = 0.0
+        row = int(errors.argmax())
+        if errors[row] <= 0.0:
+            return ""
+        name, unit = self._limits.joint_names[row], self._limits.units[row]
+        return (
+            f"{name!r} has moved by {moved[row]:.3g} {unit} in {format_duration(now - travel.since)}, where "
+            f"its velocities add up to {travel.commanded[row]:.3g}; has it power, is it free to move, and do "
+            "its encoder and its motor turn the same way?"
+        )
+
+
+class _Travel:
+    """What velocities of setpoints add up to since the instant ``since``, at the measured ``start``."""
+
+    def __init__(self, since: int, start: NDArray[np.float64]) -> None:
+        self.since, self.start = since, start
+        self.commanded = np.zeros(len(start))
+        self.path = np.zeros(len(start))
+        self.fastest = np.zeros(len(start))
+
+    def add(self, velocities: NDArray[np.float64], dt_s: float) -> None:
+        speeds = np.abs(velocities)
+        self.commanded += velocities * dt_s
+        self.path += speeds * dt_s
+        np.maximum(self.fastest, speeds, out=self.fastest)
+
 
 def check_arguments(
-    driver: Driver, limits: Limits, names: tuple[str, ...], on_silence: str, faults_allowed: int
+    driver: Driver,
+    limits: Limits,
+    names: tuple[str, ...],
+    *,
+    on_silence: str,
+    faults_allowed: int,
+    ros2_mode: Mode | None,
 ) -> None:
     """Raise InvalidInput with all problems."""
     problems: list[str] = []
-    if "position" not in driver.modes:
-        problems.append(f"the driver takes setpoints of {', '.join(sorted(driver.modes))}, not of positions")
+    known = {"position", "velocity", "effort"}
+    if not driver.modes or not known.issuperset(driver.modes):
+        problems.append(f"the modes of the driver are some of {sorted(known)}, not {sorted(driver.modes)}")
+    if ros2_mode is not None and ros2_mode not in driver.modes:
+        problems.append(f"ros2_mode={ros2_mode!r} is none of the driver's modes, {sorted(driver.modes)}")
     if limits.joint_names != names:
         problems.append(f"the limits are of {limits.joint_names}, the driver's joints are {names}")
     if on_silence not in ("hold", "relax"):

@@ -13,7 +13,9 @@ import logging
 import queue
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from concurrent.futures import Future
+from contextlib import ExitStack, suppress
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import zenoh
@@ -210,36 +212,56 @@ class Queryable(Receiver[zenoh.Query]):
 
     def _on_query(self, received: zenoh.Query) -> None:
         with received:  # the end of the block ends the query for its sender
-            reply = self._reply_to(received)
-            if reply is None:
-                return
-            with suppress(zenoh.ZError):  # the sender, or the session, is gone
-                if reply.is_error:
-                    received.reply_err(reply.payload, encoding=reply.encoding)
-                else:
-                    received.reply(
-                        reply.key or self._key,
-                        reply.payload,
-                        encoding=reply.encoding,
-                        attachment=reply.attachment,
-                        timestamp=reply.timestamp,
-                    )
-                self.answered += 1
+            self._send(received, self._reply_to(received))
+
+    def _send(self, received: zenoh.Query, reply: Reply | None) -> None:
+        if reply is None:
+            return
+        with suppress(zenoh.ZError):  # the sender, or the session, is gone
+            if reply.is_error:
+                received.reply_err(reply.payload, encoding=reply.encoding)
+            else:
+                received.reply(
+                    reply.key or self._key,
+                    reply.payload,
+                    encoding=reply.encoding,
+                    attachment=reply.attachment,
+                    timestamp=reply.timestamp,
+                )
+            self.answered += 1
 
     def _reply_to(self, received: zenoh.Query) -> Reply | None:
         return self._answer(parse_parameters(str(received.parameters)))
 
 
-class RequestQueryable(Queryable):
-    """Replies to queries that carry a message: ``answer(payload, encoding)``, as in ``Queryable``."""
+RequestAnswer: TypeAlias = "Reply | Future[Reply | None] | None"
 
-    def __init__(self, session: Session, key: str, answer: Callable[[bytes, str], Reply | None]) -> None:
+
+class RequestQueryable(Queryable):
+    """Replies to queries that carry a message: ``answer(payload, encoding)``, as in ``Queryable``.
+
+    Other queries are answered while the future of an answer is not done.
+    """
+
+    def __init__(self, session: Session, key: str, answer: Callable[[bytes, str], RequestAnswer]) -> None:
         self._answer_request = answer
         super().__init__(session, key, lambda _: None)
 
-    def _reply_to(self, received: zenoh.Query) -> Reply | None:
+    def _on_query(self, received: zenoh.Query) -> None:
         payload = b"" if received.payload is None else received.payload.to_bytes()
-        return self._answer_request(payload, str(received.encoding or ""))
+        with ExitStack() as ending:
+            ending.enter_context(received)
+            answer = self._answer_request(payload, str(received.encoding or ""))
+            if isinstance(answer, Future):
+                ending.pop_all()
+                answer.add_done_callback(partial(self._on_done, received))
+            else:
+                self._send(received, answer)
+
+    def _on_done(self, received: zenoh.Query, answer: Future[Reply | None]) -> None:
+        with received:
+            if not answer.cancelled():
+                self._send(received, answer.result())
 
 
 def parse_parameters(text: str) -> dict[str, str]:

@@ -27,6 +27,7 @@ Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0)]
 Interval = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
+Mode = Literal["position", "velocity", "effort"]
 Level = Literal["ok", "warn", "error", "stale"]
 
 POSE_BYTES = 7 * 8
@@ -184,11 +185,13 @@ MAX_STATE_TEXT_LENGTH = 2000
 
 
 class JointCommand(Sample, frozen=True, array_like=True, gc=False):
-    """Setpoints for a driver, of the joints ``names``; a block that is not commanded is None.
+    """Setpoints for a driver, of the joints ``names``.
 
-    They are valid for ``ttl`` [ns] after they have arrived; 0 stands for the driver's own limit. A driver
-    refuses a command without names, unless it is for a ``motion``: the ``seq`` of a JointTrajectory of the
-    same session, which stays valid for ``ttl`` by that.
+    Each joint has one number, in the block of its mode, and NaN in the others: one message commands wheels by
+    velocities and an arm by positions at the same tick. A block of a mode that no joint has is None. They are
+    valid for ``ttl`` [ns] after they have arrived; 0 stands for the driver's own limit. A driver refuses a
+    command without names, unless it is for a ``motion``: the ``seq`` of a JointTrajectory of the same
+    session, which stays valid for ``ttl`` by that.
     """
 
     positions: bytes | None = None
@@ -337,7 +340,8 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     moved slower than commanded at the last tick. ``faults`` counts failed calls of the driver, ``refused``
     commands by reason, the newest described by ``last_refusal``. ``motion`` is under way, by session and
     ``seq`` of its JointTrajectory, and ``progress`` is the part of its duration that has passed, 0 to 1.
-    ``outcomes`` are those of the last motions, newest last. ``stamp`` [ns] is of the driver's system clock.
+    ``outcomes`` are those of the last motions, newest last. ``modes`` are those in which joints may be
+    commanded. ``stamp`` [ns] is of the driver's system clock.
     """
 
     stamp: Stamp
@@ -360,6 +364,7 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     motion: tuple[Count, Count] | None = None
     progress: float = 0.0
     outcomes: tuple[MotionOutcome, ...] = ()
+    modes: tuple[Mode, ...] = ("position",)
 
 
 def with_short_texts(state: DriverState) -> DriverState:

@@ -11,15 +11,17 @@ import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, started, zstate
 from helpers.processes import DEADLINE_S, Child, until
 
-from zstate import TransformListener, connect
+from zstate import JointReading, TransformListener, connect
 from zstate.driving import Commander
+from zstate.sources import JointStateListener
 
 pytestmark = pytest.mark.processes
 
 
 def driven(spawn: Spawn, name: str = "rrbot") -> Child:
     """A simulated driver of ``name`` that is ready; on a busy machine a commander may pause."""
-    child = started(spawn, "drive", "sim", "rrbot", "--name", name, "--ttl", "10")
+    robot = "diffbot" if name == "diffbot" else "rrbot"
+    child = started(spawn, "drive", "sim", robot, "--name", name, "--ttl", "10")
     assert child.line().startswith(f"driving {name!r}")
     assert child.line() == "ready"
     return child
@@ -74,6 +76,30 @@ def test_points_of_a_file_are_followed(spawn: Spawn, tmp_path: Path):
     )
 
 
+def test_wheels_keep_a_velocity_for_some_seconds_and_brake(spawn: Spawn):
+    host = driven(spawn, "diffbot")
+    turned: list[JointReading] = []
+    with connect() as session, JointStateListener(session, "diffbot", on_reading=turned.append) as joints:
+        until(lambda: joints.read(0) is not None)
+        assert printed("move", "diffbot", "--velocity", "left_wheel_joint=2", "--seconds", "0.5") == ""
+        assert host.line().startswith("active, commanded by zstate-move@")
+        until(lambda: turned[-1].velocities[0] == pytest.approx(0.0, abs=1e-3))
+    assert max(one.velocities[0] for one in turned) == pytest.approx(2.0, abs=0.01)
+    left, right = turned[-1].positions
+    assert left > 0.4 * 2.0
+    assert right == 0.0
+    assert "limits" not in failure("move", "diffbot", "--velocity", "left_wheel=2")
+
+
+def test_ctrl_c_brakes_wheels(spawn: Spawn):
+    driven(spawn, "diffbot")
+    child = started(spawn, "move", "diffbot", "--velocity", "left_wheel_joint=2", "--seconds", "60")
+    until(lambda: "moving" in child.stderr)
+    interrupted(child)
+    with connect() as session, JointStateListener(session, "diffbot") as joints:
+        until(lambda: (reading := joints.read(0)) and abs(reading.velocities[0]) < 1e-3)
+
+
 def test_ctrl_c_cancels_a_motion_and_the_joints_brake(spawn: Spawn):
     host = driven(spawn)
     child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
@@ -103,6 +129,7 @@ def test_motions_without_a_driver_or_joints_are_refused(tmp_path: Path):
         (("elbow",), "'elbow' is not JOINT=VALUE with a number"),
         (("elbow=1", "elbow=2"), "a joint is given twice"),
         (("--file", __file__, "--seconds", "1"), "--file has its own times"),
+        (("elbow=1", "--velocity", "--stretch"), "--velocity takes JOINT=VALUE and --seconds"),
     ):
         assert error in failure("move", "rrbot", *arguments, code=2)
 

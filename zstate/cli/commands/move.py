@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from zstate.wire.messages import DriverState
 
 _SECONDS = 1.0
+_SEND_PERIOD_S = 0.05
 _CHECK_S = 1.0
 _CANCELLED_WITHIN_S = 2.0
 _CACHES_WITHIN_S = 0.5
@@ -50,6 +51,11 @@ _CACHES_WITHIN_S = 0.5
     help="Move through the points of a file: a line time,JOINT,... then the seconds after the start and the "
     "positions of each point.",
 )
+@click.option(
+    "--velocity",
+    is_flag=True,
+    help="Each VALUE is a velocity [rad/s or m/s]: move at it for --seconds, then brake.",
+)
 @click.option("--stretch", is_flag=True, help="Move slower where the limits need it, instead of refusing.")
 @options.timeout_option("Fail if no driver has published its state after this time [s].", 5.0)
 @options.json_option("One JSON object, also for a motion that is refused.")
@@ -60,6 +66,7 @@ def move_command(
     positions: tuple[tuple[str, float], ...],
     seconds: float | None,
     file: str | None,
+    velocity: bool,
     stretch: bool,
     timeout: float,
     as_json: bool,
@@ -72,27 +79,38 @@ def move_command(
     acceleration: a motion that would leave them is refused with all findings, and nothing moves. Ctrl-C
     cancels it, and the joints brake. The exit code is 0 if the joints have reached the last point.
 
+    With --velocity the joints, such as wheels, speed up within the limit of acceleration, keep VALUE for
+    --seconds, and brake, also on Ctrl-C and when this command ends otherwise. They slow down before the
+    limits of their positions.
+
     This is NOT a safety-rated channel: an emergency stop is wired to the power of the hardware.
 
     \b
     zstate move panda panda_joint4=-1.2 panda_joint6=2
     zstate move panda panda_joint4=-1.2 --seconds 3
     zstate move panda --file wave.csv --stretch
+    zstate move diffbot --velocity left_wheel_joint=2 right_wheel_joint=2 --seconds 3
     """
     if bool(positions) is (file is not None):
         raise click.UsageError("give JOINT=VALUE for some joints, such as elbow=0.5, or --file CSV")
     if file is not None and seconds is not None:
         raise click.UsageError("--file has its own times; leave out --seconds")
+    if velocity and (file is not None or stretch):
+        raise click.UsageError("--velocity takes JOINT=VALUE and --seconds; leave out --file and --stretch")
+    numbers = _by_joint(positions)
     from zstate.driving import Commander
 
     if file is not None:
         points, times_s = _read_points(file)
     else:
-        points, times_s = {joint: [value] for joint, value in positions}, [seconds or _SECONDS]
-        if len(points) < len(positions):
-            raise click.UsageError("a joint is given twice")
+        points, times_s = {joint: [value] for joint, value in numbers.items()}, [seconds or _SECONDS]
     with open_session(network) as session, Commander(session, robot) as commander:
-        commander.wait_for_driver(timeout)
+        state = commander.wait_for_driver(timeout)
+        if velocity:
+            _keep_velocities(commander, state, numbers, seconds or _SECONDS)
+            if as_json:
+                _print_outcome(robot, "ended")
+            return
         started = time.monotonic()
         try:
             motion = commander.move(points, times_s, stretch=stretch or (file is None and seconds is None))
@@ -110,6 +128,49 @@ def move_command(
         print_result(f"reached in {time.monotonic() - started:.1f} s")
     if outcome.name != "reached":
         fail(f"the motion of {robot!r} was {outcome.name}: {outcome.reason}")
+
+
+def _by_joint(values: Sequence[tuple[str, float]]) -> dict[str, float]:
+    """A number for each joint. Raises UsageError for a joint with two."""
+    if len(dict(values)) < len(values):
+        raise click.UsageError("a joint is given twice")
+    return dict(values)
+
+
+def _keep_velocities(
+    commander: Commander, before: DriverState, velocities: dict[str, float], seconds: float
+) -> None:
+    """Move joints at ``velocities`` for ``seconds``, and brake them, also after a signal or a failure."""
+    period_s = min(_SEND_PERIOD_S, 0.25e-9 * before.ttl)
+    end = time.monotonic() + seconds
+    try:
+        commander.send(velocities=velocities)
+        text = f"{', '.join(velocities)} of {commander.robot!r}"
+        print_status(
+            f"moving {text} for {seconds:g} s; Ctrl-C ends it", event="moving", robot=commander.robot
+        )
+        while time.monotonic() < end:
+            time.sleep(period_s)
+            _check_moves(commander, before)
+            commander.send(velocities=velocities)
+    finally:
+        with suppress(ZStateError):
+            commander.send(velocities=dict.fromkeys(velocities, 0.0))
+    if (state := commander.driver) is not None and state.state != "active":
+        fail(f"the joints of {commander.robot!r} have not moved: {state.last_refusal or state.state}")
+
+
+def _check_moves(commander: Commander, before: DriverState) -> None:
+    """End the command if the driver is silent or stopped, or has refused commands since ``before``."""
+    from zstate.driving.driver_state import state_text
+
+    state = commander.driver
+    if state is None:
+        fail(f"the driver of {commander.robot!r} has fallen silent")
+    if state.state in ("stopped", "fault", "off"):
+        fail(f"the driver of {commander.robot!r} is {state_text(state)}")
+    if state.state != "active" and sum(state.refused.values()) > sum(before.refused.values()):
+        fail(f"the driver of {commander.robot!r} refuses it: {state.last_refusal}")
 
 
 def _print_outcome(robot: str, outcome: str, reason: str = "", *, findings: Sequence[str] = ()) -> None:

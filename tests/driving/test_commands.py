@@ -1,0 +1,161 @@
+"""Targets of joints in all modes, and the limiter that follows them: what a driver writes in any sequence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
+from zstate.driving.driver import Mode
+from zstate.driving.limits import Limits
+from zstate.driving.setpoint_limiter import Limited, Rate, SetpointLimiter
+from zstate.errors import InvalidInput
+
+DT = 0.004
+TICK = 4_000_000
+TTL = 6 * TICK
+EXACT = 1e-9
+COUNT = 6
+MODES: tuple[Mode, ...] = ("position", "velocity", "effort")
+
+
+class Robot:
+    """Joints that are where, or as fast as, they are commanded to be; efforts accelerate them."""
+
+    def __init__(self, positions: np.ndarray) -> None:
+        self.positions = positions.copy()
+        self.velocities = np.zeros(len(positions))
+
+    def advance(self, setpoint: Limited, disturbance: np.ndarray) -> None:
+        modes = np.array(setpoint.modes)
+        efforts = np.zeros(len(modes)) if setpoint.efforts is None else setpoint.efforts
+        pushed = self.velocities + (3.0 * efforts + disturbance) * DT
+        self.velocities = np.where(modes == "effort", pushed, setpoint.velocities)
+        moved = self.positions + self.velocities * DT
+        self.positions = np.where(modes == "position", setpoint.positions, moved)
+
+
+class Core:
+    """What a host does with commands and readings at each tick, without network and driver."""
+
+    def __init__(self, limits: Limits, modes: tuple[Mode, ...], robot: Robot) -> None:
+        self.limits, self.robot, self.now = limits, robot, 0
+        self.targets, self.limiter = Targets(COUNT), SetpointLimiter(limits, modes)
+        self.last = self.start()
+        self.seq = 0
+
+    def start(self) -> Limited:
+        """After a stop: the first setpoint is what is measured."""
+        self.robot.velocities[:] = 0.0
+        self.targets.clear()
+        self.targets.start(self.now, self.robot.positions)
+        self.last = self.limiter.start(self.robot.positions)
+        return self.last
+
+    def send(self, rates: dict[int, Rate], ttl: int = TTL) -> None:
+        columns = [column for column, rate in rates.items() if rate.mode == "position"]
+        positions = np.array([rates[column].value for column in columns])
+        others = {column: rate for column, rate in rates.items() if rate.mode != "position"}
+        self.seq += 1
+        at = np.array(columns, dtype=np.intp) if columns else NO_COLUMNS
+        place = positions if columns else NO_POSITIONS
+        command = Command(7, self.seq, at, place, self.now, self.now + ttl, rates=others)
+        inside = np.clip(np.zeros(COUNT), self.limits.lower, self.limits.upper)
+        try:
+            self.limiter.check(self.targets.merged(command, inside))
+        except InvalidInput:
+            return
+        self.targets.accept(command)
+
+    def tick(self, *, is_read: bool = True) -> Limited:
+        self.now += TICK
+        if is_read:
+            self.limiter.observe(self.robot.positions, self.robot.velocities, self.now)
+        if not self.targets.is_live(self.now):
+            return self.limiter.brake(DT)
+        target = self.targets.current(self.now, lambda: self.last.positions)
+        return self.limiter.step(target, DT, rates=self.targets.rates)
+
+
+def random_limits(generator: np.random.Generator) -> Limits:
+    has_range, has_acceleration = np.arange(COUNT) % 4 > 0, np.arange(COUNT) % 3 > 0
+    return Limits(
+        tuple(f"j{number}" for number in range(COUNT)),
+        np.where(has_range, -generator.uniform(0.05, 2.0, COUNT), -np.inf),
+        np.where(has_range, generator.uniform(0.05, 2.0, COUNT), np.inf),
+        generator.uniform(0.2, 8.0, COUNT),
+        np.where(has_acceleration, generator.uniform(1.0, 80.0, COUNT), np.inf),
+        effort=generator.uniform(0.5, 5.0, COUNT),
+    )
+
+
+def random_command(
+    generator: np.random.Generator, limits: Limits, modes: tuple[Mode, ...]
+) -> dict[int, Rate]:
+    columns = generator.choice(COUNT, generator.integers(1, COUNT), replace=False).tolist()
+    low, high = np.maximum(limits.lower, -3.0), np.minimum(limits.upper, 3.0)
+    values: dict[Mode, np.ndarray] = {
+        "position": generator.uniform(low, high),
+        "velocity": generator.uniform(-1.5, 1.5, COUNT) * limits.velocity,
+        "effort": generator.uniform(-1.5, 1.5, COUNT) * limits.effort,
+    }
+    picked = {column: modes[generator.integers(len(modes))] for column in columns}
+    return {column: Rate(mode, float(values[mode][column])) for column, mode in picked.items()}
+
+
+@pytest.mark.parametrize("modes", [MODES, MODES[:2], MODES[1:], MODES[1:2]], ids="-".join)
+def test_no_sequence_of_modes_commands_silences_and_stops_exceeds_a_limit(modes: tuple[Mode, ...]):
+    generator = np.random.default_rng(19)
+    limits = random_limits(generator)
+    robot = Robot(np.zeros(COUNT))
+    core = Core(limits, modes, robot)
+    worst_step = worst_change = 0.0
+    seen: set[tuple[Mode, Mode]] = set()
+    braked = 0
+    for _ in range(2_500):  # of four kinds of drivers: 10,000 sequences
+        match generator.choice(["command", "command", "command", "silence", "stop", "push"]):
+            case "command":
+                core.send(random_command(generator, limits, modes), int(generator.integers(1, 12)) * TICK)
+            case "silence":
+                core.now += 20 * TICK
+            case "stop":
+                core.start()
+            case "push" if set(core.last.modes) == {"position"}:  # a stopped joint is moved by hand
+                robot.positions = robot.positions + generator.normal(0.0, 0.05, COUNT)
+                core.start()
+        for _ in range(generator.integers(1, 12)):
+            before, measured = core.last, robot.positions.copy()
+            is_read = generator.random() > 0.05
+            setpoint = core.tick(is_read=is_read)
+            seen.update(zip(before.modes, setpoint.modes, strict=True))
+            braked += len(setpoint.braked)
+            was_pushed = np.array(before.modes) == "effort"
+            is_pushed = np.array(setpoint.modes) == "effort"
+            at = np.array(setpoint.modes) == "position"
+            steps = np.abs(setpoint.positions - measured)[at] / (limits.velocity * DT)[at]
+            if is_read or not was_pushed[at].any():
+                worst_step = max(worst_step, steps.max(initial=0.0))
+            assert (
+                np.abs(setpoint.velocities[~is_pushed]) <= limits.velocity[~is_pushed] * (1 + EXACT)
+            ).all()
+            compared = ~is_pushed & ~was_pushed & np.isfinite(limits.acceleration)
+            changes = np.abs(setpoint.velocities - before.velocities)[compared]
+            worst_change = max(
+                worst_change, (changes / (limits.acceleration[compared] * DT)).max(initial=0.0)
+            )
+            if setpoint.efforts is not None:
+                assert (np.abs(setpoint.efforts) <= limits.effort).all()
+                assert (setpoint.efforts[~is_pushed] == 0.0).all()
+            if generator.random() < 0.03:  # the write has failed; the joints go on as they were commanded
+                core.limiter.resume(before, DT)
+                setpoint = before
+            core.last = setpoint
+            robot.advance(setpoint, generator.normal(0.0, 5.0, COUNT))
+            # Efforts and hands move joints out of their range; nothing else does, nor further out.
+            allowed = limits.containing(measured)
+            outside = (robot.positions > allowed.upper + EXACT) | (robot.positions < allowed.lower - EXACT)
+            assert not (outside & ~is_pushed & ~was_pushed).any()
+    assert 1.0 - EXACT < worst_change <= 1.0 + EXACT
+    assert worst_step <= 1.0 + EXACT
+    assert seen >= {(one, other) for one in modes for other in modes} - {("effort", "effort")}
+    assert bool(braked) == ("effort" in modes)

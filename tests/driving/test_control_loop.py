@@ -1,0 +1,234 @@
+"""ControlLoop, stepped with a manual clock: no setpoint is far from where the joints are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+
+import numpy as np
+from helpers.robots import RRBOT
+
+from zstate import JointReading
+from zstate._util.refusals import Refusals
+from zstate.clock import MONOTONIC, ManualClock
+from zstate.driving import Limits, SimulatedDriver
+from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command
+from zstate.driving.control_loop import ControlLoop
+from zstate.driving.driver import Setpoint, StopMode
+from zstate.driving.motion_service import plan
+from zstate.driving.stops import StopRegister
+from zstate.driving.stops_file import ActiveStop
+from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
+from zstate.errors import DriverFault, InvalidInput, MessageError
+from zstate.net.presence import local_writer
+from zstate.wire.messages import JointTrajectory, MotionCancel, Release, to_block
+
+LIMITS = Limits(RRBOT.joint_names, [-1.0, -2.0], [1.0, 2.0], [2.0, 0.5], [50.0, np.inf])
+PERIOD_NS = 2_000_000
+TTL_NS = 20_000_000
+EXACT = 1e-9  # rounding, in units of the bound
+
+
+class Joints(SimulatedDriver):
+    """A mirror that keeps the longest step, in units of what the velocity limits allow in a tick."""
+
+    def __init__(self) -> None:
+        super().__init__(RRBOT, "mirror")
+        self.allowed_s = 0.0
+        """For how long joints may move at the next ``write``."""
+        self.longest = 0.0
+        self.writes = 0
+        self.failing: set[str] = set()
+        """The methods of which the next call fails."""
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Where the joints are, or are to be: the simulation moves them at the next ``read``."""
+        return self._joints.positions if self._target is None else self._target.positions
+
+    def read(self, stamp: int) -> JointReading:
+        self._fail("read")
+        return super().read(stamp)
+
+    def write(self, setpoint: Setpoint) -> None:
+        step = np.abs(setpoint.positions - self.positions) / LIMITS.velocity
+        self.longest = max(self.longest, step.max() / self.allowed_s if step.any() else 0.0)
+        self.writes += 1
+        self._fail("write")
+        super().write(setpoint)
+
+    def stop(self, how: StopMode) -> None:
+        self._fail("stop")
+        super().stop(how)
+
+    def sag(self, way: np.ndarray) -> None:
+        self._joints.positions += way
+
+    def _fail(self, method: str) -> None:
+        if method in self.failing:
+            self.failing.remove(method)
+            raise OSError(method)
+
+
+class Bench:
+    """A control loop with everything that happens to it: commanders, motions, stops, faults and restarts."""
+
+    def __init__(self, generator: np.random.Generator) -> None:
+        self.random = generator
+        self.clock = ManualClock(10**9, MONOTONIC)
+        self.driver = Joints()
+        self.stops = StopRegister()
+        self.refusals = Refusals()
+        self.outcomes: Counter[str] = Counter()
+        self.waiting: list[Command] = []
+        self.session, self.seq = 1, 0
+        self.loop = self.opened()
+
+    def opened(self) -> ControlLoop:
+        """A loop of a host that has just opened, and obeys the stops that are latched."""
+
+        def receive() -> list[Command]:
+            waiting, self.waiting = self.waiting, []
+            return waiting
+
+        loop = ControlLoop(
+            "arm",
+            local_writer(99),
+            SupervisedDriver(self.driver, "arm"),
+            self.stops,
+            limits=LIMITS,
+            following=FollowingCheck(LIMITS, 0.2, TTL_NS),
+            ttl_ns=TTL_NS,
+            on_silence="relax" if self.random.random() < 0.3 else "hold",
+            faults_allowed=3,
+            refusals=self.refusals,
+            receive=receive,
+            publish=lambda *_: None,
+            publish_setpoint=lambda _: None,
+            name_of=str,
+            has_ended=lambda _: False,
+            on_change=lambda: None,
+            clock=self.clock,
+        )
+        loop.start()
+        return loop
+
+    def tick(self) -> None:
+        """A tick after about a period, in which joints may move for the duration of it."""
+        elapsed = round(PERIOD_NS * self.random.uniform(0.5, 1.5))
+        self.clock.set(self.clock.now() + elapsed)
+        self.driver.allowed_s = elapsed * 1e-9
+        before, is_stopped = self.driver.writes, bool(self.stops.current.stops)
+        with suppress(DriverFault):
+            self.loop.tick(self.clock.now(), lambda _since, _now: elapsed * 1e-9)
+            self.renew()
+        assert not (is_stopped and self.driver.writes > before), "a setpoint after a stop"
+        if self.loop.state.name == "fault":
+            self.restart()
+
+    def renew(self) -> None:
+        underway = self.loop.motions.underway[0]
+        if underway is not None and underway[0] == self.session:
+            self.seq += 1
+            head = (self.session, self.seq, NO_COLUMNS, NO_POSITIONS)
+            self.waiting.append(Command(*head, self.clock.now(), self.clock.now() + TTL_NS, underway[1]))
+
+    def command(self, session: int | None = None) -> None:
+        self.seq += 1
+        columns = self.random.permutation(2)[: self.random.integers(1, 3)]
+        positions = self.random.uniform(1.2 * LIMITS.lower, 1.2 * LIMITS.upper)[columns]
+        now = self.clock.now()
+        deadline = now + round(TTL_NS * self.random.uniform(0.1, 1.0))
+        self.waiting.append(Command(session or self.session, self.seq, columns, positions, now, deadline))
+
+    def take_over(self) -> None:
+        """Another commander, often before the commands of the first have expired."""
+        self.session += 1
+        self.command()
+
+    def second_commander(self) -> None:
+        self.command(self.session + 1000)
+
+    def motion(self) -> None:
+        """A motion in place of the last one, near or far; its start may be later."""
+        self.seq += 1
+        count = int(self.random.integers(1, 5))
+        times = np.cumsum(self.random.uniform(0.001, 0.1, count))
+        way = self.random.choice([0.01, 1.0]) * self.random.uniform(-1.0, 1.0, (count, 2))
+        points = np.clip(self.driver.positions + way, LIMITS.lower, LIMITS.upper)
+        start = self.clock.now() + round(1e7) if self.random.random() < 0.2 else None
+        names = RRBOT.joint_names
+        blocks = to_block(times), to_block(points)
+        request = JointTrajectory(
+            self.clock.now(), self.seq, self.session, names, *blocks, start=start, stretch=True
+        )
+        with suppress(MessageError, InvalidInput):
+            planned = plan(request, LIMITS, self.loop.present(), self.clock.now())
+            if not planned.findings:
+                self.loop.motions.start(planned, self.clock.now())
+
+    def cancel(self) -> None:
+        underway = self.loop.motions.underway[0]
+        if underway is not None:
+            self.loop.motions.cancel(MotionCancel(0, 0, underway[0], underway[1]))
+
+    def stop(self) -> None:
+        self.seq += 1
+        how = "relax" if self.random.random() < 0.5 else "hold"
+        self.stops.add(ActiveStop(int(self.random.integers(200, 210)), self.seq, how, "", "desk"))
+
+    def release(self) -> None:
+        self.seq += 1
+        latched = tuple((one.session, one.seq) for one in self.stops.current.stops)
+        self.stops.release(Release(0, self.seq, self.session, latched))
+
+    def pause(self) -> None:
+        """A time in which commands expire; motions are renewed."""
+        for _ in range(25):
+            self.tick()
+
+    def fail(self) -> None:
+        self.driver.failing.add(str(self.random.choice(["read", "write", "stop"])))
+
+    def restart(self) -> None:
+        """The loop of the same host runs again, or that of a new one; joints without power sag."""
+        self.keep_outcomes()
+        self.loop.finish()
+        if self.random.random() < 0.5:
+            self.loop.start()
+        else:
+            with suppress(OSError):
+                self.driver.close()
+            self.driver.sag(self.random.normal(0.0, 0.05, 2))
+            self.loop = self.opened()
+
+    def keep_outcomes(self) -> None:
+        self.outcomes.update(one.name for one in self.loop.motions.outcomes)
+
+
+def test_ten_thousand_take_overs_replacements_stops_faults_and_restarts_never_step_above_the_limits():
+    bench = Bench(np.random.default_rng(19))
+    events: list[Callable[[], None]] = [
+        *[bench.command] * 6,
+        *[bench.motion] * 6,
+        *[bench.release] * 3,
+        *(bench.take_over, bench.second_commander, bench.cancel, bench.stop, bench.pause),
+        *(bench.fail, bench.restart),
+    ]
+    happened: Counter[str] = Counter()
+    states: Counter[str] = Counter()
+    for number in bench.random.integers(0, len(events), 10_000):
+        events[number]()
+        happened[events[number].__name__] += 1
+        for _ in range(bench.random.integers(1, 6)):
+            bench.tick()
+            states[bench.loop.state.name] += 1
+    bench.keep_outcomes()
+    assert 1.0 - EXACT < bench.driver.longest <= 1.0 + EXACT
+    # It is no empty claim: joints have moved in each state, and each kind of end was seen.
+    assert min(happened[name] for name in ("take_over", "motion", "stop", "restart")) > 400
+    assert set(states) >= {"ready", "active", "holding", "stopped"}
+    assert states["active"] > 10_000
+    assert set(bench.outcomes) == {"reached", "aborted", "replaced", "cancelled", "stopped"}
+    assert set(bench.refusals.counts) >= {"second commander", "stopped", "not released", "outside limits"}
