@@ -88,6 +88,7 @@ GUESTS = {
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
     ("cli/snapshot_file.py", "msgspec"),
     ("cli/up/cell.py", "msgspec"),
+    ("cli/commands/drive.py", "msgspec"),  # so is --param, into the types that a driver annotates
     ("scans/map_files.py", "PIL"),
     # each reads one kind of file in YAML
     ("cli/up/static_edges.py", "yaml"),

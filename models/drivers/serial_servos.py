@@ -9,11 +9,11 @@ TORQUE, GOAL, POSITION = 64, 116, 132  # addresses in the control table
 
 
 class SerialServos:
-    """The servos ``ids`` move the joints. Nothing is retried: the next tick of the host reads again."""
+    """The servos ``ids`` move the joints. A lost write raises nothing: the next tick repeats it."""
 
     modes = frozenset({"position"})
 
-    def __init__(self, port, joint_names, ids, *, latency_ms=16, zero=2048, sign=1, ratio=1):
+    def __init__(self, port: str, joint_names, ids: list[int], *, latency_ms=16, zero=2048, sign=1, ratio=1):
         self.joint_names, self._ids, self._encoders = joint_names, ids, Calibration(4096, zero, sign, ratio)
         self._port, self._bus = dxl.PortHandler(port), dxl.PacketHandler(2.0)
         dxl.port_handler.LATENCY_TIMER = latency_ms  # of the USB adapter: replies may take twice as long

@@ -107,7 +107,6 @@ class Bench:
             publish=lambda *_: None,
             publish_setpoint=lambda _: None,
             name_of=str,
-            has_ended=lambda _: False,
             on_change=lambda: None,
             clock=self.clock,
         )

@@ -22,7 +22,7 @@ from zstate import JointReading, StatePublisher, load_model
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.driving.driver import Setpoint, StopMode
 from zstate.driving.stops import stops_file, wait_for_state
-from zstate.errors import DriverFault, InvalidInput, SecondWriter
+from zstate.errors import DriverFault, InvalidInput, MotionRefused, SecondWriter
 from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
@@ -936,6 +936,38 @@ def test_commands_from_before_a_release_do_not_move_the_robot_after_it(sessions)
         until(lambda: host.report().rate.ticks > ticks + 5)
         assert host.report().refused["stopped"] >= 32
     assert driver.written().size == 0
+
+
+def test_a_commander_that_has_closed_does_not_keep_the_next_one_waiting(sessions):
+    driver = RecordingDriver()
+
+    def move_elbow_to(goal: float) -> None:
+        with Commander(sessions[1], "arm") as arm:
+            arm.wait_for_driver()
+            send_until(
+                arm, {"elbow": goal}, lambda: driver.written().size and driver.written()[-1, 1] == goal
+            )
+
+    with running(sessions[0], driver, ttl_s=10.0 * DEADLINE_S) as host:
+        move_elbow_to(0.1)
+        move_elbow_to(-0.1)
+        assert host.report().refused.keys() <= {"second commander"}  # until the end of the first is known
+
+
+def test_a_driver_without_a_reading_yet_is_ready_with_that_reason(sessions):
+    class Silent(RecordingDriver):
+        is_silent = True
+
+        def read(self, stamp: int) -> JointReading | None:
+            return None if self.is_silent else super().read(stamp)
+
+    driver = Silent()
+    with running(sessions[0], driver), Commander(sessions[1], "arm") as arm:
+        until(lambda: arm.wait_for_driver().reason == "no reading has arrived yet")
+        with pytest.raises(MotionRefused, match="joints are not known: no reading has arrived yet"):
+            arm.move({"elbow": [0.1]}, [1.0])
+        driver.is_silent = False
+        until(lambda: (arm.wait_for_driver().state, arm.wait_for_driver().reason) == ("ready", ""))
 
 
 def test_a_command_from_before_the_release_that_arrives_after_it_is_refused(sessions):

@@ -19,11 +19,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from zstate.driving import Commander
+from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.errors import InvalidInput, RecordingError
 from zstate.model.kinematics import MovingEdges
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
+from zstate.net.presence import local_writer
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.partial_publisher import PartialStatePublisher
@@ -689,16 +690,17 @@ def test_commands_are_recorded_as_joint_states_and_not_replayed(sessions, tmp_pa
         publisher.publish([0.0, 0.0])
         with StreamPublisher(sessions[0], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as renewal:
             renewal.put(encode(JointCommand(STAMP, 0, 1, order_digest(()), names=(), motion=0)))
-        commander.send({"elbow": 0.25})
+        commander.send({"elbow": 0.25}, ttl_s=0.05)
         until(lambda: recorder.stats.messages.get(("arm", "joint_commands")))
         until(lambda: recorder.stats.messages.get(("arm", "joint_states")))
         assert recorder.stats.refused == {}
     (command,) = read(path, "/joint_commands")
     assert (command.name, command.position.tolist()) == (["elbow"], [0.25])
+    assert command.header.frame_id == "ttl_ns=50000000"
     with Recording(path) as recording:
         (same,) = recording.commands("arm")
-    assert same.stamp == stamp_of(command.header)
-    assert (same.names, from_block(same.positions).tolist()) == (("elbow",), [0.25])
+    assert (same.stamp, same.ttl) == (stamp_of(command.header), 50_000_000)
+    assert (same.names, from_block(same.positions or b"").tolist()) == (("elbow",), [0.25])
     (robot,) = recorded_robots(read_info(path))
     (stream,) = [one for one in robot.streams if one.stream == "joint_commands"]
     assert (stream.count, stream.writer.partition("@")[0]) == (1, "teleop")
@@ -711,3 +713,56 @@ def test_commands_are_recorded_as_joint_states_and_not_replayed(sessions, tmp_pa
         player.run()
         states.joint_states(1)
         assert commands.arrivals == []
+
+
+def test_states_motions_and_stops_of_a_driver_are_recorded_and_not_replayed(sessions, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    path = tmp_path / "run.mcap"
+    driver = SimulatedDriver(RRBOT, "mirror")
+    with (
+        Recorder(sessions[1], path, ["arm"]) as recorder,
+        DriverHost(sessions[0], driver, RRBOT, "arm", limits=Limits.of(RRBOT, velocity=2.0)) as host,
+        Commander(sessions[1], "arm", program="teleop") as arm,
+    ):
+        loop = threading.Thread(target=host.run)
+        loop.start()
+        arm.wait_for_driver(SOON_S)
+        assert arm.move({"elbow": [0.05]}, [0.2], stretch=True).wait(SOON_S).name == "reached"
+        stop(sessions[1], "arm", "door open", timeout_s=SOON_S)
+        until(lambda: count(recorder, "arm", "stop"))
+        assert arm.release(SOON_S).state == "ready"
+        host.close()
+        loop.join()
+        until(lambda: count(recorder, "arm", "joint_states"))
+        assert (recorder.stats.refused, recorder.stats.missed) == ({}, 0)
+    with Recording(path) as recording:
+        states, stops = list(recording.driver_states("arm")), list(recording.stops())
+    (program, one), by_state = stops[0], {state.state: state for state in states}
+    assert (one.how, one.reason, program) == ("hold", "door open", str(local_writer(0)))
+    assert set(by_state) >= {"ready", "active", "stopped", "off"}
+    assert by_state["stopped"].stops == ((one.session, one.seq),)
+    assert by_state["stopped"].reason == f"stopped by {program}: door open"
+    assert [(outcome.name, outcome.reason) for outcome in states[-1].outcomes] == [("reached", "")]
+    assert any(state.motion is not None and 0.0 < state.progress <= 1.0 for state in states)
+    for other in OTHERS:
+        shown = [message.status[0] for topic, message in other(path) if topic == "/diagnostics"]
+        assert len(shown) == len(states)
+        assert {(status.name, status.hardware_id) for status in shown} == {("arm: driver", "arm")}
+        warning = next(status for status in shown if bytes([status.level]) == b"\x01")
+        assert warning.message == by_state["stopped"].reason
+        assert {value.key: value.value for value in warning.values}["joint_names"] == '["shoulder", "elbow"]'
+    (robot,) = recorded_robots(read_info(path))
+    writers = {stream.stream: stream.writer for stream in robot.streams}
+    assert (writers["driver"], writers["stop"]) == (states[0].program, program)
+    with (
+        closing(SampleCollector(sessions[1], "zstate/arm/*")) as seen,
+        closing(SampleCollector(sessions[1], "zstate/arm/stop/*")) as stopped,
+        Player(sessions[0], path, rate=math.inf) as player,
+    ):
+        wait_for_stream_readers(sessions[0], "arm", "joint_states")
+        player.run()
+        until(lambda: any(arrival.key.endswith("joint_states") for arrival in list(seen.arrivals)))
+        assert stopped.arrivals == []
+        assert {arrival.key.rpartition("/")[2] for arrival in seen.arrivals}.isdisjoint(
+            {"driver", "joint_commands"}
+        )

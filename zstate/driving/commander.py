@@ -115,8 +115,8 @@ class Commander(Closeable):
         with self._has_changed:
             if not self._has_changed.wait_for(lambda: self.driver is not None, timeout_s):
                 raise Unreachable(
-                    f"no driver of {self.robot!r} has published its state within {timeout_s:g} s; start the "
-                    "program with its DriverHost first",
+                    f"no driver of {self.robot!r} has published its state within {timeout_s:g} s; start it "
+                    "first: `zstate drive`, or a program with a DriverHost",
                     endpoints=(),
                 )
             state = self.driver

@@ -246,9 +246,9 @@ class Targets:
     """The positions to which the joints move, each until its command expires. For one thread.
 
     Joints without a command stay where they were at ``start``, or came to rest after their last one, also
-    after a change of the session. While commands of one session are valid, those of others are refused, and
-    so is an older one of that session. ``rates`` are the velocities and efforts of the joints that are not
-    commanded by positions, None for those whose command has expired.
+    after a change of the session. While commands of one session are valid, those of others are refused,
+    unless it is gone, and so is an older one of that session. ``rates`` are the velocities and efforts of the
+    joints that are not commanded by positions, None for those whose command has expired.
     """
 
     def __init__(self, count: int) -> None:
@@ -257,6 +257,8 @@ class Targets:
         self._first_deadline = self._last_deadline = NO_DEADLINE
         self._last_seqs: BoundedDict[int, int] = BoundedDict()
         self._rates: dict[int, Rate | None] = {}
+        self._gone: BoundedDict[int, None] = BoundedDict()
+        """Commanders that have closed."""
         self.session = 0
         """The session of the newest command; 0 before the first."""
         self.arrived = 0
@@ -279,11 +281,23 @@ class Targets:
         if command.seq <= self._last_seqs.get(command.session, -1):
             raise MessageError(f"the command {command.seq} comes after a newer one", reason="old")
 
-    def check_session(self, session: int, now: int) -> None:
-        """Raise MessageError for another session than the active one."""
-        if session != self.session and self.is_live(now):
-            text = f"a command of session {session:016x} while that of another session is valid"
-            raise MessageError(text, reason="second commander")
+    def check_session(self, session: int, now: int, name_of: Callable[[int], str]) -> None:
+        """Raise MessageError for another session than the active one, unless that is gone."""
+        if session != self.session and self.session not in self._gone and self.is_live(now):
+            left = format_duration(self._last_deadline - now)
+            text = f"it came from {name_of(session)}, while commands of {name_of(self.session)} are valid"
+            raise MessageError(f"{text} for {left} more", reason="second commander")
+
+    def set_announced(self, session: int, alive: bool) -> None:
+        """The commander of ``session`` is announced, or has closed: others need not wait; for any thread."""
+        if alive:
+            self._gone.pop(session, None)
+        else:
+            self._gone[session] = None
+
+    def is_gone(self, session: int) -> bool:
+        """Whether the commander of ``session`` has closed."""
+        return session in self._gone
 
     def merged(self, command: Command, present: Floats) -> Floats:
         """The positions of ``command``; ``present`` ones for all other joints."""

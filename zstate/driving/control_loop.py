@@ -33,6 +33,8 @@ _LOG = logging.getLogger("zstate")
 Floats = NDArray[np.float64]
 StateName = Literal["off", "ready", "active", "holding", "stopped", "fault"]
 
+NO_READING = "no reading has arrived yet"
+"""The reason of "ready" until the joints are known."""
 
 StepDuration: TypeAlias = "Callable[[int, int], float]"
 """For how long joints move at ``now`` that moved last at ``since`` [ns]: in s."""
@@ -60,8 +62,8 @@ class ControlLoop:
     again, then ``finish``; attributes and ``present`` may be read from any. Each tick takes the commands of
     ``receive()``, oldest first; instants are those of ``clock``, and monotonic. ``publish`` and
     ``publish_setpoint`` are called with what was read and written, ``on_change`` after each change of
-    ``state`` or of a motion; ``name_of(session)`` is the program of a commander, and ``has_ended(session)``
-    whether it is not announced any more. ``writer`` is the program of this loop, which latches its own stops.
+    ``state`` or of a motion; ``name_of(session)`` is the program of a commander. ``writer`` is the program of
+    this loop, which latches its own stops.
     """
 
     def __init__(
@@ -81,7 +83,6 @@ class ControlLoop:
         publish: Publish,
         publish_setpoint: Callable[[Setpoint], object],
         name_of: Callable[[int], str],
-        has_ended: Callable[[int], bool],
         on_change: Callable[[], object],
         clock: Clock | None = None,
     ) -> None:
@@ -98,7 +99,7 @@ class ControlLoop:
         self._refusals = refusals
         self._receive = receive
         self._publish, self._publish_setpoint = publish, publish_setpoint
-        self._name_of, self._has_ended, self._on_change = name_of, has_ended, on_change
+        self._name_of, self._on_change = name_of, on_change
         self._now = (clock or MonotonicClock()).now
         self._inside = np.clip(0.0, limits.lower, limits.upper)
         """Any positions inside the limits."""
@@ -133,7 +134,7 @@ class ControlLoop:
         self.obeyed = LatchedStops((), latched.arrived - len(latched.stops))
         if not latched.stops:  # the last one may have been released since the last loop
             self._barred.pop(self._stops.released_by[0], None)
-            self._change("ready", "")
+            self._change("ready", NO_READING if self._measured is None else "")
 
     def tick(self, stamp: int, step_s: StepDuration) -> None:
         """Read the joints at ``stamp`` [ns], the present instant of the system clock, and write a setpoint.
@@ -188,6 +189,8 @@ class ControlLoop:
         self._publish(positions, velocities, efforts, stamp if reading.stamp is None else reading.stamp)
         self._measured, self._measured_at = positions, self._now()
         self._limiter.observe(positions, velocities, self._measured_at)
+        if self.state.reason == NO_READING:
+            self._change("ready", "")
 
     def _check_following(self, now: int) -> None:
         """Stop if a joint does not follow its setpoints, or is not measured any more."""
@@ -256,8 +259,8 @@ class ControlLoop:
     def _check_commander(self, session: int, seq: int, now: int) -> None:
         """Raise MessageError while stopped, and for a commander that has not released the stop itself.
 
-        And for another one than that whose targets are valid at ``now``, and for a message ``seq`` from
-        before the release: releases travel on another key, and may overtake it.
+        And while the targets of another one that is not gone are valid at ``now``, and for a message ``seq``
+        from before the release: releases travel on another key, and may overtake it.
         """
         if self.state.name == "stopped":
             self._barred[session] = None
@@ -270,7 +273,7 @@ class ControlLoop:
         releaser, release = self._stops.released_by
         if session == releaser and seq < release:
             raise MessageError(f"the command {seq} was sent before the release of the stop", reason="old")
-        self.targets.check_session(session, now)
+        self.targets.check_session(session, now, self._name_of)
 
     def _check_limits(self, command: Command) -> None:
         """Raise MessageError unless the limiter accepts the positions of ``command``."""
@@ -365,7 +368,7 @@ class ControlLoop:
             resting = positions + velocities * np.abs(velocities) / (2.0 * self._limits.acceleration)
             return Present(positions, velocities, resting, stops)
         if measured is None or self.state.name in ("off", "fault"):
-            reason = self.state.reason or "no reading has arrived yet"
+            reason = self.state.reason or NO_READING
             text = f"the driver is {self.state.name}, and its joints are not known: {reason}"
             raise MessageError(text, reason="not ready")
         return Present(measured, np.zeros(len(measured)), measured, stops)
@@ -407,6 +410,6 @@ class ControlLoop:
     def _silence_text(self, now: int) -> str:
         commander = self.targets.session
         name = self._name_of(commander)
-        if self._has_ended(commander):
+        if self.targets.is_gone(commander):
             return f"{name} has ended"
         return f"nothing from {name} for {format_duration(now - self.targets.arrived)}"

@@ -24,7 +24,14 @@ from zstate.net.writer import WireWriter
 from zstate.rate import RateReport
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import driver_expression, driver_key, robot_from_key
-from zstate.wire.messages import DriverState, JointState, order_digest, to_block, with_short_texts
+from zstate.wire.messages import (
+    DriverState,
+    JointState,
+    order_digest,
+    state_text,
+    to_block,
+    with_short_texts,
+)
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
@@ -168,15 +175,6 @@ def check_only_host(session: Session, robot: str) -> None:
                 stream="driver",
                 first=first,
             )
-
-
-def state_text(state: DriverState) -> str:
-    """The state of a driver and its commander or reason, in one line."""
-    if state.state == "active":
-        return f"active, commanded by {state.commander}"
-    if not state.reason or state.reason.startswith(f"{state.state} by "):
-        return state.reason or state.state
-    return f"{state.state}: {state.reason}"
 
 
 class ReceivedState(NamedTuple):

@@ -130,8 +130,6 @@ class DriverHost(Closeable):
         self._refusals = Refusals(f"command for {self.robot!r}")
         self._programs: BoundedDict[int, str] = BoundedDict()
         """Announced commanders by session."""
-        self._ended: BoundedDict[int, None] = BoundedDict()
-        """Those that are not announced any more."""
         self._lateness = Durations()
         self._rate: Rate | DevicePace | None = None
         self._stop = fork_safe(threading.Event())
@@ -170,7 +168,6 @@ class DriverHost(Closeable):
                 publish=self._publish,
                 publish_setpoint=setpoints.publish,
                 name_of=self._name_of,
-                has_ended=self._ended.__contains__,
                 on_change=self._notify,
             )
             self._open_requests(session, controller, opening)
@@ -351,6 +348,4 @@ class DriverHost(Closeable):
         session = announced.writer.session
         if alive:  # also for messages about a commander that has gone
             self._programs[session] = str(announced.writer)
-            self._ended.pop(session, None)
-        else:
-            self._ended[session] = None
+        self._loop.targets.set_announced(session, alive)

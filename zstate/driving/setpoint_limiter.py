@@ -184,11 +184,11 @@ class SetpointLimiter:
 
     ``modes`` are those of the driver, and ``step`` takes ``Rates`` of joints in mode "velocity" or "effort",
     which ``observe`` follows. Another mode starts where the joint is then, with its velocity. A joint whose
-    command has expired comes to rest: from mode "velocity" in that mode, and then holds its position if it
-    has a range and the driver has mode "position"; from mode "effort" in mode "position", or else "velocity",
-    or else without effort. The same happens to a joint in mode "effort" that leaves its range or exceeds its
-    velocity limit, until its command has expired or has another mode; a driver that has mode "effort" only
-    gets efforts inwards, or against the motion.
+    command has expired comes to rest: from mode "velocity" in that mode, and holds its position 0.2 s later
+    if it has a range and the driver has mode "position"; from mode "effort" in mode "position", or else
+    "velocity", or else without effort. The same happens to a joint in mode "effort" that leaves its range or
+    exceeds its velocity limit, until its command has expired or has another mode; a driver that has mode
+    "effort" only gets efforts inwards, or against the motion.
     """
 
     def __init__(self, limits: Limits, modes: Collection[Mode] = ("position",)) -> None:
@@ -199,6 +199,8 @@ class SetpointLimiter:
         self._positions: list[float] | None = None
         self._velocities = [0.0] * len(self._joints)
         self._efforts = [0.0] * len(self._joints)
+        self._rested_s = [0.0] * len(self._joints)
+        """For how long joints in mode "velocity" have had zero velocity."""
         ranked: tuple[Mode, ...] = ("position", "velocity", "effort")
         self._resting_mode: Mode = next(mode for mode in ranked if mode in modes)
         self._all_resting = (self._resting_mode,) * len(self._joints)
@@ -347,6 +349,7 @@ class SetpointLimiter:
                 left = wish - self._efforts[column]
             elif mode == "velocity":
                 positions[column], velocities[column] = joint.turn(here, before, wish, dt_s)
+                self._rested_s[column] = self._rested_s[column] + dt_s if velocities[column] == 0.0 else 0.0
                 left = wish - velocities[column]
             else:
                 wish = 0.0 if rate is None else wanted[column]
@@ -368,16 +371,21 @@ class SetpointLimiter:
         if column in self._braked:
             rate = None
         mode = self._modes[column] = self._mode_at_rest(column) if rate is None else rate.mode
+        if before != mode:
+            self._rested_s[column] = 0.0
         if before == "effort" != mode:
             self._velocities[column] = joint.stoppable(here, self._velocities[column])
             self._efforts[column] = 0.0
         return rate
 
     def _mode_at_rest(self, column: int) -> Mode:
-        """The mode in which a joint comes to rest, or stays at rest."""
+        """The mode in which a joint comes to rest, or stays at rest.
+
+        A joint that follows its velocities with a lag moves on for a while, before its position is held.
+        """
         mode = self._modes[column]
-        holds = self._velocities[column] == 0.0 and self._joints[column].has_range
-        return self._resting_mode if mode == "effort" or (mode == "velocity" and holds) else mode
+        is_held = self._rested_s[column] > _ARRIVAL_S and self._joints[column].has_range
+        return self._resting_mode if mode == "effort" or (mode == "velocity" and is_held) else mode
 
     def _excess_text(self, column: int, here: float) -> str:
         limits, velocity = self._limits, self._velocities[column]

@@ -19,8 +19,12 @@ _LOG = logging.getLogger("zstate")
 
 _TRAVEL_NS = 1_000_000_000
 _TRAVEL_SHARE = 0.25
+_LONGEST_GAP_NS = 100_000_000
 _LAG_S = 0.1
-"""Joints in mode "velocity" are compared each second; they may differ by a share of the way, and a lag."""
+"""Joints in mode "velocity" are compared each second; they may differ by a share of the way, and a lag.
+
+After a longer gap between two setpoints the comparison begins again.
+"""
 
 
 class SupervisedDriver:
@@ -136,11 +140,11 @@ class FollowingCheck:
 
     def written(self, setpoint: Limited, now: int) -> None:
         """``setpoint`` has been written at ``now``."""
-        before = self._setpoint
-        if before is not None and self._travel is not None:
-            self._travel.add(before.velocities, (now - self._written_at) * 1e-9)
-        if before is None or before.modes != setpoint.modes:
-            self._travel = None
+        before, elapsed = self._setpoint, now - self._written_at
+        if before is None or before.modes != setpoint.modes or elapsed > _LONGEST_GAP_NS:
+            self._travel = None  # devices stop by themselves in a pause, or move on
+        elif self._travel is not None:
+            self._travel.add(before.velocities, elapsed * 1e-9)
         self._setpoint, self._written_at = setpoint, now
 
     def stopped(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -15,7 +15,8 @@ from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance
-from zstate.recording.encode import CARRIERS, TOPICS, StaticAccumulator
+from zstate.recording.driver_messages import DRIVER_TYPES, decode_command, decode_status, driver_stream
+from zstate.recording.encode import TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
 from zstate.wire.keys import Stream
@@ -39,10 +40,6 @@ joint_states with such a name."""
 
 SCAN_STREAMS: tuple[Stream, ...] = ("scan", "map")
 """Further streams that can be decoded: the channels of these types, whatever their topic is."""
-
-COMMAND_STREAMS: tuple[Stream, ...] = ("joint_commands",)
-"""Those of commands of drivers, in recordings by zstate. They are never published again, since a replay must
-not move hardware."""
 
 _NAMED: dict[Stream, Stream] = {topic: named for named, topic in TOPICS.items()}
 
@@ -78,12 +75,15 @@ class RecordedWriter:
         name, facts = channel.topic.rpartition("/")[2], channel.metadata
         foreign = _SESSION not in facts
         if child_frame(channel) is None:
-            for stream in (*_TOPICS, *SCAN_STREAMS, *(() if foreign else COMMAND_STREAMS)):
+            for stream in (*_TOPICS, *SCAN_STREAMS):
                 is_named = name == stream or stream in SCAN_STREAMS
-                if is_named and channel.type_name == ros_type(CARRIERS.get(stream, stream)).name:
+                if is_named and channel.type_name == ros_type(stream).name:
                     break
             else:
-                return None
+                of_driver = None if foreign else driver_stream(channel.topic, channel.type_name)
+                if of_driver is None:
+                    return None
+                stream = of_driver
         if EDGE_WRITER in facts:
             stream = _NAMED.get(stream, stream)
         digest = blake2b(channel.topic.encode(), digest_size=4).digest()
@@ -203,8 +203,15 @@ class DecodedRecording:
         """The messages of one record; none if it cannot be decoded."""
         channel, record, seq = undecoded
         writer = channel.writer
+        messages: Sequence[Message]
         try:
-            messages = channel.ros.messages(channel.topic, record.payload, writer.session, seq, channel.names)
+            if writer.stream == "joint_commands":
+                messages = (decode_command(record.payload, writer.session, seq),)
+            elif writer.stream in DRIVER_TYPES:
+                messages = (decode_status(writer.stream, record.payload),)
+            else:
+                topic = channel.topic
+                messages = channel.ros.messages(topic, record.payload, writer.session, seq, channel.names)
         except MessageError as error:
             self._refuse(error.reason, f"{record.topic}: {error}")
             return
@@ -245,7 +252,7 @@ class DecodedRecording:
             if writer is not None:
                 options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))
                 names = FrameNames(options, writer.robot or SHARED)
-                topic = CARRIERS.get(writer.stream, writer.stream)
+                topic = TOPICS.get(writer.stream, writer.stream)
                 decoder = ChannelDecoder(writer, topic, names, RosDecoder(), child_frame(channel) or "")
             self._known[channel] = decoder
         return self._known[channel]

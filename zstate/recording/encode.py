@@ -19,6 +19,13 @@ from zstate.recording.covariances import (
     known_covariances,
     ros_name,
 )
+from zstate.recording.driver_messages import (
+    DRIVER_TYPES,
+    driver_topic,
+    encode_command,
+    encode_status,
+    program_of,
+)
 from zstate.recording.mcap.writer import ChannelId, RecordingWriter
 from zstate.recording.storage import EDGE_WRITER, ROBOT
 from zstate.wire.joint_order import SampleLayout
@@ -26,6 +33,7 @@ from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     POSE_BYTES,
     ClockMessage,
+    DriverState,
     JointCommand,
     JointState,
     LaserScan,
@@ -35,6 +43,7 @@ from zstate.wire.messages import (
     Sample,
     StampedMessage,
     StaticTransforms,
+    Stop,
     TransformSample,
     WriterTransforms,
     order_digest,
@@ -43,7 +52,7 @@ from zstate.wire.messages import (
 from zstate.wire.ros2.cdr import to_time
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.qos import STREAM_QOS
+from zstate.wire.ros2.qos import STREAM_QOS, Qos
 from zstate.wire.ros2.topics import SHARED, FrameNames, RmwKeys, ros_type
 from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 
@@ -70,6 +79,8 @@ _STREAMS: dict[type[Message], Stream] = {
     StaticTransforms: "tf_static",
     RobotDescription: "robot_description",
     JointCommand: "joint_commands",
+    DriverState: "driver",
+    Stop: "stop",
     LaserScan: "scan",
     OccupancyGrid: "map",
     ClockMessage: "clock",
@@ -84,9 +95,6 @@ _NAMED_STREAMS: dict[type[Message], Stream] = {
 
 TOPICS: dict[Stream, Stream] = {"transforms": "tf", "partial_joint_states": "joint_states"}
 """The streams after which the topics of others are named: ROS has no topics of single writers."""
-
-CARRIERS: dict[Stream, Stream] = {**TOPICS, "joint_commands": "joint_states"}
-"""The streams with the messages of others: commands are joint states, on a topic of their own."""
 
 NO_MAP = OccupancyGrid(0, 1, "map", 1.0, 0, 0, to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), b"")
 """Recorded when a map is withdrawn."""
@@ -166,6 +174,9 @@ class RecordingEncoder:
                 self._write_description(robot, message, log_time)
             elif isinstance(message, OccupancyGrid):
                 self._latch(robot, message, log_time, edge_writer or "")
+            elif isinstance(message, (JointCommand, DriverState, Stop)):
+                with self._lock:
+                    self._write_of_driver(robot, message, log_time, edge_writer or "")
             elif isinstance(message, StampedMessage):
                 with self._lock:
                     self._write_sample(robot, message, log_time, edge_writer or "")
@@ -173,7 +184,8 @@ class RecordingEncoder:
             self._refuse("too many writers", f"{robot!r}: {error}")
             return False
         except InvalidInput as error:
-            reason, stamp = "not sayable", message.stamp if isinstance(message, StampedMessage) else 1
+            is_stamped = isinstance(message, (StampedMessage, DriverState))
+            reason, stamp = "not sayable", message.stamp if is_stamped else 1
             try:
                 to_time(stamp)
             except InvalidInput:
@@ -197,8 +209,6 @@ class RecordingEncoder:
                 self._counts[robot, stream] += 1
 
     def _write_sample(self, robot: str, message: StampedMessage, log_time: int, edge_writer: str) -> None:
-        if isinstance(message, JointCommand) and message.motion is not None:
-            return  # keeps a motion valid, and has no positions
         sample_names = self._orders_of(robot).sample_names(message)
         if sample_names is None:
             self._pending.append(robot, message, log_time)
@@ -208,13 +218,27 @@ class RecordingEncoder:
             edges = sample_names.moving_edges if message.edges is None else message.edges
             for one in known_covariances(message, edges):
                 self._write_covariance(robot, message, one, log_time, edge_writer)
-        if isinstance(message, JointCommand):
-            message = _as_joint_state(message)
         channel = self._channel(robot, stream, message.session, log_time, edge_writer)
         payload = channel.encode(message, sample_names)
         # MCAP begins in 1970; the payload keeps an earlier stamp.
         publish_time = max(message.stamp, 0)
         self._writer.write(channel.number, payload, log_time, publish_time, sequence=message.seq)
+        self._counts[robot, stream] += 1
+
+    def _write_of_driver(
+        self, robot: str, message: JointCommand | DriverState | Stop, log_time: int, edge_writer: str
+    ) -> None:
+        if isinstance(message, JointCommand):
+            if message.motion is not None:
+                return  # keeps a motion valid, and has no numbers
+            program, payload, seq = "", encode_command(message), message.seq
+        else:
+            program = program_of(message, edge_writer)
+            payload = encode_status(message, robot, program)
+            seq = message.seq if isinstance(message, Stop) else 0
+        stream = _STREAMS[type(message)]
+        channel = self._channel(robot, stream, message.session, log_time, program=program)
+        self._writer.write(channel.number, payload, log_time, max(message.stamp, 0), sequence=seq)
         self._counts[robot, stream] += 1
 
     def _write_covariance(
@@ -303,6 +327,7 @@ class RecordingEncoder:
         edge_writer: str = "",
         *,
         covariances_of: str = "",
+        program: str = "",
     ) -> ChannelEncoder:
         """The channel of a writer's stream, or of the covariances of one of its child frames."""
         key = (stream, session, edge_writer, covariances_of)
@@ -319,16 +344,19 @@ class RecordingEncoder:
             metadata |= {ROBOT: robot, "zstate.frame_prefix": options.frame_prefix}
         if edge_writer:
             metadata[EDGE_WRITER] = edge_writer
-        if session in self._programs:
-            metadata["zstate.program"] = self._programs[session]
-        carrier = CARRIERS.get(stream, stream)
-        topic, kind = RmwKeys(options).topic(robot, carrier, ros_name(edge_writer)), ros_type(carrier)
-        if stream == "joint_commands":
-            topic = f"{topic.rpartition('/')[0]}/{stream}"
+        program = program or self._programs.get(session, "")
+        if program:
+            metadata["zstate.program"] = program
+        carrier, qos = TOPICS.get(stream, stream), Qos()
+        if stream in DRIVER_TYPES:
+            topic, kind = driver_topic(options.namespace, stream), DRIVER_TYPES[stream]
+        else:
+            topic, kind = RmwKeys(options).topic(robot, carrier, ros_name(edge_writer)), ros_type(carrier)
+            qos = STREAM_QOS[carrier]
         if covariances_of:
             metadata[CHILD_FRAME] = child = names.to_ros(covariances_of)
             topic, kind = covariance_topic(options.namespace, names.to_zstate(child)), POSE_WITH_COVARIANCE
-        number = self._writer.channel(topic, kind, STREAM_QOS[carrier], metadata)
+        number = self._writer.channel(topic, kind, qos, metadata)
         channel = ChannelEncoder(number, stream, names)
         for unused in opened.add(key, channel, self._latched.get(robot, {}).values()):
             self._writer.release(unused.number)
@@ -344,14 +372,6 @@ class RecordingEncoder:
                 name += "_"
             self._namespaces[robot] = name
         return Ros2Options(namespace=self._namespaces[robot], frame_prefix=f"{robot}/")
-
-
-def _as_joint_state(command: JointCommand) -> JointState:
-    """The positions of a command. Raises InvalidInput if it has none, or no names of joints."""
-    if command.positions is None or command.names is None:
-        raise InvalidInput("a command without positions or without names of joints, which drivers refuse")
-    head = command.stamp, command.seq, command.session, command.order
-    return JointState(*head, command.positions, names=command.names)
 
 
 def _latched_key(robot: str, stream: Stream, name: str) -> str:

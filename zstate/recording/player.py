@@ -19,7 +19,6 @@ from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
 from zstate.recording.decode import (
-    COMMAND_STREAMS,
     SCAN_STREAMS,
     STREAMS,
     DecodedMessage,
@@ -30,6 +29,7 @@ from zstate.recording.decode import (
     recorded_model,
     robot_with_joint_states,
 )
+from zstate.recording.driver_messages import DRIVER_TYPES
 from zstate.recording.joint_parts import has_parts
 from zstate.recording.playback_publishers import PlaybackPublishers
 from zstate.recording.player_clock import Lateness, PlayerClock
@@ -80,11 +80,10 @@ class Player(Closeable):
     all, by default until ``close``; not at an infinite rate.
 
     Robots with a recorded model are published by a StatePublisher, other messages unchanged, such as scans,
-    maps, and the joint states of several drivers of a robot, by writers of the recorded names; commands of
-    drivers are never published. Raises
-    RecordingError, and InvalidInput for robots and times that are not in the recording. A context manager;
-    ``run`` plays, other threads may pause and seek. ``run`` raises SecondWriter if another writer publishes
-    one of the robots, unless ``takeover``.
+    maps, and the joint states of several drivers of a robot, by writers of the recorded names; commands,
+    states and stops of drivers are never published. Raises RecordingError, and InvalidInput for robots and
+    times that are not in the recording. A context manager; ``run`` plays, other threads may pause and seek.
+    ``run`` raises SecondWriter if another writer publishes one of the robots, unless ``takeover``.
     """
 
     def __init__(
@@ -119,7 +118,7 @@ class Player(Closeable):
             selected = tuple(check_has_robot(self._recording, robot) for robot in robots)
             self.robots = selected or self._recording.names
             streams = {writer.stream for writer in self._recording.writers_of(self.robots)}
-            self.has_samples = not streams <= {*LATCHED_STREAMS, *COMMAND_STREAMS, "clock"}
+            self.has_samples = not streams <= {*LATCHED_STREAMS, *DRIVER_TYPES, "clock"}
             self._begin, self._end = self._bounds(path, start_s, duration_s)
             self._models: dict[str, RobotModel] = {}
             self._in_parts: set[str] = set()

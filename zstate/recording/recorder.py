@@ -26,6 +26,7 @@ from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.rate import Rate
+from zstate.recording.driver_messages import DRIVER_TYPES
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.wire.identity import Announcement
@@ -140,11 +141,11 @@ class Recorder(Closeable):
     """Records ``robots``, or all robots, on ``wire`` into ``path``; a context manager.
 
     Subscribes to all of their streams, /tf too, which makes their publishers compute it, to their scans and
-    maps, and to the commands of their drivers. A map is written when it changes, and at the start of each
-    file. A single selected robot, or the only robot when the recording starts, is in the file's root with
-    unchanged frame names; others have a namespace and a frame prefix. ``max_bytes``, ``max_seconds`` and
-    ``overwrite`` are those of RecordingWriter. Raises RecordingError if the file cannot be created,
-    InvalidInput for invalid names.
+    maps, and, on the wire "native", to the commands, states and stops of their drivers. A map is written when
+    it changes, and at the start of each file. A single selected robot, or the only robot when the recording
+    starts, is in the file's root with unchanged frame names; others have a namespace and a frame prefix.
+    ``max_bytes``, ``max_seconds`` and ``overwrite`` are those of RecordingWriter. Raises RecordingError if
+    the file cannot be created, InvalidInput for invalid names.
 
     When the disk is full or gone, the recording ends: ``wait`` returns, ``failure`` is the reason, and what
     was written stays readable.
@@ -168,8 +169,8 @@ class Recorder(Closeable):
         # On a ROS wire all moving edges are on tf, and all joints on joint_states.
         named = self._wire.partial_joint_states, self._wire.transforms
         latched: tuple[Stream, ...] = ("robot_description", "tf_static", "map")
-        commands: tuple[Stream, ...] = ("joint_commands",) if wire == "native" else ()
-        samples: tuple[Stream, ...] = ("joint_states", "tf", *named, "scan", *commands)
+        driving = tuple(DRIVER_TYPES) if wire == "native" else ()
+        samples: tuple[Stream, ...] = ("joint_states", "tf", *named, "scan", *driving)
         self._streams: tuple[Stream, ...] = tuple(dict.fromkeys((*latched, *samples)))
         self._counters = Counters()
         self._gaps = GapCounter(self._counters)

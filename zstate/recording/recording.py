@@ -57,13 +57,16 @@ from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, full_name
 from zstate.wire.messages import (
+    DriverState,
     Edges,
+    JointCommand,
     JointState,
     LaserScan,
     OccupancyGrid,
     RobotDescription,
     Sample,
     StaticTransforms,
+    Stop,
     TransformSample,
     covariances_of,
     poses_from_block,
@@ -237,16 +240,38 @@ class Recording(Closeable):
                 except InvalidInput as error:
                     refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
 
-    def commands(self, robot: str | None = None) -> Iterator[JointState]:
+    def commands(self, robot: str | None = None) -> Iterator[JointCommand]:
         """The commands that were sent to the driver of ``robot``, by default of all robots, one by one.
 
-        Each has the names of its joints, and their commanded positions [rad] or [m]. They are all that
-        arrived at the recorder, also those that the driver has refused. Raises InvalidInput for a robot that
-        is not in the recording.
+        Each has the ``names`` of its joints, their numbers in blocks (``from_block``), and its ``ttl``. They
+        are all that arrived at the recorder, also those that the driver has refused. Raises InvalidInput for
+        a robot that is not in the recording.
         """
         for _, message, _ in self._messages(robot, "joint_commands", Refusals("recorded joint_commands")):
-            assert isinstance(message, JointState)
+            assert isinstance(message, JointCommand)
             yield message
+
+    def driver_states(self, robot: str | None = None) -> Iterator[DriverState]:
+        """The states of the driver of ``robot``, by default of all robots, one by one.
+
+        A driver publishes its state at each change and ten times a second: with the commander, the motion
+        under way and the outcomes of the last ones, the stops that it obeys and why, and the commands that
+        it has refused. Raises InvalidInput for a robot that is not in the recording.
+        """
+        for _, message, _ in self._messages(robot, "driver", Refusals("recorded states of drivers")):
+            assert isinstance(message, DriverState)
+            yield message
+
+    def stops(self, robot: str | None = None) -> Iterator[tuple[str, Stop]]:
+        """The stops sent to the driver of ``robot``, by default of all robots, each after its program.
+
+        They are all that arrived at the recorder while it ran, whether or not a driver has obeyed them: that
+        is in ``driver_states``, and so are releases. Raises InvalidInput for a robot that is not in the
+        recording.
+        """
+        for writer, message, _ in self._messages(robot, "stop", Refusals("recorded stops")):
+            assert isinstance(message, Stop)
+            yield writer.program or "", message
 
     def _messages(self, robot: str | None, stream: Stream, refusals: Refusals) -> Iterator[DecodedMessage]:
         recording = DecodedRecording(self._reader, refusals.count)

@@ -49,6 +49,8 @@ Stream = Literal[
     "robot_description",
     "joint_commands",
     "joint_setpoints",
+    "driver",
+    "stop",
     "scan",
     "map",
     "clock",
@@ -58,7 +60,7 @@ CLOCK_KEY = "zstate/clock"
 ANY = "*"
 
 NAMED_STREAMS: frozenset[Stream] = frozenset(
-    {"tf_static", "transforms", "partial_joint_states", "scan", "map"}
+    {"tf_static", "transforms", "partial_joint_states", "stop", "scan", "map"}
 )
 """The streams with one key for each of the writer names of a robot."""
 

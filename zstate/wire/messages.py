@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from hashlib import blake2b
+from itertools import takewhile
 from math import inf, isfinite
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -90,6 +91,7 @@ class StampedMessage(Message, frozen=True, array_like=True, gc=False):
     session: Count
 
 
+M = TypeVar("M", bound=Message)
 _Stamped = TypeVar("_Stamped", bound=StampedMessage)
 
 
@@ -378,6 +380,30 @@ def _cut(text: str) -> str:
     return text if more <= 0 else f"{text[:MAX_STATE_TEXT_LENGTH]}... and {more} more characters"
 
 
+def state_text(state: DriverState) -> str:
+    """The state of a driver and its commander or reason, in one line."""
+    if state.state == "active":
+        return f"active, commanded by {state.commander}"
+    if not state.reason or state.reason.startswith(f"{state.state} by "):
+        return state.reason or state.state
+    return f"{state.state}: {state.reason}"
+
+
+def message_fields(message: Message) -> dict[str, Any]:
+    """The fields of a message without blocks by name, as JSON has them."""
+    return dict(zip(message.__struct_fields__, msgspec.to_builtins(message), strict=True))
+
+
+def message_from_fields(kind: type[M], fields: Mapping[str, Any]) -> M:
+    """The message with these ``fields``; others are ignored. Raises MessageError ("malformed")."""
+    # Fields are appended only: those that a file of an earlier version lacks are the last ones.
+    known = takewhile(fields.__contains__, kind.__struct_fields__)
+    try:
+        return msgspec.convert([fields[name] for name in known], kind)
+    except msgspec.ValidationError as error:
+        raise MessageError(f"a malformed {kind.__name__}: {error}", reason="malformed") from None
+
+
 class StaticTransforms(Message, frozen=True, array_like=True, gc=False):
     """All static edges of one writer: row i of ``poses`` is ``parent_from_child`` of ``edges[i]``."""
 
@@ -597,6 +623,8 @@ MAX_BYTES: Mapping[Stream, int] = {
     "transforms": SAMPLE_BYTES,
     "joint_commands": SAMPLE_BYTES,
     "joint_setpoints": SAMPLE_BYTES,
+    "driver": SAMPLE_BYTES,
+    "stop": 8_000,
     "scan": SCAN_BYTES,
     "tf_static": 1_000_000,
     "robot_description": LATCHED_BYTES,

@@ -77,6 +77,8 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "robot_description": RobotDescription,
     "joint_commands": JointCommand,
     "joint_setpoints": JointState,
+    "driver": DriverState,
+    "stop": Stop,
     "scan": LaserScan,
     "map": OccupancyGrid,
     "clock": ClockMessage,

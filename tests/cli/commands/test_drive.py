@@ -11,13 +11,16 @@ from pathlib import Path
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started
 from helpers.processes import DEADLINE_S, Child, until
+from helpers.raw_ros_nodes import COMMANDS, announced_publisher
 
-from zstate import TransformListener, connect
+from zstate import JointReading, TransformListener, connect, load_model
 from zstate.driving import Commander
+from zstate.sources import JointStateListener
 
 pytestmark = pytest.mark.processes
 
 ARM = """
+import socket
 import time
 from pathlib import Path
 from zstate.driving import SimulatedDriver
@@ -38,7 +41,12 @@ class Arm(SimulatedDriver):
 
 class Unreachable(Arm):
     def open(self):
-        raise ConnectionError("/dev/ttyUSB0 is gone")
+        socket.create_connection(("127.0.0.1", 1))
+
+class Servos(Arm):
+    def __init__(self, model, joint_names, log: Path, ids: list[int], serial: str | None = None):
+        super().__init__(model, joint_names, log)
+        log.write_text(f"{ids} {serial!r}")
 
 class Paced(Arm):
     def read(self, stamp):
@@ -48,6 +56,10 @@ class Paced(Arm):
 class Nothing:
     pass
 """
+
+
+CONNECTS = 1 + ARM.splitlines().index('        socket.create_connection(("127.0.0.1", 1))')
+"""The line of its own code where a driver fails."""
 
 
 @pytest.fixture
@@ -100,6 +112,33 @@ def test_driver_of_a_file_gets_its_parameters_and_is_closed_at_the_end(
     assert log.read_text() == "shoulder elbow closed"
 
 
+def test_parameters_have_the_types_that_the_driver_annotates(spawn: Spawn, arm: str, tmp_path: Path):
+    log = tmp_path / "log.txt"
+    given = [f"--param={one}" for one in (f"log={log}", "ids=[1, 2]", "serial=0042")]
+    child = started(spawn, "drive", f"{arm}:Servos", "rrbot", *given)
+    line_with(child, "ready")
+    assert log.read_text() == "[1, 2] '0042'"
+
+
+def test_ros_nodes_command_the_joints_as_a_controller_and_receive_them(spawn: Spawn):
+    given = ("drive", "sim", "rrbot", "--wire", "native", "--wire", "ros2", "--ttl", "10")
+    child = started(spawn, *given, "--ros2-controller", "forward_position_controller")
+    assert child.line().startswith("driving 'rrbot' (2 joints, sim)")
+    assert child.line() == (
+        "ROS 2 nodes command shoulder, elbow, in this order, on /forward_position_controller/commands and "
+        "/forward_position_controller/joint_trajectory"
+    )
+    readings: list[JointReading] = []
+    with (
+        connect() as session,
+        JointStateListener(session, "rrbot", load_model("rrbot"), wire="ros2", on_reading=readings.append),
+        announced_publisher(session, "teleop", COMMANDS) as node,
+    ):
+        node.numbers([0.0, 0.1])
+        until(lambda: readings and abs(readings[-1].positions[1] - 0.1) < 1e-3)
+    assert "active, commanded by /teleop" in line_with(child, "active")
+
+
 def test_device_sets_the_pace_of_the_loop(spawn: Spawn, arm: str, tmp_path: Path):
     given = ("drive", f"{arm}:Paced", "rrbot", "--param", f"log={tmp_path / 'log.txt'}")
     child = started(spawn, *given, "--rate", "device", "--seconds", "0.5")
@@ -131,7 +170,12 @@ def test_driver_that_fails_three_times_in_a_row_ends_the_command_stopped(
         (("ARM:Arm",), 1, "missing a required argument: 'log'; it is "),
         (("ARM:Arm", "--param", "port"), 2, "'port' is not a parameter; write KEY=VALUE"),
         (("ARM:Nothing",), 1, "is no driver: it has no joint_names, modes, open, enable, read, write"),
-        (("ARM:Unreachable", "--param", "log=/dev/null"), 1, "ConnectionError: /dev/ttyUSB0 is gone ("),
+        (("ARM:Unreachable", "--param", "log=/dev/null"), 1, f"Connection refused (ARM, line {CONNECTS})"),
+        (
+            ("ARM:Servos", "--param", "log=/dev/null", "--param", "ids=1,2"),
+            *(1, "--param ids=1,2 does not fit ARM:Servos, which takes list[int] as 'ids'; VALUE is JSON"),
+        ),
+        (("sim", "--ros2-controller", "arm_controller"), 2, "--ros2-controller needs one wire `ros2`, as in"),
         (("ARM:Arm", "--plant", "lag"), 2, "--plant is of `sim`"),
         (("sim", "--velocity", "elbow=fast"), 2, "'elbow=fast' is not JOINT=VALUE with a number"),
         (("sim", "--velocity", "9"), 1, "velocity 9 of 'shoulder' is above 2.5, the limit in the URDF"),
@@ -142,7 +186,9 @@ def test_unusable_drivers_and_options_are_refused(
     arm: str, arguments: tuple[str, ...], code: int, error: str
 ):
     driver, *rest = arguments
-    assert error in failure("drive", driver.replace("ARM", arm), "rrbot", *rest, code=code)
+    assert error.replace("ARM", arm) in failure(
+        "drive", driver.replace("ARM", arm), "rrbot", *rest, code=code
+    )
 
 
 def test_joint_without_a_velocity_limit_needs_one(tmp_path: Path):

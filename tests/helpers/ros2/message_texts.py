@@ -8,6 +8,22 @@ FIELDS = {
     "builtin_interfaces/msg/Time": ("int32 sec", "uint32 nanosec"),
     "std_msgs/msg/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
     "std_msgs/msg/String": ("string data",),
+    "std_msgs/msg/MultiArrayDimension": ("string label", "uint32 size", "uint32 stride"),
+    "std_msgs/msg/MultiArrayLayout": ("MultiArrayDimension[] dim", "uint32 data_offset"),
+    "std_msgs/msg/Float64MultiArray": ("MultiArrayLayout layout", "float64[] data"),
+    "builtin_interfaces/msg/Duration": ("int32 sec", "uint32 nanosec"),
+    "trajectory_msgs/msg/JointTrajectoryPoint": (
+        "float64[] positions",
+        "float64[] velocities",
+        "float64[] accelerations",
+        "float64[] effort",
+        "builtin_interfaces/Duration time_from_start",
+    ),
+    "trajectory_msgs/msg/JointTrajectory": (
+        "std_msgs/Header header",
+        "string[] joint_names",
+        "JointTrajectoryPoint[] points",
+    ),
     "rosgraph_msgs/msg/Clock": ("builtin_interfaces/Time clock",),
     "sensor_msgs/msg/JointState": (
         "std_msgs/Header header",

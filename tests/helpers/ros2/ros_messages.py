@@ -16,6 +16,8 @@ STRING = "std_msgs/msg/String"
 CLOCK = "rosgraph_msgs/msg/Clock"
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
+NUMBERS = "std_msgs/msg/Float64MultiArray"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 
 XYZ, XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
 SCAN_NUMBERS = (
@@ -46,6 +48,27 @@ def joint_state(
 ) -> dict[str, Any]:
     numbers = {"position": list(positions), "velocity": list(velocities), "effort": list(efforts)}
     return {"header": header(stamp), "name": list(names), **numbers}
+
+
+def numbers(values: Sequence[float]) -> dict[str, Any]:
+    return {"layout": {"dim": [], "data_offset": 0}, "data": list(values)}
+
+
+def trajectory(
+    names: Sequence[str], points: Sequence[Sequence[float]], times: Sequence[int]
+) -> dict[str, Any]:
+    """Positions at ``times`` [ns] after the arrival of the message."""
+    rows = [
+        {
+            "positions": list(point),
+            "velocities": [],
+            "accelerations": [],
+            "effort": [],
+            "time_from_start": time(at),
+        }
+        for point, at in zip(points, times, strict=True)
+    ]
+    return {"header": header(0), "joint_names": list(names), "points": rows}
 
 
 def transform_stamped(stamp: int, parent: str, child: str, pose7: Sequence[float]) -> dict[str, Any]:

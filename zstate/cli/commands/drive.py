@@ -6,6 +6,7 @@ import inspect
 import json
 import math
 import sys
+import time
 import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 _SIMULATED = "sim"
 _DEVICE = "device"
+_FIRST_READING_S = 2.0
+"""It is a line of its own if the first reading takes longer."""
 _MODULE = "zstate_driver"
 """The name of the module that a driver's file becomes."""
 
@@ -48,14 +51,11 @@ def _check_driver(text: str) -> str:
     raise InvalidInput(f"{text!r} is neither 'sim' nor FILE.py:CLASS, such as servos.py:ServoBus")
 
 
-def _parse_parameter(text: str) -> tuple[str, Any]:
+def _parse_parameter(text: str) -> tuple[str, str]:
     key, sign, value = text.partition("=")
     if not sign or not key.isidentifier():
         raise InvalidInput(f"{text!r} is not a parameter; write KEY=VALUE, such as port=/dev/ttyUSB0")
-    try:
-        return key, json.loads(value)
-    except ValueError:
-        return key, value
+    return key, value
 
 
 def parse_joint_value(text: str) -> tuple[str, float]:
@@ -95,7 +95,8 @@ _LIMIT = options.Checked("[JOINT=]V", _parse_limit)
     "parameters",
     type=_PARAMETER,
     multiple=True,
-    help="A keyword argument of CLASS: VALUE is JSON (1000000, true, [1, 2]), or else text. Repeatable.",
+    help="A keyword argument of CLASS: VALUE is JSON (1000000, true, [1, 2]), or else text, and of the type "
+    "that CLASS annotates. Repeatable.",
 )
 @click.option(
     "--plant",
@@ -144,6 +145,13 @@ _LIMIT = options.Checked("[JOINT=]V", _parse_limit)
     multiple=True,
     help="The same for the acceleration, of which a URDF has none [rad/s^2 or m/s^2]. Repeatable.",
 )
+@options.wires_option
+@click.option(
+    "--ros2-controller",
+    metavar="NAME",
+    help="With `--wire ros2`: ROS 2 nodes command the joints as a controller of this name, on NAME/commands "
+    "(std_msgs/Float64MultiArray, positions) and NAME/joint_trajectory (trajectory_msgs/JointTrajectory).",
+)
 @options.seconds_option
 @options.name_option
 @options.session_options
@@ -152,7 +160,7 @@ def drive_command(
     driver: str,
     robot: str,
     xacro_args: dict[str, str],
-    parameters: tuple[tuple[str, Any], ...],
+    parameters: tuple[tuple[str, str], ...],
     plant: str | None,
     rate: float | None,
     realtime: Literal["fifo", "spin"] | None,
@@ -160,11 +168,16 @@ def drive_command(
     on_silence: Literal["hold", "relax"],
     velocities: tuple[_Limit, ...],
     accelerations: tuple[_Limit, ...],
+    wires: tuple[str, ...],
+    ros2_controller: str | None,
     seconds: float | None,
     name: str | None,
     network: SessionOptions,
 ) -> None:
     """Host the driver of ROBOT: publish its joints, and write the commands that are sent to it.
+
+    It takes the place of ros2_control_node with a hardware component, joint_state_broadcaster,
+    forward_command_controller and joint_trajectory_controller.
 
     CLASS in FILE.py is a driver as in zstate.driving.Driver; sim is one without hardware. ROBOT is a name
     such as panda, or a URDF or xacro file; NAME:=VALUE are xacro arguments. CLASS is called with the --param
@@ -172,8 +185,15 @@ def drive_command(
     has parameters of these names.
 
     `zstate move` or a zstate.driving.Commander moves the joints, within the limits of the URDF; `zstate stop`
-    stops them. Each change of state is a line. A driver that fails three times in a row is stopped, and the
-    exit code is 1. After Ctrl-C the joints are stopped as after silence, and the driver is closed.
+    stops them. Each change of state is a line. After Ctrl-C the joints are stopped as after silence, and the
+    driver is closed.
+
+    A driver that fails three times in a row is stopped, and the exit code is 1. It does not connect again by
+    itself: start the command again once the hardware is back, or let `zstate up` (restart = "on-failure").
+    The joints then stay stopped until `zstate stop ROBOT --release`.
+
+    With `--wire ros2` ROS 2 nodes receive the joints on /joint_states, and with --ros2-controller they
+    command them. `zstate move`, `zstate stop` and the driver's state are on the native wire in any case.
 
     This is NOT a safety-rated channel: an emergency stop is wired to the power of the hardware.
 
@@ -183,16 +203,18 @@ def drive_command(
     zstate drive servos.py:ServoBus arm.urdf --param port=/dev/ttyUSB0 --param ids=[1,2,3]
     zstate drive arm.py:Arm arm.urdf --rate 1000 --realtime fifo
     zstate drive servos.py:ServoBus arm.urdf --velocity 0.5 --acceleration elbow=4 --acceleration wrist=8
+    zstate drive sim panda --wire native --wire ros2 --ros2-controller arm_controller
     """
     from zstate.driving import DriverHost
 
     if plant is not None and driver != _SIMULATED:
         raise click.UsageError("--plant is of `sim`; a driver in a file gets its arguments by --param")
     model, robot_name = load_robot(robot, name, xacro_args)
+    inputs = _controller_text(wires, robot_name, ros2_controller) if ros2_controller else ""
     given = dict(parameters) | ({} if plant is None else {"plant": plant})
     hardware = _new_driver(driver, model, given)
     limits = _limits(model, hardware, velocities, accelerations)
-    with open_session(network) as session, ExitStack() as opened:
+    with open_session(network, wires) as session, ExitStack() as opened:
         with _failures_of(driver):
             host = opened.enter_context(
                 DriverHost(
@@ -201,6 +223,8 @@ def drive_command(
                     ttl_s=ttl,
                     limits=limits,
                     on_silence=on_silence,
+                    wires=wires,
+                    ros2_controller=ros2_controller or "",
                     realtime=realtime,
                 )
             )
@@ -211,8 +235,25 @@ def drive_command(
             f"driving {robot_name!r} ({joints}, {driver}) at {pace}; the joints {then} after "
             f"{format_duration(round(ttl * 1e9))} without a command"
         )
+        if inputs:
+            print_wrapped(
+                f"ROS 2 nodes command {', '.join(hardware.joint_names)}, in this order, on {inputs}"
+            )
         opened.enter_context(_StateLines(session, robot_name))
         _run(host, seconds)
+
+
+def _controller_text(wires: tuple[str, ...], robot: str, name: str) -> str:
+    """The topics of the ROS 2 controller ``name``. Raises UsageError if it has no wire."""
+    from zstate.wire.registry import get_controller
+
+    try:
+        return " and ".join(get_controller(wires, robot, name).topics)
+    except InvalidInput as error:
+        if sum(wire.partition(":")[0] == "ros2" for wire in wires) == 1:
+            raise
+        text = "--ros2-controller needs one wire `ros2`, as in `--wire native --wire ros2`"
+        raise click.UsageError(text) from error
 
 
 def _run(host: DriverHost, seconds: float | None) -> None:
@@ -255,23 +296,24 @@ class _StateLines(Closeable):
         from zstate.net.latched import LatchedSubscriber
         from zstate.wire.keys import driver_key
 
-        self._newest = ""
+        self._newest, self._opened_at = "", time.monotonic()
         self._subscriber = LatchedSubscriber(session, driver_key(robot), self._on_state)
 
     def close(self) -> None:
         self._subscriber.close()
 
     def _on_state(self, sample: SerializedSample) -> None:
-        from zstate.driving.driver_state import state_text
-        from zstate.wire.messages import DriverState
+        from zstate.driving.control_loop import NO_READING
+        from zstate.wire.messages import DriverState, state_text
         from zstate.wire.native import decode
 
         with suppress(MessageError):
             state = decode(sample.payload, sample.encoding, DriverState)
+            is_waiting = state.reason == NO_READING and time.monotonic() - self._opened_at < _FIRST_READING_S
             text = state_text(state)
-            if state.state != "off" and text != self._newest:
+            if state.state != "off" and text != self._newest and not is_waiting:
                 print_wrapped(text)
-            self._newest = text
+                self._newest = text
 
 
 def _limits(
@@ -302,15 +344,19 @@ def _by_joint(limits: Sequence[_Limit], option: str) -> float | Mapping[str, flo
     return {joint: value for joint, value in limits if joint is not None} or None
 
 
-def _new_driver(text: str, model: RobotModel, parameters: Mapping[str, Any]) -> Driver:
+def _new_driver(text: str, model: RobotModel, parameters: Mapping[str, str]) -> Driver:
     """The driver that ``text`` names, called with ``parameters``, and what it takes of ``model``."""
     from zstate.driving import Driver
 
     factory = _driver_class(text)
-    signature = inspect.signature(factory)
+    signature = _signature_of(factory)
     offered = {"model": model, "joint_names": model.joint_names}
-    arguments = {name: value for name, value in offered.items() if name in signature.parameters}
-    arguments |= parameters
+    arguments: dict[str, Any] = {
+        name: value for name, value in offered.items() if name in signature.parameters
+    }
+    for key, value in parameters.items():
+        kind = signature.parameters[key].annotation if key in signature.parameters else Any
+        arguments[key] = _argument(text, key, value, kind)
     try:
         signature.bind(**arguments)
     except TypeError as error:
@@ -321,6 +367,45 @@ def _new_driver(text: str, model: RobotModel, parameters: Mapping[str, Any]) -> 
     if missing:
         fail(f"{text} is no driver: it has no {', '.join(missing)}; zstate.driving.Driver describes them")
     return driver
+
+
+def _signature_of(factory: Callable[..., Any]) -> inspect.Signature:
+    """The parameters of ``factory``, with types as annotations where they are known."""
+    with suppress(Exception):  # an annotation is any expression, often one for type checkers only
+        return inspect.signature(factory, eval_str=True)
+    return inspect.signature(factory)
+
+
+def _argument(driver: str, key: str, text: str, kind: Any) -> Any:
+    """``text`` as JSON, or else as it is, if that is of the type ``kind``. Ends the command otherwise."""
+    import msgspec
+
+    value: Any = text
+    with suppress(ValueError):
+        value = json.loads(text)
+    with suppress(msgspec.ValidationError):
+        return _converted(value, kind)
+    with suppress(msgspec.ValidationError):
+        return _converted(text, kind)
+    return fail(
+        f"--param {key}={text} does not fit {driver}, which takes {inspect.formatannotation(kind)} as "
+        f"{key!r}; VALUE is JSON, such as 5, true or [1, 2], or else text"
+    )
+
+
+def _converted(value: Any, kind: Any) -> Any:
+    """``value`` as the type ``kind``, such as Path. Raises msgspec.ValidationError if that is impossible.
+
+    An annotation that is no type, or unknown, is not checked.
+    """
+    import msgspec
+
+    if kind is inspect.Parameter.empty or isinstance(kind, str):
+        return value
+    try:
+        return msgspec.convert(value, kind, dec_hook=lambda wanted, given: wanted(given))
+    except TypeError:
+        return value
 
 
 def _driver_class(text: str) -> Callable[..., Any]:
@@ -346,12 +431,18 @@ def _driver_class(text: str) -> Callable[..., Any]:
 
 @contextmanager
 def _failures_of(driver: str) -> Generator[None]:
-    """End the command for exceptions of a driver, with the line of its code instead of a traceback."""
+    """End the command for exceptions of a driver, with the line of its code instead of a traceback.
+
+    That is the last one in its own file: what it calls, such as the SDK of a vendor, may raise.
+    """
     try:
         yield
     except (ZStateError, click.ClickException):
         raise
     except Exception as error:
-        *_, place = traceback.extract_tb(error.__traceback__)
+        frames = traceback.extract_tb(error.__traceback__)
+        file = str(Path(driver.rpartition(":")[0] or driver).resolve())
+        own = [frame for frame in frames if str(Path(frame.filename).resolve()) == file]
+        place = (own or frames)[-1]
         at = f"{place.filename}, line {place.lineno}"
         fail(f"{driver} failed: {type(error).__name__}: {error} ({at})")

@@ -15,7 +15,7 @@ from zstate.cli import options
 from zstate.cli.commands.drive import parse_joint_value
 from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
-from zstate.errors import MotionRefused, MotionTimeout, Unreachable, ZStateError
+from zstate.errors import MotionRefused, MotionTimeout, SecondWriter, Unreachable, ZStateError
 
 if TYPE_CHECKING:
     from zstate.driving import Commander
@@ -237,7 +237,7 @@ def stop_command(
     if release and (relax or reason):
         raise click.UsageError("--release ends stops; leave out --relax and --reason")
     from zstate.cli.processes import BackgroundCall  # loads numpy, which --help does not need
-    from zstate.driving.driver_state import state_text
+    from zstate.wire.messages import state_text
 
     act = partial(_release, timeout_s=timeout)
     if not release:
@@ -289,8 +289,14 @@ def _stop(session: Session, robot: str, *, reason: str, how: StopMode, timeout_s
 def _release(session: Session, robot: str, *, timeout_s: float) -> DriverState:
     from zstate.driving import Commander
 
-    with Commander(session, robot) as commander:
-        return commander.release(timeout_s)
+    try:
+        with Commander(session, robot) as commander:
+            return commander.release(timeout_s)
+    except SecondWriter as error:
+        raise ZStateError(
+            f"it is commanded by {str(error.first)!r}, and only its commander releases a stop: end that "
+            "program, or let it call Commander.release"
+        ) from None
 
 
 def _as_document(robot: str, state: DriverState | None, error: str | None) -> dict[str, object]:

@@ -99,9 +99,12 @@ def record_command(
 
     Writes ROS 2 messages, which Foxglove, PlotJuggler, Rerun and rosbags read directly. Each file of a split
     recording is complete by itself: the model and the fixed edges are written at its start and every 10 s,
-    a map at its start and when it changes. Commands of drivers are on the topic joint_commands, as joint
-    states. After a crash all but the last 0.5 s is in the file; `zstate
+    a map at its start and when it changes. After a crash all but the last 0.5 s is in the file; `zstate
     recover` makes a complete file of it.
+
+    Of drivers it keeps the commands, as joint states on /joint_commands; the states with motions and their
+    outcomes on /diagnostics, which Foxglove and rqt show; and the stops on /stops. A replay never publishes
+    these.
 
     FILE may have the start time in its name: %Y %m %d %H %M %S are replaced by the local time (also %y and
     %j; %% is a percent sign). The default, rec-%Y%m%d-%H%M%S.mcap in the working directory, gives each start

@@ -80,8 +80,8 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     map_frame = "hall/map"
     identity = "left"
     after = "left"
-    [[program]]                       # any other program, such as a driver
-    run = "python driver.py ${rate}"  # or "zstate record run.mcap"
+    [[program]]                       # any other program
+    run = "python driver.py ${rate}"  # or "zstate drive ...", "zstate record"
     identity = "left"
     after = ["left", "static"]        # starts when these are ready
     ready = "driver runs"             # text it prints when it is ready itself

@@ -271,7 +271,8 @@ def _has_driver(session: Session, sliders: SliderPublisher) -> bool:
     if not sliders.conflict:
         return False
     if wait_for_state(session, robot, lambda state: state.state != "off", _DRIVER_WITHIN_S) is not None:
-        print_status(f"{robot!r} has a driver: take control of it on the page, tab Joints", robot=robot)
+        text = f"{robot!r} has a driver: the page commands it after a click, in its tab Joints"
+        print_status(text, robot=robot)
         return True
     print_status(f"{robot!r} is not moved: {sliders.conflict}", robot=robot)
     return False

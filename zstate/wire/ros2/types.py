@@ -25,6 +25,16 @@ _FIELDS: dict[str, tuple[tuple[str, str], ...]] = {
         ("string[]", "joint_names"),
         ("trajectory_msgs/JointTrajectoryPoint[]", "points"),
     ),
+    "diagnostic_msgs/KeyValue": (("string", "key"), ("string", "value")),
+    "diagnostic_msgs/DiagnosticStatus": (
+        ("byte", "level"),
+        *(("string", name) for name in ("name", "message", "hardware_id")),
+        ("diagnostic_msgs/KeyValue[]", "values"),
+    ),
+    "diagnostic_msgs/DiagnosticArray": (
+        ("std_msgs/Header", "header"),
+        ("diagnostic_msgs/DiagnosticStatus[]", "status"),
+    ),
     "rosgraph_msgs/Clock": (("builtin_interfaces/Time", "clock"),),
     "sensor_msgs/JointState": (
         ("std_msgs/Header", "header"),
@@ -74,7 +84,7 @@ _FIELDS: dict[str, tuple[tuple[str, str], ...]] = {
 }
 # The numbers of type_description_interfaces/FieldType.
 _NESTED, _ARRAY, _UNBOUNDED_SEQUENCE = 1, 48, 144
-_PRIMITIVES = {"int8": 2, "int32": 6, "uint32": 7, "float32": 10, "float64": 11, "string": 17}
+_PRIMITIVES = {"int8": 2, "int32": 6, "uint32": 7, "float32": 10, "float64": 11, "byte": 16, "string": 17}
 
 _SEPARATOR = "=" * 80
 
@@ -142,5 +152,6 @@ LASER_SCAN = RosType.from_fields("sensor_msgs/LaserScan")
 OCCUPANCY_GRID = RosType.from_fields("nav_msgs/OccupancyGrid")
 CLOCK = RosType.from_fields("rosgraph_msgs/Clock")
 FLOAT64_MULTI_ARRAY = RosType.from_fields("std_msgs/Float64MultiArray")
+DIAGNOSTIC_ARRAY = RosType.from_fields("diagnostic_msgs/DiagnosticArray")
 JOINT_TRAJECTORY = RosType.from_fields("trajectory_msgs/JointTrajectory")
 POSE_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/PoseWithCovarianceStamped")

@@ -234,9 +234,10 @@ class Ros2Controller:
         self._name = name
         self._namespace = f"/{options.robot_namespace(robot)}"
         root = f"{self._namespace.rstrip('/')}/{name}"
-        self._topics = {f"{root}/commands": FLOAT64_MULTI_ARRAY, f"{root}/joint_trajectory": JOINT_TRAJECTORY}
+        self.topics = {f"{root}/commands": FLOAT64_MULTI_ARRAY, f"{root}/joint_trajectory": JOINT_TRAJECTORY}
+        """The names of both topics, and their types."""
         self.commands, self.trajectories = (
-            f"{options.domain}{topic}/{kind.dds}/*" for topic, kind in self._topics.items()
+            f"{options.domain}{topic}/{kind.dds}/*" for topic, kind in self.topics.items()
         )
         """The key expressions of both topics."""
 
@@ -264,7 +265,7 @@ class Ros2Controller:
         node = NodeToken(self._options.domain, zid, number(), "/", self._namespace, self._name)
         endpoints = [
             EndpointToken(node, number(), "MS", topic, kind.dds, self._hash_of(kind), Qos()).key
-            for topic, kind in self._topics.items()
+            for topic, kind in self.topics.items()
         ]
         return node.key, *endpoints
 
@@ -276,7 +277,7 @@ class Ros2Controller:
 
     def parse_token(self, token: str, robot: str) -> tuple[Announcement, ...]:
         parsed = parse_token(token)
-        if not isinstance(parsed, EndpointToken) or parsed.kind != "MP" or parsed.topic not in self._topics:
+        if not isinstance(parsed, EndpointToken) or parsed.kind != "MP" or parsed.topic not in self.topics:
             return ()
         writer = WriterId(parsed.full_name, host="", pid=0, since=0, session=session_from_gid(gid(token)))
         return (Announcement(robot, "joint_commands", writer),)
