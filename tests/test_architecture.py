@@ -37,7 +37,7 @@ FLOORS = (
     {"net"},
     {"sources"},
     {"nodes"},
-    {"scans", "driving"},
+    {"scans", "driving", "odometry"},
     {"bridges", "recording"},
     {"zstate"},
     {"metrics"},

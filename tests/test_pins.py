@@ -40,6 +40,7 @@ from zstate.cli.main import group
 from zstate.extension import REVISION
 from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
+from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
 from zstate.wire.native import ENCODINGS
 
 PACKAGE = Path(__file__).parent.parent / "zstate"
@@ -129,10 +130,21 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
         if wire == "native":
             odometry = opened.enter_context(TransformPublisher(writer, "r1", "odometry", program="driver"))
             odometry.publish([Transform("odom", "world", (1.0, 0.0, 0.0), UPRIGHT)])
+        wheels, imu, flow = (
+            opened.enter_context(kind(writer, "r1", name, (wire,), program="driver"))
+            for kind, name in (
+                (OdometryPublisher, "odom"),
+                (ImuPublisher, "chest"),
+                (VelocityPublisher, "flow"),
+            )
+        )
 
         def publish() -> None:
             publisher.publish([0.0, 0.0])
             clock.publish(1)
+            wheels.publish(Transform("start", "odom", (1.0, 0.0, 0.0), UPRIGHT), [0, 0, 0], [0, 0, 0])
+            imu.publish([0, 0, 0], [0, 0, 9.81])
+            flow.publish([0, 0, 0])
 
         with repeated(publish):
             yield
@@ -293,7 +305,8 @@ def test_keys_of_the_json_lines_of_monitored_robots(spawn: Any):
         line = json.loads(command.line())
         command.process.send_signal(signal.SIGINT)
         command.wait()
-    check_pin("json_monitored_robots", sorted(key_paths(line)))
+    # A slow machine has late ticks among the faults.
+    check_pin("json_monitored_robots", sorted(key_paths({**line, "faults": []})))
 
 
 @pytest.mark.processes

@@ -18,6 +18,8 @@ from zstate.transform import Transform, Twist, combine_kinds
 NAN, INF = math.nan, math.inf
 TURN = (0.5, -0.5, 0.5, 0.5)
 
+COVARIANCE = np.diag([0.5, 0.4, 0.3, 0.2, 0.1, 0.05]) + 0.02
+
 angles = st.floats(-3.0, 3.0)
 numbers = st.floats(-100.0, 100.0)
 
@@ -297,7 +299,44 @@ def test_covariance_is_kept_and_cannot_be_written():
     copied = pickle.loads(pickle.dumps(uncertain))
     assert np.array_equal(copied.covariance, covariance)
     assert (copied.stamp, copied.kind) == (5, "exact")
-    assert uncertain.inverse().covariance is None
+
+
+@given(transforms("a", "b"), transforms("b", "c"), transforms("c", "d"))
+def test_covariances_follow_the_algebra_of_their_transforms(
+    a_from_b: Transform, b_from_c: Transform, c_from_d: Transform
+) -> None:
+    first, second = a_from_b.with_covariance(COVARIANCE), b_from_c.with_covariance(2.0 * COVARIANCE)
+    for one, other in (
+        (first, first.inverse().inverse()),
+        ((first @ second).inverse(), second.inverse() @ first.inverse()),
+        ((first @ second) @ c_from_d, first @ (second @ c_from_d)),  # c_from_d is static: exact
+    ):
+        assert one.covariance is not None
+        assert other.covariance is not None
+        # Arms of some hundred metres multiply each other, and cancel.
+        scale = float(np.abs(one.covariance).max())
+        np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-9 * max(scale, 1e5))
+
+
+def test_turn_about_an_arm_away_displaces_and_correlates():
+    """c is 3 m from b, along y of a: a turn w of b about z of a moves c by -3 w along x of a."""
+    turn = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 0.01])
+    a_from_b = Transform("a", "b", (7.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)).with_covariance(turn)
+    product = a_from_b @ Transform("b", "c", (0.0, 3.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    expected = turn.copy()
+    expected[0, 0], expected[0, 5], expected[5, 0] = 0.09, -0.03, -0.03
+    assert product.covariance is not None
+    np.testing.assert_allclose(product.covariance, expected, atol=1e-15)
+
+
+def test_covariance_of_a_product_is_unknown_if_that_of_a_moving_factor_is():
+    moving = Transform("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 5)
+    fixed = Transform("b", "c", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    assert (moving @ fixed.with_covariance(COVARIANCE)).covariance is None
+    assert (moving @ fixed).covariance is None
+    assert (fixed @ fixed.inverse()).covariance is None
+    assert (moving.with_covariance(COVARIANCE) @ fixed).covariance is not None
+    assert (moving.inverse()).covariance is None
 
 
 @pytest.mark.parametrize(

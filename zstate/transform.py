@@ -7,7 +7,7 @@ is ``a_from_b``: the pose of frame b in frame a, which also maps coordinates in 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, cast, overload
 
 import numpy as np
@@ -217,7 +217,10 @@ class Transform(TransformFields):
         """The covariance of the pose: (6, 6), or None if it is not known.
 
         In the order x y z [m], rotation about the fixed axes x y z of ``target`` [rad], as in ROS
-        (geometry_msgs/PoseWithCovariance). Inverses and products have none.
+        (geometry_msgs/PoseWithCovariance). A lookup has one if samples of the path have it, an inverse if its
+        transform has, and a product if one factor has and the other has, too, or is of kind "static", which
+        is exact. The factors' errors are taken as independent, and the result is of first order in them
+        (``se3.carry_covariance``): right for rotations uncertain by a few tenths of a radian at most.
         """
         return None
 
@@ -242,7 +245,12 @@ class Transform(TransformFields):
         pose = se3.invert(self._pose)  # type: ignore[arg-type]
         if not all(map(math.isfinite, pose)):
             raise InvalidInput(f"the inverse of {self!r} is not finite: its numbers are too large")
-        return Transform.trusted(self.source, self.target, pose, self.stamp, self.kind, self.predicted_s)
+        inverse = Transform.trusted(self.source, self.target, pose, self.stamp, self.kind, self.predicted_s)
+        covariance = self.covariance
+        if covariance is None:
+            return inverse
+        carried = se3.carry_covariance(covariance, pose[3:], pose[:3])
+        return PoseWithCovariance.of_pose(inverse, carried[UPPER_TRIANGLE].tolist())
 
     @overload
     def __matmul__(self, other: Transform) -> Transform: ...
@@ -265,7 +273,7 @@ class Transform(TransformFields):
         if not all(map(math.isfinite, pose)):
             raise InvalidInput(f"the product of {self!r} and {other!r} is not finite: numbers are too large")
         stamps = {stamp for stamp in (self.stamp, other.stamp) if stamp is not None}
-        return Transform.trusted(
+        product = Transform.trusted(
             self.target,
             other.source,
             se3.normalize(pose, se3.SCALARS),
@@ -273,6 +281,25 @@ class Transform(TransformFields):
             combine_kinds(self.kind, other.kind),
             max(self.predicted_s, other.predicted_s),
         )
+        covariance = self._covariance_of_product(other)
+        if covariance is None:
+            return product
+        return PoseWithCovariance.of_pose(product, covariance[UPPER_TRIANGLE].tolist())
+
+    def _covariance_of_product(self, other: Transform) -> Array | None:
+        """The covariance of ``self @ other``, None if it is not known."""
+        first, second = self.covariance, other.covariance
+        is_unknown = (first is None and self.kind != "static") or (second is None and other.kind != "static")
+        if is_unknown or (first is None and second is None):
+            return None
+        rotation: se3.Quaternion = self._pose[3:]  # type: ignore[assignment]
+        total = np.zeros((6, 6))
+        if first is not None:
+            arm = se3.rotate(rotation, other._pose[:3])  # type: ignore[arg-type]
+            total += se3.carry_covariance(first, se3.IDENTITY[3:], arm)
+        if second is not None:
+            total += se3.carry_covariance(second, rotation, (0.0, 0.0, 0.0))
+        return total
 
     def _apply_to_points(self, points: object) -> Array:
         if not (isinstance(points, (list, tuple)) or hasattr(points, "__array__")):
@@ -348,55 +375,69 @@ class Transform(TransformFields):
         )
 
 
+Triangle: TypeAlias = Sequence[float]
+"""The upper triangle of a covariance: 21 numbers, row by row."""
+
+
 class PoseWithCovariance(Transform):
     """A Transform whose covariance is known. Made by ``Transform.with_covariance`` and by lookups."""
 
-    __slots__ = ("_covariance",)
+    __slots__ = ("_triangle",)
+
+    _triangle: Triangle | Callable[[], Triangle]
 
     @classmethod
-    def of_pose(cls, transform: Transform, triangle: Sequence[float]) -> PoseWithCovariance:
-        """``transform`` with the covariance that has this upper triangle, 21 numbers row by row."""
+    def of_pose(cls, transform: Transform, triangle: Triangle | Callable[[], Triangle]) -> PoseWithCovariance:
+        """``transform`` with this covariance, or that which ``triangle()`` returns when it is first used."""
         pose = cls.trusted(*Transform.__reduce__(transform)[1])
-        object.__setattr__(pose, "_covariance", tuple(triangle))
+        object.__setattr__(pose, "_triangle", triangle if callable(triangle) else tuple(triangle))
         return pose
+
+    def _known_triangle(self) -> Triangle:
+        if callable(self._triangle):
+            object.__setattr__(self, "_triangle", tuple(self._triangle()))
+        return self._triangle  # type: ignore[return-value]
 
     @property
     def covariance(self) -> Array:
         """As ``Transform.covariance``."""
         matrix = np.empty((6, 6))
-        matrix[UPPER_TRIANGLE] = matrix.T[UPPER_TRIANGLE] = self._covariance
+        matrix[UPPER_TRIANGLE] = matrix.T[UPPER_TRIANGLE] = self._known_triangle()
         matrix.flags.writeable = False
         return matrix
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (PoseWithCovariance.of_pose, (Transform.trusted(*super().__reduce__()[1]), self._covariance))
+        pose = Transform.trusted(*super().__reduce__()[1])
+        return (PoseWithCovariance.of_pose, (pose, self._known_triangle()))
 
 
-def check_covariance(covariance: ArrayLike) -> list[float]:
-    """The upper triangle of a covariance, (6, 6): 21 numbers row by row.
+def check_covariance(
+    covariance: ArrayLike, what: str = "the covariance of a pose", size: int = 6
+) -> list[float]:
+    """The upper triangle of a covariance, (size, size): 21 numbers row by row of a pose.
 
     Raises InvalidInput unless it is finite, symmetric within 1e-6 of its largest number, and positive
     semidefinite.
     """
-    matrix = real_numbers(covariance, "a covariance")
-    if matrix.shape != (6, 6):
-        raise InvalidInput(f"the covariance of a pose has shape (6, 6); got {matrix.shape}")
+    matrix = real_numbers(covariance, what)
+    if matrix.shape != (size, size):
+        raise InvalidInput(f"{what} has shape ({size}, {size}); got {matrix.shape}")
     if not np.isfinite(matrix).all():
-        raise InvalidInput("the covariance of a pose must be finite; leave it out if it is not known")
+        raise InvalidInput(f"{what} must be finite; leave it out if it is not known")
     tolerance = 1e-6 * float(np.abs(matrix).max())
     if np.abs(matrix - matrix.T).max() > tolerance:
-        row, column = np.unravel_index(np.abs(matrix - matrix.T).argmax(), (6, 6))
+        row, column = np.unravel_index(np.abs(matrix - matrix.T).argmax(), (size, size))
         raise InvalidInput(
-            f"the covariance of a pose is symmetric; got {matrix[row, column]:g} in row {row}, column "
+            f"{what} is symmetric; got {matrix[row, column]:g} in row {row}, column "
             f"{column}, and {matrix[column, row]:g} in row {column}, column {row}"
         )
     smallest = float(np.linalg.eigvalsh(matrix)[0])
     if smallest < -tolerance:
         raise InvalidInput(
-            f"the covariance of a pose has no negative eigenvalue; got {smallest:g}. Variances (the "
-            "diagonal, in m^2 and rad^2) are not negative, and limit the covariances in their row"
+            f"{what} has no negative eigenvalue; got {smallest:g}. Variances (the diagonal, in squares of "
+            "units) are not negative, and limit the covariances in their row"
         )
-    return matrix[UPPER_TRIANGLE].tolist()
+    return matrix[np.triu_indices(size)].tolist()
 
 
 def _frozen(numbers: ArrayLike) -> Array:

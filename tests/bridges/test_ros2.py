@@ -23,6 +23,7 @@ from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.odometry import OdometryPublisher
 from zstate.sources import JointStateListener, SineSource
 from zstate.transform import Transform
 from zstate.wire.protocol import SerializedSample
@@ -333,6 +334,24 @@ def odometry_on(session: Session, side: str) -> TransformPublisher:
 
 def edge(child: str, x: float, parent: str = "odom") -> Transform:
     return Transform(parent, child, (x, 0.0, 0.0), UPRIGHT)
+
+
+def test_the_edge_of_odometry_is_carried_to_tf(world):
+    world.bridge("r1")
+    with (
+        StatePublisher(world.join("native"), RRBOT, "r1") as publisher,
+        OdometryPublisher(world.join("native"), "r1") as odometry,
+        TransformListener(world.join("ros2"), "r1", wire="ros2") as carried,
+    ):
+
+        def move(stamp: int) -> bool:
+            publish(publisher, [stamp])
+            odometry.publish(edge("world", 2.0), [0, 0, 0], [0, 0, 0], stamp)
+            return carried.buffer.can_lookup("odom", "tool")
+
+        stamps = iter(range(1, 1_000_000))
+        until(lambda: move(next(stamps)))
+        assert carried.buffer.lookup("odom", "world").translation[0] == 2.0
 
 
 @pytest.mark.parametrize("side", ["native", "ros2"])

@@ -75,6 +75,15 @@ def test_refused_samples_are_a_warning_and_an_error_if_none_was_published(sent: 
     )
 
 
+def test_warning_of_the_program_lasts_until_it_is_empty():
+    slow_wheels = "wheels: NIS 14.2 for 3 numbers, expected 0.2 to 9.3"
+    before, now = replace(counts(5), warning=slow_wheels), replace(counts(6), warning=slow_wheels)
+    assert assess_health(before, now, quiet_ns=0) == Health("warn", slow_wheels)
+    assert assess_health(now, counts(7), quiet_ns=0) == OK
+    silent = assess_health(now, replace(now, warning="the IMU is silent"), quiet_ns=3 * SECOND)
+    assert silent == Health("stale", "nothing was published for 3.0 s: the IMU is silent")
+
+
 def test_status_has_writer_counts_and_commanded_rate():
     read = [counts(), counts(7, rate_hz=50.0, late=2)]
     reporter = StatusReporter(WriterId("driver", "nuc", 412, 5, 9), lambda: read.pop(0))

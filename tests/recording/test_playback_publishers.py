@@ -24,7 +24,8 @@ from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.recording.decode import SCAN_STREAMS, DecodedRecording
+from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
+from zstate.recording.decode import ODOMETRY_STREAMS, SCAN_STREAMS, DecodedRecording
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
@@ -35,13 +36,17 @@ from zstate.wire.messages import (
     JointState,
     LaserScan,
     OccupancyGrid,
+    Odometry,
     TransformSample,
+    order_digest,
     poses_from_block,
     to_block,
     to_float32_block,
 )
 from zstate.wire.native import ENCODINGS, decode
 from zstate.wire.registry import get_wire
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import RmwKeys
 
 COUNT = 20
 CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
@@ -383,3 +388,84 @@ def test_an_active_sensor_is_not_replayed(sessions, scanned: Path):
         with pytest.raises(SecondWriter, match="rear"):
             replay(writer, scanned)
         assert replay(writer, scanned, takeover=True) == 2 * COUNT
+
+
+@pytest.fixture
+def driven(sessions, tmp_path: Path) -> Path:
+    """A cart with an IMU, a velocity and odometry, recorded from the native wire."""
+    writer, reader = sessions
+    path = tmp_path / "driven.mcap"
+    with (
+        ImuPublisher(writer, "cart", "chest") as imu,
+        VelocityPublisher(writer, "cart", "flow") as velocity,
+        OdometryPublisher(writer, "cart", "wheels") as odometry,
+        Recorder(reader, path, ["cart"]) as recorder,
+    ):
+        wait_for_stream_readers(writer, "cart", "imu/chest", "velocity/flow", "odometry/wheels")
+        for n in range(COUNT):
+            stamp = START + n * 10 * MS
+            imu.publish([n, 0, 0], [0, 0, 9.81], stamp)
+            velocity.publish([n, 0, 0], stamp=stamp)
+            base = Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1]).with_covariance(np.eye(6) * (n + 1))
+            odometry.publish(base, [n, 0, 0], [0, 0, 0], stamp)
+        until(lambda: measured(recorder) == 3 * COUNT)
+    return path
+
+
+def measured(recorder: Recorder) -> int:
+    return sum(count for (_, stream), count in recorder.stats.messages.items() if stream in ODOMETRY_STREAMS)
+
+
+def test_sensors_and_odometry_are_replayed_as_they_were_recorded(sessions, driven: Path, tmp_path: Path):
+    writer, reader = sessions
+
+    def messages(path: Path) -> list[object]:
+        with RecordingReader(path) as opened:
+            decoded = DecodedRecording(opened, lambda *_: None).messages(streams=ODOMETRY_STREAMS)
+            facts = [
+                (one.writer.stream, one.writer.edge_writer, structs.asdict(one.message) | {"session": 0})
+                for one in decoded
+            ]
+        return sorted(facts, key=lambda fact: (fact[0], fact[2]["seq"]))
+
+    again = tmp_path / "again.mcap"
+    with (
+        TransformListener(reader, "cart") as listener,
+        Recorder(reader, again, ["cart"]) as recorder,
+    ):
+        wait_for_stream_readers(writer, "cart", "imu/chest", "velocity/flow", "odometry/wheels")
+        with Player(writer, driven) as player:
+            report = player.run()
+        until(lambda: measured(recorder) == 3 * COUNT)
+        found = listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=SOON_S)
+    assert (report.samples, report.refused) == (3 * COUNT, {})
+    assert messages(again) == messages(driven)
+    assert found.translation[0] == 5.0
+    assert found.covariance == pytest.approx(np.eye(6) * 6)
+
+
+def test_odometry_is_replayed_to_ros_with_its_edge_on_tf(sessions, driven: Path):
+    writer, reader = sessions
+    samples: list[Received] = []
+    with (
+        TransformListener(reader, "cart", wire="ros2", follow="tf") as listener,
+        subscribe(reader, get_wire("ros2"), "cart", "odometry", samples.extend),
+        Player(writer, driven, wires="ros2") as player,
+    ):
+        for stream, name in (("odometry", "wheels"), ("tf", "")):
+            wait_for_reader(writer, RmwKeys(Ros2Options()).key("cart", stream, name))
+        assert player.run().samples == 4 * COUNT
+        assert listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=SOON_S).translation[0] == 5.0
+        until(lambda: len(samples) == COUNT)
+
+
+def test_odometry_of_ros_nodes_is_no_edge_on_the_native_wire(sessions, tmp_path: Path):
+    path = tmp_path / "ros.mcap"
+    edge = (("odom", "base"),)
+    with RecordingBuilder(path, "cart") as builder:
+        builder.edges("cart", START, {edge[0]: pose(1)}, session=5)
+        head = (START, 1, 6, order_digest(edge))
+        sample = Odometry(*head, to_block(pose(2)), edge, None, to_block([0.0] * 6))
+        builder.encoder.write_message("cart", sample, START, "odom")
+    assert replay(sessions[0], path) == 1
+    assert recorded_buffer(path).lookup("odom", "base", START).translation[0] == 1.0

@@ -27,10 +27,12 @@ from zstate.model.robot import RobotModel
 from zstate.net.presence import local_writer
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
 from zstate.recording.info import read_info, recorded_robots
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
@@ -661,6 +663,57 @@ def test_scans_and_maps_are_recorded_as_published(sessions, tmp_path: Path, wire
     assert (grid.cells.tolist(), grid.resolution, grid.stamp) == (hall.cells.tolist(), 0.5, STAMP)
     assert [scan.ray_ns for scan in front] == [1000] * 5
     assert all(np.array_equal(one.ranges, r, equal_nan=True) for one, r in zip(front, sweeps, strict=True))
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_path: Path, wire: str):
+    writer, reader = sessions
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-3
+    path = tmp_path / "run.mcap"
+    now = time.time_ns()
+    with (
+        TransformListener(reader, "r1", wire=wire, follow="tf") as listener,
+        ImuPublisher(writer, "r1", "imu", [wire], frame="chest") as imu,
+        VelocityPublisher(writer, "r1", "flow", [wire]) as velocity,
+        OdometryPublisher(writer, "r1", "odom", [wire]) as odometry,
+        Recorder(reader, path, ["r1"], wire=wire) as recorder,
+    ):
+        for stream, name in (("imu", "imu"), ("velocity", "flow"), ("odometry", "odom")):
+            keys = {"native": f"zstate/r1/{stream}/{name}", "ros2": ROS_KEYS.key("r1", stream, name)}
+            wait_for_reader(writer, keys[wire])
+        for k in range(5):
+            imu.publish([k, 0, 0], [0, 0, 9.81], now + k)
+            velocity.publish([k, 1, 2], stamp=now + k, covariance=np.eye(3))
+            pose = Transform("odom", "base", [k, 0, 0], UPRIGHT).with_covariance(covariance * (k + 1))
+            odometry.publish(pose, [k, 0, 0], [0, 0, 1], now + k * PERIOD, twist_covariance=covariance)
+        until(lambda: [count(recorder, "r1", one) for one in ("imu", "velocity", "odometry")] == [5] * 3)
+        until(lambda: count(recorder, "r1", {"native": "transforms", "ros2": "tf"}[wire]) == 5)
+        live = [listener.buffer.wait("odom", "base", at, SOON_S) for at in (now + PERIOD // 2, now + PERIOD)]
+    assert (recorder.stats.missed, recorder.stats.refused) == (0, {})
+    for other in OTHERS:
+        by_topic: dict[str, list[Any]] = {}
+        for topic, message in other(path):
+            by_topic.setdefault(topic, []).append(message)
+        assert [one.angular_velocity.x for one in by_topic["/imu"]] == list(range(5))
+        assert [one.twist.twist.linear.x for one in by_topic["/flow"]] == list(range(5))
+        assert [one.pose.pose.position.x for one in by_topic["/odom"]] == list(range(5))
+        assert [one.transforms[0].child_frame_id for one in by_topic["/tf"]] == ["base"] * 5
+    with Recording(path) as recording:
+        readings, velocities = list(recording.imu("r1", "imu")), list(recording.velocities())
+        samples = list(recording.odometry("r1", "odom"))
+        buffer = recording.buffer()
+        recorded = [buffer.lookup("odom", "base", at) for at in (now + PERIOD // 2, now + PERIOD)]
+        streams = {one.stream for one in recorded_robots(recording.info)[0].streams}
+    assert [(one.stamp, one.frame) for one in readings] == [(now + k, "r1/chest") for k in range(5)]
+    assert [from_block(one.linear)[0] for one in velocities] == list(range(5))
+    assert velocities[0].angular is None
+    assert from_block(velocities[0].covariance).tolist() == [1, 0, 0, 1, 0, 1]
+    assert [from_block(one.twist).tolist() for one in samples] == [[k, 0, 0, 0, 0, 1] for k in range(5)]
+    assert {"imu", "velocity", "odometry"} <= streams
+    for there, here in zip(live, recorded, strict=True):
+        assert (there.pose7 == here.pose7).all()
+        assert (here.kind, np.array_equal(there.covariance, here.covariance)) == (there.kind, True)
+    assert (recorded[1].covariance is None) == (wire == "ros2")  # /tf has none
 
 
 def test_withdrawn_map_keeps_static_edges_of_its_name(sessions, tmp_path: Path):

@@ -26,11 +26,11 @@ from zstate import Recording, TransformBuffer, UnknownFrame
 from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
 from zstate.transform import Transform
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
+from zstate.wire.messages import Imu, LaserScan, OccupancyGrid, to_block, to_float32_block
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
-from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
+from zstate.wire.ros2.types import IMU, LASER_SCAN, OCCUPANCY_GRID
 
 
 def test_repr_has_duration_and_robots(tmp_path: Path):
@@ -294,6 +294,22 @@ def test_scans_that_are_none_are_left_out(tmp_path: Path):
             builder.encoder.write_message("arm", scan(START, ranges), START, "front")
     with Recording(path) as recording:
         assert [one.ranges.tolist() for one in recording.scans()] == [[1.0], [2.0]]
+
+
+def test_sensors_of_a_bag_are_those_of_its_robots_whatever_their_namespace(tmp_path: Path):
+    encoder = RosStreamEncoder(FrameNames(Ros2Options(), "ros"), SampleLayout())
+    reading = Imu(START, 0, 1, "imu_link", to_block([1, 2, 3]), to_block([0, 0, 9.81]))
+    with Bag(tmp_path / "bag") as bag:
+        bag.tf(START, [Transform("odom", "base", [1.0, 0, 0], [0, 0, 0, 1], START)])
+        bag.joints(START, {"wheel": 1.0}, "/r1/joint_states")
+        for topic in ("/imu/data", "/r1/imu/data"):
+            bag.write(topic, START, STORE.deserialize_cdr(encoder.encode(reading), IMU.name), IMU.name)
+    with Recording(tmp_path / "bag") as recording:
+        assert recording.robots == ("r1", "ros")
+        (of_r1,) = recording.imu("r1", "imu_data")
+        (of_all,) = recording.imu("ros", "imu_data")
+    assert (of_r1.frame, of_all.frame) == ("r1/imu_link", "ros/imu_link")
+    assert of_r1.gyro == reading.gyro
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])

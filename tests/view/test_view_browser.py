@@ -12,9 +12,10 @@ import pytest
 from helpers.processes import DEADLINE_S, repeated, until
 from numpy.typing import NDArray
 
-from zstate import StatePublisher, load_model
+from zstate import StatePublisher, Transform, load_model
 from zstate.model.geometry import read_shapes
 from zstate.net.session import Session
+from zstate.odometry import OdometryPublisher
 from zstate.scans import Grid, MapPublisher
 from zstate.view.camera import FIELD_OF_VIEW, CameraPose, fit_camera
 from zstate.view.data_source import ViewSource
@@ -152,6 +153,41 @@ def test_beyond_loopback_a_browser_needs_the_token(browser, open_tab, sessions):
         until(page.connected.is_set)
         view.draw()
         view_tab.text("No robot is announced")
+
+
+def test_ellipse_of_a_base_is_drawn_where_it_is(open_tab, show_view, sessions):
+    # sqrt(5.991) times the standard deviations: 0.73 and 0.37 m.
+    half_axes = np.sqrt(5.991 * np.array([0.09, 0.0225]))
+    covariance = np.diag([0.09, 0.0225, 0.01, 0.01, 0.01, 0.01])
+    world = Transform("odom", "world", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)).with_covariance(covariance)
+    still = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    with (
+        standing(sessions[0], "rrbot"),
+        OdometryPublisher(sessions[0], "rrbot") as odometry,
+        repeated(lambda: odometry.publish(world, *still), every_s=0.05),
+    ):
+        shown = show_view(sessions[1], "rrbot")
+        until(lambda: {"rrbot/odom", "rrbot/tool"} <= set(shown.source.snapshot().tree.names))
+        view_tab = open_tab(shown.page.url)
+        until(lambda: not shown.view.scene.busy, PATIENCE_S)
+        full = picture(view_tab)
+        view_tab.save_screenshot("ellipse")
+        field(view_tab, "Odometry").click()
+        until(lambda: not shown.view.scene.odometry.is_on)
+        drawn = changed(full, picture(view_tab))
+
+        snapshot = shown.source.snapshot()
+        placed = snapshot.poses_in("rrbot/odom")
+        framing = fit_camera(snapshot, placed, 1.0, shown.view.scene.corners(snapshot.tree, placed))
+        assert framing is not None
+        angles = np.linspace(0.0, 2.0 * math.pi, 40)
+        ring = np.stack((np.cos(angles) * half_axes[0], np.sin(angles) * half_axes[1], 0.0 * angles), axis=1)
+        height, width = drawn.shape
+        near = [
+            drawn[max(0, y - 3) : y + 4, max(0, x - 3) : x + 4].any()
+            for x, y in pixels_of(ring, framing, (width, height)).round().astype(int).tolist()
+        ]
+        assert np.mean(near) > 0.9
 
 
 def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):

@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from hashlib import blake2b
 from typing import Any
 
@@ -9,13 +10,20 @@ from zstate.wire.messages import (
     GRID_CELLS,
     MAX_BYTES,
     SCAN_RAYS,
+    Imu,
     JointState,
     JointTrajectory,
     LaserScan,
+    Message,
     OccupancyGrid,
+    Odometry,
     StaticTransforms,
     TransformSample,
+    Velocity,
+    WriterTransforms,
     cells_of,
+    covariance_matrix,
+    edge_of,
     from_block,
     from_float32_block,
     order_digest,
@@ -144,6 +152,78 @@ def test_ranges_that_are_no_measurements_are_part_of_a_scan():
 def test_a_scan_with_impossible_geometry_or_times_cannot_be_made(changed: dict[str, Any], text: str):
     with pytest.raises(InvalidInput, match=text):
         scan(**changed)
+
+
+def imu(**changed: Any) -> Imu:
+    fields: dict[str, Any] = {
+        **{"stamp": 5, "seq": 0, "session": 1, "frame": "imu"},
+        **{"gyro": to_block([0.1, 0.2, 0.3]), "accel": to_block([0.0, 0.0, 9.81])},
+    }
+    return Imu(**{**fields, **changed})
+
+
+def velocity(**changed: Any) -> Velocity:
+    fields: dict[str, Any] = {"stamp": 5, "seq": 0, "session": 1, "frame": "base"}
+    return Velocity(**{**fields, "linear": to_block([1, 0, 0]), **changed})
+
+
+def odometry(**changed: Any) -> Odometry:
+    edge = (("odom", "base"),)
+    fields: dict[str, Any] = {
+        **{"stamp": 5, "seq": 0, "session": 1, "order": order_digest(edge), "edges": edge},
+        **{"poses": to_block([1, 2, 3, 0, 0, 0, 1]), "twist": to_block(range(6))},
+    }
+    return Odometry(**{**fields, **changed})
+
+
+@pytest.mark.parametrize(
+    ("make", "changed", "text"),
+    [
+        (imu, {"frame": ""}, "1 to 1024 characters, not 0"),
+        (imu, {"gyro": to_block([1, 2])}, "angular velocities of 3 numbers take 24 bytes, not 16"),
+        (imu, {"accel": to_block([0, np.nan, 0])}, "accelerations of finite numbers .* not 0.0, nan"),
+        (imu, {"gyro_covariance": to_block(range(5))}, "of 6 numbers take 48 bytes, not 40"),
+        # the variances of an upper triangle xx xy xz yy yz zz are the 1st, 4th and 6th
+        (imu, {"accel_covariance": to_block([1, 2, 3, 4, 5, -6])}, r"not negative; got \[1.0, 4.0, -6.0\]"),
+        (imu, {"orientation": to_block([0, 0, 0, 2])}, "length 1, not 2"),
+        (imu, {"orientation_covariance": to_block(range(6))}, "needs an orientation"),
+        (velocity, {"linear": b""}, "velocities of 3 numbers take 24 bytes, not 0"),
+        (velocity, {"angular": to_block([np.inf, 0, 0])}, "finite numbers"),
+        (velocity, {"covariance": to_block(range(21))}, "of 6 numbers take 48 bytes, not 168"),
+        (velocity, {"angular": bytes(24), "covariance": bytes(48)}, "of 21 numbers take 168 bytes, not 48"),
+        (odometry, {"edges": None}, "odometry has one edge"),
+        (odometry, {"poses": bytes(112)}, "1 edges need as many poses, not 2"),
+        (odometry, {"covariances": bytes(168 * 2)}, "21 numbers of covariance each"),
+        (odometry, {"twist": b""}, "a twist of 6 numbers take 48 bytes, not 0"),
+        (odometry, {"twist_covariance": to_block([-1.0, *range(20)])}, "not negative; got .-1.0, 5.0"),
+    ],
+)
+def test_a_measurement_with_impossible_numbers_cannot_be_made(
+    make: Callable[..., Message], changed: dict[str, Any], text: str
+):
+    with pytest.raises(InvalidInput, match=text):
+        make(**changed)
+
+
+def test_messages_of_sensors_and_odometry_fit_the_limit_of_their_streams():
+    frame, six = "\U0001f916" * 1024, bytes(21 * 8)
+    edge = ((frame, frame),)
+    largest = odometry(edges=edge, order=order_digest(edge), covariances=six, twist_covariance=six)
+    assert max(len(encode(one)) for one in (imu(frame=frame), largest)) <= MAX_BYTES["odometry"]
+
+
+def test_odometry_is_a_sample_of_its_edge():
+    sample = odometry(covariances=to_block(range(21)))
+    edge = edge_of(sample)
+    assert type(edge) is WriterTransforms
+    assert (edge.stamp, edge.edges, edge.poses) == (5, (("odom", "base"),), sample.poses)
+    assert edge.covariances == sample.covariances
+
+
+def test_an_upper_triangle_is_a_symmetric_matrix():
+    matrix = covariance_matrix(to_block([1, 2, 3, 4, 5, 6]))
+    assert matrix.tolist() == [[1, 2, 3], [2, 4, 5], [3, 5, 6]]
+    assert covariance_matrix(to_block(range(21)))[5].tolist() == [5, 10, 14, 17, 19, 20]
 
 
 def test_row_0_of_the_cells_is_the_first_width_cells():

@@ -16,6 +16,7 @@ from zstate.wire.messages import (
     ClockMessage,
     DriverState,
     HistoryPage,
+    Imu,
     JointCommand,
     JointState,
     JointTrajectory,
@@ -25,12 +26,14 @@ from zstate.wire.messages import (
     MotionOutcome,
     MotionReply,
     OccupancyGrid,
+    Odometry,
     Release,
     RobotDescription,
     StaticTransforms,
     Status,
     Stop,
     TransformSample,
+    Velocity,
     WriterTransforms,
     order_digest,
     to_block,
@@ -194,6 +197,41 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + b"".join(b"\xcb" + struct.pack(">d", number) for number in (0.125, 8.0))
         + bin8(struct.pack("<2f", 0.5, np.inf))
         + bin8(struct.pack("<2f", 1, 2)),
+    ),
+    "imu": (
+        Imu(
+            *(STAMP, 300, 2**63 + 5, "imu", to_block([1, 2, 3]), to_block([0, 0, 9.81])),
+            *(to_block([0, 0, 0, 1]), None, to_block(range(6)), to_block(range(6))),
+        ),
+        header(10)[:-10]
+        + fixstr("imu")
+        + bin8(struct.pack("<3d", 1, 2, 3))
+        + bin8(struct.pack("<3d", 0, 0, 9.81))
+        + bin8(struct.pack("<4d", 0, 0, 0, 1))
+        + NIL
+        + bin8(struct.pack("<6d", *range(6))) * 2,
+    ),
+    "velocity": (
+        Velocity(STAMP, 300, 2**63 + 5, "base", to_block([1, 2, 3]), None, to_block(range(6))),
+        header(7)[:-10]
+        + fixstr("base")
+        + bin8(struct.pack("<3d", 1, 2, 3))
+        + NIL
+        + bin8(struct.pack("<6d", *range(6))),
+    ),
+    "odometry": (
+        Odometry(
+            *(STAMP, 300, 2**63 + 5, order_digest(EDGES[:1]), to_block([1, 2, 3, 0, 0, 0, 1]), EDGES[:1]),
+            *(None, to_block(range(6)), to_block(range(21))),
+        ),
+        header(9)[:-8]
+        + order_digest(EDGES[:1])
+        + bin8(struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1))
+        + b"\x91"
+        + pairs(*EDGES[:1])
+        + NIL
+        + bin8(struct.pack("<6d", *range(6)))
+        + bin8(struct.pack("<21d", *range(21))),
     ),
     "grid": (
         OccupancyGrid(7, 6, "map", 0.5, 2, 1, to_block([1, 2, 0, 0, 0, 0, 1]), b"\xff\x64"),

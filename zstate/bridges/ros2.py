@@ -132,11 +132,11 @@ class BridgeSide(NamedTuple):
 class TransformBridge(Closeable):
     """Publishes on ``target`` the moving edges of programs on ``source``, except those of ``model``.
 
-    On the native side they keep the names of their writers; for a ROS node it is its own. Covariances are
-    dropped, because /tf has none. Samples of bridges are skipped, and samples of writers that are not
-    announced, which may be bridges. If all robots share /tf, the edges whose child is a frame of this robot
-    are published. Subscribes only while there is a writer: on the ROS side the bridge itself would be
-    a reader for which it computes /tf.
+    On the native side they keep the names of their writers; for a ROS node it is its own. Covariances, and
+    the velocities of odometry, are dropped, because /tf has none. Samples of bridges are skipped, and
+    samples of writers that are not announced, which may be bridges. If all robots share /tf, the edges
+    whose child is a frame of this robot are published. Subscribes only while there is a writer: on the ROS
+    side the bridge itself would be a reader for which it computes /tf.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class TransformBridge(Closeable):
         self._opened.close()
 
     def _on_writer(self, announced: Announcement, alive: bool) -> None:
-        if announced.stream != self._wire.transforms or is_bridge(announced):
+        if announced.stream not in self._wire.edges or is_bridge(announced):
             return
         session = announced.writer.session
         name = announced.name or edge_writer_of_node(announced.writer.program)
@@ -181,13 +181,14 @@ class TransformBridge(Closeable):
     def _subscribe(self) -> None:
         if self._subscription is not None:
             return
-        session, robot, stream = self._source.session, self._robot, self._wire.transforms
+        session, robot, streams = self._source.session, self._robot, self._wire.edges
         on_error = self._counters.count_refusal
         with ExitStack() as opening:
-            opening.enter_context(
-                subscribe(session, self._wire, robot, stream, self._on_messages, on_error=on_error)
-            )
-            for announcement in announce_reader(session, self._wire, robot, [stream]):
+            for stream in streams:
+                opening.enter_context(
+                    subscribe(session, self._wire, robot, stream, self._on_messages, on_error=on_error)
+                )
+            for announcement in announce_reader(session, self._wire, robot, streams):
                 opening.enter_context(announcement)
             self._subscription = opening.pop_all()
 

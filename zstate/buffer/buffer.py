@@ -102,6 +102,10 @@ class TransformBuffer(BufferCore):
         that are missing. An older transform than ``max_age_s`` is an error. ``predict_s`` allows instants up
         to so long after the newest sample, from published velocities; its transforms are of kind "predicted".
 
+        The transform has a ``covariance`` if its path has edges whose samples have covariances, and all other
+        edges are exact: static, or joints of a model. A moving edge without a covariance leaves it None:
+        unknown is not zero. So does a prediction.
+
         Raises UnknownFrame, AmbiguousFrame, Disconnected, ClockMismatch, NoData, InPast, InFuture, Stale or
         NotFinite, all of them LookupFailed; after a wait also a TimeoutError. Raises InvalidInput for names
         that cannot be frame names.
@@ -128,7 +132,8 @@ class TransformBuffer(BufferCore):
         """The pose of ``source`` at one instant in ``target`` at another (tf2's advanced form).
 
         ``fixed`` is assumed not to move between the two. None for an instant is the newest of that side. The
-        transform has the target side's stamp.
+        transform has the target side's stamp, and no covariance: the errors of one edge at two instants are
+        not independent, and how much of them is common is not known.
         """
         check_names(target, source, fixed)
         for name in (target, source, fixed):

@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from zstate._util.fork_safe import fork_safe
 from zstate._util.format import did_you_mean
 from zstate.buffer.clock_domain import ClockDomain
+from zstate.buffer.covariance_path import compile_path_with_covariances
 from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreeSnapshot
 from zstate.buffer.history import FastPath, HistoryView, insert_together, keep_only_around
-from zstate.buffer.path import TrackUse, TransformPath, compile_path
+from zstate.buffer.path import TrackUse, TransformPath
 from zstate.buffer.pose_tracks import (
     EdgeNames,
     Poses,
@@ -498,7 +499,7 @@ class BufferCore:
             return self._cached_path(target, source).path
         with self._lock:
             edges = self._tree.path(target, source)
-            return compile_path(target, source, edges, self._read_views, compiled=False)
+            return compile_path_with_covariances(target, source, edges, self._read_views, compiled=False)
 
     def _cached_path(self, target: str, source: str) -> CachedPath:
         version, cached = self._tree.version, self._paths.get((target, source))
@@ -509,7 +510,7 @@ class BufferCore:
         else:
             with self._lock:
                 edges = self._tree.path(target, source)
-                path = compile_path(target, source, edges, self._read_views)
+                path = compile_path_with_covariances(target, source, edges, self._read_views)
                 cached = CachedPath(self._tree.version, path, edges.dependencies)
         if len(self._paths) >= _MAX_CACHED_PATHS:
             self._paths = {}

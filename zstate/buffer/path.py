@@ -41,7 +41,7 @@ from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InFuture, InPast, InvalidInput, LookupFailed, NoData, NotFinite, Stale
 from zstate.extension import kernel
 from zstate.model.joint_transforms import JointTransform
-from zstate.transform import Kind, PoseWithCovariance, Transform
+from zstate.transform import Kind, Transform
 
 if TYPE_CHECKING or kernel == "c":
     from zstate import _kernel
@@ -308,29 +308,6 @@ def _flat(numbers: Sequence[se3.Component]) -> NDArray[np.float64]:
     return np.concatenate([np.empty(0), *(np.ravel(number) for number in numbers)])
 
 
-class CovariancePath(TransformPath):
-    """The path of one edge, from child to parent, whose samples have covariances.
-
-    Between two samples the covariance is interpolated linearly, which keeps it positive semidefinite.
-    """
-
-    def transform(self, stamp: int | None, predict_ns: int = 0) -> Transform:
-        transform = super().transform(stamp, predict_ns)
-        (use,) = self.uses
-        (view,) = self.read_views(self.uses)
-        assert isinstance(use.track, PoseTrack)
-        assert transform.stamp is not None
-        now = bracket_at(view, transform.stamp)
-        if now is None:  # predicted
-            return transform
-        columns = use.track.covariance_columns(use.track.edges.index(use.edge))
-        triangle = [
-            (1.0 - now.ratio) * before + now.ratio * after
-            for before, after in zip(now.a[columns], now.b[columns], strict=True)
-        ]
-        return transform if math.isnan(sum(triangle)) else PoseWithCovariance.of_pose(transform, triangle)
-
-
 class CompiledPath(TransformPath):
     """The same results as ``TransformPath``, in a hundredth of the time."""
 
@@ -385,14 +362,7 @@ def compile_path(
     uses = tuple(by_track.values())
     is_cubic = any(getattr(one, "cubic", False) for use in uses for one in use.interpolators)
     kind = CompiledPath if compiled and kernel == "c" and not is_cubic else TransformPath
-    if len(edges.to_source) == 1 and not edges.to_target and _has_covariances(edges.to_source[0]):
-        kind = CovariancePath
     return kind(target, source, steps_to_target, steps_to_source, uses, read_views, edges.domain)
-
-
-def _has_covariances(edge: Edge) -> bool:
-    """Whether the samples of an edge have covariances."""
-    return isinstance(edge.track, PoseTrack) and edge.track.has_covariances
 
 
 def _steps(edges: Sequence[Edge], uses: dict[Track, TrackUse]) -> list[Step]:

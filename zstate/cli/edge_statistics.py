@@ -54,7 +54,7 @@ class EdgeMeasure:
 
 
 class EdgeStatistics(Closeable):
-    """Subscribes to ``stream`` and the transforms of ``robot`` ("*": of all) on ``wire``.
+    """Subscribes to ``stream`` and the transforms and odometry of ``robot`` ("*": of all) on ``wire``.
 
     ``clock`` is the one of the stamps.
     """
@@ -73,8 +73,9 @@ class EdgeStatistics(Closeable):
         wire_format = get_wire(wire)
         self.topic = TopicStatistics(session, wire_format, sources=sources, clock=clock)
         self.topic.subscribe(stream, robot)
-        if wire_format.transforms != stream:
-            self.topic.subscribe(wire_format.transforms, robot)
+        for edges in wire_format.edges:
+            if edges != stream:
+                self.topic.subscribe(edges, robot)
         if stream == "joint_states" != wire_format.partial_joint_states:
             self.topic.subscribe(wire_format.partial_joint_states, robot)
 

@@ -48,7 +48,7 @@ _COMMANDS = {
     "tree": ("Look", "The frames of the announced robots, as a tree."),
     "ls": ("Look", "The announced robots and their writers."),
     "graph": ("Look", "The writers and readers of each stream."),
-    "echo": ("Look", "Joint states, transforms, scans or maps as documents."),
+    "echo": ("Look", "Joint states, transforms, odometry, sensors or maps as documents."),
     "hz": ("Look", "The rate at which samples come in."),
     "doctor": ("Look", "What is wrong, and what to do next."),
     "wait": ("Look", "Wait until a robot, a pose or a router is there."),

@@ -17,7 +17,7 @@ from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream
+from zstate.wire.keys import EDGE_STREAMS, Stream
 
 Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]
 
@@ -140,7 +140,7 @@ class CallbackThread(Closeable, Generic[T]):
                         threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
 
-_NAMED_SAMPLES: frozenset[Stream] = frozenset({"transforms", "partial_joint_states"})
+_NAMED_SAMPLES: frozenset[Stream] = frozenset({*EDGE_STREAMS, "partial_joint_states"})
 _Place = tuple[str, Stream, str]
 
 
@@ -226,8 +226,11 @@ class EventLog(Closeable):
                 self._add_static_conflict(source.robot, source.name, child, text)
                 return
             announced = self._sample_writer(source.robot, source.session)
-            writer = None if announced is None else announced.writer
-            self._add_conflict((source.robot, "", source.session, child), stream, writer, text)
+            key = (source.robot, "", source.session, child)
+            if announced is None:
+                self._add_conflict(key, stream, None, text)
+            else:
+                self._add_conflict(key, announced.stream, announced.writer, text)
 
     def set_static_children(self, robot: str, name: str, children: frozenset[str]) -> None:
         """Set the full names of the frames that the static writer ``name`` of ``robot`` places now."""

@@ -16,6 +16,7 @@ from zstate.wire.keys import MODEL_WRITER, EdgeNames, full_name
 from zstate.wire.messages import (
     POSE_BYTES,
     Edges,
+    Odometry,
     RobotDescription,
     Sample,
     StaticTransforms,
@@ -194,6 +195,8 @@ class TransformIngest(StreamIngest):
             return None
         if isinstance(sample, WriterTransforms) and sample.covariances is not None:
             return None
+        if isinstance(sample, Odometry):
+            return None  # its twist changes as well
         return self._all_admitted.get(sample.order)
 
     def _drop_history(self) -> None:

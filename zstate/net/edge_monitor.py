@@ -20,7 +20,7 @@ from zstate.net.ownership import CHECK_PERIOD_S, Edge, frame_conflict, named_edg
 from zstate.net.session import Session
 from zstate.net.streams import CAPACITY, Ring, to_serialized
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import stream_key, writer_expression
+from zstate.wire.keys import EDGE_STREAMS, stream_key, writer_expression
 from zstate.wire.messages import SAMPLE_BYTES, TransformSample
 from zstate.wire.native import NativeWire
 
@@ -41,7 +41,7 @@ class _Watched(NamedTuple):
 
 
 class EdgeMonitor(Closeable):
-    """Watches the older writers of transforms of one robot. Has no thread: reads samples when it is asked.
+    """Watches the older writers of moving edges of one robot. Has no thread: reads samples when it is asked.
 
     Of two writers that publish one edge the later one ends: its ``check`` raises SecondWriter. A token alone
     displaces no writer, whatever start time it carries: its holder must also publish the edge. Writers whose
@@ -62,7 +62,7 @@ class EdgeMonitor(Closeable):
         """Watch these edges, which ``claim_edges`` owns now."""
         if self._tokens is None:
             self._tokens = self._session.zenoh.liveliness().declare_subscriber(
-                writer_expression(self._writer.robot, "transforms"),
+                writer_expression(self._writer.robot),
                 zenoh.handlers.RingChannel(CAPACITY),
                 history=True,
             )
@@ -87,14 +87,14 @@ class EdgeMonitor(Closeable):
 
     def _on_token(self, token: zenoh.Sample, now: float) -> None:
         for rival in _WIRE.parse_token(str(token.key_expr), self._writer.robot):
-            if rival.stream != "transforms":
+            if rival.stream not in EDGE_STREAMS:
                 continue
             is_older = seniority(rival) < seniority(self._writer) and bool(rival.name)
             if token.kind == zenoh.SampleKind.DELETE:
                 self._stop_watching(rival)
             elif is_older and rival.writer.session not in self._allowed and len(self._watched) < _MAX_WATCHED:
                 ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
-                key = stream_key(rival.robot, "transforms", rival.name)
+                key = stream_key(rival.robot, rival.stream, rival.name)
                 samples = self._session.zenoh.declare_subscriber(key, ring)
                 self._watched[rival] = _Watched(samples, now + _WATCHED_S)
 
@@ -103,7 +103,7 @@ class EdgeMonitor(Closeable):
         for sample in _drain(samples):
             with suppress(MessageError):
                 for message in _WIRE.decode(
-                    "transforms", to_serialized(sample, "", SAMPLE_BYTES), rival.robot
+                    rival.stream, to_serialized(sample, "", SAMPLE_BYTES), rival.robot
                 ):
                     if isinstance(message, TransformSample) and message.session == rival.writer.session:
                         yield from named_edges(rival.robot, message.edges or ())

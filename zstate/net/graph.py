@@ -18,7 +18,7 @@ from zstate.net.presence import RobotInfo, discover, discover_readers, discover_
 from zstate.net.session import Session
 from zstate.net.status import StatusSubscriber
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream
+from zstate.wire.keys import ANY, EDGE_STREAMS, MODEL_WRITER, Stream
 from zstate.wire.messages import Status
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class Graph:
         return [StreamGroup(*ends, tuple(streams)) for ends, streams in groups.items()]
 
 
-_OPTIONAL: frozenset[Stream] = frozenset({"transforms", "partial_joint_states", "joint_commands"})
+_OPTIONAL: frozenset[Stream] = frozenset({*EDGE_STREAMS, "partial_joint_states", "joint_commands"})
 """Streams that a robot with other ones does not lack."""
 
 RateLookup = Callable[[str, Stream, WriterId], float | None]
@@ -240,8 +240,8 @@ class RosGraph:
 def discover_ros_graph(session: Session, wire: Ros2Wire) -> RosGraph:
     """The ROS graph of all namespaces of the domain. Takes up to a second if nothing is announced.
 
-    A topic belongs to the stream of its type, and of its last name unless it is a scan or a map; other topics
-    are left out.
+    A topic belongs to the stream of its type, and of its last name unless its writer names it, as scans and
+    maps; other topics are left out.
     """
     from zstate.wire.ros2.graph import NodeToken, parse_dds_token, parse_token  # noqa: PLC0415 - ROS only
     from zstate.wire.ros2.topics import topic_stream  # noqa: PLC0415 - ROS only

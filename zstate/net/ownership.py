@@ -32,9 +32,11 @@ from zstate.net.streams import Ring, to_serialized
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import (
     ANY,
+    EDGE_STREAMS,
     FOREIGN_FRAME,
     MODEL_WRITER,
     NAMED_STREAMS,
+    SENSOR_STREAMS,
     Stream,
     edge_expression,
     edge_key,
@@ -66,9 +68,9 @@ CHECK_PERIOD_S = 0.05
 _STARTUP_S = 1.0
 """Each sample checks for this long: by then the tokens of writers that opened at the same time are here."""
 
-_ALL_HISTORIES_OF_EDGES = tuple(
-    f"{stream_expression(ANY, stream)}?session=0" for stream in ("transforms", "partial_joint_states")
-)
+_MOVING: tuple[Stream, ...] = (*EDGE_STREAMS, "partial_joint_states")
+
+_ALL_HISTORIES_OF_EDGES = tuple(f"{stream_expression(ANY, stream)}?session=0" for stream in _MOVING)
 """Queries that each writer of moving edges or of some joints receives, and to which none has samples."""
 
 _Handler: TypeAlias = "zenoh.handlers.Handler[zenoh.Sample]"
@@ -257,7 +259,7 @@ class WriterClaim(Closeable):
         claimed = {claimed.stream for claimed in self._claimed}
         if "partial_joint_states" in {first.stream, *claimed} and first.stream not in claimed:
             advice = "stop it first, for it and this writer would publish the same joints"
-        elif first.stream in ("transforms", "partial_joint_states"):
+        elif first.stream in (*_MOVING, *SENSOR_STREAMS):
             advice = "stop it first, or give this writer another name"
         elif first.stream == "joint_commands":
             advice = "a robot has one commander at a time: close the first"
@@ -494,7 +496,7 @@ def frame_conflict(first: Announcement, edge: Edge, verb: str) -> SecondWriter:
     """The error of a writer whose edge excludes ``edge`` of the writer ``first``."""
     parent, child = edge
     advice = "stop or withdraw that first, or use takeover=True (--takeover)"
-    if first.stream in ("transforms", "partial_joint_states"):
+    if first.stream in _MOVING:
         verb, advice = "places", "stop that first"
     text = (
         f"{writer_text(first.writer)} {verb} {child!r} on {parent!r} already, as {first.name!r} of "

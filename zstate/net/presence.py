@@ -62,7 +62,8 @@ class RobotInfo:
 
     ``static_names`` are (name, writer) for the names under which static edges are written, and
     ``transform_names`` and ``part_names`` the same for moving edges, and for drivers of some of its joints;
-    ``scan_names`` are its laser scanners, ``map_names`` its maps.
+    ``scan_names`` are its laser scanners, ``imu_names`` and ``velocity_names`` other sensors, ``map_names``
+    its maps, and ``odometry_names`` its writers of odometry.
     """
 
     name: str
@@ -72,6 +73,9 @@ class RobotInfo:
     part_names: tuple[tuple[str, WriterId], ...] = ()
     scan_names: tuple[tuple[str, WriterId], ...] = ()
     map_names: tuple[tuple[str, WriterId], ...] = ()
+    imu_names: tuple[tuple[str, WriterId], ...] = ()
+    velocity_names: tuple[tuple[str, WriterId], ...] = ()
+    odometry_names: tuple[tuple[str, WriterId], ...] = ()
 
     def __repr__(self) -> str:
         streams: dict[str, list[str]] = {}
@@ -88,6 +92,9 @@ class RobotInfo:
             "partial_joint_states": self.part_names,
             "scan": self.scan_names,
             "map": self.map_names,
+            "imu": self.imu_names,
+            "velocity": self.velocity_names,
+            "odometry": self.odometry_names,
         }.get(stream, ())
         return tuple(name for name, owner in names if owner == writer)
 
@@ -212,6 +219,9 @@ def by_robot(found: Iterable[Announcement]) -> tuple[RobotInfo, ...]:
             sorted_names(robot, "partial_joint_states"),
             sorted_names(robot, "scan"),
             sorted_names(robot, "map"),
+            sorted_names(robot, "imu"),
+            sorted_names(robot, "velocity"),
+            sorted_names(robot, "odometry"),
         )
         for robot in sorted(writers)
     )

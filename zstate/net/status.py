@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 import zenoh
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
 from zstate.errors import Closed, InvalidInput, MessageError
@@ -27,6 +28,9 @@ from zstate.wire.protocol import SerializedSample
 PERIOD_S = 1.0
 JOIN_WITHIN_S = 0.5
 MAX_STATUS_BYTES = 65_536
+
+_RECENT_S = 3.0 * PERIOD_S
+"""Publishers whose last status is older are gone, frozen or unreachable."""
 
 
 class StatusPublisher(Closeable):
@@ -82,6 +86,24 @@ class StatusSubscriber(StreamSubscriber):
                 callback(name, status)
 
         super().__init__(session, status_expression(robot), lambda samples: call_for_each(samples, on_sample))
+
+
+class StatusMonitor(StatusSubscriber):
+    """The newest status of each publisher of ``robot`` ("*": of all robots)."""
+
+    def __init__(self, session: Session, robot: str) -> None:
+        self._newest: BoundedDict[tuple[str, int], tuple[Status, float]] = BoundedDict()
+        super().__init__(session, robot, self._on_status)
+
+    def _on_status(self, robot: str, status: Status) -> None:
+        self._newest[robot, status.session] = status, time.monotonic()
+
+    def recent(self, robot: str) -> list[Status]:
+        """Those of ``robot`` received in the last 3 s, sorted by program."""
+        since = time.monotonic() - _RECENT_S
+        newest = self._newest.copy().items()
+        found = [status for (name, _), (status, at) in newest if name == robot and at >= since]
+        return sorted(found, key=lambda status: (status.program, status.host, status.pid, status.session))
 
 
 def _decode_status(sample: SerializedSample) -> tuple[str, Status]:

@@ -30,7 +30,16 @@ from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot, shortened, stream_from_key, stream_key
+from zstate.wire.keys import (
+    ANY,
+    EDGE_STREAMS,
+    MODEL_WRITER,
+    Stream,
+    check_robot,
+    shortened,
+    stream_from_key,
+    stream_key,
+)
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
 from zstate.wire.protocol import SerializedSample, selected_robots
 from zstate.wire.registry import get_wire
@@ -54,7 +63,8 @@ class TransformListener(Closeable):
     ``follow="tf"`` subscribes to transforms and needs no model. Joint positions may come from several
     drivers, each with its own joints (``PartialStatePublisher``, in ROS any node): each joint is interpolated
     between the samples of its own driver, and one that stops leaves exactly its own links behind. The edges
-    of other writers of the robot, of a ``StaticPublisher`` or a ``TransformPublisher``, come in either way;
+    of other writers of the robot, of a ``StaticPublisher``, a ``TransformPublisher`` or an
+    ``OdometryPublisher``, come in either way;
     on the ROS wires these are all edges of /tf and /tf_static but those of a model, which
     robot_state_publisher repeats. With ``history_on_join``
     the buffer also gets the samples that publishers of the native wire cached in the seconds before (their
@@ -163,9 +173,9 @@ class TransformListener(Closeable):
         received: dict[Stream, StreamIngests] = {self._follow: self._samples}
         if self._follow == "joint_states":
             received[self._parts.stream] = self._parts  # in ROS any joint state may be a part
-        others = self._wire.transforms
-        if others != self._follow:
-            received[others] = StreamIngests(others, is_shared=True)
+        for stream in self._wire.edges:
+            if stream != self._follow:
+                received[stream] = StreamIngests(stream, is_shared=True)
         return received
 
     def _subscribe(self, session: Session, streams: Sequence[Stream]) -> ExitStack:
@@ -413,7 +423,7 @@ class TransformListener(Closeable):
 
     def _set_followed_writer(self, samples: StreamIngests, announced: Announcement, *, alive: bool) -> None:
         robot, session = announced.robot, announced.writer.session
-        if samples.stream == "transforms":
+        if samples.stream in EDGE_STREAMS:
             (self._ownership.add_writer if alive else self._ownership.remove_writer)(robot, session)
         elif self._follow == "joint_states":
             parts = self._joint_parts(robot)

@@ -48,7 +48,8 @@ class PublisherStats:
     ``streams`` has the counts by (wire, stream). ``rate`` is the report of the last ``run``, None before
     the first. ``outside_limits`` published samples had joints outside their limits, the newest described
     by ``last_excess``. ``kinematics`` is what computes transforms: "Pinocchio 4.1.0", for instance, or
-    "closed forms"; empty without the stream tf.
+    "closed forms"; empty without the stream tf. ``warning`` is that of the program that publishes, empty
+    for none.
     """
 
     sent: int
@@ -59,6 +60,7 @@ class PublisherStats:
     outside_limits: int = 0
     last_excess: str = ""
     kinematics: str = ""
+    warning: str = ""
 
 
 class LimitWatch:
@@ -139,6 +141,8 @@ class StatusReporter:
         level, text = assess_health(before, now, quiet_ns=at_ns - self._sent_at_ns)
         self._stats, self._at_ns = now, at_ns
         values = {"refused": str(now.refused)}
+        if now.warning:
+            values["warning"] = now.warning
         if now.outside_limits:
             values["outside limits"] = f"{now.outside_limits} samples, {now.last_excess}"
         if now.rate is not None:
@@ -159,7 +163,10 @@ def assess_health(before: PublisherStats, now: PublisherStats, *, quiet_ns: int)
     longest_ns = _QUIET_NS if now.rate is None else max(_QUIET_NS, 2e9 / now.rate.commanded_hz)
     if quiet_ns > longest_ns:
         what = "since this publisher opened" if not now.sent else f"for {format_duration(quiet_ns)}"
-        return Health("stale", f"nothing was published {what}")
+        reason = f": {now.warning}" if now.warning else ""
+        return Health("stale", f"nothing was published {what}{reason}")
+    if now.warning:
+        return Health("warn", now.warning)
     outside = now.outside_limits - before.outside_limits
     if outside:
         return Health("warn", f"{outside} {ARE_OUTSIDE}: {now.last_excess}")

@@ -1,25 +1,30 @@
-"""What the publishers of samples have in common: counts, samples at a fixed rate, and the end."""
+"""What the publishers of samples have in common: counts, samples at a fixed rate, ownership and the end."""
 
 from __future__ import annotations
 
+import secrets
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.clock import SYSTEM, Clock, SystemClock
-from zstate.errors import Closed
+from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net.clock_offset import ClockService
+from zstate.net.ownership import WriterClaim
+from zstate.net.presence import local_writer
 from zstate.net.sample_history import SampleCache
 from zstate.net.session import Session
-from zstate.net.writer import SampleWriter
-from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StreamStats
+from zstate.net.status import StatusPublisher
+from zstate.net.writer import SampleWriter, WireWriter, write_all
+from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
 from zstate.rate import Rate, RateReport
-from zstate.wire.identity import WriterId
-from zstate.wire.keys import Stream, check_robot
-from zstate.wire.registry import as_wire_names
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.keys import Stream, check_robot, check_writer
+from zstate.wire.messages import StampedMessage, renumbered
+from zstate.wire.registry import as_wire_names, get_wire
 
 T = TypeVar("T")
 
@@ -32,6 +37,8 @@ class SamplePublisher(Closeable):
 
     def __init__(self, robot: str, wires: str | Sequence[str], clock: Clock | None, session_id: int) -> None:
         self.robot = check_robot(robot)
+        self.warning = ""
+        """A fault that the counts do not show, such as a sensor's: part of the status until it is empty."""
         self._wires = as_wire_names(wires)
         self._clock: Clock = clock or SystemClock()
         self._session_id = session_id
@@ -41,6 +48,9 @@ class SamplePublisher(Closeable):
         self._refused = 0
         self._last_refusal = ""
         self._rate: Rate | None = None
+        self._claims: tuple[Callable[[], object], ...] = ()
+        """Each raises SecondWriter if another writer owns what this one publishes."""
+        self._second_writer: SecondWriter | None = None
         self._opened = ExitStack()
         self._lock = fork_safe_lock()
         self._stop = fork_safe(threading.Event())
@@ -66,7 +76,16 @@ class SamplePublisher(Closeable):
         }
         rate = None if self._rate is None else self._rate.report()
         outside, excess = (0, "") if self._limits is None else self._limits.counted()
-        return PublisherStats(self._sent, self._refused, self._last_refusal, streams, rate, outside, excess)
+        return PublisherStats(
+            self._sent,
+            self._refused,
+            self._last_refusal,
+            streams,
+            rate,
+            outside,
+            excess,
+            warning=self.warning,
+        )
 
     @property
     def _sent(self) -> int:
@@ -76,6 +95,27 @@ class SamplePublisher(Closeable):
     def _count_refusal(self, error: Exception) -> None:
         self._last_refusal = str(error)
         self._refused += 1
+
+    @contextmanager
+    def _refusals_counted(self) -> Generator[None]:
+        """Counts an InvalidInput that is raised inside."""
+        try:
+            yield
+        except InvalidInput as error:
+            self._count_refusal(error)
+            raise
+
+    def _check_ownership(self) -> None:
+        """Raise SecondWriter if an older writer owns what this one publishes (sticky), and close."""
+        if self._second_writer is None:
+            try:
+                for check in self._claims:
+                    check()
+            except SecondWriter as error:
+                self._second_writer = error
+                self._opened.close()
+        if self._second_writer is not None:
+            raise self._second_writer.with_traceback(None)
 
     def _publish_at(
         self,
@@ -105,3 +145,53 @@ class SamplePublisher(Closeable):
         self._stop.set()
         with self._lock:
             self._opened.close()
+
+
+class SensorPublisher(SamplePublisher):
+    """Base of the publishers of one ``sensor`` on ``stream``, which is the writer's name there.
+
+    Under congestion messages are dropped, and joining listeners receive none from the past. On the native
+    wire each sensor has one writer.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        stream: Stream,
+        sensor: str,
+        *,
+        wires: str | Sequence[str],
+        clock: Clock | None,
+        program: str,
+    ) -> None:
+        identity = local_writer(secrets.randbits(32), program)
+        super().__init__(robot, wires, clock, identity.session)
+        self.sensor = check_writer(sensor)
+        self._stream: Stream = stream
+        with ExitStack() as opening:
+            if "native" in self._wires:
+                announced = Announcement(self.robot, stream, identity, self.sensor)
+                claim = opening.enter_context(WriterClaim(session, [announced]))
+                self._claims = (claim.check,)
+                self._serve_clock(session, identity, opening)
+            for name in self._wires:
+                wire_writer = opening.enter_context(WireWriter(session, get_wire(name), self.robot, identity))
+                self._writers[name, stream] = wire_writer.open_stream(stream, self.sensor)
+            if self._claims:
+                status = StatusReporter(identity, lambda: self.stats).status
+                opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
+            self._opened = opening.pop_all()
+
+    def __repr__(self) -> str:
+        closed = ", closed" if self._stop.is_set() else ""
+        return f"<{type(self).__name__} {self.sensor!r} of {self.robot!r}: {self._seq} messages{closed}>"
+
+    def _publish_message(self, message: StampedMessage) -> None:
+        """Publish ``message`` as the next one of this session. Raises SecondWriter and Closed."""
+        with self._lock:
+            if self._stop.is_set():
+                raise Closed(f"the {self._stream} publisher {self.sensor!r} is closed")
+            self._check_ownership()
+            write_all(self._writers.values(), renumbered(message, self._seq, self._session_id))
+            self._seq += 1

@@ -30,7 +30,7 @@ from zstate.wire.messages import (
 )
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.topics import SHARED, FrameNames, robot_from_topic, ros_type
+from zstate.wire.ros2.topics import NAMED_TOPICS, SHARED, FrameNames, robot_from_topic, ros_type
 
 _TOPICS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
 STREAMS: tuple[Stream, ...] = (*_TOPICS, *TOPICS)
@@ -40,6 +40,9 @@ joint_states with such a name."""
 
 SCAN_STREAMS: tuple[Stream, ...] = ("scan", "map")
 """Further streams that can be decoded: the channels of these types, whatever their topic is."""
+
+ODOMETRY_STREAMS: tuple[Stream, ...] = ("imu", "velocity", "odometry")
+"""Likewise. The edges of odometry are recorded on tf as well, and read from there."""
 
 _NAMED: dict[Stream, Stream] = {topic: named for named, topic in TOPICS.items()}
 
@@ -54,11 +57,11 @@ class RecordedWriter:
     """One writer of one stream, as one channel of a recording describes it.
 
     ``robot`` is empty for the clock. ``edge_writer`` is the name under which edges were written: moving ones,
-    or static ones, each time all of them; or the name of a driver of some joints, of a sensor or of a map.
-    In the bags of ROS it is the last name of the topic of scans or of a map, and None for edges, of which
-    static ones add up there. ``program`` is the writer's program, ``session`` one start of it. ``foreign``
-    channels do not describe writers: their robot is the topic's namespace, and all writers of a topic count
-    as one.
+    or static ones, each time all of them; or the name of a driver of some joints, of a sensor, of odometry or
+    of a map. In the bags of ROS it is the last name of the topic of scans or of a map, for ``/r1/imu/data``
+    of the robot r1 "imu_data", and None for edges, of which static ones add up there. ``program`` is the
+    writer's program, ``session`` one start of it. ``foreign`` channels do not describe writers: their robot
+    is the topic's namespace, and all writers of a topic count as one.
     """
 
     robot: str
@@ -69,14 +72,18 @@ class RecordedWriter:
     foreign: bool
 
     @classmethod
-    def from_channel(cls, channel: Channel) -> RecordedWriter | None:
-        """The writer of ``channel``; None if it is no stream of a robot."""
+    def from_channel(cls, channel: Channel, robots: Collection[str] = ()) -> RecordedWriter | None:
+        """The writer of ``channel``; None if it is no stream of a robot.
+
+        Topics of IMUs, velocities and odometry in a bag are those of one of ``robots``, or of "ros": their
+        namespace may be that of a sensor.
+        """
         stream: Stream = "transforms"
         name, facts = channel.topic.rpartition("/")[2], channel.metadata
         foreign = _SESSION not in facts
         if child_frame(channel) is None:
-            for stream in (*_TOPICS, *SCAN_STREAMS):
-                is_named = name == stream or stream in SCAN_STREAMS
+            for stream in (*_TOPICS, *SCAN_STREAMS, *ODOMETRY_STREAMS):
+                is_named = name == stream or stream in NAMED_TOPICS
                 if is_named and channel.type_name == ros_type(stream).name:
                     break
             else:
@@ -88,14 +95,37 @@ class RecordedWriter:
             stream = _NAMED.get(stream, stream)
         digest = blake2b(channel.topic.encode(), digest_size=4).digest()
         robot = robot_from_topic(channel.topic) if foreign else facts.get(ROBOT, "")
+        if foreign and stream in ODOMETRY_STREAMS:
+            robot, name = _sensor_from_topic(channel.topic, robots)
         return cls(
             robot="" if stream == "clock" else robot,
             stream=stream,
             session=int.from_bytes(digest, "little") if foreign else int(facts[_SESSION]),
-            edge_writer=facts.get(EDGE_WRITER, name if stream in SCAN_STREAMS else None),
+            edge_writer=facts.get(EDGE_WRITER, name if stream in NAMED_TOPICS else None),
             program=facts.get("zstate.program"),
             foreign=foreign,
         )
+
+
+def _sensor_from_topic(topic: str, robots: Collection[str]) -> tuple[str, str]:
+    """The robot of ``topic``: the last of its namespaces that is one of ``robots``; and the name below it."""
+    tokens = topic.strip("/").split("/")
+    for place in range(len(tokens) - 2, -1, -1):
+        if tokens[place] in robots:
+            return tokens[place], "_".join(tokens[place + 1 :])
+    return SHARED, "_".join(tokens)
+
+
+def _robots_of(channels: Sequence[Channel]) -> frozenset[str]:
+    """The robots of ``channels``, without namespaces that may be those of sensors."""
+    writers = filter(None, map(RecordedWriter.from_channel, channels))
+    return frozenset(writer.robot for writer in writers if writer.stream not in ODOMETRY_STREAMS)
+
+
+def recorded_writers(channels: Sequence[Channel]) -> list[RecordedWriter | None]:
+    """The writers of all ``channels`` of a recording, in their order."""
+    robots = _robots_of(channels)
+    return [RecordedWriter.from_channel(channel, robots) for channel in channels]
 
 
 class DecodedMessage(NamedTuple):
@@ -128,6 +158,7 @@ class DecodedRecording:
         self._counts: Counter[RecordedWriter] = Counter()
         self._topics: dict[str, set[RecordedWriter]] = {}
         self.ignored: tuple[Channel, ...] = ()
+        self._bag_robots = _robots_of(reader.channels())
         for channel in reader.channels():
             decoder = self._decoder(channel)
             if decoder is None:
@@ -247,7 +278,7 @@ class DecodedRecording:
 
     def _decoder(self, channel: Channel) -> ChannelDecoder | None:
         if channel not in self._known:
-            writer = RecordedWriter.from_channel(channel)
+            writer = RecordedWriter.from_channel(channel, self._bag_robots)
             decoder = None
             if writer is not None:
                 options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))

@@ -34,17 +34,20 @@ from zstate.wire.messages import (
     POSE_BYTES,
     ClockMessage,
     DriverState,
+    Imu,
     JointCommand,
     JointState,
     LaserScan,
     Message,
     OccupancyGrid,
+    Odometry,
     RobotDescription,
     Sample,
     StampedMessage,
     StaticTransforms,
     Stop,
     TransformSample,
+    Velocity,
     WriterTransforms,
     order_digest,
     to_block,
@@ -82,6 +85,9 @@ _STREAMS: dict[type[Message], Stream] = {
     DriverState: "driver",
     Stop: "stop",
     LaserScan: "scan",
+    Imu: "imu",
+    Velocity: "velocity",
+    Odometry: "odometry",
     OccupancyGrid: "map",
     ClockMessage: "clock",
 }
@@ -158,8 +164,9 @@ class RecordingEncoder:
 
         ``edge_writer`` is the name under which edges are written: static ones, or moving ones of a
         TransformPublisher, which go to the topic tf; or under which a driver publishes some of the joints,
-        which go to the topic joint_states; or it is the name of a sensor or a map, and of its topic. Without
-        one, as in ROS, the static edges of a session add up.
+        which go to the topic joint_states; or it is the name of a sensor, of odometry or of a map, and of its
+        topic. Without one, as in ROS, the static edges of a session add up. The edge of odometry is not
+        written with it.
         Returns False if the robot has no channel left for that writer. Raises RecordingError if the file
         cannot grow.
         """
@@ -214,7 +221,8 @@ class RecordingEncoder:
             self._pending.append(robot, message, log_time)
             return
         stream = (_NAMED_STREAMS if edge_writer else _STREAMS)[type(message)]
-        if edge_writer and isinstance(message, TransformSample):
+        if stream == "transforms":
+            assert isinstance(message, TransformSample)
             edges = sample_names.moving_edges if message.edges is None else message.edges
             for one in known_covariances(message, edges):
                 self._write_covariance(robot, message, one, log_time, edge_writer)

@@ -12,7 +12,7 @@ from typing import Any
 from zstate.errors import MessageError, ModelError
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.recording.decode import RecordedWriter
+from zstate.recording.decode import RecordedWriter, recorded_writers
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import ROBOT, Channel
 from zstate.wire.keys import LATCHED_STREAMS, Stream
@@ -126,8 +126,7 @@ class RecordedRobot:
 def recorded_robots(info: RecordingInfo) -> list[RecordedRobot]:
     """The robots by name. Raises RecordingError if the chunk of a description is damaged."""
     by_name: dict[str, list[tuple[RecordedWriter, Channel]]] = {}
-    for channel in info.channels:
-        writer = RecordedWriter.from_channel(channel)
+    for writer, channel in zip(recorded_writers(info.channels), info.channels, strict=True):
         if writer is not None and writer.robot:
             by_name.setdefault(writer.robot, []).append((writer, channel))
     robots: list[RecordedRobot] = []
@@ -166,8 +165,12 @@ def _ray_count(reader: RecordingReader, topic: str) -> int | None:
 
 def other_channels(info: RecordingInfo) -> list[Channel]:
     """The channels of no robot: the clock and other topics."""
-    writers = ((RecordedWriter.from_channel(channel), channel) for channel in info.channels)
-    return [channel for writer, channel in writers if writer is None or not writer.robot]
+    writers = recorded_writers(info.channels)
+    return [
+        channel
+        for writer, channel in zip(writers, info.channels, strict=True)
+        if writer is None or not writer.robot
+    ]
 
 
 def mean_rate(channel: Channel, duration_s: float) -> float | None:

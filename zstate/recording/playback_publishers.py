@@ -6,6 +6,7 @@ import secrets
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
@@ -26,14 +27,14 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder
-from zstate.wire.keys import MODEL_WRITER, NAMED_STREAMS, Stream, full_name
+from zstate.wire.keys import EDGE_STREAMS, MODEL_WRITER, NAMED_STREAMS, SENSOR_STREAMS, Stream, full_name
 from zstate.wire.messages import (
     Edges,
     JointState,
-    LaserScan,
     Message,
     OccupancyGrid,
     RobotDescription,
+    StampedMessage,
     StaticTransforms,
     TransformSample,
     renumbered,
@@ -47,6 +48,9 @@ EdgeWriter: TypeAlias = tuple[str, str]
 
 LatchedMessage: TypeAlias = RobotDescription | StaticTransforms | OccupancyGrid
 """Messages in effect until the next of their writer."""
+
+_Named: TypeAlias = tuple[str, Stream, str]
+"""The robot, the stream and the name of a writer."""
 
 _SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
 
@@ -84,9 +88,12 @@ class PlaybackPublishers(Closeable):
         self._robots: dict[str, _RobotPublisher] = {}
         self._others: dict[str, PassthroughPublisher] = {}
         self._parts: dict[str, JointPartPlayback] = {}
-        self._scans: dict[tuple[str, str], PassthroughPublisher] = {}
+        self._named: dict[_Named, PassthroughPublisher] = {}
+        """Of sensors and of odometry."""
+        self._copied = {_edge_of_odometry(one) for one in writers} & set(writers)
+        """The writers of edges that odometry has as well."""
         self._open_passthrough = partial(
-            PassthroughPublisher, session, wires, sessions=self._sessions, takeover=takeover
+            PassthroughPublisher, session, wires=wires, sessions=self._sessions, takeover=takeover
         )
         with ExitStack() as opening:
             opening.callback(lambda: [robot.publisher.close() for robot in self._robots.values()])
@@ -94,7 +101,11 @@ class PlaybackPublishers(Closeable):
             for robot, model in models.items():
                 self._open(robot, model, robot not in in_parts and _is_computed(robot, writers))
             recorded = {(writer.robot, writer.stream) for writer in writers}
-            moving = {(one.robot, one.edge_writer) for one in writers if one.stream == "transforms"}
+            moving = {
+                (one.robot, one.edge_writer)
+                for one in writers
+                if one.stream == "transforms" and one not in self._copied
+            }
             self._transforms = opening.enter_context(
                 TransformPlayback(
                     self._open_passthrough, sorted((robot, name or "") for robot, name in moving)
@@ -109,14 +120,28 @@ class PlaybackPublishers(Closeable):
                 ]
                 self._others[robot] = self._open_passthrough(robot, streams)
                 opening.enter_context(self._others[robot])
-            for robot, name in sorted(
-                {(one.robot, one.edge_writer or "") for one in writers if one.stream == "scan"}
-            ):
-                scans = self._open_passthrough(robot, ("scan",), name)
-                self._scans[robot, name] = opening.enter_context(scans)
+            for named, on_wires in sorted(self._named_writers(writers).items()):
+                robot, stream, name = named
+                publisher = self._open_passthrough(robot, (stream,), name, wires=on_wires)
+                self._named[named] = opening.enter_context(publisher)
             for decoded in (*latched.descriptions.values(), *latched.statics, *latched.maps.values()):
                 self._publish_counted(decoded)
             self._opened = opening.pop_all()
+
+    def _named_writers(self, writers: Collection[RecordedWriter]) -> dict[_Named, Sequence[str]]:
+        """The wires on which each sensor, each writer of odometry, and its edge, is published.
+
+        On the native wire odometry is its edge, which is recorded once more for ROS. The edge of a ROS node's
+        odometry is that of another program on /tf, if it is one at all.
+        """
+        ros = [wire for wire in self._wires if get_wire(wire).shared]
+        found: dict[_Named, Sequence[str]] = {}
+        for writer in writers:
+            if writer.stream in SENSOR_STREAMS or _edge_of_odometry(writer) in self._copied:
+                found[_named(writer)] = self._wires
+            elif ros and (writer.stream == "odometry" or writer in self._copied):
+                found.setdefault(_named(writer), ros)
+        return found
 
     def _open(self, robot: str, model: RobotModel, is_computed: bool) -> None:
         """Open the publisher of a robot with a known model."""
@@ -187,6 +212,11 @@ class PlaybackPublishers(Closeable):
         elif isinstance(message, JointState) and robot is not None:
             positions, velocities, efforts = robot.order.read(message)
             robot.publisher.publish(positions, velocities, efforts, message.stamp)
+        elif writer.stream in (*SENSOR_STREAMS, "odometry") or writer in self._copied:
+            publisher = self._named.get(_named(writer))
+            if publisher is None:
+                return False
+            publisher.publish(message)
         elif isinstance(message, TransformSample) and writer.stream == "transforms":
             self._transforms.publish((writer.robot, writer.edge_writer or ""), message)
         elif isinstance(message, TransformSample):
@@ -196,8 +226,6 @@ class PlaybackPublishers(Closeable):
             self._others[writer.robot].publish(rest)
         elif isinstance(message, JointState):
             self._others[writer.robot].publish(message)
-        elif isinstance(message, LaserScan):
-            self._scans[writer.robot, writer.edge_writer or ""].publish(message)
         return True
 
     def _parts_of(self, robot: str) -> JointPartPlayback:
@@ -209,6 +237,15 @@ class PlaybackPublishers(Closeable):
     def close(self) -> None:
         """Close all publishers. A second call does nothing."""
         self._opened.close()
+
+
+def _named(writer: RecordedWriter) -> _Named:
+    return writer.robot, writer.stream, writer.edge_writer or ""
+
+
+def _edge_of_odometry(writer: RecordedWriter) -> RecordedWriter | None:
+    """The writer under which the edge of ``writer`` is recorded, if that writes odometry."""
+    return replace(writer, stream="transforms") if writer.stream == "odometry" else None
 
 
 class _RobotPublisher(NamedTuple):
@@ -359,20 +396,20 @@ class PassthroughPublisher(Closeable):
     """Publishes messages of ``robot`` unchanged on all ``wires``, with its own session and sequence numbers.
 
     ``streams`` are announced at once, latched values with the first of their name; ``transforms``,
-    ``partial_joint_states`` and ``scan`` under the name ``edge_writer``. A message that one of the wires
-    cannot encode raises InvalidInput, and is published on none. Raises SecondWriter if another live writer
-    publishes the same on the native wire, unless ``takeover``. Edges of the ``sessions`` of this playback,
-    its own included, may place the same frame, as in the recording.
+    ``partial_joint_states``, sensors and odometry under the name ``edge_writer``. A message that one of the
+    wires cannot encode raises InvalidInput, and is published on none. Raises SecondWriter if another live
+    writer publishes the same on the native wire, unless ``takeover``. Edges of the ``sessions`` of this
+    playback, its own included, may place the same frame, as in the recording.
     """
 
     def __init__(
         self,
         session: Session,
-        wires: Sequence[str],
         robot: str,
         streams: Sequence[Stream],
         edge_writer: str = "",
         *,
+        wires: Sequence[str],
         sessions: set[int],
         takeover: bool = False,
     ) -> None:
@@ -380,6 +417,7 @@ class PassthroughPublisher(Closeable):
         self._session_id = secrets.randbits(32)
         self._robot = robot
         self.edge_writer = edge_writer
+        self._moving: Stream = "odometry" if "odometry" in streams else "transforms"
         self._sessions = sessions
         self._is_alone = "native" in wires and not takeover
         self._seqs: Counter[Stream] = Counter()
@@ -391,7 +429,7 @@ class PassthroughPublisher(Closeable):
         with ExitStack() as opening:
             announced = [self._announced(stream, edge_writer) for stream in streams]
             self._claim = self._claimed(opening, announced)
-            moving = self._announced("transforms", edge_writer)
+            moving = self._announced(self._moving, edge_writer)
             self._edge_monitor = opening.enter_context(EdgeMonitor(session, moving, allowed=sessions))
             self._wire_writers = [
                 opening.enter_context(WireWriter(session, get_wire(wire), robot, writer)) for wire in wires
@@ -405,20 +443,15 @@ class PassthroughPublisher(Closeable):
             }
             self._opened = opening.pop_all()
 
-    def publish(self, message: JointState | TransformSample | LaserScan) -> None:
+    def publish(self, message: Message) -> None:
         """Publish one sample."""
+        assert isinstance(message, StampedMessage)
         if self._claim is not None:
             self._claim.check()
             self._edge_monitor.check()
-        named: Stream = "partial_joint_states"
-        shared: Stream = "joint_states"
-        if isinstance(message, TransformSample):
-            named, shared = "transforms", "tf"
-            if named in self._streams:
-                self._own(message.edges or ())
-        elif isinstance(message, LaserScan):
-            named = shared = "scan"
-        stream = named if named in self._streams else shared
+        stream: Stream = next(one for one in _carrying(message) if one in self._streams)
+        if isinstance(message, TransformSample) and stream in EDGE_STREAMS:
+            self._own(message.edges or ())
         write_all(self._streams[stream], renumbered(message, self._seqs[stream], self._session_id))
         self._seqs[stream] += 1
 
@@ -434,7 +467,7 @@ class PassthroughPublisher(Closeable):
         placed = self._placed.setdefault(self.edge_writer, set())
         new = [edge for edge in named_edges(self._robot, edges) if edge not in placed]
         if new and self._is_alone:
-            announced = self._announced("transforms", self.edge_writer)
+            announced = self._announced(self._moving, self.edge_writer)
             claim = claim_edges(self._session, announced, new, allowed=self._sessions)
             self._opened.enter_context(claim)
             self._edge_monitor.add(new)
@@ -504,6 +537,13 @@ class PassthroughPublisher(Closeable):
         for name in tuple(self._maps):
             self._withdraw_map(name)
         self._opened.close()
+
+
+def _carrying(message: Message) -> tuple[Stream, ...]:
+    """The streams that may carry ``message``."""
+    if isinstance(message, JointState):
+        return ("partial_joint_states", "joint_states")
+    return (*EDGE_STREAMS, "tf") if isinstance(message, TransformSample) else SENSOR_STREAMS
 
 
 def _is_computed(robot: str, writers: Collection[RecordedWriter]) -> bool:

@@ -19,6 +19,7 @@ from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
 from zstate.recording.decode import (
+    ODOMETRY_STREAMS,
     SCAN_STREAMS,
     STREAMS,
     DecodedMessage,
@@ -79,11 +80,12 @@ class Player(Closeable):
     samples (``has_samples``), what is latched stays in effect after the last message, for ``duration_s`` in
     all, by default until ``close``; not at an infinite rate.
 
-    Robots with a recorded model are published by a StatePublisher, other messages unchanged, such as scans,
-    maps, and the joint states of several drivers of a robot, by writers of the recorded names; commands,
-    states and stops of drivers are never published. Raises RecordingError, and InvalidInput for robots and
-    times that are not in the recording. A context manager; ``run`` plays, other threads may pause and seek.
-    ``run`` raises SecondWriter if another writer publishes one of the robots, unless ``takeover``.
+    Robots with a recorded model are published by a StatePublisher, other messages unchanged, such as those of
+    sensors, maps, odometry, and the joint states of several drivers of a robot, by writers of the recorded
+    names; commands, states and stops of drivers are never published, and odometry of ROS nodes, whose edges
+    are on /tf, on ROS wires only. Raises RecordingError, and InvalidInput for robots and times that are not
+    in the recording. A context manager; ``run`` plays, other threads may pause and seek. ``run`` raises
+    SecondWriter if another writer publishes one of the robots, unless ``takeover``.
     """
 
     def __init__(
@@ -245,7 +247,7 @@ class Player(Closeable):
             self._player_clock.start(begin)
             has_clock = any(writer.stream == "clock" for writer in writers)
             ticks = None if has_clock else _ClockTicks(clock, begin, self._player_clock.rate)
-            streams = (*STREAMS, *SCAN_STREAMS)
+            streams = (*STREAMS, *SCAN_STREAMS, *ODOMETRY_STREAMS)
             for decoded in self._recording.messages(self.robots, streams, begin, self._end):
                 if not self._advance(decoded.log_time, ticks):
                     return

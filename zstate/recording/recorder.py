@@ -30,8 +30,8 @@ from zstate.recording.driver_messages import DRIVER_TYPES
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, LATCHED_STREAMS, NAMED_STREAMS, Stream, check_robot
-from zstate.wire.messages import Message, StampedMessage
+from zstate.wire.keys import ANY, LATCHED_STREAMS, NAMED_STREAMS, SENSOR_STREAMS, Stream, check_robot
+from zstate.wire.messages import Message, Odometry, StampedMessage, edge_of
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.topics import SHARED
@@ -140,12 +140,12 @@ class RecorderStats:
 class Recorder(Closeable):
     """Records ``robots``, or all robots, on ``wire`` into ``path``; a context manager.
 
-    Subscribes to all of their streams, /tf too, which makes their publishers compute it, to their scans and
-    maps, and, on the wire "native", to the commands, states and stops of their drivers. A map is written when
-    it changes, and at the start of each file. A single selected robot, or the only robot when the recording
-    starts, is in the file's root with unchanged frame names; others have a namespace and a frame prefix.
-    ``max_bytes``, ``max_seconds`` and ``overwrite`` are those of RecordingWriter. Raises RecordingError if
-    the file cannot be created, InvalidInput for invalid names.
+    Subscribes to all of their streams, /tf too, which makes their publishers compute it, to their sensors,
+    odometry and maps, and, on the wire "native", to the commands, states and stops of their drivers. A map is
+    written when it changes, and at the start of each file. A single selected robot, or the only robot when
+    the recording starts, is in the file's root with unchanged frame names; others have a namespace and a
+    frame prefix. ``max_bytes``, ``max_seconds`` and ``overwrite`` are those of RecordingWriter. Raises
+    RecordingError if the file cannot be created, InvalidInput for invalid names.
 
     When the disk is full or gone, the recording ends: ``wait`` returns, ``failure`` is the reason, and what
     was written stays readable.
@@ -170,7 +170,7 @@ class Recorder(Closeable):
         named = self._wire.partial_joint_states, self._wire.transforms
         latched: tuple[Stream, ...] = ("robot_description", "tf_static", "map")
         driving = tuple(DRIVER_TYPES) if wire == "native" else ()
-        samples: tuple[Stream, ...] = ("joint_states", "tf", *named, "scan", *driving)
+        samples: tuple[Stream, ...] = ("joint_states", "tf", *named, *SENSOR_STREAMS, "odometry", *driving)
         self._streams: tuple[Stream, ...] = tuple(dict.fromkeys((*latched, *samples)))
         self._counters = Counters()
         self._gaps = GapCounter(self._counters)
@@ -332,6 +332,9 @@ class Recorder(Closeable):
             self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
         for message in messages:
             is_known = encoder.write_message(robot, message, stamp, edge_writer)
+            if isinstance(message, Odometry) and stream in self._wire.edges:
+                # On /tf, where ROS tools and readers of recordings find edges; ROS nodes publish it there.
+                encoder.write_message(robot, edge_of(message), stamp, edge_writer)
             if is_known and isinstance(message, StampedMessage):
                 self._gaps.add((robot, stream, message.session), message.seq)
 

@@ -22,6 +22,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,16 +60,20 @@ from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, full_name
 from zstate.wire.messages import (
     DriverState,
     Edges,
+    Imu,
     JointCommand,
     JointState,
     LaserScan,
     OccupancyGrid,
+    Odometry,
     RobotDescription,
     Sample,
     StaticTransforms,
     Stop,
     TransformSample,
+    Velocity,
     covariances_of,
+    in_frame,
     poses_from_block,
 )
 
@@ -77,6 +82,8 @@ HISTORY_S = 9e8
 # The buffer drops unneeded samples after every so many messages, at least.
 _BATCH = 4096
 _UNNAMED = "a ROS node"
+
+_Measurement = TypeVar("_Measurement", Imu, Velocity)
 
 
 class Recording(Closeable):
@@ -161,7 +168,7 @@ class Recording(Closeable):
     ) -> Iterator[DecodedMessage]:
         """Insert all of the recording into an empty ``buffer``; each message is returned when it is in.
 
-        Scans and maps, which no buffer has, are returned if they are among ``streams``.
+        Scans, maps, IMUs and so on, which no buffer has, are returned if they are among ``streams``.
         """
         return self._fill(buffer, Counters(), None if self.robot is None else (self.robot,), streams)
 
@@ -219,6 +226,40 @@ class Recording(Closeable):
             if isinstance(message, LaserScan) and sensor in (None, writer.edge_writer):
                 try:
                     yield scan_from_message(message, writer.robot)
+                except InvalidInput as error:
+                    refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
+
+    def imu(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Imu]:
+        """The readings of the IMUs of ``robot``, by default of all robots, or of one ``sensor``.
+
+        They are in the order of recording and read one after the other; their frames have full names.
+        Messages that cannot be used are left out; the first of each reason is logged. Raises InvalidInput
+        for a robot that is not in the recording.
+        """
+        return self._measurements(Imu, robot, "imu", sensor)
+
+    def velocities(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Velocity]:
+        """The measured velocities of ``robot``, likewise."""
+        return self._measurements(Velocity, robot, "velocity", sensor)
+
+    def odometry(self, robot: str | None = None, writer: str | None = None) -> Iterator[Odometry]:
+        """The odometry of ``robot``, by default of all robots, or of one ``writer``, likewise.
+
+        Its frames are named as in the message.
+        """
+        refusals = Refusals("recorded odometry")
+        for recorded, message, _ in self._messages(robot, "odometry", refusals):
+            if isinstance(message, Odometry) and writer in (None, recorded.edge_writer):
+                yield message
+
+    def _measurements(
+        self, kind: type[_Measurement], robot: str | None, stream: Stream, sensor: str | None
+    ) -> Iterator[_Measurement]:
+        refusals = Refusals(f"recorded {stream}")
+        for writer, message, _ in self._messages(robot, stream, refusals):
+            if isinstance(message, kind) and sensor in (None, writer.edge_writer):
+                try:
+                    yield in_frame(message, full_name(writer.robot, message.frame))
                 except InvalidInput as error:
                     refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
 
@@ -323,7 +364,7 @@ class RecordingLoader:
             else:
                 self._set_name(joints.whole, writer)
                 joints.insert(writer, message)
-        elif isinstance(message, TransformSample):
+        elif isinstance(message, TransformSample) and writer.stream != "odometry":
             self._insert_transforms(writer, message)
         elif isinstance(message, StaticTransforms):
             self._insert_statics(writer, message)

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
-from contextlib import ExitStack
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from zstate.clock import Clock, check_stamp
-from zstate.errors import Closed, InvalidInput, SecondWriter
-from zstate.net.ownership import WriterClaim
+from zstate.errors import InvalidInput
 from zstate.net.presence import local_writer
 from zstate.net.session import Session
-from zstate.net.status import StatusPublisher
-from zstate.net.writer import WireWriter, write_all
-from zstate.nodes.publisher_status import StatusReporter
-from zstate.nodes.sample_publisher import SamplePublisher
+from zstate.nodes.sample_publisher import SensorPublisher
 from zstate.nodes.static_publisher import ValuePublisher
 from zstate.rate import RateReport
 from zstate.scans.grid import Grid, grid_to_message
 from zstate.scans.scan import Scan, scan_to_message
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import check_robot, check_writer, full_name
-from zstate.wire.registry import get_wire
 
 
 class RangeSource(Protocol):
@@ -40,7 +34,7 @@ class RangeSource(Protocol):
         ...
 
 
-class ScanPublisher(SamplePublisher):
+class ScanPublisher(SensorPublisher):
     """Publishes the scans of one laser scanner of a robot, whose geometry is given once.
 
     ``sensor`` is the scanner's name, in ROS its topic. Its frame is ``frame``, by default a frame of the
@@ -70,32 +64,11 @@ class ScanPublisher(SamplePublisher):
         clock: Clock | None = None,
         program: str = "",
     ) -> None:
-        identity = local_writer(secrets.randbits(32), program)
-        super().__init__(robot, wires, clock, identity.session)
-        self.sensor = check_writer(sensor)
         self.frame = sensor if frame is None else frame
         self._angles = angle_min, angle_increment, ray_ns
         self._limits_m = range_min, range_max
         self._empty = self._scan(0, [range_max, range_max], None)  # raises here, where the mistake is made
-        self._claim: WriterClaim | None = None
-        self._second_writer: SecondWriter | None = None
-        announced = Announcement(self.robot, "scan", identity, self.sensor)
-        with ExitStack() as opening:
-            if "native" in self._wires:
-                self._claim = opening.enter_context(WriterClaim(session, [announced]))
-                self._serve_clock(session, identity, opening)
-            for name in self._wires:
-                wire_writer = WireWriter(session, get_wire(name), self.robot, identity)
-                opening.enter_context(wire_writer)
-                self._writers[name, "scan"] = wire_writer.open_stream("scan", self.sensor)
-            if self._claim is not None:
-                status = StatusReporter(identity, lambda: self.stats).status
-                opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
-            self._opened = opening.pop_all()
-
-    def __repr__(self) -> str:
-        closed = ", closed" if self._stop.is_set() else ""
-        return f"<ScanPublisher {self.sensor!r} of {self.robot!r}: {self._seq} scans{closed}>"
+        super().__init__(session, robot, "scan", sensor, wires=wires, clock=clock, program=program)
 
     def _scan(self, stamp: int, ranges: ArrayLike, intensities: ArrayLike | None) -> Scan:
         return Scan(stamp, *self._angles, ranges, *self._limits_m, self.frame, intensities)
@@ -109,19 +82,10 @@ class ScanPublisher(SamplePublisher):
         measurement is inf without an echo, -inf if it is too near, and NaN if it is invalid (REP 117). Raises
         InvalidInput for other shapes, SecondWriter and Closed. If it raises, nothing was sent.
         """
-        try:
+        with self._refusals_counted():
             stamp = self._first_stamp(self._clock.now(), ranges) if stamp is None else check_stamp(stamp)
             scan = self._scan(stamp, ranges, intensities)
-            with self._lock:
-                if self._stop.is_set():
-                    raise Closed(f"the scan publisher {self.sensor!r} is closed")
-                self._check_ownership()
-                message = scan_to_message(scan, self._seq, self._session_id, self._scan_ns())
-                write_all(self._writers.values(), message)
-                self._seq += 1
-        except InvalidInput as error:
-            self._count_refusal(error)
-            raise
+            self._publish_message(scan_to_message(scan, scan_ns=self._scan_ns()))
 
     def _first_stamp(self, last: int, ranges: ArrayLike) -> int:
         """The instant of the first ray of a sweep whose last ray is at ``last``."""
@@ -130,17 +94,6 @@ class ScanPublisher(SamplePublisher):
 
     def _scan_ns(self) -> int:
         return 0 if self._rate is None else round(1e9 / self._rate.report().commanded_hz)
-
-    def _check_ownership(self) -> None:
-        """Raise SecondWriter if an older writer publishes this sensor (sticky)."""
-        if self._second_writer is None and self._claim is not None:
-            try:
-                self._claim.check()
-            except SecondWriter as error:
-                self._second_writer = error
-                self._opened.close()
-        if self._second_writer is not None:
-            raise self._second_writer.with_traceback(None)
 
     def _check_geometry(self, sweep: Scan) -> None:
         own, other = _geometry(self._empty, self.robot), _geometry(sweep, self.robot)

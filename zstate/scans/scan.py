@@ -154,13 +154,16 @@ class Scan:
         )
 
 
-def scan_to_message(scan: Scan, seq: int, session: int, scan_ns: int = 0) -> LaserScan:
-    """``scan`` on the wire; ``scan_ns`` [ns] is the time between two scans, 0 if it is not known."""
+def scan_to_message(scan: Scan, scan_ns: int = 0) -> LaserScan:
+    """``scan`` on the wire, without numbers of a writer.
+
+    ``scan_ns`` [ns] is the time between two scans, 0 if it is not known.
+    """
     intensities = None if scan.intensities is None else to_float32_block(scan.intensities)
     return LaserScan(
         scan.stamp,
-        seq,
-        session,
+        0,
+        0,
         scan.frame,
         scan.angle_min,
         scan.angle_increment,

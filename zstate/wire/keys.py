@@ -8,6 +8,9 @@
 ``zstate/<robot>/transforms/<writer>``            WriterTransforms, each sample; likewise
 ``zstate/<robot>/robot_description``              RobotDescription, latched
 ``zstate/<robot>/scan/<sensor>``                  LaserScan, each scan; the sensor is the writer's name
+``zstate/<robot>/imu/<sensor>``                   Imu, each reading; the sensor is the writer's name
+``zstate/<robot>/velocity/<sensor>``              Velocity, each measurement; likewise
+``zstate/<robot>/odometry/<writer>``              Odometry, each sample; a query returns a HistoryPage
 ``zstate/<robot>/map/<writer>``                   OccupancyGrid, latched
 ``zstate/<robot>/joint_commands``                 JointCommand, to a driver
 ``zstate/<robot>/joint_setpoints``                JointState with joint names, of a driver, while read
@@ -53,6 +56,9 @@ Stream = Literal[
     "stop",
     "scan",
     "map",
+    "imu",
+    "velocity",
+    "odometry",
     "clock",
 ]
 
@@ -60,9 +66,15 @@ CLOCK_KEY = "zstate/clock"
 ANY = "*"
 
 NAMED_STREAMS: frozenset[Stream] = frozenset(
-    {"tf_static", "transforms", "partial_joint_states", "stop", "scan", "map"}
+    {"tf_static", "transforms", "partial_joint_states", "stop", "scan", "map", "imu", "velocity", "odometry"}
 )
 """The streams with one key for each of the writer names of a robot."""
+
+EDGE_STREAMS: tuple[Stream, ...] = ("transforms", "odometry")
+"""The streams of moving edges under the names of their writers."""
+
+SENSOR_STREAMS: tuple[Stream, ...] = ("scan", "imu", "velocity")
+"""The streams of sensors under their names."""
 
 LATCHED_STREAMS: frozenset[Stream] = frozenset({"robot_description", "tf_static", "map"})
 """The streams of one current value, which late joiners receive as well."""

@@ -8,11 +8,12 @@ the memory that a writer can make a reader use.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from hashlib import blake2b
 from itertools import takewhile
-from math import inf, isfinite
+from math import inf, isfinite, sqrt
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -34,6 +35,9 @@ Level = Literal["ok", "warn", "error", "stale"]
 POSE_BYTES = 7 * 8
 COVARIANCE_NUMBERS = 21
 """The upper triangle of a covariance of a pose."""
+VECTOR_BYTES = 3 * 8
+_UNIT_TOLERANCE = 1e-3
+_UPPER_TRIANGLES = {size: np.triu_indices(size) for size in (3, 6)}
 _FLOAT64 = np.dtype("<f8")
 _FLOAT32 = np.dtype("<f4")
 
@@ -162,6 +166,31 @@ class WriterTransforms(TransformSample, frozen=True, array_like=True, gc=False):
                 f"{len(self.poses) // POSE_BYTES} poses take 21 numbers of covariance each; got "
                 f"{len(self.covariances)} bytes"
             )
+
+
+class Odometry(WriterTransforms, frozen=True, array_like=True, gc=False):
+    """The pose and the velocity of a base, the child of the one edge: nav_msgs/Odometry.
+
+    ``twist`` is a block of six numbers in the axes of the child: the velocity of its origin relative to the
+    parent [m/s], and its angular velocity [rad/s]. ``twist_covariance`` is the upper triangle of their
+    covariance, a block of 21 numbers, None if it is not known; ``covariances`` that of the pose.
+    """
+
+    twist: bytes = b""
+    twist_covariance: bytes | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.edges is None or len(self.edges) != 1:
+            raise InvalidInput(f"odometry has one edge, from its frame to the base; got {self.edges}")
+        _finite_numbers("a twist", self.twist, 6)
+        _check_covariance("a twist", self.twist_covariance, 6)
+
+
+def edge_of(odometry: Odometry) -> WriterTransforms:
+    """The pose of ``odometry`` alone."""
+    head = (odometry.stamp, odometry.seq, odometry.session, odometry.order)
+    return WriterTransforms(*head, odometry.poses, odometry.edges, odometry.covariances)
 
 
 def covariances_of(sample: TransformSample) -> NDArray[np.float64] | None:
@@ -480,6 +509,76 @@ class LaserScan(StampedMessage, frozen=True, array_like=True, gc=False):
             )
 
 
+class Imu(StampedMessage, frozen=True, array_like=True, gc=False):
+    """One reading of an inertial measurement unit, in the axes of ``frame``, which is named as in edges.
+
+    ``gyro`` [rad/s] and ``accel`` [m/s^2] are blocks of x y z. The accelerometer measures specific force:
+    at rest +9.81 along the axis that points up. ``orientation``, None for a device that has none, is a block
+    of the quaternion x y z w of ``frame`` in axes that the device defines. Each covariance is a block of six
+    numbers, the upper triangle row by row, or None if it is not known; that of the orientation is in rad^2.
+    """
+
+    frame: str
+    gyro: bytes
+    accel: bytes
+    orientation: bytes | None = None
+    gyro_covariance: bytes | None = None
+    accel_covariance: bytes | None = None
+    orientation_covariance: bytes | None = None
+
+    def __post_init__(self) -> None:
+        _check_frame(self.frame)
+        _finite_numbers("angular velocities", self.gyro, 3)
+        _finite_numbers("accelerations", self.accel, 3)
+        _check_covariance("angular velocities", self.gyro_covariance, 3)
+        _check_covariance("accelerations", self.accel_covariance, 3)
+        _check_covariance("an orientation", self.orientation_covariance, 3)
+        if self.orientation is not None:
+            quaternion = _finite_numbers("an orientation", self.orientation, 4)
+            length = sqrt(sum(number * number for number in quaternion))
+            if not abs(length - 1.0) <= _UNIT_TOLERANCE:
+                raise InvalidInput(f"an orientation is a quaternion of length 1, not {length:.6g}")
+        elif self.orientation_covariance is not None:
+            raise InvalidInput("the covariance of an orientation needs an orientation")
+
+
+class Velocity(StampedMessage, frozen=True, array_like=True, gc=False):
+    """A measured velocity of ``frame`` relative to the world, in its own axes.
+
+    ``linear`` [m/s], of its origin, and ``angular`` [rad/s] are blocks of x y z; ``angular`` is None if it
+    was not measured. ``covariance`` is a block of the upper triangle row by row: 6 numbers of ``linear``, or
+    21 of both; None if it is not known. ``frame`` is named as in edges.
+    """
+
+    frame: str
+    linear: bytes
+    angular: bytes | None = None
+    covariance: bytes | None = None
+
+    def __post_init__(self) -> None:
+        _check_frame(self.frame)
+        _finite_numbers("velocities", self.linear, 3)
+        if self.angular is not None:
+            _finite_numbers("angular velocities", self.angular, 3)
+        _check_covariance("velocities", self.covariance, 3 if self.angular is None else 6)
+
+
+_InFrame = TypeVar("_InFrame", bound="Imu | Velocity")
+
+
+def in_frame(message: _InFrame, frame: str) -> _InFrame:
+    """The same message with another name of its frame."""
+    return msgspec.structs.replace(message, frame=frame)
+
+
+def covariance_matrix(triangle: bytes) -> NDArray[np.float64]:
+    """The matrix with an upper triangle, a block row by row: (3, 3) of 6 numbers, (6, 6) of 21."""
+    size = 3 if len(triangle) == 6 * 8 else 6
+    matrix, upper = np.empty((size, size)), _UPPER_TRIANGLES[size]
+    matrix[upper] = matrix.T[upper] = from_block(triangle)
+    return matrix
+
+
 GRID_CELLS = 4096 * 4096
 """The most cells of an occupancy grid."""
 
@@ -536,11 +635,11 @@ class ClockMessage(StampedMessage, frozen=True, array_like=True, gc=False):
 class Status(Message, frozen=True, array_like=True, gc=False):
     """The state of a writer.
 
-    ``level`` is "ok"; "warn" if it is late or cannot publish some of its input; "error" if it cannot publish
-    any; "stale" without new input. ``text`` is the reason. ``rate_hz`` counts the samples of the last
-    second, ``sent`` all samples, ``late`` the ticks that began more than a period after they were due;
-    ``values`` has further facts. ``stamp`` [ns] is of the system clock of ``host``, also if samples carry
-    simulated time.
+    ``level`` is "ok"; "warn" if it is late, cannot publish some of its input, or its program gives a warning
+    (also in ``values``); "error" if it cannot publish any; "stale" without new input. ``text`` is the reason.
+    ``rate_hz`` counts the samples of the last second, ``sent`` all samples, ``late`` the ticks that began
+    more than a period after they were due; ``values`` has further facts. ``stamp`` [ns] is of the system
+    clock of ``host``, also if samples carry simulated time.
     """
 
     stamp: Stamp
@@ -583,13 +682,35 @@ def _check_frame(frame: str) -> None:
     if not 0 < len(frame) <= MAX_FRAME_NAME_LENGTH:
         raise InvalidInput(
             f"the name of a frame has 1 to {MAX_FRAME_NAME_LENGTH} characters, not {len(frame)}; name the "
-            "frame of the rays or of the grid"
+            "frame of the measurement or of the grid"
         )
 
 
 def _check_finite(what: str, *numbers: float) -> None:
     if not all(map(isfinite, numbers)):
         raise InvalidInput(f"{what} of finite numbers are needed, not {', '.join(map(str, numbers))}")
+
+
+def _finite_numbers(what: str, block: bytes, count: int) -> tuple[float, ...]:
+    """The numbers of ``block``. Raises InvalidInput unless they are ``count`` finite ones."""
+    if len(block) != 8 * count:
+        raise InvalidInput(f"{what} of {count} numbers take {8 * count} bytes, not {len(block)}")
+    numbers = struct.unpack(f"<{count}d", block)
+    _check_finite(what, *numbers)
+    return numbers
+
+
+def _check_covariance(what: str, triangle: bytes | None, size: int) -> None:
+    """Raise InvalidInput unless it is None or the upper triangle of a covariance of ``size`` numbers."""
+    if triangle is None:
+        return
+    numbers = _finite_numbers(f"a covariance of {what}", triangle, size * (size + 1) // 2)
+    first, variances = 0, list[float]()
+    for row in range(size):
+        variances.append(numbers[first])
+        first += size - row
+    if min(variances) < 0.0:
+        raise InvalidInput(f"variances of {what} are not negative; got {variances}")
 
 
 def _check_poses(block: bytes, edges: Edges | None) -> None:
@@ -611,6 +732,9 @@ SAMPLE_BYTES = 256_000
 SCAN_BYTES = 810_000
 """A scan of ``SCAN_RAYS`` with intensities takes less on each wire."""
 
+SENSOR_BYTES = 10_000
+"""Odometry with the longest names of its frames takes less on each wire."""
+
 LATCHED_BYTES = GRID_CELLS + 8 * 2**10
 """A grid of ``GRID_CELLS`` takes less on each wire."""
 ATTACHMENT_BYTES = 1_024
@@ -626,6 +750,9 @@ MAX_BYTES: Mapping[Stream, int] = {
     "driver": SAMPLE_BYTES,
     "stop": 8_000,
     "scan": SCAN_BYTES,
+    "imu": SENSOR_BYTES,
+    "velocity": SENSOR_BYTES,
+    "odometry": SENSOR_BYTES,
     "tf_static": 1_000_000,
     "robot_description": LATCHED_BYTES,
     "map": LATCHED_BYTES,

@@ -24,6 +24,7 @@ from zstate.wire.messages import (
     ClockMessage,
     DriverState,
     HistoryPage,
+    Imu,
     JointCommand,
     JointState,
     JointTrajectory,
@@ -32,12 +33,14 @@ from zstate.wire.messages import (
     MotionCancel,
     MotionReply,
     OccupancyGrid,
+    Odometry,
     Release,
     RobotDescription,
     StaticTransforms,
     Status,
     Stop,
     TransformSample,
+    Velocity,
     WriterTransforms,
     check_edges,
     check_size,
@@ -64,6 +67,9 @@ ENCODINGS: dict[type[Message], str] = {
     RobotDescription: "zstate/RobotDescription;v=1",
     LaserScan: "zstate/LaserScan;v=1",
     OccupancyGrid: "zstate/OccupancyGrid;v=1",
+    Imu: "zstate/Imu;v=1",
+    Velocity: "zstate/Velocity;v=1",
+    Odometry: "zstate/Odometry;v=1",
     ClockMessage: "zstate/Clock;v=1",
     Status: "zstate/Status;v=1",
     HistoryPage: "zstate/Past;v=1",
@@ -81,6 +87,9 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "stop": Stop,
     "scan": LaserScan,
     "map": OccupancyGrid,
+    "imu": Imu,
+    "velocity": Velocity,
+    "odometry": Odometry,
     "clock": ClockMessage,
 }
 
@@ -210,6 +219,7 @@ class NativeWire:
     name = "native"
     shared: frozenset[Stream] = frozenset()
     transforms: Stream = "transforms"
+    edges = keys.EDGE_STREAMS
     partial_joint_states: Stream = "partial_joint_states"
 
     def node_token(self, node: WriterNode) -> None:

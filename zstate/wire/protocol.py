@@ -111,7 +111,8 @@ class Wire(WriterTokens, Protocol):
 
     A stream carries the same messages in each: JointState on ``joint_states``, TransformSample on ``tf``,
     StaticTransforms on ``tf_static``, RobotDescription on ``robot_description``, LaserScan on ``scan``,
-    OccupancyGrid on ``map``, Clock on ``clock``.
+    OccupancyGrid on ``map``, Imu on ``imu``, Velocity on ``velocity``, Odometry on ``odometry``, Clock on
+    ``clock``.
     Decoding may keep state, so each reader has an instance of its own.
     """
 
@@ -123,6 +124,9 @@ class Wire(WriterTokens, Protocol):
 
     transforms: Stream
     """The stream that carries the edges of a ``TransformPublisher``."""
+
+    edges: tuple[Stream, ...]
+    """The streams of all moving edges that are not a model's."""
 
     partial_joint_states: Stream
     """The stream that carries the joints of a ``PartialStatePublisher``."""

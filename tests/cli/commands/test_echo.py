@@ -8,13 +8,15 @@ import sys
 from math import nan
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started, zstate
-from helpers.processes import DEADLINE_S, until
+from helpers.processes import DEADLINE_S, repeated, until
 from helpers.robots import SampleCollector, wait_for_reader
 
-from zstate import connect
+from zstate import Transform, connect
 from zstate.cli.output.joint_state_text import ChangeFilter
+from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
 
 pytestmark = pytest.mark.processes
 
@@ -221,3 +223,51 @@ def test_with_several_robots_the_candidates_are_named(command: str):
 def test_a_topic_of_ros_leads_to_its_wire(command: str):
     message = failure(command, "/joint_states", code=2)
     assert f"is a ROS topic, not a robot; `zstate {command} --wire ros2` reads /joint_states" in message
+
+
+@pytest.mark.parametrize(
+    ("stream", "expected"),
+    [
+        (
+            "odometry",
+            {
+                **{"parent": "r1/odom", "child": "r1/base", "translation": [1.0, 0.0, 0.0]},
+                **{"rotation": [0.0, 0.0, 0.0, 1.0], "linear": [0.5, 0.0, 0.0], "angular": [0.0, 0.0, 0.25]},
+                "pose_sigma": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+            },
+        ),
+        ("imu", {"frame": "r1/chest", "gyro": [0.0, 0.0, 0.25], "accel": [0.0, 0.0, 9.81]}),
+        ("velocity", {"frame": "r1/flow", "linear": [0.5, 0.0, 0.0], "velocity_sigma": [2.0, 2.0, 2.0]}),
+    ],
+)
+def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str, object]):
+    variances = np.diag(np.arange(1.0, 7.0) ** 2)
+    base = Transform("odom", "base", [1, 0, 0], [0, 0, 0, 1]).with_covariance(variances)
+    with (
+        connect() as session,
+        OdometryPublisher(session, "r1") as odometry,
+        ImuPublisher(session, "r1", frame="chest") as imu,
+        VelocityPublisher(session, "r1", "flow") as velocity,
+    ):
+
+        def publish() -> None:
+            odometry.publish(base, [0.5, 0, 0], [0, 0, 0.25])
+            imu.publish([0, 0, 0.25], [0, 0, 9.81])
+            velocity.publish([0.5, 0, 0], covariance=np.eye(3) * 4)
+
+        with repeated(publish):
+            document = json.loads(zstate("echo", "r1", "--stream", stream, "--once", "--json").stdout)
+            rate = json.loads(zstate("hz", "r1", "--stream", stream, "--once", "--json").stdout)
+            listed = json.loads(zstate("ls", "--json").stdout)
+    assert {name: value for name, value in document.items() if name not in ("stamp", "seq")} == expected
+    assert rate["rate_hz"] > 1.0
+    names = {writer["stream"]: writer["names"] for writer in listed[0]["writers"]}
+    assert names == {"odometry": ["odometry"], "imu": ["imu"], "velocity": ["flow"]}
+    assert all(writer["rate_hz"] for writer in listed[0]["writers"])
+
+
+def test_sensor_that_is_not_published_is_explained():
+    with published_robot():
+        message = failure("echo", "rrbot", "--stream", "imu", "--once", "--timeout", "1")
+    assert "imu of 'rrbot' has no writer; start the program of the sensor" in message
+    assert "zstate.odometry.ImuPublisher" in message

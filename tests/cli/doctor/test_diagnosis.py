@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -327,6 +328,28 @@ def test_two_writers_of_one_stream_are_a_warning():
     (writers,) = [check for check in checks if check["name"] == "writers"]
     assert writers["state"] == "warning"
     assert "and so does" in writers["text"]
+
+
+class StillBase:
+    """A base that stands at the origin of its odometry."""
+
+    def read(self, stamp: int) -> list[Transform]:
+        return [Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp)]
+
+
+def test_warning_of_a_writer_of_transforms_is_reported_though_it_keeps_its_rate():
+    text = "wheels: NIS 14.2 for 3 numbers, expected 0.2 to 9.3: its sigmas are about 2 times too small"
+    with connect() as session, TransformPublisher(session, "cart", "wheels", program="odometry") as odometry:
+        odometry.warning = text
+        thread = threading.Thread(target=odometry.run, args=(StillBase(), 50.0))
+        thread.start()
+        try:
+            until(lambda: odometry.stats.sent > 0)
+            found = warnings()["writers"]
+        finally:
+            odometry.close()
+            thread.join()
+    assert re.fullmatch(rf"odometry@\S+ pid {os.getpid()} reports: {re.escape(text)}", found)
 
 
 def test_disconnected_frames_are_a_warning(spawn: Spawn):

@@ -304,6 +304,7 @@ def test_viewers_discover_all_readers(site: Site):
             "tf_static",
             "tf",
             "transforms",
+            "odometry",
         }
 
 

@@ -11,13 +11,16 @@ from zstate.wire.ros2.types import (
     CLOCK,
     DIAGNOSTIC_ARRAY,
     FLOAT64_MULTI_ARRAY,
+    IMU,
     JOINT_STATE,
     JOINT_TRAJECTORY,
     LASER_SCAN,
     OCCUPANCY_GRID,
+    ODOMETRY,
     POSE_WITH_COVARIANCE,
     STRING,
     TF_MESSAGE,
+    TWIST_WITH_COVARIANCE,
     RosType,
 )
 
@@ -32,6 +35,9 @@ TYPES = (
     FLOAT64_MULTI_ARRAY,
     JOINT_TRAJECTORY,
     DIAGNOSTIC_ARRAY,
+    IMU,
+    TWIST_WITH_COVARIANCE,
+    ODOMETRY,
 )
 EACH = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])
 

@@ -193,7 +193,20 @@ def test_key_in_a_namespace_that_ros_does_not_allow_is_foreign():
     assert caught.value.reason == "foreign"
 
 
-STREAMS = st.sampled_from(["joint_states", "tf", "tf_static", "robot_description", "scan", "map", "clock"])
+STREAMS = st.sampled_from(
+    [
+        "joint_states",
+        "tf",
+        "tf_static",
+        "robot_description",
+        "scan",
+        "map",
+        "imu",
+        "velocity",
+        "odometry",
+        "clock",
+    ]
+)
 BESIDE = st.one_of(
     st.none(),
     st.binary(max_size=40),

@@ -31,7 +31,10 @@ def _check_amount(amount: float) -> float:
 @click.option(
     "--stream",
     type=click.Choice(
-        ["joint_states", "partial_joint_states", "joint_setpoints", "transforms", "scan", "map"]
+        [
+            *("joint_states", "partial_joint_states", "joint_setpoints", "transforms", "odometry"),
+            *("imu", "velocity", "scan", "map"),
+        ]
     ),
     default="joint_states",
     show_default=True,
@@ -67,13 +70,15 @@ def echo_command(
     form: str | None,
     wire: str,
 ) -> None:
-    """Print joint states, setpoints, transforms, scans or maps of ROBOT as they arrive, as YAML documents.
+    """Print joint states, setpoints, transforms, odometry, what sensors measure, or maps of ROBOT as they
+    arrive, as YAML documents.
 
     ROBOT may be left out if only one robot is announced. Transforms, and partial joint states, are those of
     all their writers; on a ROS wire these are all messages of /tf, or /joint_states. Joint setpoints are what
-    the program that owns the robot's hardware writes to it, while it moves or holds the joints. A scan or a
-    map is a summary: geometry and counts; --json, --csv and --field also have the ranges of a scan [m], null
-    where nothing was measured.
+    the program that owns the robot's hardware writes to it, while it moves or holds the joints. Of known
+    covariances of odometry, IMUs and velocities the standard deviations are printed, in the same units. A
+    scan or a map is a summary: geometry and counts; --json, --csv and --field also have the ranges of a scan
+    [m], null where nothing was measured.
 
     \b
     zstate echo
@@ -81,6 +86,7 @@ def echo_command(
     zstate echo panda --stream transforms
     zstate echo panda --stream joint_setpoints
     zstate echo diffbot --stream scan --json
+    zstate echo rover --stream odometry --field translation
     zstate echo hall --stream map --once
     zstate echo panda --field panda_joint1 --csv > joint1.csv
     zstate echo panda --by 0.001
@@ -91,10 +97,13 @@ def echo_command(
         ChangeFilter,
         CsvFormatter,
         DescribedJointStates,
+        imu_document,
         map_document,
+        odometry_document,
         scan_document,
         select_field,
         transforms_document,
+        velocity_document,
         yaml_text,
     )
     from zstate.cli.stream_reader import StreamReader
@@ -124,10 +133,16 @@ def echo_command(
     ):
         selected = named_robot(session, robot, wire)
         document: Callable[[Any], Any]
+        named: dict[Stream, Callable[..., Any]] = {
+            "map": map_document,
+            "imu": imu_document,
+            "velocity": velocity_document,
+            "odometry": odometry_document,
+        }
         if stream == "scan":
             document = partial(scan_document, robot=selected, has_ranges=(form or field) is not None)
-        elif stream == "map":
-            document = partial(map_document, robot=selected)
+        elif stream in named:
+            document = partial(named[stream], robot=selected)
         elif stream == "transforms":
             document = transforms_document
         else:

@@ -79,15 +79,15 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.net.graph import build_graph
     from zstate.net.presence import discover, discover_readers
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
-    from zstate.wire.keys import ANY
+    from zstate.wire.keys import ANY, EDGE_STREAMS, SENSOR_STREAMS
     from zstate.wire.registry import get_wire
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
         always: tuple[Stream, ...] = (
             "joint_states",
             "partial_joint_states",
-            "transforms",
-            "scan",
+            *EDGE_STREAMS,
+            *SENSOR_STREAMS,
             "joint_commands",
         )
         for stream in always:

@@ -25,7 +25,10 @@ _SETTLING_S = 0.1
 @click.option(
     "--stream",
     type=click.Choice(
-        ["joint_states", "partial_joint_states", "joint_setpoints", "tf", "transforms", "scan"]
+        [
+            *("joint_states", "partial_joint_states", "joint_setpoints", "tf", "transforms", "odometry"),
+            *("imu", "velocity", "scan"),
+        ]
     ),
     default="joint_states",
     show_default=True,
@@ -57,8 +60,8 @@ def hz_command(
     """Print once a second the rate at which samples of ROBOT arrive.
 
     ROBOT may be left out if only one robot is announced. On a ROS wire this is the rate of the messages of a
-    topic, from all nodes together; that of transforms, of partial joint states and of scans is the rate of
-    all their writers together.
+    topic, from all nodes together; that of transforms, odometry, partial joint states and sensors is the rate
+    of all their writers together.
 
     \b
     zstate hz

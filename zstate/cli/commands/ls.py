@@ -45,7 +45,10 @@ _REFRESH_S, _JSON_PERIOD_S = 0.5, 1.0
 _DISCOVERY_S = 0.5
 _HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
 _OPTIONAL = ("since", "age")
-_MEASURED: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "transforms", "scan")
+_MEASURED: tuple[Stream, ...] = (
+    *("joint_states", "partial_joint_states", "transforms", "odometry"),
+    *("scan", "imu", "velocity"),
+)
 
 
 @click.command("ls")
@@ -56,10 +59,10 @@ _MEASURED: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "transf
 def ls_command(network: SessionOptions, *, watch: bool, as_json: bool, wire: str) -> None:
     """List the announced robots and, for each stream, its writer and since when it writes.
 
-    Joint states, transforms and scans also have their rate, from their stamps, and the age of the newest
-    sample. On a ROS wire: the nodes, and the publishers and subscribers of the topics of robot states, with
-    QoS. A terminal gets headings. With --watch a pipe gets the list after each change; with --json, once a
-    second. If no robot is announced the list is empty and the exit code is 0.
+    Joint states, transforms, odometry and sensors also have their rate, from their stamps, and the age of the
+    newest sample. On a ROS wire: the nodes, and the publishers and subscribers of the topics of robot states,
+    with QoS. A terminal gets headings. With --watch a pipe gets the list after each change; with --json, once
+    a second. If no robot is announced the list is empty and the exit code is 0.
 
     \b
     zstate ls

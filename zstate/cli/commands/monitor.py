@@ -30,7 +30,7 @@ from zstate.cli.output.console import (
 from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
-from zstate.wire.keys import ANY, JOINT_STREAMS, Stream, check_robot
+from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, Stream, check_robot
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from zstate.net.session import Session
     from zstate.net.topic_statistics import IntervalStatistics
     from zstate.nodes.listener import Follow, TransformListener
+    from zstate.wire.messages import Status
 
 _FIRST_AFTER_S = 1.0
 # Discovery takes less.
@@ -88,8 +89,10 @@ def monitor_command(
     be looked up, and counts since the start: received, dropped here, missed on the way, late (older than the
     history), refused, and off the clock (stamped more than a minute away from the time here). Rate, age and
     latency are those of its joint states, if it has any; transforms besides them, and scans, have a rate of
-    their own. A robot with a driver has a second line, with the driver's state. On a ROS wire this is
-    /tf, all nodes together; with --robot, the joint states of a robot that has a description.
+    their own. A robot with a driver has a second line, with the driver's state, and a line for each writer
+    that reports a fault: late ticks, refused samples, no new ones, or odometry whose sensors contradict it.
+    On a ROS wire this is /tf, all nodes together; with --robot, the joint states of a robot that has a
+    description.
 
     \b
     zstate monitor
@@ -289,6 +292,7 @@ class RobotMonitor(Closeable):
         self, session: Session, directory: RobotDirectory, robot: str, wire: str, clock: Clock | None
     ) -> None:
         from zstate.driving.driver_state import DriverStateListener
+        from zstate.net.status import StatusMonitor
         from zstate.net.topic_statistics import TopicStatistics
         from zstate.wire.registry import get_wire
 
@@ -301,6 +305,7 @@ class RobotMonitor(Closeable):
         self._opened = ExitStack()
         self.drivers = self._opened.enter_context(DriverStateListener(session, robot))
         """Those of the native wire; other wires have none."""
+        self._statuses = self._opened.enter_context(StatusMonitor(session, robot))
         scans = TopicStatistics(session, get_wire(wire), sources=lambda name, _, __: (name,), clock=clock)
         self._scans = self._opened.enter_context(scans)
         scans.subscribe("scan", robot)
@@ -340,8 +345,8 @@ class RobotMonitor(Closeable):
         known = self._robots.get(robot)
         if known is not None and follow in (known.follow, "tf"):
             return
-        # A native listener also receives transforms, and partial joint states as joint states.
-        others: tuple[Stream, ...] = () if is_ros(self._wire) else ("partial_joint_states", "transforms")
+        # A native listener also receives moving edges, and partial joint states as joint states.
+        others: tuple[Stream, ...] = () if is_ros(self._wire) else ("partial_joint_states", *EDGE_STREAMS)
         shown: list[Stream] = [stream for stream in (follow, *others) if stream in streams]
         if not shown:
             return
@@ -365,9 +370,11 @@ class RobotMonitor(Closeable):
             scans = self._scans.get(one.robot)
             window = None if scans is None else scans.recent(_SCANS_WITHIN_NS)
             scans_hz = None if window is None else window.rate_hz
+            faulty = [status for status in self._statuses.recent(one.robot) if status.level != "ok"]
             if as_json:
                 facts = {"robot": one.robot, **asdict(measure), "scans_hz": scans_hz, **asdict(stats)}
-                print_json({**facts, "driver": None if driver is None else _driver_facts(driver)})
+                facts["driver"] = None if driver is None else _driver_facts(driver)
+                print_json({**facts, "faults": list(map(_fault_facts, faulty))})
                 continue
             rate = _rate_text(one.buffer.statistics_of(one.robot), measure.rate_hz)
             if measure.transforms_hz is not None:
@@ -386,6 +393,16 @@ class RobotMonitor(Closeable):
             )
             if driver is not None:
                 print_wrapped(f"{one.robot}  driver {_driver_text(driver)}")
+            for status in faulty:
+                print_wrapped(f"{one.robot}  {status.level}  {_program(status)}: {status.text}")
+
+
+def _program(status: Status) -> str:
+    return f"{status.program}@{status.host} pid {status.pid}"
+
+
+def _fault_facts(status: Status) -> dict[str, str]:
+    return {"writer": _program(status), "level": status.level, "text": status.text}
 
 
 def _driver_text(driver: ReceivedState) -> str:

@@ -141,7 +141,7 @@ def _show(player: Player, call: BackgroundCall[PlayerReport]) -> PlayerReport:
 def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequence[str]) -> list[str]:
     """Writers on the network of streams that a replay of ``robots`` would publish."""
     from zstate.net.presence import discover
-    from zstate.wire.keys import JOINT_STREAMS
+    from zstate.wire.keys import JOINT_STREAMS, SENSOR_STREAMS
     from zstate.wire.registry import get_wire
 
     conflicts: list[str] = []
@@ -149,7 +149,14 @@ def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequenc
         wire = get_wire(name)
         # The name of a replayed robot on this wire: ROS has only namespaces.
         names = {wire.robot_from_key(wire.expression(robot, "joint_states")): robot for robot in robots}
-        replayed = {*JOINT_STREAMS, "robot_description", "tf", "scan", "map"} - wire.shared
+        replayed = {
+            *JOINT_STREAMS,
+            "robot_description",
+            "tf",
+            "map",
+            "odometry",
+            *SENSOR_STREAMS,
+        } - wire.shared
         for info in discover(session, wire=name):
             writers = {str(writer) for stream, writer in info.writers if stream in replayed}
             if info.name in names and writers:

@@ -8,13 +8,13 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from zstate.cli.output.console import colored, count_text, output_width
-from zstate.wire.keys import JOINT_STREAMS
+from zstate.wire.keys import EDGE_STREAMS, JOINT_STREAMS
 
 State = Literal["ok", "warning", "broken", "skipped"]
 
 _COLORS = {"ok": "green", "warning": "yellow", "broken": "red", "skipped": None}
 _STATE, _NAME, _MIN_TEXT = 7, 12, 20  # widths
-_MOVING = {*JOINT_STREAMS, "tf", "transforms"}
+_MOVING = {*JOINT_STREAMS, *EDGE_STREAMS, "tf"}
 
 
 @dataclass(frozen=True, slots=True)

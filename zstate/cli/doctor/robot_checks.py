@@ -64,6 +64,7 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
     yield from named_writers_checks(probe, "transforms", probe.transforms, probe.info.transform_names)
     yield from named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names)
     yield from scan_frames_checks(probe)
+    yield from measured_checks(probe)
     yield clocks_check(probe)
     yield stamps_check(probe, session)
     if model is not None:
@@ -95,6 +96,8 @@ def _has_own_check(status: Status) -> bool:
     """Whether another check covers a warning, or the writer was only late now and then."""
     if ARE_OUTSIDE in status.text:
         return True
+    if "warning" in status.values:
+        return False
     commanded = status.values.get("commanded", "").partition(" ")[0]
     return bool(commanded) and status.rate_hz >= _MIN_RATE * float(commanded)
 
@@ -295,6 +298,18 @@ def named_writers_checks(
             yield ok(stream, f"one sample from {known_as}, {silence} ago")
         else:
             yield ok(stream, f"{window.rate_hz:.1f} Hz from {known_as}, newest {silence} ago")
+
+
+def measured_checks(probe: RobotProbe, command: str = "") -> Iterator[Check]:
+    """Whether each writer of odometry, each IMU and each sensor of velocities publishes.
+
+    ``command`` shows rates, without its stream; default: that of the native wire.
+    """
+    info = probe.info
+    names = {"odometry": info.odometry_names, "imu": info.imu_names, "velocity": info.velocity_names}
+    for stream, samples in probe.measured.items():
+        hz = f"{command or f'zstate hz {info.name}'} --stream {stream}"
+        yield from named_writers_checks(probe, stream, samples, names[stream], hz)
 
 
 def maps_checks(probe: RobotProbe, patient: str) -> Iterator[Check]:

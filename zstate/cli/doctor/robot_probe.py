@@ -24,8 +24,9 @@ from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import JOINT_STREAMS, Stream, clock_key
+from zstate.wire.keys import EDGE_STREAMS, JOINT_STREAMS, Stream, clock_key
 from zstate.wire.messages import (
+    Imu,
     JointState,
     LaserScan,
     OccupancyGrid,
@@ -33,6 +34,7 @@ from zstate.wire.messages import (
     StampedMessage,
     Status,
     TransformSample,
+    Velocity,
     from_block,
     order_digest,
 )
@@ -42,13 +44,14 @@ from zstate.wire.registry import get_wire
 _MIN_WINDOW_S = 1.2  # writers publish their status once a second
 _REPLY_WITHIN_S = 0.4
 _ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf")
+_MEASURED: tuple[Stream, ...] = ("imu", "velocity", "odometry")
 _ALL = ""
 
 
 class WriterSamples:
     """Samples of one writer: ``statistics``, ``names`` of joints or frames, and ranges of positions.
 
-    The frames are those that its edges place, or those of its scans.
+    The frames are those that its edges place, or those of its measurements.
     """
 
     def __init__(self, statistics: IntervalStatistics) -> None:
@@ -60,7 +63,7 @@ class WriterSamples:
 
     def add(self, sample: StampedMessage) -> None:
         """Include ``sample``; positions in another joint order replace all before."""
-        if isinstance(sample, LaserScan):
+        if isinstance(sample, LaserScan | Imu | Velocity):
             self.names[sample.frame] = None
         elif isinstance(sample, TransformSample):
             self.names.update(dict.fromkeys(child for _, child in sample.edges or ()))
@@ -133,7 +136,8 @@ class RobotProbe(Closeable):
     ``neighbours`` are all announced robots. ``on_change()`` is called after each description and sample.
     ``nodes`` are the samples of each stream by ROS node, on a ROS wire; ``transforms`` and ``parts``, the
     partial joint states, are the samples of these streams by writer, on the native wire. ``scans`` are those
-    of its laser scanners, ``maps`` its maps by name; ``driver`` is the state of its driver.
+    of its laser scanners, ``measured`` those of its other sensors and its odometry; ``maps`` are its maps by
+    name; ``driver`` is the state of its driver.
     """
 
     def __init__(
@@ -170,6 +174,12 @@ class RobotProbe(Closeable):
             self._drivers: DriverStateListener | None = None
             scans = StreamSamples(session, info.name, "scan", wire_format, on_change)
             self.scans = opening.enter_context(scans)
+            self.measured: dict[Stream, StreamSamples] = {
+                stream: opening.enter_context(
+                    StreamSamples(session, info.name, stream, wire_format, on_change)
+                )
+                for stream in _MEASURED
+            }
             if info.map_names:
                 maps = subscribe(session, wire_format, info.name, "map", self._on_maps)
                 opening.enter_context(maps)
@@ -249,13 +259,14 @@ class RobotProbe(Closeable):
 
     @property
     def sample_count(self) -> int:
-        """How many joint states, transforms and scans have arrived."""
-        all_samples = [self.samples, self.transforms, self.parts, self.scans]
+        """How many joint states, transforms, odometry and messages of sensors have arrived."""
+        all_samples = [self.samples, self.transforms, self.parts, self.scans, *self.measured.values()]
         return sum(samples.statistics.count for samples in all_samples if samples is not None)
 
     def statistics(self) -> list[IntervalStatistics]:
-        """Those of the followed stream, and of each writer of partial joint states and of transforms."""
-        named = [samples for samples in (self.parts, self.transforms) if samples is not None]
+        """Those of the followed stream, and of each writer of partial joint states or of moving edges."""
+        moving = self.parts, self.transforms, self.measured["odometry"]
+        named = [samples for samples in moving if samples is not None]
         writers = [writer for samples in named for writer in samples.writers.values()]
         return [self.samples.statistics, *(writer.statistics for writer in writers)]
 
@@ -268,7 +279,7 @@ class RobotProbe(Closeable):
     def has_only_transforms(self) -> bool:
         """Whether its writers publish moving edges, and no joints or model."""
         others = {*JOINT_STREAMS, "tf", "robot_description"}
-        return "transforms" in self.streams and self.streams.isdisjoint(others)
+        return not self.streams.isdisjoint(EDGE_STREAMS) and self.streams.isdisjoint(others)
 
     def find_unresponsive(self) -> None:
         """Query the writers that have not reported their clocks, and collect those that do not reply.

@@ -11,6 +11,7 @@ from zstate.cli.doctor.clock_checks import stamps_check
 from zstate.cli.doctor.robot_checks import (
     limits_check,
     maps_checks,
+    measured_checks,
     model_check,
     named_writers_checks,
     poses_check,
@@ -70,6 +71,7 @@ class _RosChecks:
         hz = f"zstate hz{self._robot} --stream scan"
         yield from named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names, hz)
         yield from scan_frames_checks(probe)
+        yield from measured_checks(probe, f"zstate hz{self._robot}")
         yield stamps_check(probe, self._session)
         if model is not None:
             yield from limits_check(probe, model, nodes.values(), f"zstate echo{self._robot}")

@@ -23,12 +23,17 @@ from zstate.net.subscription import Received, subscribe
 from zstate.scans.grid import grid_from_message
 from zstate.scans.map_files import SAVED_FREE, SAVED_OCCUPIED
 from zstate.scans.scan import scan_from_message
+from zstate.wire.keys import full_name
 from zstate.wire.messages import (
+    Imu,
     JointState,
     LaserScan,
     OccupancyGrid,
+    Odometry,
     RobotDescription,
     TransformSample,
+    Velocity,
+    covariance_matrix,
     from_block,
     order_digest,
     poses_from_block,
@@ -180,6 +185,58 @@ def scan_document(message: LaserScan, robot: str, *, has_ranges: bool) -> dict[s
         "farthest": measured.max().item() if measured.size else np.nan,
     }
     return {**document, "ranges": ranges.tolist()} if has_ranges else document
+
+
+def imu_document(message: Imu, robot: str) -> dict[str, Any]:
+    """A reading of an IMU of ``robot``: stamp [ns], gyro [rad/s], accel [m/s^2], and sigmas if known."""
+    document = _head(message, robot)
+    document |= {"gyro": _list(message.gyro), "accel": _list(message.accel)}
+    if message.orientation is not None:
+        document["orientation"] = _list(message.orientation)
+    triangles = message.gyro_covariance, message.accel_covariance, message.orientation_covariance
+    return document | _sigmas(zip(("gyro", "accel", "orientation"), triangles, strict=True))
+
+
+def velocity_document(message: Velocity, robot: str) -> dict[str, Any]:
+    """A velocity of a frame of ``robot``: stamp [ns], linear [m/s], angular [rad/s], and sigmas if known."""
+    document = {**_head(message, robot), "linear": _list(message.linear)}
+    if message.angular is not None:
+        document["angular"] = _list(message.angular)
+    return document | _sigmas([("velocity", message.covariance)])
+
+
+def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
+    """Odometry of ``robot``: stamp [ns], frames, pose [m], velocities [m/s, rad/s], and sigmas if known."""
+    ((parent, child),) = message.edges or (("", ""),)
+    pose, twist = _list(message.poses), _list(message.twist)
+    document = {
+        "stamp": message.stamp,
+        "seq": message.seq,
+        "parent": full_name(robot, parent),
+        "child": full_name(robot, child),
+        "translation": pose[:3],
+        "rotation": pose[3:],
+        "linear": twist[:3],
+        "angular": twist[3:],
+    }
+    return document | _sigmas([("pose", message.covariances), ("twist", message.twist_covariance)])
+
+
+def _head(message: Imu | Velocity, robot: str) -> dict[str, Any]:
+    return {"stamp": message.stamp, "seq": message.seq, "frame": full_name(robot, message.frame)}
+
+
+def _list(block: bytes) -> list[float]:
+    return from_block(block).tolist()
+
+
+def _sigmas(covariances: Iterable[tuple[str, bytes | None]]) -> dict[str, list[float]]:
+    """The standard deviations of each known covariance, in the units of its numbers."""
+    return {
+        f"{name}_sigma": np.sqrt(np.diag(covariance_matrix(triangle))).tolist()
+        for name, triangle in covariances
+        if triangle is not None
+    }
 
 
 def map_document(message: OccupancyGrid, robot: str) -> dict[str, Any]:

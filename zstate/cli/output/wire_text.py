@@ -93,13 +93,20 @@ class NativeMessages:
         command = f"zstate transform TARGET SOURCE --xyz X Y Z --robot {robot}"
         if stream == "partial_joint_states":
             command = f"{publish_command_for('joints', robot)} --only NAME"
+        elif stream == "odometry":
+            command = f"zstate odometry {robot} --imu SENSOR"
         elif stream == "scan":
             command = f"zstate scan {robot} --frame FRAME --dummy"
         elif stream == "map":
             command = f"zstate map FILE.yaml --name {robot}"
         elif stream != "transforms":
             command = publish_command_for("joints" if stream == "joint_states" else "publish", robot)
-        return f"{stream} of {robot!r} has no writer{' any more' * ended}; start one: `{command}`"
+        start = f"start one: `{command}`"
+        if stream in ("imu", "velocity"):
+            start = (
+                f"start the program of the sensor, with its zstate.odometry.{stream.capitalize()}Publisher"
+            )
+        return f"{stream} of {robot!r} has no writer{' any more' * ended}; {start}"
 
     def missing_text(
         self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, has_frames: bool

@@ -16,9 +16,9 @@ from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
 from zstate.net.security.acl import AclRoles, access_control, check_namespace
 from zstate.net.security.credentials import Credentials
-from zstate.wire.keys import Stream, check_robot, stream_expression
+from zstate.wire.keys import EDGE_STREAMS, Stream, check_robot, stream_expression
 
-DOWNSAMPLED: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "tf", "transforms")
+DOWNSAMPLED: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "tf", *EDGE_STREAMS)
 """Streams that may lose samples: each is replaced by a newer one."""
 
 _WIDTH = 100
@@ -31,7 +31,7 @@ class Downsampling:
     """Limits on the samples per second that a router forwards to each neighbour.
 
     ``rates_hz`` is the limit by stream, for each of ``robots``; ``interfaces`` are the network interfaces
-    that it applies to (default: all). The limits of ``transforms`` and ``partial_joint_states`` are those of
+    that it applies to (default: all). The limits of streams with names, such as ``transforms``, are those of
     all their writers of one robot together. Latched values are never dropped. Readers count dropped samples
     as missed. Raises InvalidInput.
     """

@@ -26,6 +26,7 @@ from zstate.view.scene.scene import Scene
 
 _DISPLAYS = ("visuals", "collisions", "axes", "names", "parent_lines")
 _MAX_SCANS = 50
+_MAX_PATH_S = 30  # the buffer's history
 _MAX_LINES = 12
 _MAX_FRAMES = 10
 _NO_POSE = "no pose"
@@ -53,6 +54,12 @@ class DisplayPanel:
             "Last scans", min=1, max=_MAX_SCANS, step=1, initial_value=world.scan_count, hint=hint
         )
         self._maps = gui.add_checkbox("Maps", world.maps)
+        odometry = scene.odometry
+        hint = "The path of each base whose pose has a covariance, and the ellipse that it is in with 95 %."
+        self._odometry = gui.add_checkbox("Odometry", odometry.is_on, hint=hint)
+        self._path_s = gui.add_slider(
+            "Path [s]", min=1, max=_MAX_PATH_S, step=1, initial_value=round(odometry.path_s)
+        )
 
     def update(self, context: PanelContext) -> None:
         tree = context.snapshot.tree
@@ -69,6 +76,8 @@ class DisplayPanel:
         world = self._scene.world
         world.scans, world.maps = self._scans.value, self._maps.value
         world.scan_count = int(self._scan_count.value)
+        odometry = self._scene.odometry
+        odometry.is_on, odometry.path_s = self._odometry.value, self._path_s.value
 
 
 class RobotsPanel:

@@ -27,6 +27,7 @@ from zstate.view.scene.frames import (
     Trails,
     in_frame,
 )
+from zstate.view.scene.odometry import OdometryPaths
 from zstate.view.scene.robot_meshes import InstancedMeshes, RenderStyle, RobotKind, RobotMeshes
 from zstate.view.scene.world import World
 
@@ -44,8 +45,8 @@ class Scene:
 
     Attributes, used by the next ``show``: ``visuals`` and ``collisions`` of robots (the latter translucent),
     and ``axes``, ``names`` and ``parent_lines`` of frames. ``layout`` places unconnected trees; ``world``
-    draws scans and maps. Meshes and maps are loaded in the background; the scene is ``busy`` until all are
-    drawn. To be used by one thread.
+    draws scans and maps, ``odometry`` the paths of bases. Meshes and maps are loaded in the background; the
+    scene is ``busy`` until all are drawn. To be used by one thread.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -70,6 +71,7 @@ class Scene:
         self._lines = ParentLines(scene)
         self._trails = Trails(scene)
         self.world = World(scene)
+        self.odometry = OdometryPaths(scene)
         self.layout = TreeLayout()
         self._stale_labels = NodeLabels(scene, "stale", anchor="top-center")
         self._tree_labels = NodeLabels(scene, "tree", anchor="bottom-center")

@@ -145,7 +145,7 @@ class ScanClouds:
         if pose is None or frame not in place.tree.index:
             count = 0
         else:
-            _move(self._root, pose)
+            move_node(self._root, pose)
         state = sensor.latest(count, at), target, count, sensor.is_stale(at)
         if state != self._state:
             self._state = state
@@ -304,7 +304,7 @@ def _place_image(image: _MapImage, place: Place, *, is_on: bool) -> None:
     pose = place.pose(image.grid.frame)
     image.handle.visible = is_on and pose is not None
     if pose is not None:
-        _move(image.handle, se3.compose(pose, _middle(image.grid)))
+        move_node(image.handle, se3.compose(pose, _middle(image.grid)))
 
 
 def _remove_image(image: _MapImage) -> None:
@@ -320,7 +320,7 @@ def _middle(grid: Grid) -> se3.Pose:
     )
 
 
-def _move(node: viser.SceneNodeHandle, pose: se3.Pose) -> None:
+def move_node(node: viser.SceneNodeHandle, pose: se3.Pose) -> None:
     """Move a node, if it is not there already."""
     x, y, z, qx, qy, qz, qw = pose
     if np.abs(node.position - (x, y, z)).max() > _SMALLEST_MOVE:

@@ -1,10 +1,10 @@
-"""Decoder of ROS 2 topics into zstate's messages: joint states, transforms, scans, maps and commands."""
+"""Decoder of ROS 2 topics into zstate's messages: joint states, transforms, measurements, maps, commands."""
 
 from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from hashlib import blake2b
 from math import isfinite
 from typing import NamedTuple
@@ -17,14 +17,17 @@ from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     ClockMessage,
     Edges,
+    Imu,
     JointState,
     JointTrajectory,
     LaserScan,
     Message,
     OccupancyGrid,
+    Odometry,
     RobotDescription,
     StaticTransforms,
     TransformSample,
+    Velocity,
     from_block,
     order_digest,
     poses_from_block,
@@ -39,6 +42,7 @@ from zstate.wire.ros2.cdr import (
     decode_string,
     unpack_stamps,
 )
+from zstate.wire.ros2.odometry import decode_imu, decode_odometry, decode_velocity
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
     FLOAT64_MULTI_ARRAY,
@@ -54,6 +58,11 @@ FLOAT_BYTES = 4
 CELL_BYTES = 1
 """Of a cell of a grid."""
 
+_MEASUREMENTS: dict[Stream, Callable[[bytes, int, int, FrameNames], Imu | Velocity | Odometry]] = {
+    "imu": decode_imu,
+    "velocity": decode_velocity,
+    "odometry": decode_odometry,
+}
 _SCAN_FLOATS = 7
 _POSE_NUMBERS = 7
 _STAMP_WORDS = STAMP_BYTES // 4
@@ -93,6 +102,9 @@ class RosDecoder:
             _checked_stamp(message.stamp)
         elif stream == "map":
             message = decode_grid(payload, session, names)
+        elif stream in _MEASUREMENTS:
+            message = _MEASUREMENTS[stream](payload, session, seq, names)
+            _checked_stamp(message.stamp)
         else:
             message = ClockMessage(decode_clock(payload), seq, session)
         return (message,)

@@ -17,13 +17,16 @@ from zstate.wire.messages import (
     POSE_BYTES,
     ClockMessage,
     Edges,
+    Imu,
     JointState,
     LaserScan,
     Message,
     OccupancyGrid,
+    Odometry,
     RobotDescription,
     StaticTransforms,
     TransformSample,
+    Velocity,
     from_block,
     to_block,
 )
@@ -36,6 +39,7 @@ from zstate.wire.ros2.decoder import (
     read_tf_message,
 )
 from zstate.wire.ros2.graph import pack_attachment
+from zstate.wire.ros2.odometry import encode_imu, encode_odometry, encode_velocity
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
@@ -97,15 +101,14 @@ class RosStreamEncoder:
         """
         if isinstance(message, JointState):
             return self._encode_joints(message)
+        if isinstance(message, LaserScan | Imu | Velocity | Odometry):
+            return self._encode_measurement(message)
         if isinstance(message, TransformSample):
             edges = self._sample_names.moving_edges if message.edges is None else message.edges
             return self._encode_edges(edges, _checked_stamp(message.stamp), message.poses)
         if isinstance(message, StaticTransforms):
             return self._encode_edges(message.edges, 0, message.poses)
-        if isinstance(message, LaserScan):
-            _checked_stamp(message.stamp)
-            payload = encode_scan(message, self._names)
-        elif isinstance(message, OccupancyGrid):
+        if isinstance(message, OccupancyGrid):
             payload = encode_grid(message, self._names)
         elif isinstance(message, RobotDescription):
             payload = encode_string(message.urdf)
@@ -114,6 +117,16 @@ class RosStreamEncoder:
         else:
             raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
         return payload
+
+    def _encode_measurement(self, message: LaserScan | Imu | Velocity | Odometry) -> bytes:
+        _checked_stamp(message.stamp)
+        if isinstance(message, Imu):
+            return encode_imu(message, self._names)
+        if isinstance(message, Velocity):
+            return encode_velocity(message, self._names)
+        if isinstance(message, Odometry):
+            return encode_odometry(message, self._names)
+        return encode_scan(message, self._names)
 
     def _encode_joints(self, state: JointState) -> bytes:
         names = self._sample_names.coordinates if state.names is None else state.names

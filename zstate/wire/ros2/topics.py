@@ -2,18 +2,21 @@
 
 Keys are those of rmw_zenoh_cpp and zenoh-plugin-ros2dds.
 
-===================  ======================  ===========================================
-stream               type                    topic of robot r1 with ``namespace=r1``
-===================  ======================  ===========================================
-joint_states         sensor_msgs/JointState  ``/r1/joint_states``
-robot_description    std_msgs/String         ``/r1/robot_description``
-tf, tf_static        tf2_msgs/TFMessage      ``/tf``; ``/r1/tf`` with ``tf=namespace``
-scan                 sensor_msgs/LaserScan   ``/r1/<sensor>``, such as ``/r1/scan``
-map                  nav_msgs/OccupancyGrid  ``/r1/<name>``, such as ``/r1/map``
-clock                rosgraph_msgs/Clock     ``/clock``
-===================  ======================  ===========================================
+===================  ========================================  ===========================================
+stream               type                                      topic of robot r1 with ``namespace=r1``
+===================  ========================================  ===========================================
+joint_states         sensor_msgs/JointState                    ``/r1/joint_states``
+robot_description    std_msgs/String                           ``/r1/robot_description``
+tf, tf_static        tf2_msgs/TFMessage                        ``/tf``; ``/r1/tf`` with ``tf=namespace``
+scan                 sensor_msgs/LaserScan                     ``/r1/<sensor>``, such as ``/r1/scan``
+imu                  sensor_msgs/Imu                           ``/r1/<sensor>``, such as ``/r1/imu``
+velocity             geometry_msgs/TwistWithCovarianceStamped  ``/r1/<sensor>``, such as ``/r1/velocity``
+odometry             nav_msgs/Odometry                         ``/r1/<name>``, such as ``/r1/odom``
+map                  nav_msgs/OccupancyGrid                    ``/r1/<name>``, such as ``/r1/map``
+clock                rosgraph_msgs/Clock                       ``/clock``
+===================  ========================================  ===========================================
 
-Scans and maps are found by their type, whatever the last name of their topic is.
+The topics with a name of a sensor, or of a writer, are found by their type, whatever their last name is.
 """
 
 from __future__ import annotations
@@ -27,11 +30,14 @@ from zstate.wire.messages import Edges
 from zstate.wire.ros2.options import Ros2Options, check_token
 from zstate.wire.ros2.types import (
     CLOCK,
+    IMU,
     JOINT_STATE,
     LASER_SCAN,
     OCCUPANCY_GRID,
+    ODOMETRY,
     STRING,
     TF_MESSAGE,
+    TWIST_WITH_COVARIANCE,
     RosType,
 )
 
@@ -48,10 +54,13 @@ _TYPES: dict[Stream, RosType] = {
     "tf_static": TF_MESSAGE,
     "scan": LASER_SCAN,
     "map": OCCUPANCY_GRID,
+    "imu": IMU,
+    "velocity": TWIST_WITH_COVARIANCE,
+    "odometry": ODOMETRY,
     "clock": CLOCK,
 }
 
-NAMED_TOPICS: frozenset[Stream] = frozenset({"scan", "map"})
+NAMED_TOPICS: frozenset[Stream] = frozenset({"scan", "map", "imu", "velocity", "odometry"})
 """The streams whose topics are named by their writers."""
 
 _CACHED_ORDERS = 64
@@ -143,7 +152,8 @@ class DdsKeys(RmwKeys):
     """The same in zenoh-plugin-ros2dds: a key is the name of the topic, without its leading slash.
 
     A bridge puts its namespace before every topic, before /tf and /clock too. Its keys have no
-    domain, no type and no type hash, so only the topics ``scan`` and ``map`` can be read as such.
+    domain, no type and no type hash, so of the topics that writers name only those with the names of the
+    streams can be read as such: ``scan``, ``imu``, ``map`` and so on.
     """
 
     def key(self, robot: str, stream: Stream, name: str = "") -> str:

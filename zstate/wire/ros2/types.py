@@ -81,6 +81,27 @@ _FIELDS: dict[str, tuple[tuple[str, str], ...]] = {
         ("std_msgs/Header", "header"),
         ("geometry_msgs/PoseWithCovariance", "pose"),
     ),
+    "geometry_msgs/Twist": (("geometry_msgs/Vector3", "linear"), ("geometry_msgs/Vector3", "angular")),
+    "geometry_msgs/TwistWithCovariance": (("geometry_msgs/Twist", "twist"), ("float64[36]", "covariance")),
+    "geometry_msgs/TwistWithCovarianceStamped": (
+        ("std_msgs/Header", "header"),
+        ("geometry_msgs/TwistWithCovariance", "twist"),
+    ),
+    "nav_msgs/Odometry": (
+        ("std_msgs/Header", "header"),
+        ("string", "child_frame_id"),
+        ("geometry_msgs/PoseWithCovariance", "pose"),
+        ("geometry_msgs/TwistWithCovariance", "twist"),
+    ),
+    "sensor_msgs/Imu": (
+        ("std_msgs/Header", "header"),
+        ("geometry_msgs/Quaternion", "orientation"),
+        ("float64[9]", "orientation_covariance"),
+        ("geometry_msgs/Vector3", "angular_velocity"),
+        ("float64[9]", "angular_velocity_covariance"),
+        ("geometry_msgs/Vector3", "linear_acceleration"),
+        ("float64[9]", "linear_acceleration_covariance"),
+    ),
 }
 # The numbers of type_description_interfaces/FieldType.
 _NESTED, _ARRAY, _UNBOUNDED_SEQUENCE = 1, 48, 144
@@ -155,3 +176,6 @@ FLOAT64_MULTI_ARRAY = RosType.from_fields("std_msgs/Float64MultiArray")
 DIAGNOSTIC_ARRAY = RosType.from_fields("diagnostic_msgs/DiagnosticArray")
 JOINT_TRAJECTORY = RosType.from_fields("trajectory_msgs/JointTrajectory")
 POSE_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/PoseWithCovarianceStamped")
+TWIST_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/TwistWithCovarianceStamped")
+ODOMETRY = RosType.from_fields("nav_msgs/Odometry")
+IMU = RosType.from_fields("sensor_msgs/Imu")

@@ -58,6 +58,7 @@ class Ros2Wire:
     name = "ros2"
     shared: frozenset[Stream] = frozenset({"tf", "tf_static"})
     transforms: Stream = "tf"
+    edges: tuple[Stream, ...] = ("tf",)
     partial_joint_states: Stream = "joint_states"
     _topic_keys = RmwKeys
     _has_gids = True

@@ -1,0 +1,263 @@
+"""Publishers of IMUs, velocities and odometry, read back from the network."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.processes import SOON_S, until
+
+from zstate.clock import ManualClock
+from zstate.errors import Closed, InvalidInput, LookupFailed, SecondWriter
+from zstate.net.presence import current_tokens, discover
+from zstate.net.session import Session
+from zstate.net.subscription import Received, subscribe
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
+from zstate.transform import Transform
+from zstate.wire.keys import Stream
+from zstate.wire.messages import (
+    Imu,
+    Message,
+    Odometry,
+    Velocity,
+    covariance_matrix,
+    covariances_of,
+    from_block,
+)
+from zstate.wire.registry import get_wire
+
+MS = 1_000_000
+STILL = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+POSE_COVARIANCE = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-3
+TWIST_COVARIANCE = np.diag([6.0, 5.0, 4.0, 3.0, 2.0, 1.0]) * 1e-3
+
+
+class Messages(list[Any]):
+    """The messages of r1 on one stream, as they arrive."""
+
+    def __init__(self, session: Session, stream: Stream, wire: str = "native") -> None:
+        self.refused: list[str] = []
+        self._subscriber = subscribe(
+            session,
+            get_wire(wire),
+            "r1",
+            stream,
+            self._on_messages,
+            on_error=lambda _, text: self.refused.append(text),
+        )
+
+    def _on_messages(self, received: list[Received]) -> None:
+        self.extend(one.message for one in received)
+
+    def first(self, publish: Any) -> Message:
+        """The first message; ``publish`` is repeated until the subscription is known to the publisher."""
+        until(lambda: publish() or self or self.refused)
+        assert not self.refused
+        return self[0]
+
+
+def base(x: float = 0.0, stamp: int | None = None) -> Transform:
+    return Transform("odom", "base_link", (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp)
+
+
+def test_reading_of_an_imu_arrives_as_it_was_published(sessions):
+    writer, reader = sessions
+    imu = Messages(reader, "imu")
+    covariance = np.diag([1.0, 2.0, 3.0])
+    with ImuPublisher(writer, "r1", "chest", frame="imu_link", gyro_covariance=covariance) as publisher:
+        reading = imu.first(lambda: publisher.publish([1, 2, 3], [0, 0, 9.81], 5, orientation=[0, 0, 1, 0]))
+    assert isinstance(reading, Imu)
+    assert (reading.stamp, reading.frame) == (5, "imu_link")
+    assert from_block(reading.gyro).tolist() == [1.0, 2.0, 3.0]
+    assert from_block(reading.accel).tolist() == [0.0, 0.0, 9.81]
+    assert reading.orientation is not None
+    assert from_block(reading.orientation).tolist() == [0.0, 0.0, 1.0, 0.0]
+    assert reading.gyro_covariance is not None
+    assert covariance_matrix(reading.gyro_covariance).tolist() == covariance.tolist()
+    assert reading.accel_covariance is reading.orientation_covariance is None
+
+
+def test_velocity_arrives_as_it_was_published(sessions):
+    writer, reader = sessions
+    velocities = Messages(reader, "velocity")
+    with VelocityPublisher(writer, "r1", "flow", clock=ManualClock(7)) as publisher:
+        both = velocities.first(lambda: publisher.publish([1, 2, 3], [4, 5, 6], covariance=TWIST_COVARIANCE))
+        publisher.publish([1, 2, 3], covariance=np.eye(3))
+        until(lambda: velocities[-1].angular is None)
+    assert isinstance(both, Velocity)
+    assert (both.stamp, both.frame) == (7, "flow")
+    assert both.covariance is not None
+    assert covariance_matrix(both.covariance).tolist() == TWIST_COVARIANCE.tolist()
+    assert covariance_matrix(velocities[-1].covariance).tolist() == np.eye(3).tolist()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"gyro": [1, 2]}, r"gyro takes 3 numbers, \(x, y, z\); got shape \(2,\)"),
+        ({"accel": [0, 0, np.nan]}, "finite numbers"),
+        ({"orientation": [0, 0, 0, 2]}, "length 1, not 2"),
+        (
+            {"orientation": [0, 0, 0, 1], "orientation_covariance": -np.eye(3)},
+            "orientation_covariance has no negative eigenvalue",
+        ),
+        ({"orientation_covariance": np.eye(3)}, "needs an orientation"),
+    ],
+)
+def test_wrong_reading_is_refused_and_counted(sessions, options: dict[str, Any], text: str):
+    with ImuPublisher(sessions[0], "r1") as publisher:
+        with pytest.raises(InvalidInput, match=text):
+            publisher.publish(**{"gyro": [0, 0, 0], "accel": [0, 0, 9.81], **options})
+        assert (publisher.stats.sent, publisher.stats.refused) == (0, 1)
+
+
+def test_covariance_of_a_velocity_has_the_size_of_what_is_measured(sessions):
+    with (
+        VelocityPublisher(sessions[0], "r1") as publisher,
+        pytest.raises(InvalidInput, match=r"covariance has shape \(3, 3\); got \(6, 6\)"),
+    ):
+        publisher.publish([1, 0, 0], covariance=np.eye(6))
+
+
+def test_a_sensor_has_one_writer(sessions):
+    first_session, second_session = sessions
+    with ImuPublisher(first_session, "r1", "chest", program="driver.py"):
+        until(lambda: current_tokens(second_session, "zstate/r1/@writer/**", 1.0))
+        with pytest.raises(SecondWriter, match=r"driver\.py.* imu of 'r1' under the name 'chest'"):
+            ImuPublisher(second_session, "r1", "chest")
+        with VelocityPublisher(second_session, "r1", "chest"):  # another stream
+            (robot,) = discover(second_session)
+    assert [name for name, _ in (*robot.imu_names, *robot.velocity_names)] == ["chest", "chest"]
+
+
+def test_odometry_is_a_moving_edge_with_its_covariance(sessions):
+    writer, reader = sessions
+    stamp = time.time_ns()
+    with (
+        OdometryPublisher(writer, "r1") as odometry,
+        TransformListener(reader, "r1") as listener,
+    ):
+        for step in range(3):
+            pose = base(float(step)).with_covariance((step + 1) * POSE_COVARIANCE)
+            odometry.publish(pose, *STILL, stamp + step * 20 * MS)
+        found = listener.buffer.wait("odom", "base_link", stamp + 20 * MS, timeout_s=SOON_S)
+        between = listener.buffer.wait("odom", "base_link", stamp + 30 * MS, timeout_s=SOON_S)
+        listener_stats = listener.stats
+    assert (found.kind, found.translation[0]) == ("exact", 1.0)
+    assert found.covariance == pytest.approx(2 * POSE_COVARIANCE)
+    assert (between.kind, between.translation[0]) == ("interpolated", 1.5)
+    assert listener_stats.received + listener_stats.recalled == 3
+
+
+def test_message_of_odometry_has_pose_twist_and_both_covariances(sessions):
+    writer, reader = sessions
+    samples = Messages(reader, "odometry")
+    pose = base(2.0, stamp=5).with_covariance(POSE_COVARIANCE)
+    with OdometryPublisher(writer, "r1") as odometry:
+        sample = samples.first(
+            lambda: odometry.publish(pose, [1, 2, 3], [4, 5, 6], twist_covariance=TWIST_COVARIANCE)
+        )
+    assert isinstance(sample, Odometry)
+    assert (sample.stamp, sample.edges) == (5, (("odom", "base_link"),))
+    assert from_block(sample.twist).tolist() == [1, 2, 3, 4, 5, 6]
+    assert sample.twist_covariance is not None
+    assert covariance_matrix(sample.twist_covariance).tolist() == TWIST_COVARIANCE.tolist()
+    covariances = covariances_of(sample)
+    assert covariances is not None
+    assert covariance_matrix(covariances.tobytes()).tolist() == POSE_COVARIANCE.tolist()
+
+
+def test_odometry_in_ros_is_a_message_and_an_edge_on_tf(sessions):
+    writer, reader = sessions
+    samples = Messages(reader, "odometry", "ros2")
+    pose = base(2.0, stamp=5).with_covariance(POSE_COVARIANCE)
+    with (
+        TransformListener(reader, "r1", wire="ros2", follow="tf") as listener,
+        OdometryPublisher(writer, "r1", "odom", "ros2") as odometry,
+    ):
+        sample = samples.first(lambda: odometry.publish(pose, [1, 2, 3], [4, 5, 6]))
+        assert listener.buffer.wait("odom", "base_link", 5, timeout_s=SOON_S).translation[0] == 2.0
+        (robot,) = discover(reader, wire="ros2")
+    assert isinstance(sample, Odometry)
+    assert sample.edges == (("odom", "base_link"),)
+    assert from_block(sample.twist).tolist() == [1, 2, 3, 4, 5, 6]
+    assert (sample.covariances is None, sample.twist_covariance) == (False, None)
+    assert {stream for stream, _ in robot.writers} == {"odometry", "tf"}
+
+
+def test_late_listener_gets_the_odometry_of_the_last_seconds(sessions):
+    writer, reader = sessions
+    stamp = time.time_ns()
+    with OdometryPublisher(writer, "r1") as odometry:
+        for step in range(300):  # more than a page
+            odometry.publish(base(float(step)), *STILL, stamp + step * MS)
+        with TransformListener(reader, "r1") as late:
+            until(lambda: late.stats.recalled + late.stats.received == 300)
+            poses, valid = late.buffer.lookup_many("odom", "base_link", stamp + MS * np.arange(300))
+    assert valid.all()
+    assert poses[:, 0].tolist() == [float(step) for step in range(300)]
+
+
+@pytest.mark.parametrize("kinds", [(OdometryPublisher, TransformPublisher), (OdometryPublisher,) * 2])
+def test_an_edge_has_one_writer_of_odometry_or_of_transforms(sessions, kinds):
+    def publish(publisher: OdometryPublisher | TransformPublisher) -> None:
+        if isinstance(publisher, OdometryPublisher):
+            publisher.publish(base(), *STILL)
+        else:
+            publisher.publish([base()])
+
+    for first_kind, second_kind in (kinds, kinds[::-1]):
+        with (
+            first_kind(sessions[0], "r1", "wheels") as first,
+            second_kind(sessions[1], "r1", "visual") as second,
+        ):
+            publish(first)
+            with pytest.raises(
+                SecondWriter, match=r"places 'r1/base_link' on 'r1/odom' already, as 'wheels'"
+            ):
+                publish(second)
+            publish(first)
+
+
+def test_closed_publisher_raises_closed(sessions):
+    odometry, imu = OdometryPublisher(sessions[0], "r1"), ImuPublisher(sessions[0], "r1")
+    odometry.close()
+    imu.close()
+    with pytest.raises(Closed, match="the odometry publisher 'odometry' is closed"):
+        odometry.publish(base(), *STILL)
+    with pytest.raises(Closed, match="the imu publisher 'imu' is closed"):
+        imu.publish([0, 0, 0], [0, 0, 9.81])
+
+
+def test_events_and_robots_name_the_writer_of_odometry(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1") as listener, OdometryPublisher(writer, "r1", "wheels"):
+        until(listener.events)
+        (event,) = listener.events()
+        (robot,) = discover(reader)
+    assert (event.kind, event.stream) == ("joined", "odometry")
+    assert [name for name, _ in robot.odometry_names] == ["wheels"]
+
+
+def x_of(listener: TransformListener) -> float | None:
+    """Where the base is now; None if that is not known."""
+    with suppress(LookupFailed):
+        return listener.buffer.lookup("odom", "base_link").translation[0]
+    return None
+
+
+def test_restarted_writer_of_odometry_begins_a_new_epoch(sessions):
+    writer, reader = sessions
+    stamp = time.time_ns()
+    with TransformListener(reader, "r1") as listener:
+        for x, begin in ((1.0, stamp), (2.0, stamp - 60_000 * MS)):  # the restarted one is a minute behind
+            with OdometryPublisher(writer, "r1") as odometry:
+                odometry.publish(base(x), *STILL, begin)
+                until(lambda x=x: x_of(listener) == x)
+                assert listener.buffer.lookup("odom", "base_link").stamp == begin
+            until(lambda: not current_tokens(reader, "zstate/r1/@writer/**", 1.0))

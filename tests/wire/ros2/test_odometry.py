@@ -1,0 +1,239 @@
+"""IMUs, velocities and odometry as ROS 2 messages; rosbags is the independent encoder."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.manual_cdr import STORE, rosbags_cdr, rosbags_time
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap_ros2._dynamic import generate_dynamic
+from numpy.typing import NDArray
+
+from zstate.errors import InvalidInput, MessageError
+from zstate.wire.joint_order import SampleLayout
+from zstate.wire.messages import Imu, Message, Odometry, Velocity, from_block, order_digest, to_block
+from zstate.wire.ros2.decoder import RosDecoder
+from zstate.wire.ros2.encoder import RosStreamEncoder
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import FrameNames
+from zstate.wire.ros2.types import IMU, ODOMETRY, TWIST_WITH_COVARIANCE
+
+STAMP = 1_700_000_000_123_456_789
+PLAIN, PREFIXED = FrameNames(Ros2Options(), "r1"), FrameNames(Ros2Options(frame_prefix="r1/"), "r1")
+HEAD = (STAMP, 5, 77)
+POSE, TWIST = [1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+EDGE = (("odom", "base"),)
+
+
+def symmetric(size: int, first: float = 1.0) -> NDArray[np.float64]:
+    """A matrix whose numbers all differ but for the symmetry."""
+    matrix = np.zeros((size, size))
+    upper = np.triu_indices(size)
+    matrix[upper] = matrix.T[upper] = first + np.arange(len(upper[0]))
+    return matrix
+
+
+def triangle(matrix: NDArray[np.float64]) -> bytes:
+    return to_block(matrix[np.triu_indices(len(matrix))])
+
+
+def header(frame: str) -> object:
+    return STORE.types["std_msgs/msg/Header"](rosbags_time(STAMP), frame)
+
+
+def vector(kind: str, numbers: Any) -> object:
+    return STORE.types[f"geometry_msgs/msg/{kind}"](*map(float, numbers))
+
+
+def rosbags_imu(orientation: Any, covariances: Any, frame: str = "imu", **options: bool) -> bytes:
+    turn, gyro, accel = (np.array(one, dtype=float).ravel() for one in covariances)
+    gyro_vector, accel_vector = vector("Vector3", [1, 2, 3]), vector("Vector3", [4, 5, 6])
+    fields = (vector("Quaternion", orientation), turn, gyro_vector, gyro, accel_vector, accel)
+    return rosbags_cdr(IMU.name, header(frame), *fields, **options)
+
+
+def rosbags_twist(numbers: Any, covariance: Any) -> object:
+    twist = STORE.types["geometry_msgs/msg/Twist"](
+        vector("Vector3", numbers[:3]), vector("Vector3", numbers[3:])
+    )
+    matrix = np.array(covariance, dtype=float).ravel()
+    return STORE.types["geometry_msgs/msg/TwistWithCovariance"](twist, matrix)
+
+
+def rosbags_velocity(numbers: Any, covariance: Any, frame: str = "base", **options: bool) -> bytes:
+    return rosbags_cdr(
+        TWIST_WITH_COVARIANCE.name, header(frame), rosbags_twist(numbers, covariance), **options
+    )
+
+
+def rosbags_odometry(
+    pose_covariance: Any, twist_covariance: Any, parent: str = "odom", **options: bool
+) -> bytes:
+    pose = STORE.types["geometry_msgs/msg/Pose"](vector("Point", POSE[:3]), vector("Quaternion", POSE[3:]))
+    matrix = np.array(pose_covariance, dtype=float).ravel()
+    with_covariance = STORE.types["geometry_msgs/msg/PoseWithCovariance"](pose, matrix)
+    twist = rosbags_twist(TWIST, twist_covariance)
+    return rosbags_cdr(ODOMETRY.name, header(parent), "base", with_covariance, twist, **options)
+
+
+def encoded(message: Message, names: FrameNames = PLAIN) -> bytes:
+    return RosStreamEncoder(names, SampleLayout()).encode(message)
+
+
+def decoded(stream: Any, payload: bytes, names: FrameNames = PLAIN) -> Any:
+    (message,) = RosDecoder().messages(stream, payload, 77, 5, names)
+    return message
+
+
+def imu(**changed: Any) -> Imu:
+    return Imu(
+        *HEAD, **{"frame": "imu", "gyro": to_block([1, 2, 3]), "accel": to_block([4, 5, 6]), **changed}
+    )
+
+
+NONE, ABSENT = np.zeros((3, 3)), [-1.0, *[0.0] * 8]
+NAN3 = [np.nan] * 3
+LINEAR_ONLY = np.full((6, 6), np.nan)
+LINEAR_ONLY[:3, :3] = symmetric(3)
+ODOMETRY_HEAD = (*HEAD, order_digest(EDGE), to_block(POSE), EDGE)
+
+CASES = [
+    ("imu", imu(), rosbags_imu([0, 0, 0, 1], [ABSENT, NONE, NONE])),
+    (
+        "imu",
+        imu(
+            orientation=to_block(POSE[3:]),
+            orientation_covariance=triangle(symmetric(3, 20)),
+            gyro_covariance=triangle(symmetric(3)),
+            accel_covariance=triangle(symmetric(3, 10)),
+        ),
+        rosbags_imu(POSE[3:], [symmetric(3, 20), symmetric(3), symmetric(3, 10)]),
+    ),
+    ("imu", imu(orientation=to_block([0, 0, 0, 1])), rosbags_imu([0, 0, 0, 1], [NONE] * 3)),
+    (
+        "velocity",
+        Velocity(*HEAD, "base", to_block(TWIST[:3]), to_block(TWIST[3:]), triangle(symmetric(6))),
+        rosbags_velocity(TWIST, symmetric(6)),
+    ),
+    (
+        "velocity",
+        Velocity(*HEAD, "base", to_block(TWIST[:3]), None, triangle(symmetric(3))),
+        rosbags_velocity([*TWIST[:3], *NAN3], LINEAR_ONLY),
+    ),
+    (
+        "odometry",
+        Odometry(*ODOMETRY_HEAD, triangle(symmetric(6)), to_block(TWIST), triangle(symmetric(6, 50))),
+        rosbags_odometry(symmetric(6), symmetric(6, 50)),
+    ),
+    (
+        "odometry",
+        Odometry(*ODOMETRY_HEAD, None, to_block(TWIST), None),
+        rosbags_odometry(np.zeros((6, 6)), np.zeros((6, 6))),
+    ),
+]
+
+
+@pytest.mark.parametrize(("stream", "message", "theirs"), CASES)
+def test_a_measurement_has_the_bytes_of_rosbags(stream: Any, message: Message, theirs: bytes):
+    assert encoded(message) == theirs
+    assert [decoded(stream, payload) for payload in (theirs, theirs + b"\x07\0\0")] == [message] * 2
+
+
+def test_messages_of_big_endian_machines_are_read_too():
+    covariances = symmetric(6), symmetric(6, 50)
+    turned = rosbags_odometry(*covariances, little_endian=False)
+    assert decoded("odometry", turned) == decoded("odometry", rosbags_odometry(*covariances))
+
+
+def test_mcap_ros2_support_decodes_measurements():
+    theirs = generate_dynamic(IMU.name, IMU.definition)[IMU.name](encoded(imu()))
+    assert (theirs.header.frame_id, theirs.angular_velocity.z, theirs.linear_acceleration.x) == (
+        "imu",
+        3.0,
+        4.0,
+    )
+    assert list(theirs.orientation_covariance) == ABSENT
+    decode = generate_dynamic(ODOMETRY.name, ODOMETRY.definition)[ODOMETRY.name]
+    theirs = decode(encoded(CASES[5][1]))
+    assert (theirs.header.frame_id, theirs.child_frame_id) == ("odom", "base")
+    assert (theirs.pose.pose.orientation.w, theirs.twist.twist.angular.x) == (0.8, 0.4)
+    assert list(theirs.twist.covariance) == symmetric(6, 50).ravel().tolist()
+
+
+def test_orientation_of_zeros_is_none():
+    # what an uninitialised geometry_msgs/Quaternion of ROS 1 has; it is no rotation
+    reading = decoded("imu", rosbags_imu([0, 0, 0, 0], [symmetric(3), NONE, NONE]))
+    assert reading.orientation is reading.orientation_covariance is None
+
+
+@pytest.mark.parametrize(
+    ("stream", "payload", "reason", "text"),
+    [
+        (
+            "imu",
+            rosbags_imu([0, 0, 0, 1], [NONE, ABSENT, NONE]),
+            "not measured",
+            "without angular velocities",
+        ),
+        ("imu", rosbags_imu([0, 0, 0, 1], [NONE, NONE, ABSENT]), "not measured", "without accelerations"),
+        ("imu", rosbags_imu([0, 0, 0, 2], [NONE] * 3), "malformed", "length 1, not 2"),
+        ("imu", rosbags_imu([0, 0, 0, 1], [NONE] * 3, ""), "malformed", "1 to 1024 characters"),
+        ("imu", rosbags_imu([0, 0, 0, 1], [NONE] * 3)[:-1], "truncated", "more are expected"),
+        ("velocity", rosbags_velocity(TWIST, np.triu(symmetric(6))), "malformed", "symmetric"),
+        ("velocity", rosbags_velocity(TWIST, -symmetric(6)), "malformed", "variances .* not negative"),
+        ("velocity", rosbags_velocity(TWIST, LINEAR_ONLY), "malformed", "symmetric and finite"),
+        ("velocity", rosbags_velocity([*NAN3, *NAN3], LINEAR_ONLY), "malformed", "finite numbers"),
+        ("odometry", rosbags_odometry(symmetric(6) * np.inf, symmetric(6)), "malformed", "finite"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_a_reason(stream: Any, payload: bytes, reason: str, text: str):
+    with pytest.raises(MessageError, match=text) as caught:
+        decoded(stream, payload)
+    assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("case", CASES[::3])
+def test_a_message_without_a_stamp_is_refused(case: tuple[Any, Message, bytes]):
+    stream, message, theirs = case
+    with pytest.raises(InvalidInput, match="the stamp is 0"):
+        encoded(type(message)(*(0, *list(_fields(message))[1:])))
+    with pytest.raises(MessageError) as caught:
+        decoded(stream, theirs[:4] + bytes(8) + theirs[12:])
+    assert caught.value.reason == "no stamp"
+
+
+def _fields(message: Message) -> list[Any]:
+    return [getattr(message, name) for name in message.__struct_fields__]
+
+
+def test_frames_have_the_prefix_of_their_robot():
+    assert encoded(imu(), PREFIXED) == rosbags_imu([0, 0, 0, 1], [ABSENT, NONE, NONE], "r1/imu")
+    payload = rosbags_odometry(symmetric(6), symmetric(6), "r1/odom")
+    sample = decoded("odometry", payload, PREFIXED)
+    assert sample.edges == (("odom", "ros/base"),)  # the child has no prefix, so it is no frame of r1
+
+
+FLOATS = st.floats(-1e6, 1e6)
+
+
+@given(st.lists(FLOATS, min_size=6, max_size=6), st.booleans(), st.booleans())
+def test_a_velocity_is_the_same_after_ros(numbers: list[float], has_angular: bool, has_covariance: bool):
+    size = 6 if has_angular else 3
+    covariance = triangle(symmetric(size)) if has_covariance else None
+    angular = to_block(numbers[3:]) if has_angular else None
+    velocity = Velocity(*HEAD, "base", to_block(numbers[:3]), angular, covariance)
+    assert decoded("velocity", encoded(velocity)) == velocity
+
+
+@given(st.binary(max_size=400), st.sampled_from(["imu", "velocity", "odometry"]), st.booleans())
+def test_arbitrary_bytes_raise_only_message_error(data: bytes, stream: Any, has_header: bool):
+    payload = b"\x00\x01\x00\x00" + data if has_header else data
+    try:
+        message = decoded(stream, payload)
+    except MessageError as error:
+        assert error.reason
+    else:
+        assert np.isfinite(from_block(getattr(message, "twist", bytes(8)))).all()

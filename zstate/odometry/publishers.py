@@ -1,0 +1,202 @@
+"""Publishers of inertial measurements, of velocities, and of odometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from numpy.typing import ArrayLike
+
+from zstate.checks import real_numbers
+from zstate.clock import Clock, check_stamp
+from zstate.errors import InvalidInput
+from zstate.net.session import Session
+from zstate.nodes.sample_publisher import SensorPublisher
+from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
+from zstate.transform import Transform, check_covariance
+from zstate.wire.keys import full_name
+from zstate.wire.messages import Imu, Odometry, Velocity, to_block
+
+
+class ImuPublisher(SensorPublisher):
+    """Publishes the readings of one inertial measurement unit of a robot.
+
+    ``sensor`` is its name, in ROS its topic. Its axes are those of ``frame``, by default a frame of the
+    sensor's name; a bare name is the robot's own. The covariances of its numbers, (3, 3), are published with
+    each reading if they are given.
+
+    Under congestion readings are dropped, and joining listeners receive none from the past. On the native
+    wire each sensor has one writer: SecondWriter, which names the first one, is raised if another writer
+    publishes it, or by ``publish`` if both opened at once, which closes the later one. ``program`` is the
+    script's name by default. A context manager; safe from any thread.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        sensor: str = "imu",
+        wires: str | Sequence[str] = ("native",),
+        *,
+        frame: str | None = None,
+        gyro_covariance: ArrayLike | None = None,
+        accel_covariance: ArrayLike | None = None,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        self.frame = sensor if frame is None else frame
+        self._covariances = (
+            _covariance(gyro_covariance, "gyro_covariance", 3),
+            _covariance(accel_covariance, "accel_covariance", 3),
+        )
+        full_name(robot, self.frame)  # raises here, where the mistake is made
+        super().__init__(session, robot, "imu", sensor, wires=wires, clock=clock, program=program)
+
+    def publish(
+        self,
+        gyro: ArrayLike,
+        accel: ArrayLike,
+        stamp: int | None = None,
+        *,
+        orientation: ArrayLike | None = None,
+        orientation_covariance: ArrayLike | None = None,
+    ) -> None:
+        """Publish one reading at ``stamp`` [ns]; default: now.
+
+        ``gyro`` [rad/s] and ``accel`` [m/s^2], specific force, are x y z. ``orientation`` is the quaternion
+        x y z w of the frame in axes that the device defines, with a covariance [rad^2], (3, 3), if that is
+        known. Raises InvalidInput for numbers that are not finite, for other shapes and for a quaternion
+        whose length is not 1; SecondWriter; and Closed. If it raises, nothing was sent.
+        """
+        with self._refusals_counted():
+            stamp = self._clock.now() if stamp is None else check_stamp(stamp)
+            turn = None if orientation is None else _numbers(orientation, "orientation", 4)
+            turn_covariance = _covariance(orientation_covariance, "orientation_covariance", 3)
+            vectors = _numbers(gyro, "gyro", 3), _numbers(accel, "accel", 3)
+            message = Imu(stamp, 0, 0, self.frame, *vectors, turn, *self._covariances, turn_covariance)
+            self._publish_message(message)
+
+
+class VelocityPublisher(SensorPublisher):
+    """Publishes the velocities that one sensor of a robot measures: optical flow, a Doppler log, a leg.
+
+    A velocity is that of ``frame`` relative to the world, in its own axes. Sensors, frames, writers and
+    threads are those of ``ImuPublisher``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        sensor: str = "velocity",
+        wires: str | Sequence[str] = ("native",),
+        *,
+        frame: str | None = None,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        self.frame = sensor if frame is None else frame
+        full_name(robot, self.frame)
+        super().__init__(session, robot, "velocity", sensor, wires=wires, clock=clock, program=program)
+
+    def publish(
+        self,
+        linear: ArrayLike,
+        angular: ArrayLike | None = None,
+        stamp: int | None = None,
+        *,
+        covariance: ArrayLike | None = None,
+    ) -> None:
+        """Publish one velocity at ``stamp`` [ns]; default: now.
+
+        ``linear`` [m/s] is that of the frame's origin, x y z; ``angular`` [rad/s] is left out if it is not
+        measured. ``covariance`` is (3, 3) of ``linear``, or (6, 6) of both; leave it out if it is not known.
+        Raises as ``ImuPublisher.publish``.
+        """
+        with self._refusals_counted():
+            stamp = self._clock.now() if stamp is None else check_stamp(stamp)
+            turn = None if angular is None else _numbers(angular, "angular", 3)
+            triangle = _covariance(covariance, "covariance", 3 if angular is None else 6)
+            vector = _numbers(linear, "linear", 3)
+            self._publish_message(Velocity(stamp, 0, 0, self.frame, vector, turn, triangle))
+
+
+class OdometryPublisher(EdgePublisher):
+    """Publishes where the base of a robot is, and how fast it moves: the edge odom -> base_link and a twist.
+
+    Listeners take it as a moving edge. Frames, writers, history and threads are those of
+    ``TransformPublisher``: on the native wire each edge has one writer, of transforms or of odometry. On the
+    ROS wires it is a nav_msgs/Odometry on a topic of the name ``writer``, and the edge on /tf.
+    """
+
+    _kind = "odometry publisher"
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        writer: str | None = "odometry",
+        wires: str | Sequence[str] = ("native",),
+        *,
+        clock: Clock | None = None,
+        program: str = "",
+        cache_s: float = 2.0,
+    ) -> None:
+        super().__init__(
+            session,
+            robot,
+            "odometry",
+            writer=writer,
+            wires=wires,
+            clock=clock,
+            program=program,
+            cache_s=cache_s,
+            numbers=_NUMBERS,
+        )
+
+    def publish(
+        self,
+        odom_from_base: Transform,
+        linear: ArrayLike,
+        angular: ArrayLike,
+        stamp: int | None = None,
+        *,
+        twist_covariance: ArrayLike | None = None,
+    ) -> None:
+        """Publish the pose of the base, with its covariance if known, and its velocity at ``stamp`` [ns].
+
+        The default stamp is that of the transform, or now if it has none. ``linear`` [m/s], the velocity of
+        the base's origin relative to the odometry frame, and ``angular`` [rad/s] are x y z in the axes of the
+        base; ``twist_covariance`` is (6, 6) of both. Raises as ``TransformPublisher.publish``.
+        """
+        with self._refusals_counted():
+            if stamp is None:
+                stamp = self._clock.now() if odom_from_base.stamp is None else odom_from_base.stamp
+            check_stamp(stamp)
+            pose, names = to_block(odom_from_base.pose7), ((odom_from_base.target, odom_from_base.source),)
+            twist = _numbers(linear, "linear", 3) + _numbers(angular, "angular", 3)
+            covariances = (
+                covariance_block([odom_from_base]),
+                _covariance(twist_covariance, "twist_covariance", 6),
+            )
+            with self._lock:
+                head = self._head(stamp, names)
+                self._send(Odometry(*head, pose, names, covariances[0], twist, covariances[1]))
+
+
+_NUMBERS = 60
+"""Of a sample, for which the cache has room for 2000."""
+
+
+def _numbers(values: ArrayLike, name: str, count: int) -> bytes:
+    """The block of ``count`` numbers; the message checks that they are finite."""
+    array = real_numbers(values, name)
+    if array.shape != (count,):
+        raise InvalidInput(
+            f"{name} takes {count} numbers, (x, y, z{', w' * (count == 4)}); got shape {array.shape}"
+        )
+    return to_block(array)
+
+
+def _covariance(values: ArrayLike | None, name: str, size: int) -> bytes | None:
+    """The block of the upper triangle of a covariance (size, size), None if it is not known."""
+    return None if values is None else to_block(check_covariance(values, name, size))
