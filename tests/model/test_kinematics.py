@@ -107,6 +107,21 @@ def test_repository_robots_agree_with_matrices_multiplied_from_the_xml(name: str
     assert_agrees_with_matrices(local_model(name).model)
 
 
+def test_origins_move_by_their_jacobians_as_twists_state() -> None:
+    kinematics, draw = every_joint(), np.random.default_rng(5)
+    model = kinematics.model
+    positions = random_positions(model, 7)
+    reference = model.links[2]
+    points, jacobians = kinematics.origins(model.links, positions, reference)
+    poses = matrices(kinematics.link_poses(positions))
+    reference_from_root = np.linalg.inv(poses[2])
+    np.testing.assert_allclose(points, (reference_from_root @ poses)[:, :3, 3], atol=TOLERANCE)
+    for _ in range(3):
+        velocities = draw.normal(size=model.velocity_count)
+        twists = [kinematics.twist(link, positions, velocities, reference)[:3] for link in model.links]
+        np.testing.assert_allclose(jacobians @ velocities, twists, atol=1e-9)
+
+
 def test_a_thousand_turns_give_the_same_pose_as_none() -> None:
     kinematics = local_model("diffbot")
     turned = kinematics.link_poses([0.3 + 2000 * pi, -0.4 - 2000 * pi])

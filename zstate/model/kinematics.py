@@ -6,6 +6,7 @@ only. Pinocchio (``pinocchio_solver.py``) computes poses in the root, velocities
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from random import Random
 
@@ -77,6 +78,20 @@ class Kinematics:
         rates = self.model.check_velocities(velocities)
         with self._lock:
             return self._solver.twist(frame, seen_from, checked, rates)
+
+    def origins(
+        self, links: Sequence[str], positions: ArrayLike, reference: str | None = None
+    ) -> tuple[Floats, Floats]:
+        """The origins of k ``links`` in ``reference`` (None: the root) [m], and their Jacobians.
+
+        (k, 3), and (k, 3, n) for the n velocities of ``model.check_velocities``: ``jacobians @ velocities``
+        are the linear velocities of ``twist``.
+        """
+        frames = [self._row(link) for link in links]
+        seen_from = self._row(self.model.root if reference is None else reference)
+        checked = self._table.normalised(self.model.check_positions(positions))
+        with self._lock:
+            return self._solver.origins(frames, seen_from, checked)
 
     @cached_property
     def _solver(self) -> PinocchioSolver:

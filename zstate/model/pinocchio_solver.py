@@ -114,6 +114,7 @@ class PinocchioSolver:
         # A configuration in which all placements differ, for the check of the memory layout.
         moved = self._pin.integrate(self._model, self._pin.neutral(self._model), np.full(self._model.nv, 0.1))
         self._pin.framesForwardKinematics(self._model, self._data, moved)
+        self._velocity_count = model.velocity_count
         links = len(model.links)
         self._links = self._read(self._data.oMf, np.arange(1, links + 1), [self._pin.SE3.Identity()] * links)
         moving = [form for form in forms if form.kind != "fixed"]
@@ -139,6 +140,45 @@ class PinocchioSolver:
         linear = linear - reference_linear - np.cross(reference_angular, lever)
         rotation = root_from_reference.rotation.T
         return np.concatenate((rotation @ linear, rotation @ (angular - reference_angular)))
+
+    def origins(self, links: Sequence[int], reference: int, positions: Floats) -> tuple[Floats, Floats]:
+        """The origins of links in the reference (k, 3), and their derivatives by velocities (k, 3, n).
+
+        ``d/dt R^T (p - p_r) = R^T (v - v_r + [p - p_r] w_r)``, with the reference's p_r, R, v_r and w_r.
+        """
+        self._pin.computeJointJacobians(self._model, self._data, self._configuration(positions))
+        own_velocities = self._velocity_jacobian(positions)
+        origin, of_reference = self._jacobian(reference)
+        points, jacobians = np.empty((len(links), 3)), np.empty((len(links), 3, own_velocities.shape[1]))
+        for row, link in enumerate(links):
+            placement, of_link = self._jacobian(link)
+            lever = placement.translation - origin.translation
+            points[row] = origin.rotation.T @ lever
+            turned = self._pin.skew(lever) @ of_reference[3:]
+            moved = origin.rotation.T @ (of_link[:3] - of_reference[:3] + turned)
+            np.matmul(moved, own_velocities, out=jacobians[row])
+        return points, jacobians
+
+    def _jacobian(self, link: int) -> tuple[Any, Floats]:
+        """The pose of a link in the root, and its Jacobian in the root's axes: (6, nv), linear first."""
+        pose = self._pin.updateFramePlacement(self._model, self._data, link + 1).copy()
+        axes = self._pin.LOCAL_WORLD_ALIGNED
+        return pose, self._pin.getFrameJacobian(self._model, self._data, link + 1, axes)
+
+    def _velocity_jacobian(self, positions: Floats) -> Floats:
+        """``_velocity(positions, v)`` is this matrix times v: (nv, n)."""
+        matrix = np.zeros((self._model.nv, self._velocity_count))
+        matrix[self._v_rows, self._velocity_columns] = self._scale
+        for form, _, row in self._planar:
+            cos, sin = np.cos(positions[form.column + 2]), np.sin(positions[form.column + 2])
+            columns = slice(form.velocity_column, form.velocity_column + 3)
+            matrix[row : row + 3, columns] = (cos, sin, 0.0), (-sin, cos, 0.0), (0.0, 0.0, 1.0)
+        for form, _, row in self._floating:
+            turn = self._pin.XYZQUATToSE3(positions[form.column : form.column + 7]).rotation.T
+            for part in (0, 3):
+                column = form.velocity_column + part
+                matrix[row + part : row + part + 3, column : column + 3] = turn
+        return matrix
 
     def _motion(self, link: int) -> tuple[Floats, Floats, Any]:
         """Linear velocity of a link's origin, its angular velocity and its pose, in the root."""

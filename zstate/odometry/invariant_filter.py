@@ -1,0 +1,347 @@
+"""Invariant Kalman filter of a body with an IMU: orientation, velocity, position, biases and contacts.
+
+The state is (R, v, p, c_1 ... c_k) of SE_{2+k}(3), with the IMU's axes as the body: ``R`` world_from_imu,
+``v`` and ``p`` of the IMU's origin in the world, contact points ``c`` in the world, and the biases of gyro
+and accelerometer beside it. The world has z up, and gravity (0, 0, -9.80665) m/s^2.
+
+The error is right-invariant: truth X and estimate X' are ``X = exp(xi) X'``, and a bias is ``b = b' + zeta``.
+To first order ``xi`` is, with the cross product matrix [.],
+
+    rotation   phi                   R = exp([phi]) R', about world axes [rad]
+    velocity   v - v' + [v'] phi     [m/s]
+    position   p - p' + [p'] phi     [m], and contacts likewise
+
+Covariances have this order, then the biases of gyro and accelerometer, then contacts: (15 + 3k, 15 + 3k).
+Apart from biases, the propagation of this error does not depend on the estimate, so that the filter stays
+consistent where one with Euler angles or a linear position error does not.
+
+Formulas: Hartley, Ghaffari, Eustice, Grizzle, "Contact-aided invariant extended Kalman filtering for robot
+state estimation", IJRR 39 (2020), with the sign of the error changed; Barrau, Bonnabel, "The invariant
+extended Kalman filter as a stable observer", IEEE TAC 62 (2017).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from zstate.errors import InvalidInput
+from zstate.odometry.rotations import SKEW, Floats, gammas, skew
+
+GRAVITY = np.array([0.0, 0.0, -9.80665])
+"""[m/s^2] in the world: standard gravity."""
+
+ROTATION, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
+GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
+"""The places of the errors in a covariance; that of contact i is 15 + 3i to 18 + 3i."""
+
+_STANDARD_GRAVITY = -float(GRAVITY[2])
+_HALF_GRAVITY = 0.5 * GRAVITY
+_IDENTITY = np.eye(3)
+# Of a constant rate over the whole step, and of the two nodes of Gauss-Legendre quadrature, for a step of 1.
+_NODES = np.array([0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)])
+_MEAN_TIMES = np.array([0.5, *_NODES])[:, None]
+_MEAN_HALF_SQUARES = np.array([1.0 / 3.0, *_NODES**2])[:, None] / 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuNoise:
+    """Noise of an IMU, as in its data sheet or by an Allan variance.
+
+    ``gyro`` [rad/s/sqrt(Hz)] and ``accel`` [m/s^2/sqrt(Hz)] are the densities of white noise, ``gyro_bias``
+    [rad/s/sqrt(s)] and ``accel_bias`` [m/s^2/sqrt(s)] those of the random walks of the biases. Raises
+    InvalidInput unless all are finite, and the first two above zero.
+    """
+
+    gyro: float
+    accel: float
+    gyro_bias: float
+    accel_bias: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            is_walk = field.name.endswith("_bias")
+            if not math.isfinite(value) or value < 0.0 or (value == 0.0 and not is_walk):
+                bound = "0 or more" if is_walk else "above 0"
+                raise InvalidInput(
+                    f"the noise {field.name!r} of an IMU is a finite density, {bound}; got {value!r}. Data "
+                    "sheets state it as noise density or random walk"
+                )
+
+
+class FilterState(NamedTuple):
+    """An estimate and the covariance of its error. Arrays are not to be written to.
+
+    ``rotation`` is world_from_imu, (3, 3); ``velocity`` [m/s] and ``position`` [m] of the IMU in the world,
+    (3,); ``gyro_bias`` [rad/s] and ``accel_bias`` [m/s^2] in the IMU's axes, (3,). ``feet`` are the names of
+    the k contacts, and ``contacts`` their points in the world [m], (k, 3). ``covariance`` is that of the
+    right-invariant error, (15 + 3k, 15 + 3k), in the order of the module's docstring.
+    """
+
+    rotation: Floats
+    velocity: Floats
+    position: Floats
+    gyro_bias: Floats
+    accel_bias: Floats
+    feet: tuple[str, ...]
+    contacts: Floats
+    covariance: Floats
+
+
+class Measurement(NamedTuple):
+    """A linearised measurement of m numbers: ``residual = jacobian @ error + noise``.
+
+    ``residual`` (m,) is measured minus expected, ``jacobian`` (m, n) its derivative by the error of the
+    state, and ``covariance`` (m, m) that of the noise.
+    """
+
+    residual: Floats
+    jacobian: Floats
+    covariance: Floats
+
+
+class Innovation(NamedTuple):
+    """The residual of a measurement with its expected covariance, (m, m).
+
+    ``nis``, the normalised innovation squared, follows the chi-square distribution of m degrees of freedom if
+    noise and estimate are as their covariances state (Bar-Shalom, Li, Kirubarajan, 2001, 5.4).
+    """
+
+    residual: Floats
+    covariance: Floats
+    nis: float
+
+
+def initial_state(
+    *,
+    rotation: Floats,
+    velocity: Floats,
+    position: Floats,
+    gyro_bias: Floats,
+    accel_bias: Floats,
+    covariance: Floats,
+) -> FilterState:
+    """A state without contacts, from the covariance of plain errors in world axes, (15, 15).
+
+    Plain errors are those of ``plain_covariance``: a rotation about world axes, and differences.
+    """
+    state = FilterState(
+        rotation, velocity, position, gyro_bias, accel_bias, (), np.zeros((0, 3)), np.asarray(covariance)
+    )
+    invariant_from_plain = _invariant_from_plain(state)
+    return state._replace(covariance=invariant_from_plain @ covariance @ invariant_from_plain.T)
+
+
+def plain_covariance(state: FilterState) -> Floats:
+    """The covariance of plain errors: (15 + 3k, 15 + 3k).
+
+    They are the rotation about world axes [rad] and the differences of velocity, position, biases and
+    contacts, each truth minus estimate.
+    """
+    plain_from_invariant = 2.0 * np.eye(len(state.covariance)) - _invariant_from_plain(state)
+    return plain_from_invariant @ state.covariance @ plain_from_invariant.T
+
+
+def predict(
+    state: FilterState,
+    gyro: Floats,
+    accel: Floats,
+    dt_s: float,
+    noise: ImuNoise,
+    *,
+    contact_noise: float = 0.0,
+) -> FilterState:
+    """The state ``dt_s`` seconds later, from an IMU's rate [rad/s] and specific force [m/s^2] in its axes.
+
+    Both are constant for ``dt_s``. The mean is then exact, and so is the propagation of the error but for
+    what a bias of the gyro does to velocity and position inside the step (``_inner_skews``). Noise of the
+    gyro is integrated with the mean acceleration of the step, noise of the accelerometer exactly, and the
+    walks of the biases to first order. ``contact_noise`` [m/sqrt(s)] is the drift of contacts, as feet slip.
+    """
+    # The orientation at the end, its mean in the step, and the integral of the integral, in units of dt.
+    turned = state.rotation @ gammas((gyro - state.gyro_bias) * dt_s)
+    pushes: Floats = turned[1:] @ (accel - state.accel_bias)
+    velocity = state.velocity + (pushes[0] + GRAVITY) * dt_s
+    position = state.position + state.velocity * dt_s + (pushes[1] + _HALF_GRAVITY) * (dt_s * dt_s)
+    skews = _inner_skews(velocity, position, state.contacts, pushes[0], dt_s)
+
+    size = len(state.covariance)
+    transition = _identity(size).copy()
+    fall = _STANDARD_GRAVITY * dt_s
+    transition[3, 1] = fall
+    transition[4, 0] = -fall
+    transition[6, 1] = 0.5 * fall * dt_s
+    transition[7, 0] = -0.5 * fall * dt_s
+    transition[6, 3] = transition[7, 4] = transition[8, 5] = dt_s
+    turn = turned[1] * -dt_s
+    by_gyro_bias: Floats = skews[0] @ turn
+    transition[ROTATION, GYRO_BIAS] = transition[VELOCITY, ACCEL_BIAS] = turn
+    transition[POSITION, ACCEL_BIAS] = turned[2] * (-dt_s * dt_s)
+    transition[3:9, GYRO_BIAS] = by_gyro_bias[:6]
+    transition[15:, GYRO_BIAS] = by_gyro_bias[6:]
+
+    covariance: Floats = transition @ state.covariance @ transition.T
+    _add_noise(covariance, skews[1:], dt_s, noise, contact_noise)
+    return FilterState(
+        turned[0],
+        velocity,
+        position,
+        state.gyro_bias,
+        state.accel_bias,
+        state.feet,
+        state.contacts,
+        covariance,
+    )
+
+
+def innovation(state: FilterState, measurement: Measurement) -> Innovation:
+    """The residual of ``measurement``, its expected covariance and its NIS."""
+    residual, jacobian, noise = measurement
+    covariance: Floats = jacobian @ state.covariance @ jacobian.T + noise
+    return Innovation(residual, covariance, float(residual @ np.linalg.solve(covariance, residual)))
+
+
+def updated(state: FilterState, measurement: Measurement) -> FilterState:
+    """The state after ``measurement``: the estimate moves by ``exp`` of gain times residual.
+
+    The covariance has Joseph's form, which stays symmetric and positive semidefinite (Bucy, Joseph, 1968).
+    """
+    residual, jacobian, noise = measurement
+    crossed: Floats = state.covariance @ jacobian.T
+    gain = np.linalg.solve(jacobian @ crossed + noise, crossed.T).T
+    rest = _identity(len(state.covariance)) - gain @ jacobian
+    covariance: Floats = rest @ state.covariance @ rest.T + gain @ noise @ gain.T
+    moved = _moved(state, gain @ residual)
+    return moved._replace(covariance=0.5 * (covariance + covariance.T))
+
+
+def with_contact(state: FilterState, foot: str, offset: Floats, covariance: Floats) -> FilterState:
+    """The state with a contact of ``foot`` at ``offset`` from the IMU, in its axes [m], (3,).
+
+    ``covariance`` of the offset (3, 3) is in the IMU's axes. The new error is that of the position plus the
+    turned error of the offset (Hartley et al., 6.2). Raises InvalidInput if the foot is in contact already.
+    """
+    if foot in state.feet:
+        raise InvalidInput(f"foot {foot!r} is in contact already; measure it with contact()")
+    size = len(state.covariance)
+    grown = np.empty((size + 3, size + 3))
+    grown[:size, :size] = state.covariance
+    grown[size:, :size] = state.covariance[POSITION]
+    grown[:size, size:] = state.covariance[:, POSITION]
+    grown[size:, size:] = (
+        state.covariance[POSITION, POSITION] + state.rotation @ covariance @ state.rotation.T
+    )
+    point = state.position + state.rotation @ offset
+    contacts = np.concatenate((state.contacts, point[None]))
+    return state._replace(feet=(*state.feet, foot), contacts=contacts, covariance=grown)
+
+
+def without_contact(state: FilterState, foot: str) -> FilterState:
+    """The state without the contact of ``foot``, marginalised. Raises InvalidInput if there is none."""
+    row = contact_row(state, foot)
+    kept = np.r_[:row, row + 3 : len(state.covariance)]
+    index = state.feet.index(foot)
+    return state._replace(
+        feet=tuple(name for name in state.feet if name != foot),
+        contacts=np.delete(state.contacts, index, axis=0),
+        covariance=state.covariance[np.ix_(kept, kept)],
+    )
+
+
+def contact_row(state: FilterState, foot: str) -> int:
+    """The first row of the contact of ``foot`` in the covariance. Raises InvalidInput if there is none."""
+    if foot not in state.feet:
+        raise InvalidInput(
+            f"foot {foot!r} is not in contact; in contact are: {', '.join(state.feet) or 'none'}"
+        )
+    return 15 + 3 * state.feet.index(foot)
+
+
+def _moved(state: FilterState, error: Floats) -> FilterState:
+    """The estimate ``exp(error) X'`` and the biases plus theirs; the covariance is left as it is."""
+    rotation, left_jacobian, _ = gammas(error[ROTATION])
+    points, shifts = np.empty((2, 2 + len(state.contacts), 3))
+    points[0], points[1], points[2:] = state.velocity, state.position, state.contacts
+    shifts[:2], shifts[2:] = error[3:9].reshape(2, 3), error[15:].reshape(-1, 3)
+    points = points @ rotation.T + shifts @ left_jacobian.T
+    turned: Floats = rotation @ state.rotation
+    # A step of Newton's iteration towards the nearest rotation keeps rounding from accumulating.
+    turned = turned @ (1.5 * _IDENTITY - 0.5 * turned.T @ turned)
+    return FilterState(
+        turned,
+        points[0],
+        points[1],
+        state.gyro_bias + error[GYRO_BIAS],
+        state.accel_bias + error[ACCEL_BIAS],
+        state.feet,
+        points[2:],
+        state.covariance,
+    )
+
+
+def _inner_skews(
+    velocity: Floats, position: Floats, contacts: Floats, acceleration: Floats, dt_s: float
+) -> Floats:
+    """What turns inside a step do to velocity, position and contacts at its end: (3, 6 + 3k, 3).
+
+    A turn at the time u before the end has the effects [v - a u], [p - a u^2 / 2] and [c], with
+    ``acceleration`` a the mean specific force in the world. The first matrices are the effect of a constant
+    rate over the whole step, where u is dt/2 and u^2 is dt^2 / 3 in the mean (the next term is of dt^3), the
+    others those at the two nodes of Gauss-Legendre quadrature.
+    """
+    points = np.empty((3, 2 + len(contacts), 3))
+    points[:, 0] = velocity - _MEAN_TIMES * (acceleration * dt_s)
+    points[:, 1] = position - _MEAN_HALF_SQUARES * (acceleration * (dt_s * dt_s))
+    points[:, 2:] = contacts
+    return (points.reshape(-1, 3) @ SKEW).reshape(3, -1, 3)
+
+
+def _add_noise(covariance: Floats, skews: Floats, dt_s: float, noise: ImuNoise, contact_noise: float) -> None:
+    """Adds the noise of a step to a covariance, (n, n). ``skews`` (2, 6 + 3k, 3) are those of the two nodes.
+
+    The white noises are isotropic, so that the orientation does not matter. The quadrature integrates the
+    squares of the gyro's effects exactly up to u^3.
+    """
+    size = len(covariance)
+    gyro, accel = noise.gyro * noise.gyro, noise.accel * noise.accel
+    # Columns of node 0, then of node 1.
+    effects = np.zeros((size, 6))
+    effects[0, 0] = effects[1, 1] = effects[2, 2] = effects[0, 3] = effects[1, 4] = effects[2, 5] = 1.0
+    effects[3:9, :3], effects[3:9, 3:] = skews[0, :6], skews[1, :6]
+    effects[15:, :3], effects[15:, 3:] = skews[0, 6:], skews[1, 6:]
+    covariance += (effects @ effects.T) * (0.5 * gyro * dt_s)
+    flat = covariance.ravel()
+    flat[:: size + 1] += _variances_per_second(noise, contact_noise, size) * dt_s
+    # Position by the noise of the accelerometer: dt^3 / 3, and dt^2 / 2 with velocity.
+    for start, variance in (
+        (6 * size + 6, accel * dt_s**3 / 3.0),
+        (6 * size + 3, accel * dt_s**2 / 2.0),
+        (3 * size + 6, accel * dt_s**2 / 2.0),
+    ):
+        flat[start : start + 3 * size : size + 1] += variance
+
+
+def _invariant_from_plain(state: FilterState) -> Floats:
+    """The derivative of the invariant error by the plain one: 1 and [v], [p], [c] below the rotation."""
+    matrix = np.eye(len(state.covariance))
+    matrix[VELOCITY, ROTATION] = skew(state.velocity)
+    matrix[POSITION, ROTATION] = skew(state.position)
+    matrix[15:, ROTATION] = (state.contacts @ SKEW).reshape(-1, 3)
+    return matrix
+
+
+@cache
+def _identity(size: int) -> Floats:
+    return np.eye(size)
+
+
+@cache
+def _variances_per_second(noise: ImuNoise, contact_noise: float, size: int) -> Floats:
+    """What the diagonal of a covariance gains per second, but for the white noise of the gyro: (size,)."""
+    densities = (0.0, noise.accel, 0.0, noise.gyro_bias, noise.accel_bias, contact_noise)
+    return np.repeat(densities, (3, 3, 3, 3, 3, size - 15)) ** 2

@@ -1,0 +1,165 @@
+"""Measurements of the invariant filter, and the pose and twist of a frame by its state.
+
+Each function linearises one kind of measurement at a state. ``imu_from_frame``, (4, 4), is the mount of the
+frame that was measured. The derivatives are by the right-invariant error (``invariant_filter.py``), whose
+order they have. Numbers are not checked here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from zstate import se3
+from zstate.errors import InvalidInput
+from zstate.odometry.invariant_filter import (
+    GYRO_BIAS,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+    FilterState,
+    Floats,
+    Measurement,
+    contact_row,
+    skew,
+)
+
+_LEVEL = 0.1
+"""The shortest level part of a unit vector that has a heading: 84 degrees of pitch."""
+
+
+def body_velocity(
+    state: FilterState, linear: Floats, covariance: Floats, imu_from_frame: Floats, gyro: Floats
+) -> Measurement:
+    """The velocity of a frame's origin in the world, in the axes of the frame [m/s], as wheels measure it.
+
+    ``R_f^T (R^T v + omega x r)``, with ``r`` and ``R_f`` of ``imu_from_frame`` and omega of ``gyro``, the
+    IMU's rate at this instant [rad/s], less its bias. ``covariance`` (3, 3) is in the axes of the frame.
+    """
+    frame_from_imu, lever = imu_from_frame[:3, :3].T, imu_from_frame[:3, 3]
+    frame_from_world: Floats = frame_from_imu @ state.rotation.T
+    # omega x r = -[r] omega; a bias lowers omega.
+    by_bias: Floats = frame_from_imu @ skew(lever)
+    expected = frame_from_world @ state.velocity - by_bias @ (gyro - state.gyro_bias)
+    jacobian = np.zeros((3, len(state.covariance)))
+    jacobian[:, VELOCITY] = frame_from_world
+    jacobian[:, GYRO_BIAS] = by_bias
+    return Measurement(linear - expected, jacobian, covariance)
+
+
+def zero_velocity(state: FilterState, gyro: Floats, velocity_sigma: float, rate_sigma: float) -> Measurement:
+    """A body at rest: six numbers, its velocity [m/s] and rate [rad/s] are zero up to these sigmas.
+
+    The rate makes the bias of the gyro observable, also about the vertical.
+    """
+    jacobian = np.zeros((6, len(state.covariance)))
+    jacobian[:3, VELOCITY] = state.rotation.T
+    jacobian[3:, GYRO_BIAS] = np.eye(3)
+    residual = np.concatenate((-(state.rotation.T @ state.velocity), gyro - state.gyro_bias))
+    return Measurement(residual, jacobian, np.diag(np.repeat((velocity_sigma, rate_sigma), 3) ** 2))
+
+
+def position(state: FilterState, measured: Floats, covariance: Floats, imu_from_frame: Floats) -> Measurement:
+    """The position of a frame's origin in the world [m], as a GNSS antenna or a prism measures it."""
+    point = state.position + state.rotation @ imu_from_frame[:3, 3]
+    return Measurement(measured - point, _point_jacobian(state, point), covariance)
+
+
+def pose(
+    state: FilterState, world_from_frame: Floats, covariance: Floats, imu_from_frame: Floats
+) -> Measurement:
+    """The pose of a frame in the world, (4, 4), as motion capture or scan matching measures it.
+
+    ``covariance`` (6, 6) is that of ``Transform.covariance``: position, then rotation about the axes of the
+    world.
+    """
+    expected = _world_from_frame(state, imu_from_frame)
+    turn = world_from_frame[:3, :3] @ expected[:3, :3].T
+    angles = se3.rotation_vector(se3.quaternion_from_matrix(turn), se3.SCALARS)
+    residual = np.concatenate((world_from_frame[:3, 3] - expected[:3, 3], angles))
+    return Measurement(residual, _pose_jacobian(state, expected), covariance)
+
+
+def heading(state: FilterState, yaw: float, variance: float, imu_from_frame: Floats) -> Measurement:
+    """The direction of a frame's x axis in the level plane [rad], from the world's x axis towards its y axis.
+
+    Raises InvalidInput if the axis is within 6 degrees of the vertical, where it has none.
+    """
+    x, y, z = (state.rotation @ imu_from_frame[:3, 0]).tolist()
+    level = x * x + y * y
+    if level < _LEVEL * _LEVEL:
+        raise InvalidInput(
+            f"the x axis of this frame has no heading: it is {math.degrees(math.asin(abs(z))):.0f} degrees "
+            "from level; leave headings out at such poses"
+        )
+    jacobian = np.zeros((1, len(state.covariance)))
+    jacobian[0, ROTATION] = -x * z / level, -y * z / level, 1.0
+    residual = math.remainder(yaw - math.atan2(y, x), math.tau)
+    return Measurement(np.array([residual]), jacobian, np.array([[variance]]))
+
+
+def contact(state: FilterState, foot: str, offset: Floats, covariance: Floats) -> Measurement:
+    """The position of a foot that is in contact, from the IMU and in its axes [m], by its joints.
+
+    ``R^T (c - p)``; ``covariance`` (3, 3) is in the IMU's axes. Raises InvalidInput if the foot has no
+    contact in ``state``.
+    """
+    row = contact_row(state, foot)
+    imu_from_world = state.rotation.T
+    jacobian = np.zeros((3, len(state.covariance)))
+    jacobian[:, POSITION] = -imu_from_world
+    jacobian[:, row : row + 3] = imu_from_world
+    expected = imu_from_world @ (state.contacts[(row - 15) // 3] - state.position)
+    return Measurement(offset - expected, jacobian, covariance)
+
+
+def frame_pose(state: FilterState, imu_from_frame: Floats) -> tuple[Floats, Floats]:
+    """world_from_frame, (4, 4), and its covariance, (6, 6), that of ``Transform.covariance``."""
+    world_from_frame = _world_from_frame(state, imu_from_frame)
+    jacobian = _pose_jacobian(state, world_from_frame)
+    return world_from_frame, jacobian @ state.covariance @ jacobian.T
+
+
+def frame_twist(
+    state: FilterState, imu_from_frame: Floats, gyro: Floats, gyro_variance: float
+) -> tuple[Floats, Floats]:
+    """The velocity of a frame in its own axes, linear [m/s] and angular [rad/s], (6,), and its covariance,
+    (6, 6).
+
+    ``gyro`` is the IMU's rate at this instant, and ``gyro_variance`` [rad^2/s^2] that of its white noise in
+    each axis: the squared density of ``ImuNoise`` times the bandwidth.
+    """
+    frame_from_imu, lever = imu_from_frame[:3, :3].T, imu_from_frame[:3, 3]
+    frame_from_world: Floats = frame_from_imu @ state.rotation.T
+    by_bias = np.concatenate((frame_from_imu @ skew(lever), -frame_from_imu))
+    twist: Floats = -by_bias @ (gyro - state.gyro_bias)
+    twist[:3] += frame_from_world @ state.velocity
+    jacobian = np.zeros((6, len(state.covariance)))
+    jacobian[:3, VELOCITY] = frame_from_world
+    jacobian[:, GYRO_BIAS] = by_bias
+    # White noise of the rate acts as a bias of this instant.
+    covariance: Floats = jacobian @ state.covariance @ jacobian.T + by_bias @ by_bias.T * gyro_variance
+    return twist, covariance
+
+
+def _world_from_frame(state: FilterState, imu_from_frame: Floats) -> Floats:
+    world_from_imu = np.eye(4)
+    world_from_imu[:3, :3], world_from_imu[:3, 3] = state.rotation, state.position
+    return world_from_imu @ imu_from_frame
+
+
+def _point_jacobian(state: FilterState, point: Floats) -> Floats:
+    """The derivative of a point of the body, given in the world: (3, n). ``-[point] phi + xi_p``."""
+    jacobian = np.zeros((3, len(state.covariance)))
+    jacobian[:, ROTATION] = -skew(point)
+    jacobian[:, POSITION] = np.eye(3)
+    return jacobian
+
+
+def _pose_jacobian(state: FilterState, world_from_frame: Floats) -> Floats:
+    """The derivative of position and rotation about world axes of a frame on the body: (6, n)."""
+    jacobian = np.zeros((6, len(state.covariance)))
+    jacobian[:3] = _point_jacobian(state, world_from_frame[:3, 3])
+    jacobian[3:, ROTATION] = np.eye(3)
+    return jacobian
