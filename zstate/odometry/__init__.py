@@ -1,7 +1,38 @@
 """Odometry: where a robot's base is, from an IMU, wheels, legs and poses, with a covariance."""
 
+from zstate.odometry.estimator import BaseEstimator, BaseState, BaseTwist
+from zstate.odometry.health import SourceHealth
+from zstate.odometry.invariant_filter import ImuNoise
+from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
 from zstate.odometry.listener import SensorListener
 from zstate.odometry.map_correction import MapCorrection
+from zstate.odometry.node import OdometryNode
 from zstate.odometry.publishers import ImuPublisher, OdometryPublisher, VelocityPublisher
+from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
+from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
-__all__ = ["ImuPublisher", "MapCorrection", "OdometryPublisher", "SensorListener", "VelocityPublisher"]
+__all__ = [
+    "Ackermann",
+    "BaseEstimator",
+    "BaseState",
+    "BaseTwist",
+    "DiffDrive",
+    "ForceThresholds",
+    "ImuNoise",
+    "ImuPublisher",
+    "LegNoise",
+    "Legs",
+    "MapCorrection",
+    "Mecanum",
+    "OdometryNode",
+    "OdometryPublisher",
+    "SensorListener",
+    "SimulatedRover",
+    "SimulatedWheels",
+    "SourceHealth",
+    "SpeedThresholds",
+    "VelocityPublisher",
+    "WheelNoise",
+    "WheelVelocity",
+    "Wheels",
+]

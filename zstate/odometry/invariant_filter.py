@@ -53,21 +53,23 @@ class ImuNoise:
     """Noise of an IMU, as in its data sheet or by an Allan variance.
 
     ``gyro`` [rad/s/sqrt(Hz)] and ``accel`` [m/s^2/sqrt(Hz)] are the densities of white noise, ``gyro_bias``
-    [rad/s/sqrt(s)] and ``accel_bias`` [m/s^2/sqrt(s)] those of the random walks of the biases. Raises
-    InvalidInput unless all are finite, and the first two above zero.
+    [rad/s/sqrt(s)] and ``accel_bias`` [m/s^2/sqrt(s)] those of the random walks of the biases. ``gyro_scale``
+    is the standard deviation of the constant relative error of the gyro, 0.01 for a usual one that was not
+    calibrated. Raises InvalidInput unless all are finite, and the first two above zero.
     """
 
     gyro: float
     accel: float
     gyro_bias: float
     accel_bias: float
+    gyro_scale: float = 0.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            is_walk = field.name.endswith("_bias")
-            if not math.isfinite(value) or value < 0.0 or (value == 0.0 and not is_walk):
-                bound = "0 or more" if is_walk else "above 0"
+            may_be_zero = field.name.endswith(("_bias", "_scale"))
+            if not math.isfinite(value) or value < 0.0 or (value == 0.0 and not may_be_zero):
+                bound = "0 or more" if may_be_zero else "above 0"
                 raise InvalidInput(
                     f"the noise {field.name!r} of an IMU is a finite density, {bound}; got {value!r}. Data "
                     "sheets state it as noise density or random walk"

@@ -155,6 +155,20 @@ class Legs:
             for name, point, jacobian in zip(self.names, points, jacobians, strict=True)
         )
 
+    def check_detection(
+        self, velocities: Mapping[str, float] | None, efforts: Mapping[str, float] | None
+    ) -> None:
+        """Raises InvalidInput, as ``touching`` does, if what ``detection`` needs is missing."""
+        if self.detection is None:
+            raise InvalidInput(
+                "contacts of feet are neither measured nor detected; pass the contacts, or "
+                "Legs(..., detection=ForceThresholds(...) or SpeedThresholds(...))"
+            )
+        if isinstance(self.detection, ForceThresholds):
+            self._numbers(efforts or {}, "effort")
+        else:
+            self._numbers(velocities or {}, "velocity")
+
     def touching(
         self,
         feet: Sequence[Foot],

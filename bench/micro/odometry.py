@@ -1,0 +1,86 @@
+"""BaseEstimator: consistency in simulated runs, cost, and the time to rewind.
+
+    python -m bench.micro.odometry [RUNS [SECONDS]]
+
+A body moves in 3D with an IMU at 200 Hz on a turned mount, and a velocity of three axes at 50 Hz, from rest.
+The mean NEES of position, attitude and velocity at the end stands with the band that has 95 % of such means
+if errors are as large as their covariances; then once more with the velocities up to 0.3 s late and out of
+order. The cost is CPU seconds of this process per simulated second, with 50 states read a second. A rewind is
+a velocity that is 100 samples of the IMU late.
+"""
+
+from __future__ import annotations
+
+import platform
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+from helpers.base_motion import IMU_HZ, stamp_at, tilted_mount
+from odometry.test_estimator import SIGMA, calls_of, estimator, feed, late, squared_errors
+
+import zstate
+from zstate.odometry.health import nis_band
+
+RUNS, SECONDS = 100, 12.0
+
+
+def consistency(runs: int, seconds: float) -> None:
+    """Print the mean NEES of ``runs``, in order and with late velocities, and the error of position."""
+    for name, is_late in (("in order", False), ("late and shuffled", True)):
+        squares: list[tuple[float, float, float]] = []
+        distances: list[float] = []
+        for seed in range(runs):
+            motion, calls = calls_of(seed, seconds)
+            base = estimator(tilted_mount())
+            feed(base, late(calls, "velocity", seed) if is_late else calls)
+            state = base.state()
+            squares.append(squared_errors(motion, state))
+            truth = motion.coordinates(np.array([1e-9 * (state.stamp - stamp_at(0.0))]))[0, :3]
+            distances.append(float(np.linalg.norm(state.odom_from_base.translation - truth)))
+        means = ", ".join(f"{mean:.2f}" for mean in np.mean(squares, axis=0).tolist())
+        low, high = nis_band(3, runs)
+        rms = float(np.sqrt(np.mean(np.square(distances))))
+        print(
+            f"{name:<18} NEES of position, attitude, velocity {means} (band {low:.2f} to {high:.2f}), ",
+            end="",
+        )
+        print(f"position {rms:.3f} m rms after {seconds:g} s, {runs} runs")
+
+
+def cost(seconds: float) -> None:
+    """Print the CPU time of a run in which a state is read with each velocity, and that of a rewind."""
+    _, calls = calls_of(0, seconds)
+    base = estimator(tilted_mount())
+    start = time.process_time()
+    for call in calls:
+        feed(base, [call])
+        if call[1] == "velocity" and call[0] > 1.0:
+            base.state()
+    used = time.process_time() - start
+    print(f"cost {100.0 * used / seconds:.2f} % of a core")
+    times: list[float] = []
+    newest = calls[-1][0]
+    for number in range(50):
+        base.velocity(stamp_at(newest - 100 / IMU_HZ) + number, [0.0] * 3, sigma=[SIGMA * 100] * 3)
+        start = time.process_time()
+        base.state()
+        times.append(1e3 * (time.process_time() - start))
+    print(f"rewind of 100 samples: median {np.median(times):.2f} ms, p90 {np.percentile(times, 90):.2f} ms")
+
+
+def main() -> None:
+    """Measure, and print."""
+    runs = int(sys.argv[1]) if len(sys.argv) > 1 else RUNS
+    seconds = float(sys.argv[2]) if len(sys.argv) > 2 else SECONDS
+    print(f"zstate {zstate.__version__}, Python {platform.python_version()}, {platform.machine()}")
+    cost(seconds)
+    consistency(runs, seconds)
+
+
+if __name__ == "__main__":
+    main()

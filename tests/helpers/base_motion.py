@@ -1,0 +1,125 @@
+"""A body that moves through space without end, and what ideal and noisy sensors on it measure."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from zstate import Transform, se3
+from zstate.buffer.buffer import TransformBuffer
+from zstate.odometry import ImuNoise
+from zstate.odometry.invariant_filter import GRAVITY, Floats
+
+NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)
+START = 1_000_000_000_000
+IMU_HZ, WHEEL_HZ = 200, 50
+
+
+def stamp_at(t: float) -> int:
+    return START + round(t * 1e9)
+
+
+@dataclass
+class Motion:
+    """Sums of sines for x y z [m] and roll pitch yaw [rad], drawn from ``seed``; ``tilt`` is their amplitude.
+
+    The speed grows from zero within the first ``rest_s`` + 1 seconds: the time runs slower there.
+    """
+
+    seed: int
+    tilt: float = 0.4
+    rest_s: float = 1.0
+    sines: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        random = np.random.default_rng(self.seed)
+        self.sines = random.uniform((0.5, 0.3, 0.0), (1.5, 0.9, math.tau), (6, 3))
+        self.sines[2, 0] *= 0.3
+        self.sines[3:5, 0] *= self.tilt
+        self.sines[5] *= 1.5, 0.5, 1.0
+
+    def _warped(self, t: Floats) -> Floats:
+        """The time of the sines: zero until ``rest_s``, then with a velocity that rises smoothly to 1."""
+        u = np.clip(t - self.rest_s, 0.0, 1.0)
+        # The integral of 10 u^3 - 15 u^4 + 6 u^5, whose end is 1/2.
+        ramp = 2.5 * u**4 - 3.0 * u**5 + u**6
+        return ramp + np.maximum(t - self.rest_s - 1.0, 0.0)
+
+    def coordinates(self, t: Floats) -> Floats:
+        """x y z roll pitch yaw from those at the start, roll and pitch level: (T, 6)."""
+        size, rate, phase = self.sines.T
+        s = self._warped(np.asarray(t))[:, None]
+        return size * (np.sin(rate * s + phase) - np.sin(phase))
+
+    def rotation(self, t: Floats) -> Floats:
+        """world_from_base: (T, 3, 3)."""
+        angles = self.coordinates(t)[:, 3:]
+        matrices: list[Floats] = []
+        for roll, pitch, yaw in angles.tolist():
+            pose = (0.0, 0.0, 0.0, *se3.quaternion_from_rpy(roll, pitch, yaw))
+            matrices.append(se3.to_matrix(pose)[:3, :3])
+        return np.array(matrices)
+
+    def truth(self, t: Floats) -> tuple[Floats, Floats, Floats]:
+        """world_from_base, velocity and position in the world."""
+        h = 1e-4
+        velocity = (self.coordinates(t + h) - self.coordinates(t - h))[:, :3] / (2 * h)
+        return self.rotation(t), velocity, self.coordinates(t)[:, :3]
+
+    def rates(self, t: Floats) -> Floats:
+        """The angular velocity in the axes of the base: (T, 3)."""
+        h = 1e-4
+        turn = (self.rotation(t + h) - self.rotation(t - h)) / (2 * h)
+        skew = np.swapaxes(self.rotation(t), 1, 2) @ turn
+        return np.stack((skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]), axis=1)
+
+    def imu(self, t: Floats, base_from_imu: Transform) -> tuple[Floats, Floats]:
+        """Rate and specific force of an ideal IMU in its axes, (T, 3) each."""
+        mount = base_from_imu.matrix
+        h = 1e-3
+        points = [self.coordinates(u)[:, :3] + self.rotation(u) @ mount[:3, 3] for u in (t - h, t, t + h)]
+        acceleration = (points[0] - 2 * points[1] + points[2]) / (h * h)
+        force = np.einsum("tji,tj->ti", self.rotation(t), acceleration - GRAVITY)
+        return self.rates(t) @ mount[:3, :3], force @ mount[:3, :3]
+
+    def velocity(self, t: Floats) -> Floats:
+        """The velocity of the base in its own axes: (T, 3)."""
+        rotation, velocity, _ = self.truth(t)
+        return np.einsum("tji,tj->ti", rotation, velocity)
+
+
+@dataclass
+class NoisyImu:
+    """The samples of an IMU with ``noise`` on a ``motion``, with biases drawn from the same generator."""
+
+    motion: Motion
+    base_from_imu: Transform
+    seconds: float
+    random: np.random.Generator
+    noise: ImuNoise = NOISE
+    bias_sigmas: tuple[float, float] = (0.01, 0.05)
+
+    def samples(self) -> tuple[Floats, Floats, Floats]:
+        """Times [s], rates and forces."""
+        t = np.arange(0.0, self.seconds, 1.0 / IMU_HZ)
+        gyro, accel = self.motion.imu(t, self.base_from_imu)
+        measured: list[Floats] = []
+        for ideal, white, walk, first in (
+            (gyro, self.noise.gyro, self.noise.gyro_bias, self.bias_sigmas[0]),
+            (accel, self.noise.accel, self.noise.accel_bias, self.bias_sigmas[1]),
+        ):
+            steps = self.random.normal(0.0, walk / math.sqrt(IMU_HZ), ideal.shape)
+            bias = self.random.normal(0.0, first, 3) + np.cumsum(steps, axis=0)
+            measured.append(ideal + bias + self.random.normal(0.0, white * math.sqrt(IMU_HZ), ideal.shape))
+        return t, measured[0], measured[1]
+
+
+def mounted(base_from_imu: Transform) -> TransformBuffer:
+    """A buffer with the mount of an IMU."""
+    buffer = TransformBuffer()
+    buffer.insert_static(base_from_imu)
+    return buffer
+
+
+def tilted_mount() -> Transform:
+    return Transform.from_rpy("base_link", "imu_link", (0.2, -0.1, 0.3), (math.pi, 0.4, 1.2))

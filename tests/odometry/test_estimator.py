@@ -1,0 +1,288 @@
+"""BaseEstimator: consistent in simulated runs, the same for any order of arrival, robust against a source."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.base_motion import NOISE, START, WHEEL_HZ, Motion, NoisyImu, mounted, stamp_at, tilted_mount
+
+from zstate import InFuture, InvalidInput, NoData, Transform, UnknownFrame, se3
+from zstate.odometry import BaseEstimator, BaseState, DiffDrive, SourceHealth
+from zstate.odometry.health import chi_square_quantile
+from zstate.odometry.invariant_filter import Floats
+
+SIGMA = 0.02
+LEVEL = Transform("base_link", "imu_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+WHEELS = DiffDrive("left", "right", radius=0.1, track=0.4)
+
+
+def estimator(mount: Transform = LEVEL, **options: Any) -> BaseEstimator:
+    buffer = mounted(mount)
+    return BaseEstimator(
+        odom="odom", base="base_link", imu="imu_link", buffer=buffer, imu_noise=NOISE, **options
+    )
+
+
+Call = tuple[float, str, tuple[Any, ...]]
+
+
+def calls_of(seed: int, seconds: float) -> tuple[Motion, list[Call]]:
+    """A motion in 3D, and calls of an estimator with their times, in the order of their stamps."""
+    motion, random = Motion(seed), np.random.default_rng(seed)
+    times, gyro, accel = NoisyImu(motion, tilted_mount(), seconds, random).samples()
+    wheel_times = np.arange(0.0025, seconds - 0.01, 1.0 / WHEEL_HZ)
+    linear = motion.velocity(wheel_times) + random.normal(0.0, SIGMA, (len(wheel_times), 3))
+    calls: list[Call] = [(t, "imu", (g, a)) for t, g, a in zip(times.tolist(), gyro, accel, strict=True)]
+    calls += [(t, "velocity", (v,)) for t, v in zip(wheel_times.tolist(), linear, strict=True)]
+    return motion, sorted(calls, key=lambda call: call[0])
+
+
+def feed(base: BaseEstimator, calls: list[Call], **options: Any) -> None:
+    for t, kind, values in calls:
+        if kind == "imu":
+            base.imu(stamp_at(t), *values)
+        else:
+            base.velocity(stamp_at(t), *values, sigma=[SIGMA] * 3, **options)
+
+
+def late(calls: list[Call], kind: str, seed: int) -> list[Call]:
+    """The calls as they arrive if those of ``kind`` are up to 0.3 s late, and out of order."""
+    random = np.random.default_rng(seed)
+    delays = {id(call): random.uniform(0.0, 0.3) if call[1] == kind else 0.0 for call in calls}
+    return sorted(calls, key=lambda call: call[0] + delays[id(call)])
+
+
+def squared_errors(motion: Motion, state: BaseState) -> tuple[float, float, float]:
+    """The normalised squared errors of position, attitude and velocity: chi-square with 3 degrees each."""
+    at = np.array([(state.stamp - START) * 1e-9])
+    (rotation,), (velocity,), (position,) = motion.truth(at)
+    estimated = state.odom_from_base.matrix
+    turn = se3.quaternion_from_matrix(rotation @ estimated[:3, :3].T)
+    errors = (
+        (position - estimated[:3, 3], state.pose_covariance[:3, :3]),
+        (np.array(se3.rotation_vector(turn, se3.SCALARS)), state.pose_covariance[3:, 3:]),
+        (rotation.T @ velocity - state.twist.linear, state.twist_covariance[:3, :3]),
+    )
+    position_nees, attitude, speed = (
+        float(error @ np.linalg.solve(covariance, error)) for error, covariance in errors
+    )
+    return position_nees, attitude, speed
+
+
+def health_of(base: BaseEstimator, name: str) -> SourceHealth:
+    return next(health for health in base.health() if health.name == name)
+
+
+def test_errors_are_as_large_as_their_covariances_with_a_source_late_and_shuffled():
+    """In 25 runs of 6 s in 3D, from rest, with a turned IMU; ``bench/micro/odometry.py`` has 100."""
+    runs = 25
+    errors: list[tuple[float, float, float]] = []
+    for seed in range(runs):
+        motion, calls = calls_of(seed, 6.0)
+        base = estimator(tilted_mount())
+        feed(base, late(calls, "velocity", seed))
+        errors.append(squared_errors(motion, base.state()))
+        assert health_of(base, "wheels").too_late == 0
+    low, high = (chi_square_quantile(p, 3 * runs) / runs for p in (0.001, 0.999))
+    for mean in np.mean(errors, axis=0).tolist():
+        assert low < mean < high
+
+
+def test_the_order_of_arrival_does_not_matter_nor_when_states_are_read():
+    _, calls = calls_of(1, 4.0)
+    in_order, shuffled = estimator(tilted_mount()), estimator(tilted_mount())
+    feed(in_order, calls)
+    for number, call in enumerate(late(late(calls, "velocity", 1), "imu", 2)):
+        feed(shuffled, [call])
+        if number % 50 == 0 and number > 300:
+            shuffled.state()
+    for at in (None, stamp_at(3.7)):
+        one, other = in_order.state(at), shuffled.state(at)
+        assert one.stamp == other.stamp
+        np.testing.assert_allclose(one.odom_from_base.pose7, other.odom_from_base.pose7, atol=1e-9)
+        np.testing.assert_allclose(one.pose_covariance, other.pose_covariance, atol=1e-9)
+        np.testing.assert_allclose(one.twist, other.twist, atol=1e-9)
+
+
+def test_events_older_than_the_history_are_counted_and_change_nothing():
+    _, calls = calls_of(2, 3.0)
+    base = estimator(tilted_mount(), history_s=0.5)
+    feed(base, calls)
+    before = base.state().odom_from_base
+    base.velocity(stamp_at(2.0), [9.0, 0.0, 0.0], sigma=[SIGMA] * 3)
+    assert base.state().odom_from_base == before
+    wheels = health_of(base, "wheels")
+    assert wheels.too_late == 1
+    assert "raise history_s" in wheels.sentence
+
+
+def drive(
+    base: BaseEstimator,
+    seconds: float,
+    *,
+    speed: float = 0.0,
+    yaw_rate: float = 0.0,
+    start: float = 0.0,
+    imu: bool = True,
+    wheels: bool = True,
+    slip: float = 0.0,
+    gyro_bias: float = 0.0,
+) -> float:
+    """A base on the floor at constant velocity: IMU at 100 Hz, wheels at 50 Hz. Returns the end."""
+    for step in range(round(seconds * 100)):
+        t = start + 0.01 * step
+        if imu:
+            base.imu(stamp_at(t), (0.0, 0.0, yaw_rate + gyro_bias), (0.0, speed * yaw_rate, 9.80665))
+        if wheels and step % 2:
+            linear, angular = [speed + slip, 0.0, 0.0], [0.0, 0.0, yaw_rate]
+            base.velocity(stamp_at(t), linear, sigma=[SIGMA] * 3, angular=angular)
+    return start + seconds
+
+
+def test_wheels_that_slip_are_rejected_and_reported():
+    base = estimator()
+    t = drive(base, 3.0)
+    t = drive(base, 1.0, start=t, slip=1.0)
+    state = base.state()
+    assert state.odom_from_base.translation[0] < 0.1  # 1 m by the wheels
+    wheels = health_of(base, "wheels")
+    assert wheels.rejected >= 45
+    assert "were rejected" in wheels.sentence
+
+
+def test_a_source_that_contradicts_for_seconds_is_followed_at_last():
+    base = estimator()
+    t = drive(base, 3.0)
+    drive(base, 6.0, start=t, slip=1.0)
+    assert health_of(base, "wheels").reacquired >= 1
+    assert base.state().twist.linear[0] == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_gyro_at_rest_measures_its_bias():
+    base = estimator()
+    drive(base, 8.0, gyro_bias=0.012)
+    state = base.state()
+    assert state.gyro_bias[2] == pytest.approx(0.012, abs=1e-4)
+    assert abs(state.odom_from_base.rpy[2]) < 1e-3  # 0.1 rad without it
+    assert health_of(base, "standstill").accepted > 10
+
+
+def test_without_imu_the_wheels_predict_and_the_state_is_marked():
+    base = estimator()
+    t = drive(base, 3.0)
+    t = drive(base, 2.0, start=t, speed=0.5, yaw_rate=0.3)
+    assert not base.state().is_coasting
+    before = base.state()
+    drive(base, 1.0, start=t, speed=0.5, yaw_rate=0.3, imu=False)
+    state = base.state()
+    assert state.is_coasting
+    moved = before.odom_from_base.inverse() @ state.odom_from_base
+    assert moved.translation[0] == pytest.approx(0.5 / 0.3 * math.sin(0.3), abs=0.05)
+    assert moved.rpy[2] == pytest.approx(0.3, abs=0.03)
+    assert state.pose_covariance[5, 5] > 10 * before.pose_covariance[5, 5]
+    assert "silent" in health_of(base, "imu").sentence
+
+
+def test_no_state_is_later_than_half_a_second_after_the_newest_event():
+    base = estimator()
+    drive(base, 2.0)
+    base.state(stamp_at(2.4))
+    with pytest.raises(InFuture, match="coast"):
+        base.state(stamp_at(2.6))
+
+
+def test_before_alignment_the_state_is_an_error_with_what_is_missing():
+    base = estimator()
+    with pytest.raises(NoData, match="no samples of the IMU"):
+        base.state()
+    drive(base, 0.2)
+    with pytest.raises(NoData, match=r"0\.5 s at rest"):
+        base.state()
+
+
+def test_gravity_is_found_through_a_turned_mount():
+    """An IMU upside down and turned, at rest: the base is level, at the origin, with the yaw zero."""
+    mount = tilted_mount()
+    base = estimator(mount)
+    force = mount.matrix[:3, :3].T @ (0.0, 0.0, 9.80665)
+    for step in range(100):
+        base.imu(stamp_at(0.01 * step), (0.0, 0.0, 0.0), force)
+        base.velocity(stamp_at(0.01 * step), (0.0, 0.0, 0.0), sigma=[SIGMA] * 3)
+    pose = base.state().odom_from_base
+    np.testing.assert_allclose(pose.rpy, 0.0, atol=1e-6)
+    np.testing.assert_allclose(pose.translation, 0.0, atol=1e-6)
+
+
+def test_wheels_from_joints_drive_a_line_in_any_order_of_readings():
+    rates = WHEELS.joint_velocities([0.5, 0.0, 0.0], [0.0, 0.0, 0.0])
+    states: list[BaseState] = []
+    for groups in (1, 3):
+        base = estimator(wheels=WHEELS, history_s=5.0)
+        drive(base, 3.0, speed=0.5, wheels=False)
+        readings = [(0.02 * i, {name: rate * 0.02 * i for name, rate in rates.items()}) for i in range(150)]
+        # With three groups, every third reading comes first: two thirds divide a displacement.
+        for group in range(groups):
+            for t, positions in readings[group::groups]:
+                base.joints(stamp_at(t), positions)
+        states.append(base.state(stamp_at(2.9)))
+    first, second = states
+    np.testing.assert_array_equal(first.odom_from_base.pose7, second.odom_from_base.pose7)
+    np.testing.assert_allclose(first.twist.linear, (0.5, 0.0, 0.0), atol=0.01)
+    assert first.odom_from_base.translation[0] == pytest.approx(0.5 * 2.9, abs=0.01)
+
+
+def wander(compass: bool, hard_iron: float) -> tuple[float, float, BaseEstimator]:
+    """The yaw error [rad] and its sigma after 60 s of turns, with a compass if any."""
+    base = estimator()
+    random = np.random.default_rng(5)
+    yaw, t = 0.0, 0.0
+    for step in range(60 * 50):
+        t = 0.02 * step
+        rate = 0.0 if t < 2.0 else 0.4 * math.sin(0.1 * t) + 0.2
+        speed = 0.0 if t < 2.0 else 0.5
+        gyro = np.array([0.0, 0.0, rate + 0.002]) + random.normal(0.0, 1e-3 * math.sqrt(50), 3)
+        base.imu(stamp_at(t), gyro, (0.0, speed * rate, 9.80665))
+        if step % 2:
+            linear = np.array([speed, 0.0, 0.0]) + random.normal(0.0, SIGMA, 3)
+            base.velocity(stamp_at(t), linear, sigma=[SIGMA] * 3, angular=(0.0, 0.0, rate))
+        if compass and step % 5 == 0:
+            measured = yaw + 1.0 + hard_iron * math.sin(yaw + 0.5)
+            base.heading(stamp_at(t), measured, 0.03, source="compass")
+        yaw += rate * 0.02
+    state = base.state()
+    error = math.remainder(state.odom_from_base.rpy[2] - yaw, math.tau)
+    return error, math.sqrt(state.pose_covariance[5, 5]), base
+
+
+def test_a_compass_with_hard_iron_of_35_degrees_is_no_worse_than_none():
+    without, _, _ = wander(compass=False, hard_iron=0.0)
+    error, sigma, base = wander(compass=True, hard_iron=math.radians(35.0))
+    assert abs(error) < abs(without) + 0.5 * sigma
+    assert abs(error) < 3.0 * sigma
+    compass = health_of(base, "compass")
+    assert compass.rejected > 0
+    assert "degrees as the base moves" in compass.sentence
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [np.zeros((3, 3)), -np.eye(3), np.eye(2), np.full((3, 3), math.nan), np.eye(3) + np.eye(3, k=1)],
+    ids=["zero", "negative", "shape", "NaN", "asymmetric"],
+)
+def test_what_is_no_covariance_is_refused_with_the_name_of_its_source(covariance: Floats):
+    with pytest.raises(InvalidInput, match="'gnss'"):
+        estimator().velocity(START, [0.0, 0.0, 0.0], covariance=covariance, source="gnss")
+
+
+def test_measurements_that_are_not_finite_are_refused_with_the_name_of_their_source():
+    base = estimator()
+    with pytest.raises(InvalidInput, match="gyro of source 'imu'"):
+        base.imu(START, (math.nan, 0.0, 0.0), (0.0, 0.0, 9.8))
+    with pytest.raises(InvalidInput, match="'compass'"):
+        base.heading(START, math.nan, 0.1, source="compass")
+
+
+def test_the_mount_of_a_sensor_that_is_missing_is_an_unknown_frame_with_near_misses():
+    with pytest.raises(UnknownFrame, match="imu_link"):
+        BaseEstimator(odom="odom", base="base_link", imu="imu_lnk", buffer=mounted(LEVEL), imu_noise=NOISE)

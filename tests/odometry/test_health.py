@@ -1,0 +1,59 @@
+"""Health: quantiles of the chi-square distribution, and sentences on sources."""
+
+import pytest
+
+from zstate.odometry.health import Fate, Outcome, SourceHealth, SourceRecord, chi_square_quantile, nis_band
+
+
+@pytest.mark.parametrize(
+    ("probability", "degrees", "value"),
+    # Abramowitz and Stegun, Handbook of Mathematical Functions, table 26.8.
+    [(0.999, 1, 10.828), (0.999, 3, 16.266), (0.999, 6, 22.458), (0.975, 3, 9.34840), (0.025, 3, 0.215795),
+     (0.025, 1, 0.000982069), (0.975, 100, 129.561), (0.025, 100, 74.2219)],
+)  # fmt: skip
+def test_quantiles_are_those_of_the_table(probability: float, degrees: int, value: float):
+    assert chi_square_quantile(probability, degrees) == pytest.approx(value, rel=1e-4)
+
+
+def test_the_band_of_a_mean_narrows_with_the_root_of_the_count():
+    """A chi-square variable of many degrees n is nearly normal, with the mean n and the variance 2 n."""
+    low, high = nis_band(3, 1000)
+    width = 2 * 1.96 * (2.0 * 3 / 1000) ** 0.5
+    assert high - low == pytest.approx(width, rel=0.01)
+    assert 0.5 * (low + high) == pytest.approx(3.0, rel=0.01)
+
+
+def health(
+    nis: float, *, fate: Fate = "accepted", count: int = 100, has_bounds: bool = False
+) -> SourceHealth:
+    record = SourceRecord(has_bounds=has_bounds)
+    for number in range(count):
+        record.stamps.append(20_000_000 * number)
+        record.keep(Outcome(fate, nis, 3))
+    return record.health("wheels", 20_000_000 * count, [], "", 1.0)
+
+
+def test_sigmas_that_are_right_need_no_sentence():
+    found = health(3.1)
+    assert found.sentence == ""
+    assert found.rate_hz == pytest.approx(50.0)
+    assert found.age_s == pytest.approx(0.02)
+    assert found.nis_band[0] < found.nis_mean < found.nis_band[1]
+
+
+def test_sigmas_that_are_too_small_are_reported_with_their_factor():
+    """A sigma that is 2 times too small makes the NIS 4 times as large."""
+    assert health(12.0).sentence == (
+        "wheels: NIS 12.0 for 3 numbers, expected 0.2 to 9.3: its sigmas are about 2 times too small"
+    )
+
+
+def test_sigmas_that_are_too_large_are_reported_unless_they_are_bounds():
+    assert "about 10 times too large" in health(0.03).sentence
+    assert health(0.03, has_bounds=True).sentence == ""
+
+
+def test_rejections_are_reported():
+    found = health(3.0, fate="rejected", count=20)
+    assert (found.accepted, found.rejected) == (0, 20)
+    assert "20 of its last 20 readings were rejected" in found.sentence

@@ -1,0 +1,604 @@
+"""BaseEstimator: where the base of a robot is, from an IMU, wheels, legs, velocities, poses and headings.
+
+All events are kept for ``history_s`` in the order of their stamps, each with the estimate after it, which is
+immutable. A late event is sorted in, and the events after it are fused again when a state is next read. So
+the order of arrival does not matter, and a replay of the same calls gives the same states, bit for bit. No
+clock is read.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from zstate._util.format import did_you_mean
+from zstate.buffer.buffer import TransformBuffer, check_duration
+from zstate.checks import real_numbers
+from zstate.clock import check_stamp
+from zstate.errors import InFuture, InPast, InvalidInput, NoData
+from zstate.odometry.alignment import Alignment, align, start_at
+from zstate.odometry.fusion import (
+    COASTING_RATE_DENSITY,
+    SILENCE_NS,
+    STANDSTILL,
+    Contacts,
+    Estimate,
+    Fusion,
+    Heading,
+    Inertia,
+    Reading,
+    Steps,
+    is_still,
+)
+from zstate.odometry.health import Outcome, SourceHealth, SourceRecord
+from zstate.odometry.invariant_filter import FilterState, Floats, ImuNoise, Measurement
+from zstate.odometry.legs import Legs
+from zstate.odometry.measurements import body_velocity, frame_pose, frame_twist, pose
+from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions
+from zstate.transform import Transform
+
+IMU, WHEELS, FEET, CONTACTS = "imu", "wheels", "feet", "contacts"
+"""The names of these sources in ``BaseEstimator.health``."""
+
+COAST_NS = 500_000_000
+"""No state is later than the newest event by more than this."""
+
+_TWIST_WINDOW_S = 0.01
+"""The time over which the noise of the rate in a twist is averaged."""
+
+_MOST_UNFUSED = 2000
+_PRUNED_AT_ONCE = 64
+
+
+class BaseTwist(NamedTuple):
+    """The velocity of a base in its own axes, (3,) each: ``linear`` [m/s] and ``angular`` [rad/s]."""
+
+    linear: Floats
+    angular: Floats
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BaseState:
+    """The pose and velocity of a base at ``stamp`` [ns].
+
+    ``odom_from_base`` has the covariance ``pose_covariance``, (6, 6), as ``Transform.covariance``;
+    ``twist_covariance``, (6, 6), is that of ``twist``, linear before angular. ``gyro_bias`` [rad/s] and
+    ``accel_bias`` [m/s^2] are those of the IMU in its axes, (3,). ``is_coasting``: the IMU is silent.
+    """
+
+    stamp: int
+    odom_from_base: Transform
+    twist: BaseTwist
+    pose_covariance: Floats
+    twist_covariance: Floats
+    gyro_bias: Floats
+    accel_bias: Floats
+    is_coasting: bool
+
+
+_Input: TypeAlias = Inertia | Reading | Heading | Contacts | Steps
+
+
+class _Event:
+    """An entry of the log. ``key`` sorts by stamp, kind, source and numbers, so that ties have one order."""
+
+    __slots__ = ("estimate", "key", "outcome", "reading", "source")
+
+    def __init__(self, source: str, reading: _Input, numbers: Sequence[float] = ()) -> None:
+        kind = 0 if isinstance(reading, Inertia) else 1
+        self.key = (reading.stamp, kind, source, *numbers)
+        self.source = source
+        self.reading = reading
+        self.estimate: Estimate | None = None
+        self.outcome: Outcome | None = None
+
+
+def _key(event: _Event) -> tuple[int | str | float, ...]:
+    return event.key
+
+
+class BaseEstimator:
+    """The pose of ``base`` in ``odom``, of a robot with an IMU in the frame ``imu``.
+
+    ``odom`` is the frame in which the base starts, at the origin with the yaw zero and z up, after about 0.5
+    s at rest; with an ``initial_pose``, odom_from_base, at the first event. Mounts of sensors are looked up
+    in ``buffer`` and must be static; names are bare or with the robot, as there. ``imu_noise`` is that of the
+    IMU. Events older than ``history_s`` before the newest one are refused and counted. ``wheels`` are those
+    that ``joints`` reads.
+
+    Events may arrive in any order. Not safe for several threads at once. Raises InvalidInput for a sensor
+    that moves on the base, UnknownFrame with near misses, and other errors of lookups.
+    """
+
+    def __init__(
+        self,
+        *,
+        odom: str,
+        base: str,
+        imu: str,
+        buffer: TransformBuffer,
+        imu_noise: ImuNoise,
+        history_s: float = 1.0,
+        wheels: Wheels | None = None,
+        legs: Legs | None = None,
+        initial_pose: Transform | None = None,
+    ) -> None:
+        self.odom, self.base = odom, base
+        self.imu_frame = imu
+        self.history_s = check_duration("history_s", history_s)
+        self._history_ns = round(history_s * 1e9)
+        self._buffer = buffer
+        self._mounts: dict[str, Floats] = {}
+        self._imu_from_base = self._mount(base)
+        self._noise = imu_noise
+        self._fusion = Fusion(imu_noise, legs)
+        self._wheels, self._legs = wheels, legs
+        self._has_contacts = False
+        if wheels is not None and wheels.frame is not None:
+            self._mount(wheels.frame)
+        self._initial_pose = initial_pose
+        self._log: list[_Event] = []
+        self._start: Estimate | None = None
+        self._is_settled = False
+        """Whether no later event can change the alignment."""
+        self._alignment_end = 0
+        """Events from here on in the log had no part in the alignment."""
+        self._fused = 0
+        """Events up to here have the estimate after them."""
+        self._missing = "no samples of the IMU yet, which give roll and pitch"
+        self._newest: int | None = None
+        self._rotations: list[tuple[int, dict[str, float]]] = []
+        """Readings of the wheels, by stamp."""
+        self._sources: dict[str, SourceRecord] = {}
+
+    def imu(self, stamp: int, gyro: ArrayLike, accel: ArrayLike) -> None:
+        """A sample of the IMU at ``stamp`` [ns]: rate [rad/s] and specific force [m/s^2] in its axes, (3,).
+
+        Raises InvalidInput for other shapes, NaN and infinity.
+        """
+        rate, force = _vector(gyro, IMU, "gyro"), _vector(accel, IMU, "accel")
+        self._insert(_Event(IMU, Inertia(check_stamp(stamp), rate, force), (*rate.tolist(), *force.tolist())))
+
+    def velocity(
+        self,
+        stamp: int,
+        linear: ArrayLike,
+        *,
+        sigma: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
+        angular: ArrayLike | None = None,
+        frame: str | None = None,
+        scale: float = 0.0,
+        source: str = WHEELS,
+    ) -> None:
+        """The velocity of the origin of ``frame`` in its own axes at ``stamp``, x y z [m/s], (3,).
+
+        Its noise is given by ``sigma``, standard deviations (3,), or by ``covariance``, (3, 3). ``frame`` is
+        the base by default. ``angular`` [rad/s] (3,) is used while the IMU is silent, and to know standstill.
+        Raises InvalidInput, which names the source, for NaN and for what is no covariance; UnknownFrame for
+        the frame.
+        """
+        vector = _vector(linear, source, "velocity")
+        rate = None if angular is None else _vector(angular, source, "angular velocity")
+        noise = _noise(sigma, covariance, 3, source)
+        measured = WheelVelocity(vector, np.zeros(3) if rate is None else rate, noise)
+        if not 0.0 <= scale < math.inf:
+            raise InvalidInput(
+                f"the scale of source {source!r} is a standard deviation of 0 or more; got {scale!r}"
+            )
+        self._insert_velocity(check_stamp(stamp), measured, frame, source, scale, has_rate=rate is not None)
+
+    def joints(
+        self,
+        stamp: int,
+        positions: Mapping[str, float],
+        *,
+        velocities: Mapping[str, float] | None = None,
+        efforts: Mapping[str, float] | None = None,
+    ) -> None:
+        """The joints by name at ``stamp`` [ns]: positions [rad] or [m], for wheels and legs.
+
+        Two readings of wheels are a displacement, whose mean velocity is fused at the middle of the interval.
+        ``velocities`` or ``efforts`` [Nm] or [N] are needed to detect contacts of feet. Others than the
+        joints of wheels and legs are ignored. Raises InvalidInput without wheels and legs, and for missing
+        joints and NaN.
+        """
+        if self._wheels is None and self._legs is None:
+            raise InvalidInput(
+                "joints() reads wheels and legs; pass wheels=DiffDrive(...) or legs=Legs(...) to "
+                "BaseEstimator"
+            )
+        stamp = check_stamp(stamp)
+        if self._wheels is not None:
+            self._insert_rotations(self._wheels, stamp, check_wheel_positions(self._wheels, positions))
+        if self._legs is not None:
+            numbers = [float(positions.get(name, math.nan)) for name in self._legs.joint_names]
+            steps = Steps(stamp, self._legs.feet(positions), velocities, efforts)
+            if not all(map(math.isfinite, numbers)):
+                raise InvalidInput(f"positions of legs must be finite; got {dict(positions)}")
+            if not self._has_contacts:
+                self._legs.check_detection(velocities, efforts)
+            self._source(FEET).has_bounds = True
+            self._insert(_Event(FEET, steps, numbers))
+
+    def contacts(self, stamp: int, touching: Mapping[str, bool]) -> None:
+        """Which feet are on the ground from ``stamp`` on, by name; those left out are not.
+
+        From the first call on, contacts are not detected from joints any more. Raises InvalidInput without
+        legs and for unknown feet.
+        """
+        names = () if self._legs is None else self._legs.names
+        unknown = [name for name in touching if name not in names]
+        if self._legs is None or unknown:
+            near = did_you_mean(unknown[0], names) if unknown else ""
+            raise InvalidInput(
+                f"contacts of {', '.join(touching)}; feet are {', '.join(names) or 'none'}{near}"
+            )
+        self._has_contacts = True
+        down = frozenset(name for name, is_down in touching.items() if is_down)
+        flags = [float(name in down) for name in names]
+        self._insert(_Event(CONTACTS, Contacts(check_stamp(stamp), down), flags))
+
+    def pose(self, stamp: int, odom_from_base: Transform, covariance: ArrayLike, *, source: str) -> None:
+        """The pose of a frame on the robot in ``odom`` at ``stamp``, as of motion capture.
+
+        ``covariance`` (6, 6) has the order and axes of ``Transform.covariance``. Raises InvalidInput, which
+        names the source, for another target than ``odom``, NaN and what is no covariance; UnknownFrame for
+        the frame.
+        """
+        if odom_from_base.target != self.odom:
+            raise InvalidInput(
+                f"poses of source {source!r} are in {odom_from_base.target!r}; they must be in {self.odom!r}"
+            )
+        mount = self._mount(odom_from_base.source)
+        noise = _noise(None, covariance, 6, source)
+        matrix = odom_from_base.matrix
+
+        def measure(state: FilterState, _: Floats) -> Measurement:
+            return pose(state, matrix, noise, mount)
+
+        reading = Reading(check_stamp(stamp), measure, is_position=True)
+        self._insert(_Event(source, reading, odom_from_base.pose7.tolist()))
+
+    def heading(self, stamp: int, yaw: float, sigma: float, *, source: str, frame: str | None = None) -> None:
+        """The yaw of ``frame``, by default the base, at ``stamp`` [rad], with a standard deviation.
+
+        It is relative to the first one of this source, because the odometry frame has no north. ``sigma`` is
+        that of errors that do not average out: the yaw will not be known better by it. See
+        ``zstate.odometry.fusion``. Raises InvalidInput, which names the source, for NaN and a sigma that is
+        not above zero.
+        """
+        mount = self._mount(frame or self.base)
+        if not (math.isfinite(yaw) and 0.0 < sigma < math.inf):
+            raise InvalidInput(
+                f"a heading of source {source!r} is finite, with a sigma above zero [rad]; got "
+                f"yaw={yaw!r}, sigma={sigma!r}"
+            )
+        reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, mount)
+        self._insert(_Event(source, reading, (yaw, sigma)))
+
+    def state(self, at: int | None = None) -> BaseState:
+        """The state at the stamp ``at`` [ns]; by default at the newest event.
+
+        Before the initial alignment raises NoData, with what is missing. Raises InFuture for an instant more
+        than 0.5 s after the newest event, and InPast for one before the oldest that is kept.
+        """
+        self._fuse()
+        if self._start is None:
+            error = NoData(self.odom, self.base, edge=(self.odom, self.base), requested=at)
+            error.note = f"the base is not aligned: {self._missing}"
+            raise error
+        newest = self._log[-1].key[0] if self._log else self._start.stamp
+        stamp = max(newest, self._start.stamp) if at is None else check_stamp(at)
+        if stamp > newest + COAST_NS:
+            error = InFuture(
+                self.odom, self.base, edge=(self.odom, self.base), requested=stamp, newest=newest
+            )
+            error.note = "IMU and wheels are silent, and a base does not coast for ever"
+            raise error
+        if stamp < self._start.stamp:
+            raise InPast(
+                self.odom,
+                self.base,
+                edge=(self.odom, self.base),
+                requested=stamp,
+                oldest=self._start.stamp,
+                newest=newest,
+            )
+        place = bisect_right(self._log, stamp, key=lambda event: event.key[0])
+        before = self._estimate_before(place)
+        return self._state_of(self._fusion.predicted(before, stamp, self._following(place)))
+
+    def health(self) -> tuple[SourceHealth, ...]:
+        """The health of each source, by name; standstill is one as soon as it is found."""
+        self._fuse()
+        newest = self._newest or 0
+        recent: dict[str, list[Outcome]] = {name: [] for name in self._sources}
+        for event in self._log[: self._fused]:
+            if event.outcome is not None:
+                recent[_outcome_source(event)].append(event.outcome)
+        last = self._estimate_before(self._fused) if self._start is not None else None
+        return tuple(
+            record.health(
+                name, newest, recent[name], self._remark(name, record, last, newest), self.history_s
+            )
+            for name, record in sorted(self._sources.items())
+        )
+
+    def _remark(self, name: str, record: SourceRecord, last: Estimate | None, newest: int) -> str:
+        if name == IMU and record.stamps and newest - max(record.stamps) > SILENCE_NS:
+            return "silent; the base is predicted from its last velocity and its wheels, with large noise"
+        compass = None if last is None else last.compasses.get(name)
+        if compass is not None and compass.deviation > 0.0:
+            degrees = math.degrees(math.sqrt(compass.deviation))
+            return f"off by about {degrees:.2g} degrees as the base moves, and weighted so"
+        return ""
+
+    def _mount(self, frame: str) -> Floats:
+        """imu_from_frame, (4, 4), which must be static."""
+        if frame not in self._mounts:
+            transform = self._buffer.lookup(self.imu_frame, frame)
+            if transform.stamp is not None:
+                raise InvalidInput(
+                    f"{frame!r} moves on the robot, seen from {self.imu_frame!r}; odometry needs sensors "
+                    "with a fixed mount"
+                )
+            self._mounts[frame] = transform.matrix
+        return self._mounts[frame]
+
+    def _source(self, name: str) -> SourceRecord:
+        return self._sources.setdefault(name, SourceRecord())
+
+    def _is_too_late(self, source: str, stamp: int) -> bool:
+        """Whether an event is older than what is kept, in which case it is counted."""
+        if self._newest is None or stamp >= self._newest - self._history_ns:
+            return False
+        self._source(source).too_late += 1
+        return True
+
+    def _insert_rotations(self, wheels: Wheels, stamp: int, found: dict[str, float]) -> None:
+        """Insert the displacements from the reading before and to that after, instead of that between."""
+        if self._is_too_late(WHEELS, stamp):
+            return
+        place = bisect_left(self._rotations, stamp, key=lambda entry: entry[0])
+        if place < len(self._rotations) and self._rotations[place][0] == stamp:
+            return  # the same reading again, as after a reconnection
+        before = self._rotations[place - 1] if place else None
+        after = self._rotations[place] if place < len(self._rotations) else None
+        self._rotations.insert(place, (stamp, found))
+        if before and after:
+            self._remove(WHEELS, (before[0] + after[0]) // 2)
+        for first, second in ((before, (stamp, found)), ((stamp, found), after)):
+            if first and second:
+                self._insert_displacement(wheels, first, second)
+        self._source(WHEELS).has_bounds = True
+
+    def _insert_displacement(
+        self, wheels: Wheels, first: tuple[int, dict[str, float]], second: tuple[int, dict[str, float]]
+    ) -> None:
+        measured = wheels.velocity(first[1], second[1], (second[0] - first[0]) * 1e-9)
+        self._newest = max(self._newest or second[0], second[0])
+        self._insert_velocity(
+            (first[0] + second[0]) // 2, measured, wheels.frame, WHEELS, wheels.noise.scale, has_rate=True
+        )
+
+    def _insert_velocity(
+        self,
+        stamp: int,
+        measured: WheelVelocity,
+        frame: str | None,
+        source: str,
+        scale: float,
+        *,
+        has_rate: bool,
+    ) -> None:
+        linear, angular, noise = measured
+        mount = self._mount(frame or self.base)
+        rate = angular if has_rate else None
+
+        def measure(state: FilterState, gyro: Floats) -> Measurement:
+            return body_velocity(state, linear, noise, mount, gyro)
+
+        reading = Reading(
+            stamp,
+            measure,
+            is_still(linear, math.sqrt(noise[0, 0]), rate),
+            None if rate is None else mount[:3, :3] @ rate,
+            scale=scale,
+        )
+        self._insert(_Event(source, reading, linear.tolist()))
+
+    def _insert(self, event: _Event) -> None:
+        stamp = event.reading.stamp
+        if self._is_too_late(event.source, stamp):
+            return
+        self._source(event.source).stamps.append(stamp)
+        if self._newest is None or stamp > self._newest:
+            self._newest = stamp
+        if not self._log or event.key >= self._log[-1].key:
+            place = len(self._log)
+            self._log.append(event)
+        else:
+            place = bisect_right(self._log, event.key, key=_key)
+            self._log.insert(place, event)
+        self._rewind(place)
+        if isinstance(event.reading, Inertia):
+            # Events since the previous sample were fused without this one.
+            while place and not isinstance(self._log[place - 1].reading, Inertia):
+                place -= 1
+            self._rewind(place)
+        if len(self._log) - self._fused > _MOST_UNFUSED:
+            self._fuse()
+
+    def _remove(self, source: str, stamp: int) -> None:
+        """Remove a displacement that a reading in its middle has divided."""
+        place = bisect_left(self._log, (stamp, 1, source), key=_key)
+        if place < len(self._log) and self._log[place].key[:3] == (stamp, 1, source):
+            del self._log[place]
+            self._rewind(place)
+
+    def _rewind(self, place: int) -> None:
+        self._fused = min(self._fused, place)
+        if not self._is_settled and self._start is not None and place < self._alignment_end:
+            self._start, self._fused = None, 0  # another sample may change the alignment
+
+    def _fuse(self) -> None:
+        """Fuse all events that have no estimate after them yet, and forget those that are too old."""
+        if self._start is None:
+            self._align()
+        if self._start is None:
+            return
+        estimate = self._estimate_before(self._fused)
+        for place in range(self._fused, len(self._log)):
+            event = self._log[place]
+            estimate, event.outcome = self._after(estimate, event, place)
+            event.estimate = estimate
+        self._fused = len(self._log)
+        self._prune()
+
+    def _after(self, estimate: Estimate, event: _Event, place: int) -> tuple[Estimate, Outcome | None]:
+        reading = event.reading
+        if reading.stamp < estimate.stamp:  # before the first estimate
+            return estimate, None
+        if isinstance(reading, Inertia):
+            after, outcome = self._fusion.after_inertia(estimate, reading)
+            if outcome is not None:
+                self._count_standstill(reading.stamp)
+            return after, outcome
+        following = self._following(place)
+        if isinstance(reading, Contacts):
+            after = self._fusion.predicted(estimate, reading.stamp, following)
+            return after._replace(touching=reading.touching), None
+        if isinstance(reading, Steps):
+            assert self._legs is not None
+            return self._fusion.after_steps(self._legs, estimate, reading, following)
+        if isinstance(reading, Heading):
+            return self._fusion.after_heading(estimate, event.source, reading, following)
+        return self._fusion.after_reading(estimate, event.source, reading, following)
+
+    def _count_standstill(self, stamp: int) -> None:
+        record = self._source(STANDSTILL)
+        record.has_bounds = True
+        if not record.stamps or stamp > record.stamps[-1]:  # else it is replayed
+            record.stamps.append(stamp)
+
+    def _align(self) -> None:
+        if self._initial_pose is not None and self._log:
+            self._start = start_at(self._log[0].reading.stamp, self._initial_pose, self._imu_from_base)
+            self._alignment_end = 1
+            return
+        samples = [event.reading for event in self._log if isinstance(event.reading, Inertia)]
+        if not samples:
+            self._forget(self._too_old())
+        outcome = align(samples, self._imu_from_base)
+        if isinstance(outcome, Alignment):
+            self._start = outcome.estimate
+            self._alignment_end = bisect_right(self._log, outcome.end, key=lambda event: event.reading.stamp)
+        else:
+            self._missing = outcome
+
+    def _prune(self) -> None:
+        """Forget events that are too old, but for the estimate after the last of them."""
+        count = self._too_old()
+        if count < _PRUNED_AT_ONCE:
+            return
+        self._start = self._estimate_before(count)
+        self._is_settled = True
+        for event in self._log[:count]:
+            if event.outcome is not None:
+                self._source(_outcome_source(event)).keep(event.outcome)
+        self._forget(count)
+
+    def _too_old(self) -> int:
+        """How many events of the log are too old to be changed by later ones."""
+        oldest = (self._newest or 0) - self._history_ns
+        return bisect_left(self._log, oldest, key=lambda event: event.reading.stamp)
+
+    def _forget(self, count: int) -> None:
+        del self._log[:count]
+        self._fused = max(0, self._fused - count)
+        oldest = (self._newest or 0) - self._history_ns
+        # A displacement starts at the reading before.
+        first = bisect_left(self._rotations, oldest, key=lambda entry: entry[0]) - 1
+        del self._rotations[: max(0, first)]
+
+    def _following(self, place: int) -> Inertia | None:
+        """The first sample of the IMU in the log from ``place`` on."""
+        for index in range(place, len(self._log)):
+            reading = self._log[index].reading
+            if isinstance(reading, Inertia):
+                return reading
+        return None
+
+    def _estimate_before(self, place: int) -> Estimate:
+        estimate = self._log[place - 1].estimate if place else self._start
+        assert estimate is not None
+        return estimate
+
+    def _state_of(self, estimate: Estimate) -> BaseState:
+        settled = self._fusion.settled(estimate)
+        matrix, pose_covariance = frame_pose(settled.state, self._imu_from_base)
+        density = COASTING_RATE_DENSITY if estimate.is_coasting else self._noise.gyro
+        variance = density * density / _TWIST_WINDOW_S
+        twist, twist_covariance = frame_twist(settled.state, self._imu_from_base, estimate.rate, variance)
+        transform = Transform.from_matrix(self.odom, self.base, matrix, estimate.stamp)
+        return BaseState(
+            estimate.stamp,
+            transform.with_covariance(pose_covariance),
+            BaseTwist(twist[:3], twist[3:]),
+            pose_covariance,
+            twist_covariance,
+            estimate.state.gyro_bias,
+            estimate.state.accel_bias,
+            estimate.is_coasting,
+        )
+
+
+def _outcome_source(event: _Event) -> str:
+    return STANDSTILL if isinstance(event.reading, Inertia) else event.source
+
+
+def _vector(values: ArrayLike, source: str, what: str) -> Floats:
+    vector = real_numbers(values, f"the {what} of source {source!r}")
+    if vector.shape != (3,):
+        raise InvalidInput(f"the {what} of source {source!r} has shape (3,); got {vector.shape}")
+    if not math.isfinite(sum(vector.tolist())):
+        raise InvalidInput(f"the {what} of source {source!r} must be finite; got {vector.tolist()}")
+    return vector.copy()
+
+
+def _noise(sigma: ArrayLike | None, covariance: ArrayLike | None, size: int, source: str) -> Floats:
+    """The covariance, (size, size), that is given as such or by standard deviations."""
+    if (sigma is None) == (covariance is None):
+        raise InvalidInput(f"the noise of source {source!r} is given by sigma or by covariance, one of both")
+    if sigma is not None:
+        sigmas = real_numbers(sigma, f"the sigma of source {source!r}")
+        if sigmas.shape != (size,) or not (np.isfinite(sigmas) & (sigmas > 0.0)).all():
+            raise InvalidInput(
+                f"the sigma of source {source!r} is {size} standard deviations above zero; got "
+                f"{sigmas.tolist()}"
+            )
+        return np.diag(sigmas * sigmas)
+    assert covariance is not None
+    matrix = real_numbers(covariance, f"the covariance of source {source!r}")
+    if matrix.shape != (size, size):
+        raise InvalidInput(
+            f"the covariance of source {source!r} has shape ({size}, {size}); got {matrix.shape}"
+        )
+    if not np.isfinite(matrix).all():
+        raise InvalidInput(f"the covariance of source {source!r} must be finite; got {matrix.tolist()}")
+    if np.abs(matrix - matrix.T).max() > 1e-6 * np.abs(matrix).max():
+        raise InvalidInput(f"the covariance of source {source!r} is symmetric; got {matrix.tolist()}")
+    smallest = float(np.linalg.eigvalsh(matrix)[0])
+    if smallest <= 0.0:
+        raise InvalidInput(
+            f"the covariance of source {source!r} has no eigenvalue of zero or less; got {smallest:g}. A "
+            "variance of 0 is no exact measurement but an unknown noise: state what the sensor has"
+        )
+    return 0.5 * (matrix + matrix.T)
