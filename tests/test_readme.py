@@ -62,6 +62,7 @@ def test_every_python_block_is_a_program_tested_here() -> None:
         "gripper.py",
         "odometry.py",
         "teleop.py",
+        "estimator.py",
         "buffer.py",
         "place.py",
         "recording.py",
@@ -154,6 +155,12 @@ def test_a_simulated_robot_is_driven_stopped_and_released(
     assert teleop.line() == "('shoulder', 'elbow')"
     lines = iter(host.stdout.readline, "")
     assert any(line.startswith("active, commanded by ") for line in lines)
+
+
+def test_estimator_of_a_base_needs_no_network(spawn: Callable[..., Child]) -> None:
+    estimator = spawn(PROGRAMS["estimator.py"])
+    assert estimator.line().startswith("<pose of base_link in odom at ")
+    assert estimator.wait() == 0, estimator.stderr
 
 
 @pytest.mark.robots

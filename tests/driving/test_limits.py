@@ -76,6 +76,15 @@ def test_velocities_are_lowered_and_accelerations_given_by_joint():
     assert limits.acceleration.tolist() == [math.inf, math.inf, 0.5]
 
 
+def test_efforts_are_those_of_the_urdf_or_lower_by_joint():
+    limits = Limits.of(ARM, effort={"shoulder": 1.5, "wheel": 3.0})
+    assert limits.effort.tolist() == [1.5, 3.0, 4.0]
+    assert limits.part(["lift", "shoulder"]).effort.tolist() == [4.0, 1.5]
+    assert one().effort.tolist() == [math.inf]
+    with pytest.raises(InvalidInput, match="effort 5 of 'lift' is above 4, the limit in the URDF"):
+        Limits.of(ARM, effort=5.0)
+
+
 def test_a_velocity_of_zero_in_the_urdf_can_be_replaced_and_is_refused_otherwise():
     assert Limits.of(robot("slow"), velocity=0.7).velocity.tolist() == [0.7]
     with pytest.raises(InvalidInput, match="the URDF limits the velocity of 'slow' to 0"):

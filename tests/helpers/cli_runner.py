@@ -21,6 +21,15 @@ RRBOT = str(Path(__file__).parents[2] / "models" / "rrbot.urdf")
 ALL_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 SHOULDER, ELBOW = 0.5, -0.2
 
+ROVER = """
+from zstate import connect
+from zstate.cli.rover import run_rover
+with connect() as session:
+    print("ready")
+    run_rover(session, 100.0)
+"""
+"""The program with the hardware of `zstate demo rover`, on the test's network."""
+
 Spawn = Callable[..., Child]
 
 

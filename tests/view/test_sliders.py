@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import threading
 from collections.abc import Iterator
 
 import numpy as np
@@ -21,8 +22,18 @@ from zstate.model.urdf import parse_urdf
 from zstate.net.presence import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
+from zstate.odometry import ImuNoise
+from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
 from zstate.se3 import quaternion_from_rpy
-from zstate.view.sliders import SliderCommander, SliderMapping, SliderPublisher, SliderSpec
+from zstate.sources.square_drive import WheelPair
+from zstate.transform import Transform
+from zstate.view.sliders import (
+    SliderCommander,
+    SliderMapping,
+    SliderPublisher,
+    SliderSpec,
+    velocity_specs,
+)
 from zstate.wire.messages import from_block
 
 ARM = parse_urdf(
@@ -252,6 +263,29 @@ def test_a_driver_is_commanded_from_the_first_move_of_a_slider_until_control_is_
     until(lambda: host.state == "holding")
     assert not commander.has_control
     assert commander.problem == ""
+
+
+def test_wheels_are_commanded_by_velocities_within_the_limits_of_the_model(sessions, browsers):
+    model = load_model("diffbot")
+    left, right = velocity_specs(model)
+    assert left == SliderSpec("left_wheel_joint", "rad/s", -20.0, 20.0)  # of its URDF
+    mount = Transform("base_footprint", "imu_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    noise = ImuNoise(gyro=1e-3, accel=1e-2, gyro_bias=0.0, accel_bias=0.0)
+    rover = SimulatedRover(WheelPair(0.08, 0.32), mount, noise)
+    with (
+        DriverHost(sessions[0], SimulatedWheels(rover, model.joint_names), model, "cart") as host,
+        DriverStateListener(sessions[1], "cart") as states,
+        SliderCommander(sessions[1], "cart", states, browsers.__contains__) as sliders,
+    ):
+        thread = threading.Thread(target=host.run)
+        thread.start()
+        in_control(sliders)
+        sliders.set(BROWSER, left.name, 2.0)
+        sliders.set(BROWSER, right.name, -2.0)
+        until(lambda: rover.pose.yaw < -0.5)
+        assert sliders.problem == ""
+        host.close()
+        thread.join()
 
 
 def test_a_stop_ends_control_and_after_its_release_nothing_moves_before_a_slider(

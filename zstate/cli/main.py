@@ -40,6 +40,7 @@ _COMMANDS = {
     "transform": ("Write", "Publish moving edges: one pose at a rate, or lines of JSON."),
     "scan": ("Write", "Publish the scans of a simulated or dummy laser."),
     "map": ("Write", "Publish the map of a place."),
+    "odometry": ("Write", "Publish where the base of a robot is, from its IMU and its wheels."),
     "drive": ("Drive", "Host the driver of a robot: the program that owns its hardware."),
     "move": ("Drive", "Move joints of a robot that has a driver, and wait until they are there."),
     "stop": ("Drive", "Stop a robot that has a driver, until that is released."),

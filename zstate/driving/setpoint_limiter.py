@@ -389,11 +389,12 @@ class SetpointLimiter:
 
     def _excess_text(self, column: int, here: float) -> str:
         limits, velocity = self._limits, self._velocities[column]
-        name, unit = limits.joint_names[column], limits.units[column]
-        return (
-            f"{name!r} in mode effort is at {here:.4g} {unit}, of {limits.range_text(column)}, and moves at "
-            f"{velocity:.3g} {unit}/s, of {limits.velocity[column]:g}: it is held until its efforts end"
-        )
+        unit, most = limits.units[column], limits.velocity[column]
+        problems = [f"moves at {velocity:.3g} {unit}/s, above {most:g}"] if abs(velocity) > most else []
+        if not limits.lower[column] <= here <= limits.upper[column]:
+            problems.append(f"is at {here:.4g} {unit}, outside {limits.range_text(column)}")
+        name = limits.joint_names[column]
+        return f"{name!r} in mode effort {' and '.join(problems)}: it is held until its efforts end"
 
     def _set_modes(self, modes: Sequence[Mode]) -> None:
         self._modes = list(modes)
@@ -417,8 +418,11 @@ class SetpointLimiter:
 
     def _limited(self, positions: list[float], slowed: list[bool]) -> Limited:
         limited = tuple(compress(self._limits.joint_names, slowed))
+        vectors = np.array(positions), np.array(self._velocities)
+        if self._has_positions_only:
+            return Limited(*vectors, limited, None, self._all_resting)
         efforts = np.array(self._efforts) if "effort" in self._modes else None
-        return Limited(np.array(positions), np.array(self._velocities), limited, efforts, tuple(self._modes))
+        return Limited(*vectors, limited, efforts, tuple(self._modes))
 
     def _outside_texts(self, positions: list[float]) -> tuple[str, ...]:
         return tuple(

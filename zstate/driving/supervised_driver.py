@@ -161,7 +161,7 @@ class FollowingCheck:
         if measured_at < self._written_at:
             return ""
         errors = measured - setpoint.positions
-        if setpoint.modes and set(setpoint.modes) != {"position"}:
+        if setpoint.modes.count("position") < len(setpoint.modes):
             errors[[mode != "position" for mode in setpoint.modes]] = 0.0
             if text := self._travel_text(setpoint, measured, now):
                 return text

@@ -20,14 +20,14 @@ from zstate.clock import Clock
 from zstate.driving import Commander, stop
 from zstate.driving.driver_state import DriverStateListener, ReceivedState
 from zstate.errors import InvalidInput, SecondWriter, ZStateError
-from zstate.model.robot import Joint, RobotModel
+from zstate.model.robot import POSITION_COUNTS, Joint, RobotModel
 from zstate.net.session import Session
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.rate import check_rate
 from zstate.se3 import quaternion_from_rpy, rpy_from_quaternion
 from zstate.sources.joint_source import JointReading, SineSource
 
-Unit = Literal["rad", "m"]
+Unit = Literal["rad", "m", "rad/s", "m/s"]
 Values = NDArray[np.float64]
 
 _REACH_M = 2.0
@@ -50,7 +50,7 @@ _PLANAR = (*_FLOATING[:2], _FLOATING[5])
 
 @dataclass(frozen=True, slots=True)
 class SliderSpec:
-    """A value between ``lower`` and ``upper`` [rad] or [m]: a joint position, or a coordinate of a joint.
+    """A value between ``lower`` and ``upper``: a joint's position, coordinate or velocity in ``unit``.
 
     A limit that the model lacks is half a turn each way, or 2 m.
     """
@@ -112,6 +112,16 @@ def _slider_specs(joint: Joint) -> list[SliderSpec]:
     if not math.isfinite(lower):
         lower = -reach if not math.isfinite(upper) else upper - 2.0 * reach
     return [SliderSpec(joint.name, unit, lower, upper if math.isfinite(upper) else lower + 2.0 * reach)]
+
+
+def velocity_specs(model: RobotModel) -> tuple[SliderSpec, ...]:
+    """Sliders of the velocities of joints with one position, [rad/s] or [m/s], within finite limits."""
+    return tuple(
+        SliderSpec(joint.name, unit, -limit, limit)
+        for joint in model.driven_joints
+        if POSITION_COUNTS[joint.type] == 1 and math.isfinite(limit := joint.limits.velocity)
+        for unit in ("m/s" if joint.type == "prismatic" else "rad/s",)
+    )
 
 
 class SliderPublisher(Closeable):
@@ -328,7 +338,8 @@ class SliderCommander(Closeable):
     """Sends slider values to the driver of ``robot`` while one browser has control of it.
 
     Browsers have numbers, as in viser. Control begins with ``take_control``, and nothing is sent until that
-    browser calls ``set``: from then on that joint's position is sent, again and again, and no other's.
+    browser calls ``set``: from then on that joint's position is sent, again and again, and no other's. A
+    driver that takes no positions, such as that of wheels, is sent velocities instead.
     Control ends with ``release_control`` or ``stop``, which are open to every browser, and by itself once
     ``is_answering(client)`` is False, if the driver is stopped, ends, restarts or is silent, or a command
     cannot be sent; ``problem`` is why. However it ends, the driver brakes, and holds the joints once the last
@@ -361,7 +372,7 @@ class SliderCommander(Closeable):
 
     @property
     def targets(self) -> dict[str, float]:
-        """The positions [rad] or [m] that are sent, by joint."""
+        """The positions [rad] or [m], or the velocities, that are sent, by joint."""
         control = self._control
         return {} if control is None or control.ended.is_set() else control.targets
 
@@ -401,7 +412,7 @@ class SliderCommander(Closeable):
         return _Control(client, commander, period_s, state.session, set(state.stops))
 
     def set(self, client: int, name: str, value: float) -> None:
-        """Send the position ``value`` [rad] or [m] of the joint ``name`` from now on.
+        """Send ``value`` of the joint ``name`` from now on: its position [rad] or [m], or its velocity.
 
         Does nothing unless ``client`` has control, and while the driver is stopped.
         """
@@ -471,7 +482,10 @@ class SliderCommander(Closeable):
         if problem or received is None or received.state.state == "stopped" or not control.targets:
             return problem
         try:
-            control.commander.send(control.targets)
+            if "position" in received.state.modes:
+                control.commander.send(control.targets)
+            else:
+                control.commander.send(velocities=control.targets)
         except ZStateError as error:
             return str(error)
         return ""

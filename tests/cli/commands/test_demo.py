@@ -12,7 +12,9 @@ from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zsta
 from helpers.processes import DEADLINE_S, Child, until
 
 from zstate import Kinematics, load_model
-from zstate.cli.commands.demo import ROVER_BASE, ROVER_MODEL, ROVER_WHEELS
+from zstate.cli.odometry_file import read_settings
+from zstate.cli.rover import ROVER_BASE, ROVER_JOINTS, ROVER_MODEL, ROVER_WHEELS, settings_file
+from zstate.odometry import DiffDrive, WheelNoise
 
 pytestmark = pytest.mark.processes
 
@@ -101,16 +103,22 @@ def rover_programs(demo: Child) -> list[int]:
     return [int(pid) for pid in match.groups()]
 
 
-def test_rover_shows_poses_across_the_edges_of_two_programs(spawn: Spawn):
+def test_rover_shows_its_odometry_and_places_the_scans_of_its_room(spawn: Spawn):
     demo = started(spawn, "demo", "rover")
     programs = rover_programs(demo)
+    room = re.fullmatch(
+        r"process (\d+) \(map\) publishes the map of a room, which lidar_link measures", demo.line()
+    )
+    assert room
     line = demo.line()
-    pattern = r"joint states [\d.]+ Hz, transforms [\d.]+ Hz, .*; lidar_link in odom: xyz \[.* 0\.195\] m, .*"
+    pattern = r"joint states [\d.]+ Hz, transforms [\d.]+ Hz, .*; lidar_link in odom: xyz \[.* 0\.\d+\] m, .*"
     assert re.fullmatch(pattern, line)
+    assert "it drives a square until it is commanded: zstate move rover --keys --connect tcp/" in demo.stderr
     interrupted(demo)
     pattern = r"\d+ joint states and \d+ transforms received in [\d.]+ s: [\d.]+ and [\d.]+ Hz, 0 missed, .*"
     until(lambda: re.fullmatch(pattern, demo.line()))
-    until(lambda: all(map(is_gone, programs)))
+    assert re.match(r"[1-9]\d* scans? with [1-9]\d* points? placed in odom", demo.line())
+    until(lambda: all(map(is_gone, [*programs, int(room[1])])))
 
 
 @pytest.mark.parametrize("number, name", [(0, "wheels"), (1, "odometry")])
@@ -126,15 +134,29 @@ def test_a_program_of_the_rover_that_dies_ends_the_demo(spawn: Spawn, number: in
 
 def test_other_commands_follow_the_rover_at_the_printed_address(spawn: Spawn):
     demo = started(spawn, "demo", "rover")
-    demo.line()
-    demo.line()
+    until(lambda: "--connect " in demo.stderr)
     address = re.search(r"--connect (\S+);", demo.stderr)
     assert address
     robots = json.loads(zstate("ls", "--json", "--connect", address[1]).stdout)
-    writers = {(one["stream"], one["program"]) for one in robots[0]["writers"]}
-    assert robots[0]["robot"] == "rover"
-    assert {("joint_states", "rover-wheels"), ("transforms", "rover-odometry")} <= writers
+    room, rover = robots
+    writers = {(one["stream"], one["program"]) for one in rover["writers"]}
+    assert (room["robot"], rover["robot"]) == ("room", "rover")
+    assert {("joint_states", "rover-wheels"), ("imu", "rover-imu"), ("scan", "rover-laser")} <= writers
+    assert "odometry" in {stream for stream, _ in writers}
     interrupted(demo)
+
+
+def test_rover_without_the_libraries_of_maps_has_no_room():
+    code = (
+        "import sys; sys.modules['yaml'] = sys.modules['PIL'] = None\n"
+        "from zstate.cli.main import main; main()"
+    )
+    command = [sys.executable, "-c", code, "demo", "rover", "--seconds", "0.5"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=2 * DEADLINE_S, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert "without a room and its laser, which need pip install 'zstate[maps]'" in ended.stderr
+    assert "(map)" not in ended.stdout
+    assert "joint states and" in ended.stdout
 
 
 def test_rover_takes_no_xacro_arguments():
@@ -143,9 +165,12 @@ def test_rover_takes_no_xacro_arguments():
 
 def test_the_wheels_of_the_rover_have_the_measures_of_its_model():
     model = load_model(ROVER_MODEL)
-    assert model.joint_names == ("left_wheel_joint", "right_wheel_joint")  # the order of WheelSource
+    assert model.joint_names == ROVER_JOINTS
     poses = dict(zip(model.links, Kinematics(model).link_poses([0.0, 0.0]), strict=True))
     radius, track = ROVER_WHEELS
+    left, right = model.joint_names
+    wheels = DiffDrive(left, right, radius, track, noise=WheelNoise(slip=0.05))
+    assert read_settings(str(settings_file())).wheels == wheels
     assert model.root == ROVER_BASE
     assert poses["left_wheel"][:3] == pytest.approx([0.0, track / 2, radius])
     assert poses["right_wheel"][:3] == pytest.approx([0.0, -track / 2, radius])

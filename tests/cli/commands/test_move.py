@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
 import re
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, started, zstate
-from helpers.processes import DEADLINE_S, Child, until
+from helpers.cli_runner import ROVER, Spawn, failure, interrupted, started, zstate
+from helpers.processes import DEADLINE_S, Child, repeated, until
 
 from zstate import JointReading, TransformListener, connect
 from zstate.driving import Commander
@@ -169,3 +175,55 @@ def test_stops_that_no_driver_confirms_fail():
     assert "no robot has a driver" in failure("stop", "--all")
     assert "name the robots to stop, or give --all" in failure("stop", code=2)
     assert "leave out --relax" in failure("stop", "rrbot", "--release", "--relax", code=2)
+
+
+@contextmanager
+def keys_moving(robot: str) -> Generator[tuple[int, subprocess.Popen[str]]]:
+    """`zstate move ROBOT --keys` in a terminal, and what types there."""
+    keyboard, terminal = pty.openpty()
+    command = [sys.executable, "-m", "zstate", "move", robot, "--keys", "--timeout", str(DEADLINE_S)]
+    move = subprocess.Popen(command, stdin=terminal, stderr=subprocess.PIPE, text=True)
+    try:
+        yield keyboard, move
+    finally:
+        move.kill()
+        move.communicate()
+        os.close(keyboard)
+        os.close(terminal)
+
+
+def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: Spawn):
+    assert spawn(ROVER).line() == "ready"
+    with (
+        connect() as session,
+        JointStateListener(session, "rover") as joints,
+        keys_moving("rover") as (keyboard, move),
+    ):
+        rates = np.zeros(2)
+
+        def measured() -> np.ndarray:
+            reading = joints.read(0)
+            if reading is not None and reading.velocities is not None:
+                rates[:] = reading.velocities
+            return rates
+
+        assert move.stderr is not None
+        assert "driving left_wheel_joint and right_wheel_joint of 'rover': hold" in move.stderr.readline()
+        with repeated(lambda: os.write(keyboard, b"w")):
+            until(lambda: np.allclose(measured(), [4.0, 4.0], atol=0.1))
+        with repeated(lambda: os.write(keyboard, b"\x1b[D")):  # the left arrow
+            until(lambda: np.allclose(measured(), [-2.0, 2.0], atol=0.1))
+        os.write(keyboard, b" ")
+        until(lambda: np.allclose(measured(), 0.0, atol=0.01))
+        os.write(keyboard, b"q")
+        assert move.wait(DEADLINE_S) == 0
+
+
+def test_keys_need_a_terminal_and_joints_that_are_wheels(spawn: Spawn):
+    assert "reads the keys of a terminal, and standard input is none" in failure("move", "rrbot", "--keys")
+    assert "--keys goes with --wheels" in failure("move", "rrbot", "--keys", "elbow=1", code=2)
+    driven(spawn)
+    with keys_moving("rrbot") as (_, move):
+        assert move.wait(DEADLINE_S) == 1
+        assert move.stderr is not None
+        assert "Name them with --wheels LEFT,RIGHT; it has shoulder, elbow" in move.stderr.read()

@@ -59,14 +59,7 @@ _RECENT_NS = 1_000_000_000
 _WIDTH_WITH_ANGLES = 72
 _NOUNS: dict[SampleKind, str] = {"joint_states": "joint state", "transforms": "transform"}
 
-RoverProgram = Literal["wheels", "odometry"]
-ROVER = "rover"
-ROVER_MODEL = "diffbot"
-# The root of the model is the frame to place: base_link is fixed on it already.
-_ODOM, ROVER_BASE = "odom", "base_footprint"
-_ROVER_LINKS = ("lidar_link", "left_wheel", "right_wheel")
-# Radius and track of diffbot's wheels [m].
-ROVER_WHEELS = 0.08, 0.32
+_ROVER = "rover"
 # The robot with a laser in a room, and the map of that, next to its URDF file.
 _ARM = "rrbot"
 _LASER = "laser_link"
@@ -77,7 +70,8 @@ class Demo(NamedTuple):
     """A robot that moves: poses of ``links`` are shown in the frame ``root``.
 
     ``programs`` publish it: the arguments of each `zstate` process, by name. ``kinds`` are those of their
-    samples. ``world`` are processes that publish the robot's surroundings and its scans of them.
+    samples. ``world`` are processes that publish the robot's surroundings, which are ``world_text``.
+    ``advice`` has a command to try, with ``{connect}`` for the options of the network.
     """
 
     robot: str
@@ -87,6 +81,8 @@ class Demo(NamedTuple):
     programs: Mapping[str, Sequence[str]]
     kinds: Sequence[SampleKind] = ("joint_states",)
     world: Mapping[str, Sequence[str]] = MappingProxyType({})
+    world_text: str = ""
+    advice: str = ""
 
 
 @click.command("demo")
@@ -96,8 +92,8 @@ class Demo(NamedTuple):
 @click.option("--world", is_flag=True, help="Put rrbot into a room, which its laser sweeps.")
 @options.rate_option
 @options.seconds_option
-# Of the processes that `zstate demo rover` starts.
-@click.option("--program", type=click.Choice(("wheels", "odometry")), hidden=True, allow_from_autoenv=False)
+# Of the process with the hardware that `zstate demo rover` starts.
+@click.option("--program", type=click.Choice(("wheels",)), hidden=True, allow_from_autoenv=False)
 @click.option("--connect", "endpoint", hidden=True, allow_from_autoenv=False)
 def demo_command(
     *,
@@ -107,7 +103,7 @@ def demo_command(
     world: bool,
     rate: float,
     seconds: float | None,
-    program: RoverProgram | None,
+    program: Literal["wheels"] | None,
     endpoint: str | None,
 ) -> None:
     """Publish ROBOT (default: panda) in one process and look up its transforms in another, over Zenoh.
@@ -117,8 +113,10 @@ def demo_command(
     processes use a port of their own and do not affect other sessions; other commands reach them with the
     printed --connect.
 
-    `zstate demo rover` is a mobile robot that drives a square: one process publishes its wheels, another one
-    its odometry, odom -> base_footprint.
+    `zstate demo rover` is a mobile robot with simulated wheels, IMU and laser in a room. One process is its
+    hardware, another one `zstate odometry`, which estimates odom -> base_footprint. It drives a square until
+    its first command, such as by `zstate move rover --keys` in another terminal with the printed --connect.
+    The room and the laser need pip install 'zstate[maps]'.
 
     `zstate demo rrbot --world` has four processes: two more publish the map of a room, and the scans of the
     laser on the arm, simulated in that map. `zstate view` draws all of it. Needs pip install 'zstate[maps]'.
@@ -133,7 +131,9 @@ def demo_command(
 
     if program is not None and endpoint is not None:
         with open_session(SessionOptions(connect=(endpoint,))) as session:
-            _run_rover_program(session, program, rate)
+            from zstate.cli.rover import run_rover
+
+            run_rover(session, rate)
         return
     if robot and robot_option and robot != robot_option:
         raise click.UsageError(f"two robots are named, {robot!r} and {robot_option!r}; give one")
@@ -147,7 +147,7 @@ def demo_command(
         print_status(
             f"{_DEFAULT!r} is not installed (pip install 'zstate[robots]'), so this shows {source!r}"
         )
-    demo = _rover(xacro_args) if source == ROVER else _swinging_robot(source, xacro_args)
+    demo = _rover(xacro_args) if source == _ROVER else _swinging_robot(source, xacro_args)
     _run(demo, rate, seconds)
 
 
@@ -168,12 +168,29 @@ def _swinging_robot(source: str, xacro_args: Mapping[str, str]) -> Demo:
 
 
 def _rover(xacro_args: Mapping[str, str]) -> Demo:
-    """A mobile robot whose wheels and odometry are published by two programs."""
+    """A mobile robot: one program is its hardware, another one its odometry, and one publishes the room."""
+    from zstate.cli import rover
+
     if xacro_args:
-        raise click.UsageError(f"{ROVER!r} takes no xacro arguments; got {', '.join(xacro_args)}")
-    model, _ = load_robot(ROVER_MODEL, None)
-    programs = {name: ("demo", "--program", name) for name in ("wheels", "odometry")}
-    return Demo(ROVER, model, _ODOM, _ROVER_LINKS, programs, ("joint_states", "transforms"))
+        raise click.UsageError(f"{_ROVER!r} takes no xacro arguments; got {', '.join(xacro_args)}")
+    model, _ = load_robot(rover.ROVER_MODEL, None)
+    demo = Demo(
+        _ROVER,
+        model,
+        rover.ROVER_ODOM,
+        (rover.ROVER_LASER, "left_wheel", "right_wheel"),
+        {
+            "wheels": ("demo", "--program", "wheels"),
+            "odometry": ("odometry", _ROVER, "--file", str(rover.settings_file())),
+        },
+        ("joint_states", "transforms"),
+        advice="it drives a square until it is commanded: zstate move rover --keys {connect}",
+    )
+    if rover.load_room() is None:
+        print_status("without a room and its laser, which need pip install 'zstate[maps]'")
+        return demo
+    room = {"map": ("map", str(rover.room_file()), "--frame", f"{_ROVER}/{rover.ROVER_ODOM}")}
+    return demo._replace(world=room, world_text=f"the map of a room, which {rover.ROVER_LASER} measures")
 
 
 def _robot_in_room() -> Demo:
@@ -188,24 +205,7 @@ def _robot_in_room() -> Demo:
         "map": ("map", str(file), "--frame", f"{_ARM}/{demo.root}"),
         "laser": ("scan", _ARM, "--frame", _LASER, "--sensor", "laser", "--simulate", str(file)),
     }
-    return demo._replace(world=world)
-
-
-def _run_rover_program(session: Session, program: RoverProgram, rate_hz: float) -> None:
-    """Publish the rover's wheels, with its model, or its odometry, until a signal."""
-    from zstate.cli.commands.publish import run_publisher
-    from zstate.nodes.publisher import StatePublisher
-    from zstate.nodes.transform_publisher import TransformPublisher
-    from zstate.sources.square_drive import OdometrySource, SquareDrive, WheelPair, WheelSource
-
-    drive = SquareDrive(WheelPair(*ROVER_WHEELS))
-    if program == "wheels":
-        model, _ = load_robot(ROVER_MODEL, None)
-        with StatePublisher(session, model, ROVER, program="rover-wheels") as wheels:
-            run_publisher(wheels, WheelSource(drive), rate_hz, None)
-    else:
-        with TransformPublisher(session, ROVER, "odometry", program="rover-odometry") as odometry:
-            run_publisher(odometry, OdometrySource(drive, _ODOM, ROVER_BASE), rate_hz, None)
+    return demo._replace(world=world, world_text=f"the map of a room and the scans of {_LASER} in it")
 
 
 def _run(demo: Demo, rate_hz: float, seconds: float | None) -> None:
@@ -230,11 +230,10 @@ def _run(demo: Demo, rate_hz: float, seconds: float | None) -> None:
         size = f"{count_text(len(model.joint_names), 'joint')}, {count_text(len(model.links), 'link')}"
         processes = f"process {children[0].pid} publishes"
         if len(programs) > 1:
-            processes = f"{_named(children)} publish"
+            processes = _named(children[: len(programs)])
         print_wrapped(f"{demo.robot} ({size}): {processes} it at {rate_hz:g} Hz, this one looks it up")
         if demo.world:
-            around = _named(children[len(programs) :])
-            print_wrapped(f"{around} publish the map of a room and the scans of {_LASER} in it")
+            print_wrapped(f"{_named(children[len(programs) :])} {demo.world_text}")
         _show_transforms(endpoint, demo, ended, seconds)
         for child in children:
             if child.exit_code is not None:
@@ -242,7 +241,9 @@ def _run(demo: Demo, rate_hz: float, seconds: float | None) -> None:
 
 
 def _named(children: Sequence[ChildProcess]) -> str:
-    return f"processes {' and '.join(f'{child.pid} ({child.name})' for child in children)}"
+    """The processes with their verb."""
+    names = " and ".join(f"{child.pid} ({child.name})" for child in children)
+    return f"process {names} publishes" if len(children) == 1 else f"processes {names} publish"
 
 
 def _show_transforms(endpoint: str, demo: Demo, ended: threading.Event, seconds: float | None) -> None:
@@ -266,6 +267,8 @@ def _show_transforms(endpoint: str, demo: Demo, ended: threading.Event, seconds:
         print_status(
             f"receiving {demo.robot!r}; other commands do so with --connect {endpoint}; Ctrl-C ends this"
         )
+        if demo.advice:
+            print_status(demo.advice.format(connect=f"--connect {endpoint}"))
         table = DemoTable(listener, buffer, demo)
         try:
             table.show(ended, seconds)

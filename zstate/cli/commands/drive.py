@@ -240,7 +240,7 @@ def drive_command(
                 f"ROS 2 nodes command {', '.join(hardware.joint_names)}, in this order, on {inputs}"
             )
         opened.enter_context(_StateLines(session, robot_name))
-        _run(host, seconds)
+        run_host(host, seconds)
 
 
 def _controller_text(wires: tuple[str, ...], robot: str, name: str) -> str:
@@ -256,7 +256,7 @@ def _controller_text(wires: tuple[str, ...], robot: str, name: str) -> str:
         raise click.UsageError(text) from error
 
 
-def _run(host: DriverHost, seconds: float | None) -> None:
+def run_host(host: DriverHost, seconds: float | None) -> None:
     """Run the loop, with the report at its end, also after a signal or a fault.
 
     A signal interrupts only the calling thread, which waits: never a call of the driver.

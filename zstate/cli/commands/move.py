@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,7 +16,7 @@ from zstate.cli import options
 from zstate.cli.commands.drive import parse_joint_value
 from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
-from zstate.errors import MotionRefused, MotionTimeout, SecondWriter, Unreachable, ZStateError
+from zstate.errors import InvalidInput, MotionRefused, MotionTimeout, SecondWriter, Unreachable, ZStateError
 
 if TYPE_CHECKING:
     from zstate.driving import Commander
@@ -27,8 +28,22 @@ if TYPE_CHECKING:
 _SECONDS = 1.0
 _SEND_PERIOD_S = 0.05
 _CHECK_S = 1.0
+_WHEEL_RATE = 4.0
 _CANCELLED_WITHIN_S = 2.0
 _CACHES_WITHIN_S = 0.5
+
+
+def _parse_wheels(text: str) -> tuple[str, str]:
+    left, _, right = text.partition(",")
+    if not left or not right or left == right or "," in right:
+        raise InvalidInput(f"{text!r} is not LEFT,RIGHT, the names of two joints")
+    return left, right
+
+
+def _check_wheel_rate(rate: float) -> float:
+    if not 0.0 < rate < math.inf:
+        raise InvalidInput(f"a rate of wheels is positive and finite [rad/s], not {rate!r}")
+    return rate
 
 
 @click.command("move")
@@ -57,6 +72,19 @@ _CACHES_WITHIN_S = 0.5
     help="Each VALUE is a velocity [rad/s or m/s]: move at it for --seconds, then brake.",
 )
 @click.option("--stretch", is_flag=True, help="Move slower where the limits need it, instead of refusing.")
+@click.option("--keys", is_flag=True, help="Drive a robot on two wheels by the keys of this terminal.")
+@click.option(
+    "--wheels",
+    type=options.Checked("LEFT,RIGHT", _parse_wheels),
+    help="The joints that --keys turns; default: those of the driver that are called left... and right....",
+)
+@click.option(
+    "--wheel-rate",
+    type=options.number("RAD/S", _check_wheel_rate),
+    default=_WHEEL_RATE,
+    show_default=True,
+    help="How fast --keys turns the wheels; half of it to turn on the spot.",
+)
 @options.timeout_option("Fail if no driver has published its state after this time [s].", 5.0)
 @options.json_option("One JSON object, also for a motion that is refused.")
 @options.session_options
@@ -68,6 +96,9 @@ def move_command(
     file: str | None,
     velocity: bool,
     stretch: bool,
+    keys: bool,
+    wheels: tuple[str, str] | None,
+    wheel_rate: float,
     timeout: float,
     as_json: bool,
     network: SessionOptions,
@@ -83,6 +114,9 @@ def move_command(
     --seconds, and brake, also on Ctrl-C and when this command ends otherwise. They slow down before the
     limits of their positions.
 
+    With --keys the wheels of a mobile robot turn while a key is held: w a s d or the arrow keys; space stops
+    them, q quits. A terminal does not report that a key was released: a short press drives for 0.6 s.
+
     This is NOT a safety-rated channel: an emergency stop is wired to the power of the hardware.
 
     \b
@@ -90,14 +124,17 @@ def move_command(
     zstate move panda panda_joint4=-1.2 --seconds 3
     zstate move panda --file wave.csv --stretch
     zstate move diffbot --velocity left_wheel_joint=2 right_wheel_joint=2 --seconds 3
+    zstate move rover --keys
     """
-    if bool(positions) is (file is not None):
-        raise click.UsageError("give JOINT=VALUE for some joints, such as elbow=0.5, or --file CSV")
-    if file is not None and seconds is not None:
-        raise click.UsageError("--file has its own times; leave out --seconds")
-    if velocity and (file is not None or stretch):
-        raise click.UsageError("--velocity takes JOINT=VALUE and --seconds; leave out --file and --stretch")
+    if keys:
+        if positions or file is not None or seconds is not None or velocity or stretch or as_json:
+            raise click.UsageError("--keys goes with --wheels, --wheel-rate and --timeout alone")
+        _move_by_keys(robot, wheels, wheel_rate, timeout, network)
+        return
     numbers = _by_joint(positions)
+    if bool(numbers) is (file is not None):
+        raise click.UsageError("give JOINT=VALUE for some joints, such as elbow=0.5, or --file CSV")
+    _check_options(file=file is not None, seconds=seconds is not None, velocity=velocity, stretch=stretch)
     from zstate.driving import Commander
 
     if file is not None:
@@ -128,6 +165,14 @@ def move_command(
         print_result(f"reached in {time.monotonic() - started:.1f} s")
     if outcome.name != "reached":
         fail(f"the motion of {robot!r} was {outcome.name}: {outcome.reason}")
+
+
+def _check_options(*, file: bool, seconds: bool, velocity: bool, stretch: bool) -> None:
+    """Raise UsageError for options that exclude each other."""
+    if file and seconds:
+        raise click.UsageError("--file has its own times; leave out --seconds")
+    if velocity and (file or stretch):
+        raise click.UsageError("--velocity takes JOINT=VALUE and --seconds; leave out --file and --stretch")
 
 
 def _by_joint(values: Sequence[tuple[str, float]]) -> dict[str, float]:
@@ -193,6 +238,52 @@ def _outcome(commander: Commander, motion: Motion) -> Outcome:
         print_status(f"{ended.name}: the joints of {motion.robot!r} brake", event="cancelled")
         raise
     return outcome
+
+
+def _move_by_keys(
+    robot: str, wheels: tuple[str, str] | None, rate: float, timeout_s: float, network: SessionOptions
+) -> None:
+    """Turn the wheels of ``robot`` while keys are held, until q."""
+    from zstate.cli.keyboard import KEYS_TEXT, HeldKey, KeyReader
+    from zstate.driving import Commander
+
+    with KeyReader() as reader, open_session(network) as session, Commander(session, robot) as commander:
+        left, right = wheels or _wheels_of(commander.wait_for_driver(timeout_s), robot)
+        print_status(f"driving {left} and {right} of {robot!r}: {KEYS_TEXT}", event="driving", robot=robot)
+        held, was_moving, shown = HeldKey(), False, ""
+        while True:
+            for key in reader.read(_SEND_PERIOD_S):
+                if key == "q":
+                    return
+                held.press(key, time.monotonic())
+            rates = held.wheel_rates(time.monotonic(), rate)
+            if rates is not None or was_moving:
+                commander.send(velocities=dict(zip((left, right), rates or (0.0, 0.0), strict=True)))
+            was_moving = rates is not None
+            if (problem := _problem(commander)) != shown:
+                shown = problem
+                print_status(problem or f"driving {robot!r} again", event="state", robot=robot)
+
+
+def _wheels_of(state: DriverState, robot: str) -> tuple[str, str]:
+    """The two joints of a driver that are called left and right. Ends the command for others."""
+    found = [[name for name in state.joint_names if side in name.lower()] for side in ("left", "right")]
+    if [len(names) for names in found] != [1, 1]:
+        fail(
+            f"which joints of {robot!r} are its wheels? Name them with --wheels LEFT,RIGHT; it has "
+            f"{', '.join(state.joint_names)}"
+        )
+    return found[0][0], found[1][0]
+
+
+def _problem(commander: Commander) -> str:
+    """Why the driver does not obey; empty if it does, as far as is known."""
+    from zstate.driving.driver_state import state_text
+
+    state = commander.driver
+    if state is None:
+        return f"the driver of {commander.robot!r} is silent"
+    return state_text(state) if state.state in ("stopped", "fault") else ""
 
 
 @click.command("stop")

@@ -51,7 +51,8 @@ _LEGEND_ROWS, _COLORS = 16, 10
 _STYLES = ("solid", "dashed", "dotted", "dashdot")
 
 
-def _check_output(file: str) -> Path:
+def plot_file(file: str) -> Path:
+    """The file of a figure. Raises InvalidInput for other formats."""
     if Path(file).suffix.lower() not in _FORMATS:
         raise InvalidInput(f"{file!r} ends with none of {', '.join(_FORMATS)}")
     return Path(file)
@@ -68,7 +69,7 @@ def _check_output(file: str) -> Path:
 )
 @click.option(
     "--output",
-    type=options.Checked("FILE", _check_output),
+    type=options.Checked("FILE", plot_file),
     help="PNG, SVG or PDF; default: ROBOT.png or B.png.",
 )
 @options.wire_option
@@ -96,7 +97,7 @@ def plot_command(
     zstate plot --path panda_link0 panda_hand          # panda_hand.png
     zstate plot --file run.mcap --start 60 --seconds 10
     """
-    _new_figure("", 1.0)  # reports a missing Matplotlib before it collects data
+    new_figure("", 1.0)  # reports a missing Matplotlib before it collects data
     if joints and frames:
         raise click.UsageError("--joint and --path exclude each other: they are different plots")
     if file is None and start is not None:
@@ -125,13 +126,18 @@ def plot_command(
         figure = _path_figure(series, f"{frames[1]} in {frames[0]}")
     else:
         figure = _joint_figure(series, f"{name}: joint positions")
+    save_figure(figure, path)
+    content = "the path" if frames else count_text(len(series.names), "curve")
+    samples = count_text(len(series.stamps), "sample")
+    print_wrapped(f"wrote {path}: {content}, {samples} in {series.seconds[-1]:.1f} s")
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write ``figure`` to a file. Raises InvalidInput if that cannot be written."""
     try:
         figure.savefig(path, dpi=120)
     except OSError as error:
         raise InvalidInput(f"cannot write {str(path)!r}: {error.strerror or error}") from None
-    content = "the path" if frames else count_text(len(series.names), "curve")
-    samples = count_text(len(series.stamps), "sample")
-    print_wrapped(f"wrote {path}: {content}, {samples} in {series.seconds[-1]:.1f} s")
 
 
 @dataclass(frozen=True)
@@ -290,7 +296,8 @@ def _recorded_joints(path: str, robot: str | None, start_s: float, seconds: floa
     return joint_series(documents, formatter.model)
 
 
-def _new_figure(title: str, height: float) -> Figure:
+def new_figure(title: str, height: float) -> Figure:
+    """An empty figure, ``height`` [inch]. Raises LibraryMissing without Matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -305,7 +312,7 @@ def _new_figure(title: str, height: float) -> Figure:
 def _joint_figure(series: TimeSeries, title: str) -> Figure:
     """Each joint over time, with a panel for each unit."""
     units = [unit for unit in _LABELS if unit in series.units]
-    figure = _new_figure(title, _HEIGHT if len(units) == 1 else _PANEL * len(units))
+    figure = new_figure(title, _HEIGHT if len(units) == 1 else _PANEL * len(units))
     panels = cast("list[Axes]", figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0].tolist())
     for unit, panel in zip(units, panels, strict=True):
         _plot(panel, series.with_unit(unit), _LABELS[unit])
@@ -315,7 +322,7 @@ def _joint_figure(series: TimeSeries, title: str) -> Figure:
 
 def _path_figure(series: TimeSeries, title: str) -> Figure:
     """The three coordinates over time, and the path seen from above."""
-    figure = _new_figure(title, _HEIGHT)
+    figure = new_figure(title, _HEIGHT)
     over_time, above = cast("tuple[Axes, Axes]", tuple(figure.subplots(1, 2, width_ratios=[3, 2])))
     _plot(over_time, series, _LABELS["m"])
     over_time.set_xlabel(_time_label(series))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from datetime import datetime
 
@@ -26,7 +26,7 @@ from zstate.view.panels import html
 from zstate.view.panels.html import format_number
 from zstate.view.panels.panel import BoundWidget, PanelContext
 from zstate.view.server import ViewServer
-from zstate.view.sliders import SliderCommander, SliderMapping, SliderPublisher, SliderSpec
+from zstate.view.sliders import SliderCommander, SliderMapping, SliderPublisher, SliderSpec, velocity_specs
 from zstate.wire.keys import ANY
 from zstate.wire.messages import DriverState
 
@@ -139,7 +139,7 @@ class _JointSlider:
         step = 10.0**-self._precision
         hint = f"{spec.name}: {lower:g} to {upper:g} {unit}"
         value = min(max(self._displayed(value), lower), upper)
-        label = f"{spec.name} [m]" if unit == "m" else spec.name
+        label = spec.name if spec.unit == "rad" else f"{spec.name} [{unit}]"
         self.handle = gui.add_slider(label, lower, max(upper, lower + step), step, value, hint=hint)
         self._bound = BoundWidget[float](self.handle)
         self.handle.on_update(self._set)
@@ -205,7 +205,7 @@ class DriversPanel(Closeable):
         with self._folder, gui.add_folder(f"Driver of {robot}"):
             self._drivers[robot] = _DriverPanel(gui, commander, self._top)
             if self._can_command:
-                self._sliders[robot] = _DriverSliders(gui, commander, model, state.joint_names)
+                self._sliders[robot] = _DriverSliders(gui, commander, model, state)
 
     def close(self) -> None:
         """End control of all drivers. A second call does nothing."""
@@ -255,8 +255,8 @@ class _DriverPanel:
 class _DriverSliders:
     """Buttons that take and release control of a driver, and a slider for each of its joints.
 
-    Sliders follow the joints until they are moved. Nothing is sent before, and a stop is released by a
-    button of its own: neither opening the page nor taking control moves anything.
+    Sliders follow the joints until they are moved; those of velocities are at zero. Nothing is sent before,
+    and a stop is released by a button of its own: neither opening the page nor taking control moves anything.
     """
 
     def __init__(
@@ -264,9 +264,10 @@ class _DriverSliders:
         gui: viser.GuiApi,
         commander: SliderCommander,
         model: RobotModel,
-        joint_names: Sequence[str],
+        state: DriverState,
     ) -> None:
         self._commander = commander
+        self._has_positions = "position" in state.modes
         self._columns = model.columns
         self._positions = model.neutral
         self._text = gui.add_html("")
@@ -276,9 +277,11 @@ class _DriverSliders:
         self._take.on_click(self._on_take)
         self._release.on_click(lambda _: commander.release_control())
         self._release_stops.on_click(self._on_release_stops)
-        specs = {spec.name: spec for spec in SliderMapping(model).specs}
+        known = SliderMapping(model).specs if self._has_positions else velocity_specs(model)
         self._sliders = {
-            name: _JointSlider(gui, commander.set, specs[name], 0.0) for name in joint_names if name in specs
+            spec.name: _JointSlider(gui, commander.set, spec, 0.0)
+            for spec in known
+            if spec.name in state.joint_names
         }
 
     def _on_take(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
@@ -299,7 +302,8 @@ class _DriverSliders:
             self._positions, _ = context.buffer.joint_positions(commander.robot)
             is_known = True
         for name, slider in self._sliders.items():
-            value = targets.get(name, float(self._positions[self._columns[name]]))
+            present = float(self._positions[self._columns[name]]) if self._has_positions else 0.0
+            value = targets.get(name, present)
             slider.show(value, disabled=not (has_control and is_known) or is_stopped)
         if has_control and is_stopped:
             self._text.content = html.paragraph(

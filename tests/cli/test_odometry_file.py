@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from zstate.cli.odometry_file import OdometrySettings, parse_diff_drive, read_settings
+from zstate.errors import ConfigError, InvalidInput
+from zstate.odometry import Ackermann, DiffDrive, ImuNoise, WheelNoise
+
+ROVER = """
+imu = "body"
+velocities = ["flow"]
+history_s = 2.0
+
+[imu_noise]
+gyro = 2e-3
+accel = 1e-2
+gyro_bias = 1e-5
+accel_bias = 1e-4
+
+[diff_drive]
+left = "l"
+right = ["r1", "r2"]
+radius = 0.1
+track = 0.5
+noise = { slip = 0.1 }
+"""
+
+
+def written(folder: Path, text: str) -> str:
+    path = folder / "rover.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_file_has_the_settings_of_one_robot(tmp_path: Path):
+    settings = read_settings(written(tmp_path, ROVER))
+    assert settings == OdometrySettings(
+        imu="body",
+        velocities=("flow",),
+        history_s=2.0,
+        imu_noise=ImuNoise(gyro=2e-3, accel=1e-2, gyro_bias=1e-5, accel_bias=1e-4),
+        wheels=DiffDrive("l", ["r1", "r2"], 0.1, 0.5, noise=WheelNoise(slip=0.1)),
+    )
+
+
+def test_other_wheels_have_tables_of_their_own_names(tmp_path: Path):
+    text = '[ackermann]\nleft="l"\nright="r"\nsteering="s"\nradius=0.3\ntrack=1.2\nwheelbase=2.5\n'
+    assert read_settings(written(tmp_path, text)).wheels == Ackermann("l", "r", "s", 0.3, 1.2, 2.5)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "error"),
+    [
+        ("radius", "radus", r"rover.toml:15: diff_drive.radus: unknown key; did you mean 'radius'\?"),
+        ("radius = 0.1", "", "rover.toml:12: diff_drive: radius missing"),
+        ("slip", "slop", r"unknown key; did you mean 'slip'\?"),
+        ("0.5", "-0.5", "rover.toml:12: diff_drive: the track of wheels is a length"),
+        ("history_s", "history", "rover.toml:4: history: unknown key"),
+        (
+            "gyro = 2e-3",
+            "gyro = 0",
+            "rover.toml:6: imu_noise: the noise 'gyro' of an IMU is a finite density",
+        ),
+    ],
+)
+def test_each_mistake_has_its_line(tmp_path: Path, before: str, after: str, error: str):
+    with pytest.raises(ConfigError, match=error):
+        read_settings(written(tmp_path, ROVER.replace(before, after, 1)))
+
+
+def test_robot_has_wheels_of_one_kind(tmp_path: Path):
+    text = ROVER + '[mecanum]\nfront_left="a"\nfront_right="b"\nrear_left="c"\nrear_right="d"\n'
+    with pytest.raises(ConfigError, match="mecanum: a robot has wheels of one kind"):
+        read_settings(written(tmp_path, text + "radius=0.1\ntrack=0.5\nwheelbase=0.5\n"))
+
+
+def test_wheels_of_a_command_line_may_be_several_on_a_side():
+    text = "left=a,left=b,right=c,radius=0.1,track=0.5"
+    assert parse_diff_drive(text) == DiffDrive(["a", "b"], "c", 0.1, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("left=a,right=b,radius=0.1", "track missing"),
+        ("left=a,right=b,radius=x,track=1", "radius is a number"),
+        ("left=a,right=b,radius=1,radius=2,track=1", "'radius=2' is not part of"),
+        ("a,b", "'a' is not part of left=JOINT"),
+    ],
+)
+def test_unusable_wheels_are_refused(text: str, error: str):
+    with pytest.raises(InvalidInput, match=error):
+        parse_diff_drive(text)

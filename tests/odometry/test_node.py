@@ -1,0 +1,170 @@
+"""OdometryNode: a simulated rover in this process, and its odometry over Zenoh."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import pytest
+from helpers.processes import DEADLINE_S, until
+
+from zstate import SecondWriter, StatePublisher, TransformListener, connect, load_model
+from zstate.clock import SystemClock
+from zstate.model.kinematics import Kinematics
+from zstate.net.session import Session
+from zstate.net.status import StatusMonitor
+from zstate.odometry import (
+    BaseEstimator,
+    DiffDrive,
+    ImuNoise,
+    ImuPublisher,
+    OdometryNode,
+    VelocityPublisher,
+)
+from zstate.odometry.simulated_rover import SimulatedRover
+from zstate.rate import Rate
+from zstate.sources.square_drive import WheelPair
+from zstate.transform import Transform
+
+MODEL = load_model("diffbot")
+NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)
+ODOM, BASE, IMU = "r1/odom", "r1/base_footprint", "r1/imu_link"
+
+
+class Rover:
+    """A rover that publishes its joints at 50 Hz and its IMU at 200 Hz, each while its event is set."""
+
+    def __init__(self, session: Session) -> None:
+        poses = dict(zip(MODEL.links, Kinematics(MODEL).link_poses(MODEL.neutral), strict=True))
+        mount = Transform.from_pose7(BASE, IMU, poses["imu_link"])
+        self.truth = SimulatedRover(WheelPair(0.08, 0.32), mount, NOISE, seed=1)
+        self.has_imu, self.has_joints = threading.Event(), threading.Event()
+        self.has_imu.set()
+        self.has_joints.set()
+        self.stop = threading.Event()
+        self._joints = StatePublisher(session, MODEL, "r1")
+        self._imu = ImuPublisher(session, "r1", "imu", frame="imu_link")
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        with self._joints, self._imu:
+            for tick, stamp in enumerate(Rate(200.0, SystemClock(), self.stop)):
+                reading = self.truth.imu(stamp)
+                if reading is not None and self.has_imu.is_set():
+                    self._imu.publish(reading.gyro, reading.accel, reading.stamp)
+                if tick % 4 == 0 and self.has_joints.is_set():
+                    joints = self.truth.joints(stamp)
+                    self._joints.publish(joints.positions, joints.velocities, stamp=joints.stamp)
+
+    def close(self) -> None:
+        self.stop.set()
+        self._thread.join()
+
+
+@contextmanager
+def rover_with_odometry(
+    **options: object,
+) -> Generator[tuple[Rover, OdometryNode, TransformListener, Session]]:
+    """A rover, its node in another session, and a listener in a third one."""
+    with ExitStack() as opened:
+        robot, estimating, reading = (opened.enter_context(connect()) for _ in range(3))
+        rover = Rover(robot)
+        opened.callback(rover.close)
+        mounts = opened.enter_context(TransformListener(estimating, "r1")).buffer
+        mounts.wait(BASE, IMU, timeout_s=DEADLINE_S)
+        base = BaseEstimator(
+            odom=ODOM,
+            base=BASE,
+            imu=IMU,
+            buffer=mounts,
+            imu_noise=NOISE,
+            wheels=DiffDrive("left_wheel_joint", "right_wheel_joint", 0.08, 0.32),
+        )
+        node = opened.enter_context(OdometryNode(estimating, "r1", base, has_joints=True, **options))  # pyright: ignore[reportArgumentType]
+        listener = opened.enter_context(TransformListener(reading, "r1"))
+        listener.buffer.wait(ODOM, BASE, timeout_s=DEADLINE_S)
+        yield rover, node, listener, reading
+
+
+def test_odometry_follows_the_truth_and_is_a_moving_edge_with_a_covariance():
+    with rover_with_odometry() as (rover, node, listener, _):
+        rover.truth.drive((5.0, 8.0))
+        until(lambda: rover.truth.pose.yaw > math.pi / 2)
+        rover.truth.drive((0.0, 0.0))
+        # A wheel at rest and the last samples under way: both are still.
+        until(lambda: _distance(rover, listener) < 0.05)
+        odom_from_base = listener.buffer.lookup(ODOM, BASE)
+        assert odom_from_base.rpy[2] == pytest.approx(rover.truth.pose.yaw, abs=0.05)
+        assert odom_from_base.covariance is not None
+        x_variance = odom_from_base.covariance[0, 0]
+        assert 0.0 < x_variance < 0.1**2
+        assert node.published > 10
+
+
+def _distance(rover: Rover, listener: TransformListener) -> float:
+    x, y, _ = listener.buffer.lookup(ODOM, BASE).translation.tolist()
+    return math.hypot(x - rover.truth.pose.x, y - rover.truth.pose.y)
+
+
+def test_without_its_imu_it_goes_on_with_the_wheels_and_without_all_it_ends():
+    with rover_with_odometry() as (rover, node, _, _):
+        rover.has_imu.clear()
+        before = node.published
+        until(lambda: node.published > before + 20)
+        rover.has_joints.clear()
+        until(lambda: _is_silent(node))
+
+
+def _is_silent(node: OdometryNode) -> bool:
+    """Whether nothing is published in a fifth of a second."""
+    before = node.published
+    return not threading.Event().wait(0.2) and node.published == before
+
+
+def test_rate_limits_the_samples_of_a_faster_imu():
+    with rover_with_odometry(rate_hz=20.0) as (_, node, listener, _):
+        before, began = node.published, listener.buffer.latest(ODOM, BASE)
+        until(lambda: node.published >= before + 20)
+        newest = listener.buffer.latest(ODOM, BASE)
+        assert (newest - began) * 1e-9 == pytest.approx(1.0, abs=0.3)
+
+
+def test_sentences_on_the_sources_are_in_the_status_of_the_writer():
+    with (
+        rover_with_odometry(velocities=("flow",)) as (_, _, _, session),
+        StatusMonitor(session, "r1") as statuses,
+        VelocityPublisher(session, "r1", "flow", frame="base_footprint") as flow,
+    ):
+        # A standing rover that a sensor reports to move at 1 m/s, with a sigma of 1 mm/s.
+        def warned() -> bool:
+            flow.publish([1.0, 0.0, 0.0], covariance=1e-6 * np.eye(3))
+            texts = [one.text for one in statuses.recent("r1") if one.level == "warn"]
+            return any("flow: " in text for text in texts)
+
+        until(warned)
+
+
+def test_velocities_without_covariance_are_refused_and_counted():
+    with (
+        rover_with_odometry(velocities=("flow",)) as (_, node, _, session),
+        VelocityPublisher(session, "r1", "flow", frame="base_footprint") as flow,
+    ):
+
+        def refused() -> int:
+            flow.publish([1.0, 0.0, 0.0])
+            return node.refused.get("refused", 0)
+
+        until(refused)
+
+
+def test_second_node_of_a_name_is_refused_with_the_first():
+    with (
+        rover_with_odometry() as (_, node, _, session),
+        pytest.raises(SecondWriter, match=f"pid {os.getpid()}"),
+    ):
+        OdometryNode(session, "r1", node.base)

@@ -1,0 +1,249 @@
+"""zstate odometry: where the base of a robot is, live or from a recording."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from zstate.cli import options
+from zstate.cli.output.console import count_text, fail, print_wrapped
+from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import LookupFailed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from zstate.cli.odometry_file import OdometrySettings
+    from zstate.model.robot import RobotModel
+    from zstate.net.session import Session
+    from zstate.nodes.listener import TransformListener
+    from zstate.odometry import DiffDrive, OdometryNode
+    from zstate.wire.messages import Imu
+
+
+def _parse_diff_drive(text: str) -> DiffDrive:
+    from zstate.cli.odometry_file import parse_diff_drive
+
+    return parse_diff_drive(text)
+
+
+def _parse_plot(file: str) -> Path:
+    from zstate.cli.commands.plot import plot_file
+
+    return plot_file(file)
+
+
+@click.command("odometry")
+@click.argument("robot")
+@click.option("--imu", metavar="SENSOR", help="The IMU: a stream of ROBOT; default: imu.")
+@click.option(
+    "--velocity",
+    "velocities",
+    multiple=True,
+    metavar="SENSOR",
+    help="A further stream of measured velocities. Repeatable.",
+)
+@click.option(
+    "--diff-drive",
+    type=options.Checked("WHEELS", _parse_diff_drive),
+    help="Wheels on one axle: left=JOINT,right=JOINT,radius=M,track=M; several on a side are repeated.",
+)
+@click.option(
+    "--file",
+    type=options.EXISTING_FILE,
+    metavar="FILE.toml",
+    help="The settings of the robot, with the noise of its sensors; options take precedence.",
+)
+@click.option("--odom", metavar="FRAME", help="The frame of the odometry; default: odom.")
+@click.option(
+    "--base", metavar="FRAME", help="The frame that is placed in it; default: the root of the model."
+)
+@click.option(
+    "--rate", type=options.RATE, help="Publish so often at most; default: with each reading of the IMU."
+)
+@click.option(
+    "--writer", default="odometry", show_default=True, metavar="NAME", help="The name to publish under."
+)
+@click.option(
+    "--replay",
+    metavar="RECORDING",
+    help="Compute from a recording instead, and publish nothing: a report of each source.",
+)
+@click.option(
+    "--plot",
+    type=options.Checked("FILE", _parse_plot),
+    help="Of --replay: draw the path with ellipses of 95 %, and the NIS of each source. PNG, SVG or PDF.",
+)
+@options.seconds_option
+@options.session_options
+def odometry_command(
+    *,
+    robot: str,
+    imu: str | None,
+    velocities: tuple[str, ...],
+    diff_drive: DiffDrive | None,
+    file: str | None,
+    odom: str | None,
+    base: str | None,
+    rate: float | None,
+    writer: str,
+    replay: str | None,
+    plot: Path | None,
+    seconds: float | None,
+    network: SessionOptions,
+) -> None:
+    """Publish where the base of ROBOT is: odom -> base, from its IMU, its joints and its velocities.
+
+    The estimate has a pose, a velocity and the covariances of both, and corrects the biases of the IMU. The
+    mounts of the sensors are those of the robot's model. Data may be late and out of order. The robot should
+    stand still for a second at first: gravity aligns the IMU.
+
+    Each source has a NIS, the mean square of what it contradicts in units of its sigmas. `zstate monitor` and
+    `zstate doctor` show the sentences about sources whose sigmas are wrong. The settings of a robot with the
+    noise of its sensors are a file, which `--replay` checks on a recording:
+
+    \b
+    zstate odometry r1 --imu imu --diff-drive left=lw,right=rw,radius=0.08,track=0.32
+    zstate odometry r1 --file r1.toml
+    zstate odometry r1 --file r1.toml --replay run.mcap --plot run.png
+    """
+    from zstate.cli.odometry_file import OdometrySettings, read_settings
+
+    if plot is not None and replay is None:
+        raise click.UsageError("--plot needs --replay RECORDING")
+    settings = OdometrySettings() if file is None else read_settings(file)
+    given = {
+        "imu": imu,
+        "velocities": velocities or None,
+        "odom": odom,
+        "base": base,
+        "wheels": diff_drive,
+    }
+    settings = replace(settings, **{key: value for key, value in given.items() if value is not None})
+    if settings.wheels is None and not settings.velocities:
+        raise click.UsageError(
+            "an IMU alone drifts by metres in seconds; give --diff-drive, --velocity or --file"
+        )
+    if replay is not None:
+        _replay(replay, robot, settings, plot)
+        return
+    with open_session(network) as session:
+        _publish(session, robot, settings, writer=writer, rate_hz=rate, seconds=seconds)
+
+
+def _publish(
+    session: Session,
+    robot: str,
+    settings: OdometrySettings,
+    *,
+    writer: str,
+    rate_hz: float | None,
+    seconds: float | None,
+) -> None:
+    """Publish until a signal, or for ``seconds``, with a report of each source at the end."""
+    from zstate.clock import wait_interruptible
+    from zstate.nodes.listener import TransformListener
+    from zstate.odometry import OdometryNode
+
+    with ExitStack() as opened:
+        listener = opened.enter_context(TransformListener(session, robot))
+        base, imu_frame = _wait_for_sensors(session, robot, settings, listener)
+        node = opened.enter_context(
+            OdometryNode(
+                session,
+                robot,
+                settings.estimator(robot, base, imu_frame, listener.buffer),
+                imu=settings.imu,
+                velocities=settings.velocities,
+                has_joints=settings.wheels is not None,
+                writer=writer,
+                rate_hz=rate_hz,
+            )
+        )
+        print_wrapped(
+            f"publishing the odometry of {robot!r}, {settings.odom} -> {base}, as {writer!r}, from "
+            f"{_sources_text(settings)}"
+        )
+        try:
+            if wait_interruptible(node.has_failed, seconds):
+                fail(str(node.failure))
+        finally:
+            for line in _end_lines(node):
+                print_wrapped(line)
+
+
+def _wait_for_sensors(
+    session: Session, robot: str, settings: OdometrySettings, listener: TransformListener
+) -> tuple[str, str]:
+    """The frames of the base and of the IMU, once its mount is known; what is missing is printed."""
+    from zstate.cli.waiting import ConditionWaiter
+    from zstate.odometry import SensorListener
+    from zstate.sources.joint_state_listener import DescriptionSubscriber
+    from zstate.wire.keys import full_name
+
+    waiter = ConditionWaiter()
+    bases = {} if settings.base is None else {robot: settings.base}
+    frames: dict[str, str] = {}
+
+    def on_imu(sensor: str, message: Imu) -> None:
+        if sensor not in frames:
+            frames[sensor] = message.frame
+            waiter.notify()
+
+    def on_description(name: str, model: RobotModel) -> None:
+        bases.setdefault(name, model.root)
+        waiter.notify()
+
+    def reason() -> str:
+        if settings.imu not in frames:
+            others = f"; there is {', '.join(sorted(frames))}" if frames else ""
+            return f"{robot!r} has no reading of the IMU {settings.imu!r}{others}"
+        if robot not in bases:
+            return f"the model of {robot!r} has no publisher; start it, or give --base"
+        try:
+            listener.buffer.lookup(full_name(robot, bases[robot]), frames[settings.imu])
+        except LookupFailed as missing:
+            return str(missing)
+        return ""
+
+    listener.add_observer(waiter.notify)
+    with (
+        SensorListener(session, robot, on_imu=on_imu),
+        DescriptionSubscriber(session, robot, on_description),
+    ):
+        waiter.wait_for(lambda: not reason(), None, reason)
+    return bases[robot], frames[settings.imu]
+
+
+def _sources_text(settings: OdometrySettings) -> str:
+    wheels = ["its wheels"] if settings.wheels is not None else []
+    return ", ".join([f"its IMU {settings.imu!r}", *wheels, *map(repr, settings.velocities)])
+
+
+def _end_lines(node: OdometryNode) -> Iterator[str]:
+    from zstate.cli.odometry_replay import health_text
+
+    yield f"{count_text(node.published, 'sample')} published"
+    for one in node.health():
+        yield health_text(one)
+
+
+def _replay(path: str, robot: str, settings: OdometrySettings, plot: Path | None) -> None:
+    """Print the report of a recording, and draw it. Ends the command if nothing can be estimated."""
+    from zstate.cli.commands.plot import new_figure, save_figure
+    from zstate.cli.odometry_replay import odometry_figure, replay, report_lines
+
+    if plot is not None:
+        new_figure("", 1.0)  # reports a missing Matplotlib before it reads the recording
+    replayed = replay(path, robot, settings)
+    if not replayed.states:
+        fail(f"{path} has no odometry of {robot!r}: it needs a second of rest, or of readings of the IMU")
+    for line in report_lines(replayed):
+        print_wrapped(line)
+    if plot is not None:
+        save_figure(odometry_figure(replayed, f"odometry of {robot}"), plot)
+        print_wrapped(f"wrote {plot}")

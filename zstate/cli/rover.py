@@ -1,0 +1,219 @@
+"""The rover of `zstate demo rover`: its simulated hardware, in a room if maps can be read."""
+
+from __future__ import annotations
+
+import math
+import threading
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from zstate.cli.options import load_robot
+from zstate.errors import Closed, LibraryMissing
+
+if TYPE_CHECKING:
+    from zstate.buffer.buffer import TransformBuffer
+    from zstate.model.robot import RobotModel
+    from zstate.net.session import Session
+    from zstate.odometry import ImuPublisher
+    from zstate.odometry.simulated_rover import SimulatedRover, WheelRates
+    from zstate.scans import Grid, Scan, SimulatedLaser
+    from zstate.sources.square_drive import WheelPair
+    from zstate.transform import Transform
+
+ROVER = "rover"
+ROVER_MODEL = "diffbot"
+# The root of the model is the frame to place: base_link is fixed on it already.
+ROVER_ODOM, ROVER_BASE = "odom", "base_footprint"
+ROVER_WHEELS = 0.08, 0.32
+"""Radius and track of diffbot's wheels [m]."""
+ROVER_JOINTS = "left_wheel_joint", "right_wheel_joint"
+ROVER_LASER, ROVER_IMU = "lidar_link", "imu_link"
+
+_IMU_HZ = 200.0
+_GYRO_BIAS, _ACCEL_BIAS = (0.002, -0.001, 0.003), (0.03, -0.02, 0.05)
+_SLIP = 0.02
+_ACCELERATION = 20.0
+"""Limit of the wheels, of which the URDF has none [rad/s^2]."""
+
+_SCAN_HZ, _RAY_COUNT, _RANGE_M, _RANGE_NOISE_M = 10.0, 720, 8.0, 0.005
+_REST_NS = 1_000_000_000
+"""The rover rests so long after its first odometry, which begins where it stands."""
+
+
+def _file(name: str) -> Path:
+    """A file next to the models that come with zstate."""
+    from zstate.model.catalog import find_entry
+
+    return find_entry(ROVER_MODEL).path.with_name(name)
+
+
+def room_file() -> Path:
+    """The map of the room."""
+    return _file("room.yaml")
+
+
+def settings_file() -> Path:
+    """The settings of the rover's odometry, with the noise of its IMU."""
+    return _file("rover.toml")
+
+
+def load_room() -> Grid | None:
+    """The room of the rover; None without the libraries that read maps."""
+    from zstate.scans import load_map
+
+    try:
+        return load_map(room_file())
+    except LibraryMissing:
+        return None
+
+
+def run_rover(session: Session, rate_hz: float) -> None:
+    """Host the driver of the rover's wheels, and publish its IMU and its laser, until a signal."""
+    from zstate.cli.commands.drive import run_host
+    from zstate.cli.odometry_file import read_settings
+    from zstate.driving import DriverHost, Limits
+    from zstate.nodes.listener import TransformListener
+    from zstate.odometry import ImuPublisher
+    from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
+    from zstate.sources.square_drive import WheelPair
+
+    model, _ = load_robot(ROVER_MODEL, None)
+    mounts, wheels = _mounts(model), WheelPair(*ROVER_WHEELS)
+    rover = SimulatedRover(
+        wheels,
+        mounts[ROVER_IMU],
+        read_settings(str(settings_file())).imu_noise,
+        slip=_SLIP,
+        gyro_bias=_GYRO_BIAS,
+        accel_bias=_ACCEL_BIAS,
+    )
+    with ExitStack() as opened:
+        stop = threading.Event()
+        listener = opened.enter_context(TransformListener(session, ROVER, history_on_join=False))
+        autopilot = _Autopilot(rover, wheels, listener.buffer)
+        driver = SimulatedWheels(rover, ROVER_JOINTS, autopilot.rates)
+        limits = Limits.of(model, acceleration=_ACCELERATION)
+        host = opened.enter_context(
+            DriverHost(session, driver, model, ROVER, rate_hz=rate_hz, limits=limits, program="rover-wheels")
+        )
+        imu = opened.enter_context(ImuPublisher(session, ROVER, "imu", frame=ROVER_IMU, program="rover-imu"))
+        opened.callback(stop.set)
+        _in_thread("rover imu", partial(_publish_imu, imu, rover, stop))
+        room = load_room()
+        if room is not None:
+            _start_laser(session, room, rover, mounts[ROVER_LASER], opened)
+        run_host(host, None)
+
+
+def _in_thread(name: str, work: partial[object]) -> None:
+    def run() -> None:
+        with suppress(Closed):  # the end of the program
+            work()
+
+    threading.Thread(target=run, name=f"zstate {name}", daemon=True).start()
+
+
+def _mounts(model: RobotModel) -> dict[str, Transform]:
+    """The pose of each link in the base, with the wheels at zero."""
+    from zstate.model.kinematics import Kinematics
+    from zstate.transform import Transform
+
+    poses = Kinematics(model).link_poses(model.neutral)
+    return {
+        link: Transform.from_pose7(ROVER_BASE, link, pose)
+        for link, pose in zip(model.links, poses, strict=True)
+        if link != ROVER_BASE
+    }
+
+
+def _publish_imu(publisher: ImuPublisher, rover: SimulatedRover, stop: threading.Event) -> None:
+    from zstate.clock import SystemClock
+    from zstate.rate import Rate
+
+    for stamp in Rate(_IMU_HZ, SystemClock(), stop):
+        reading = rover.imu(stamp)
+        if reading is not None:
+            publisher.publish(reading.gyro, reading.accel, reading.stamp)
+
+
+def _start_laser(
+    session: Session, room: Grid, rover: SimulatedRover, mount: Transform, opened: ExitStack
+) -> None:
+    from zstate.scans import ScanPublisher, SimulatedLaser
+
+    increment, ray_ns = math.tau / _RAY_COUNT, round(1e9 / (_SCAN_HZ * _RAY_COUNT))
+    laser = SimulatedLaser(
+        room,
+        angle_min=-math.pi,
+        angle_increment=increment,
+        ray_count=_RAY_COUNT,
+        ray_ns=ray_ns,
+        range_max=_RANGE_M,
+        frame=ROVER_LASER,
+        noise_m=_RANGE_NOISE_M,
+        seed=0,
+    )
+    publisher = ScanPublisher(
+        session,
+        ROVER,
+        "laser",
+        angle_min=-math.pi,
+        angle_increment=increment,
+        ray_ns=ray_ns,
+        range_min=0.0,
+        range_max=_RANGE_M,
+        frame=ROVER_LASER,
+        program="rover-laser",
+    )
+    opened.enter_context(publisher)
+    _in_thread("rover laser", partial(publisher.run, _RoverLaser(laser, rover, mount), _SCAN_HZ))
+
+
+class _RoverLaser:
+    """A RangeSource: each ray is cast from where the rover truly is at its instant, through the room."""
+
+    def __init__(self, laser: SimulatedLaser, rover: SimulatedRover, mount: Transform) -> None:
+        self._laser, self._rover = laser, rover
+        self._x, self._y, _ = mount.translation.tolist()
+        _, _, self._yaw = mount.rpy.tolist()
+        self._begin: int | None = None
+
+    def read(self, stamp: int) -> Scan | None:
+        """The sweep that ends at ``stamp`` [ns]; None before the rover is that old."""
+        import numpy as np
+
+        end = self._rover.advance(stamp)
+        if self._begin is None:
+            self._begin = end
+        first = end - self._laser.sweep_ns
+        if first < self._begin:
+            return None
+        x, y, yaw = self._rover.poses(self._laser.stamps(first)).T
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        ahead, left = cosine * self._x - sine * self._y, sine * self._x + cosine * self._y
+        return self._laser.scan(first, x + ahead, y + left, yaw + self._yaw)
+
+
+class _Autopilot:
+    """Keeps the rover on a square, as soon as its odometry is in ``buffer``: where that begins."""
+
+    def __init__(self, rover: SimulatedRover, wheels: WheelPair, buffer: TransformBuffer) -> None:
+        from zstate.sources.square_drive import SquareDrive
+
+        self._rover, self._wheels, self._buffer = rover, wheels, buffer
+        self._square = SquareDrive(wheels)
+        self._start: int | None = None
+
+    def rates(self, stamp: int) -> WheelRates:
+        """The rates of the wheels at ``stamp`` [ns]."""
+        from zstate.odometry.simulated_rover import tracking_twist
+
+        if self._start is None:
+            if not self._buffer.can_lookup(f"{ROVER}/{ROVER_ODOM}", f"{ROVER}/{ROVER_BASE}"):
+                return 0.0, 0.0
+            self._start = stamp + _REST_NS
+        if stamp < self._start:
+            return 0.0, 0.0
+        return self._wheels.roll(*tracking_twist(self._square.state(stamp - self._start), self._rover.pose))

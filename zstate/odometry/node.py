@@ -1,0 +1,202 @@
+"""OdometryNode: from the streams of a robot to its odometry; the same steps serve recordings."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection
+from contextlib import ExitStack
+
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe
+from zstate._util.refusals import Refusals
+from zstate.errors import Closed, InvalidInput, NoData, SecondWriter
+from zstate.model.robot import POSITION_COUNTS, RobotModel
+from zstate.net.session import Session
+from zstate.odometry.estimator import BaseEstimator, BaseState
+from zstate.odometry.health import SourceHealth
+from zstate.odometry.listener import SensorListener
+from zstate.odometry.publishers import OdometryPublisher
+from zstate.sources import JointReading, JointStateListener
+from zstate.wire.messages import Imu, Velocity, covariance_matrix, from_block
+
+_SILENT_NS = 100_000_000
+"""After this time without its IMU, a node publishes at the stamps of other sources."""
+
+_HEALTH_NS = 500_000_000
+"""The interval at which the health of the sources is assessed, by stamps."""
+
+
+def add_imu(base: BaseEstimator, message: Imu) -> None:
+    """Pass one reading to ``base``."""
+    base.imu(message.stamp, from_block(message.gyro), from_block(message.accel))
+
+
+def add_velocity(base: BaseEstimator, sensor: str, message: Velocity) -> None:
+    """Pass one measurement of ``sensor`` to ``base``. Raises InvalidInput for one without covariance."""
+    if message.covariance is None:
+        raise InvalidInput(f"velocities of {sensor!r} have no covariance: publish them with one")
+    base.velocity(
+        message.stamp,
+        from_block(message.linear),
+        covariance=covariance_matrix(message.covariance)[:3, :3],
+        angular=None if message.angular is None else from_block(message.angular),
+        frame=message.frame,
+        source=sensor,
+    )
+
+
+def add_joints(base: BaseEstimator, model: RobotModel, reading: JointReading) -> None:
+    """Pass the joints of ``model`` that have one position each to ``base``."""
+    assert reading.stamp is not None
+    columns = [
+        (joint.name, model.columns[joint.name])
+        for joint in model.driven_joints
+        if POSITION_COUNTS[joint.type] == 1
+    ]
+    positions = reading.positions.tolist()
+    base.joints(reading.stamp, {name: positions[column] for name, column in columns})
+
+
+class OdometryNode(Closeable):
+    """Feeds ``base`` with the sensors of ``robot``, and publishes its odometry as ``writer``.
+
+    ``base`` gets the readings of the IMU ``imu``, of the sensors ``velocities``, and with ``has_joints`` the
+    joint states, from the threads of their subscriptions. Each reading of the IMU publishes the newest state,
+    at most ``rate_hz`` of them a second. If the IMU is silent for 0.1 s, readings of the other sources do; if
+    all are silent, nothing is published. The sentences of ``base.health()`` are the warning in the status of
+    the writer.
+
+    Raises SecondWriter as ``OdometryPublisher``. While it runs, that becomes its ``failure``, and
+    ``has_failed`` is set. A context manager.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        base: BaseEstimator,
+        *,
+        imu: str = "imu",
+        velocities: Collection[str] = (),
+        has_joints: bool = False,
+        writer: str = "odometry",
+        rate_hz: float | None = None,
+        program: str = "",
+    ) -> None:
+        self.base = base
+        self.failure: Exception | None = None
+        self.has_failed = fork_safe(threading.Event())
+        self._refusals = Refusals("joint states")
+        self._imu, self._velocities = imu, frozenset(velocities)
+        self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
+        self._lock = fork_safe(threading.Lock())
+        self._imu_stamp = self._due = self._newest = self._assessed = 0
+        with ExitStack() as opening:
+            self._publisher = opening.enter_context(
+                OdometryPublisher(session, robot, writer, program=program)
+            )
+            self._joints = (
+                opening.enter_context(JointStateListener(session, robot, on_reading=self._on_joints))
+                if has_joints
+                else None
+            )
+            self._sensors = opening.enter_context(
+                SensorListener(
+                    session,
+                    robot,
+                    on_imu=self._on_imu,
+                    on_velocity=self._on_velocity if velocities else None,
+                )
+            )
+            self._opened = opening.pop_all()
+
+    def __repr__(self) -> str:
+        return f"<OdometryNode of {self._publisher.robot!r}: {self.published} samples>"
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Counts of messages that could not be used, by reason; the first of each is also logged."""
+        return {**self._sensors.refused, **self._refusals.counts}
+
+    @property
+    def published(self) -> int:
+        """How many samples of odometry were published."""
+        return self._publisher.stats.sent
+
+    def health(self) -> tuple[SourceHealth, ...]:
+        """That of each source, with a sentence where something is wrong."""
+        with self._lock:
+            return self.base.health()
+
+    def state(self) -> BaseState:
+        """The newest state. Raises NoData before the first alignment."""
+        with self._lock:
+            return self.base.state()
+
+    def close(self) -> None:
+        """Stop. A second call does nothing."""
+        self._opened.close()
+
+    # In the threads of the subscriptions
+
+    def _on_imu(self, sensor: str, message: Imu) -> None:
+        if sensor != self._imu:
+            return
+        with self._lock:
+            add_imu(self.base, message)
+            self._imu_stamp = max(self._imu_stamp, message.stamp)
+            self._publish(message.stamp)
+
+    def _on_velocity(self, sensor: str, message: Velocity) -> None:
+        if sensor in self._velocities:
+            with self._lock:
+                add_velocity(self.base, sensor, message)
+                self._publish_without_imu(message.stamp)
+
+    def _on_joints(self, reading: JointReading) -> None:
+        assert self._joints is not None
+        assert self._joints.model is not None
+        assert reading.stamp is not None
+        with self._lock:
+            try:
+                add_joints(self.base, self._joints.model, reading)
+            except InvalidInput as error:
+                self._refusals.count("refused joints", error)
+            else:
+                self._publish_without_imu(reading.stamp)
+
+    def _publish_without_imu(self, stamp: int) -> None:
+        if stamp - self._imu_stamp > _SILENT_NS:
+            self._publish(stamp)
+
+    def _publish(self, stamp: int) -> None:
+        """Publish the newest state if that is due at ``stamp``; with the lock."""
+        if stamp < self._due or self.failure is not None:
+            return
+        try:
+            state = self.base.state()
+        except NoData:  # not aligned yet
+            return
+        if state.stamp <= self._newest:
+            return
+        self._newest = state.stamp
+        # On the grid of the rate, unless the stamps have left it behind.
+        following = self._due + self._period_ns
+        self._due = following if following > stamp else stamp + self._period_ns
+        self._assess(stamp)
+        linear, angular = state.twist
+        try:
+            self._publisher.publish(
+                state.odom_from_base, linear, angular, state.stamp, twist_covariance=state.twist_covariance
+            )
+        except Closed:
+            pass
+        except SecondWriter as error:
+            self.failure = error
+            self.has_failed.set()
+
+    def _assess(self, stamp: int) -> None:
+        if stamp - self._assessed >= _HEALTH_NS:
+            self._assessed = stamp
+            sentences = [one.sentence for one in self.base.health() if one.sentence]
+            self._publisher.warning = "; ".join(sentences)
