@@ -8,9 +8,11 @@ import pytest
 from helpers.base_motion import NOISE, START, WHEEL_HZ, Motion, NoisyImu, mounted, stamp_at, tilted_mount
 
 from zstate import InFuture, InvalidInput, NoData, Transform, UnknownFrame, se3
+from zstate.model.load import load_model
 from zstate.odometry import BaseEstimator, BaseState, DiffDrive, SourceHealth
 from zstate.odometry.health import chi_square_quantile
 from zstate.odometry.invariant_filter import Floats
+from zstate.odometry.legs import Legs
 
 SIGMA = 0.02
 LEVEL = Transform("base_link", "imu_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -230,6 +232,27 @@ def test_wheels_from_joints_drive_a_line_in_any_order_of_readings():
     np.testing.assert_array_equal(first.odom_from_base.pose7, second.odom_from_base.pose7)
     np.testing.assert_allclose(first.twist.linear, (0.5, 0.0, 0.0), atol=0.01)
     assert first.odom_from_base.translation[0] == pytest.approx(0.5 * 2.9, abs=0.01)
+
+
+LEG = """<link name="leg{0}"/><link name="foot{0}"/>
+  <joint name="slide{0}" type="prismatic"><parent link="base_link"/><child link="leg{0}"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  <joint name="sole{0}" type="fixed"><parent link="leg{0}"/><child link="foot{0}"/>
+    <origin xyz="0 {0} -0.4"/></joint>"""
+LEGGED = f'<robot name="slider"><link name="base_link"/>{LEG.format(1)}{LEG.format(2)}</robot>'
+
+
+def test_feet_on_the_ground_push_the_base_forward():
+    """Feet that slide back by 0.2 m under the base, and stay where they are."""
+    legs = Legs(load_model(LEGGED), ["foot1", "foot2"], imu="base_link")
+    base = estimator(legs=legs)
+    base.contacts(START, {"foot1": True, "foot2": True})
+    for step in range(401):
+        t = 0.01 * step
+        base.imu(stamp_at(t), (0.0, 0.0, 0.0), (0.0, 0.0, 9.80665))
+        base.joints(stamp_at(t), dict.fromkeys(legs.joint_names, -0.1 * max(0.0, t - 2.0)))
+    assert base.state().odom_from_base.translation[0] == pytest.approx(0.2, abs=0.01)
+    assert health_of(base, "feet").accepted > 380
 
 
 def wander(compass: bool, hard_iron: float) -> tuple[float, float, BaseEstimator]:
