@@ -42,6 +42,7 @@ STATE = DriverState(
         0.5,
     ),
     outcomes=tuple(MotionOutcome(1, k, name, "5") for k, name in enumerate(get_args(OutcomeName))),
+    modes=("position", "velocity"),
 )
 STOP = Stop(5, 0, 9, "relax", "7")
 

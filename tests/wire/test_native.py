@@ -142,9 +142,9 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     "driver state": (
         DriverState(
             *(5, 7, "host", "active", "", NAMES, 100, "teleop", 6, ("j2",), 0.5, 4, 3, 2, {"old": 1}, "late"),
-            *(((8, 9),), (7, 3), 0.25, (MotionOutcome(7, 2, "reached", "in time"),)),
+            *(((8, 9),), (7, 3), 0.25, (MotionOutcome(7, 2, "reached", "in time"),), ("effort", "velocity")),
         ),
-        b"\xdc\x00\x14\x05\x07"
+        b"\xdc\x00\x15\x05\x07"
         + fixstr("host")
         + fixstr("active")
         + fixstr("")
@@ -166,7 +166,10 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + struct.pack(">d", 0.25)
         + b"\x91\x94\x07\x02"
         + fixstr("reached")
-        + fixstr("in time"),
+        + fixstr("in time")
+        + b"\x92"
+        + fixstr("effort")
+        + fixstr("velocity"),
     ),
     "statics": (
         StaticTransforms(7, (("b", "c"),), to_block([0, 0, 1, 0, 0, 0, 1])),

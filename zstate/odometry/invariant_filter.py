@@ -1,8 +1,8 @@
 """Invariant Kalman filter of a body with an IMU: orientation, velocity, position, biases and contacts.
 
 The state is (R, v, p, c_1 ... c_k) of SE_{2+k}(3), with the IMU's axes as the body: ``R`` world_from_imu,
-``v`` and ``p`` of the IMU's origin in the world, contact points ``c`` in the world, and the biases of gyro
-and accelerometer beside it. The world has z up, and gravity (0, 0, -9.80665) m/s^2.
+``v`` and ``p`` of the IMU's origin in the world, contact points ``c`` in the world, with the biases of
+gyro and accelerometer. The world has z up, and gravity (0, 0, -9.80665) m/s^2.
 
 The error is right-invariant: truth X and estimate X' are ``X = exp(xi) X'``, and a bias is ``b = b' + zeta``.
 To first order ``xi`` is, with the cross product matrix [.],
