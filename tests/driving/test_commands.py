@@ -9,7 +9,7 @@ from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
 from zstate.driving.driver import Mode
 from zstate.driving.limits import Limits
 from zstate.driving.setpoint_limiter import Limited, Rate, SetpointLimiter
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, MessageError
 
 DT = 0.004
 TICK = 4_000_000
@@ -159,3 +159,20 @@ def test_no_sequence_of_modes_commands_silences_and_stops_exceeds_a_limit(modes:
     assert worst_step <= 1.0 + EXACT
     assert seen >= {(one, other) for one in modes for other in modes} - {("effort", "effort")}
     assert bool(braked) == ("effort" in modes)
+
+
+def test_a_commander_whose_token_vanishes_for_a_moment_stays_the_only_one_while_it_sends():
+    targets = Targets(1)
+
+    def send(session: int, arrived: int) -> None:
+        targets.check_session(session, arrived, str)
+        at = np.array([0], dtype=np.intp)
+        targets.accept(Command(session, arrived, at, np.zeros(1), arrived, arrived + TTL))
+
+    send(1, TICK)
+    targets.set_announced(1, alive=False, now=2 * TICK)
+    send(1, 3 * TICK)
+    with pytest.raises(MessageError, match="while commands of 1 are valid"):
+        send(2, 4 * TICK)
+    targets.set_announced(1, alive=False, now=4 * TICK)  # it has closed: the next one need not wait
+    send(2, 4 * TICK)

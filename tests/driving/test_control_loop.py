@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from helpers.robots import RRBOT
@@ -28,6 +29,7 @@ LIMITS = Limits(RRBOT.joint_names, [-1.0, -2.0], [1.0, 2.0], [2.0, 0.5], [50.0, 
 PERIOD_NS = 2_000_000
 TTL_NS = 20_000_000
 EXACT = 1e-9  # rounding, in units of the bound
+AT_ZERO = np.array([0], dtype=np.intp), np.zeros(1)
 
 
 class Joints(SimulatedDriver):
@@ -231,3 +233,16 @@ def test_ten_thousand_take_overs_replacements_stops_faults_and_restarts_never_st
     assert states["active"] > 10_000
     assert set(bench.outcomes) == {"reached", "aborted", "replaced", "cancelled", "stopped"}
     assert set(bench.refusals.counts) >= {"second commander", "stopped", "not released", "outside limits"}
+
+
+def test_a_driver_that_repeats_its_last_reading_is_stopped():
+    bench = Bench(np.random.default_rng(0))
+    first = bench.driver.read(bench.clock.now())
+    readings = [replace(first, stamp=number) for number in range(1, 5)]
+    bench.driver.read = lambda _: readings[0] if len(readings) == 1 else readings.pop(0)
+    while bench.driver.writes < 20 and bench.loop.state.name != "stopped":
+        bench.waiting.append(
+            Command(1, bench.clock.now(), *AT_ZERO, bench.clock.now(), bench.clock.now() + TTL_NS)
+        )
+        bench.tick()
+    assert "there is no new reading of the joints" in bench.loop.state.reason

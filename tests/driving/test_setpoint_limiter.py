@@ -326,6 +326,18 @@ def test_after_an_effort_the_joint_brakes_from_the_measured_velocity_by_what_the
         assert abs(resting.positions[0] - 0.5 * 199 * DT) <= limits.velocity[0] * DT
 
 
+def test_without_new_readings_a_pushed_joint_is_held_where_it_is_expected():
+    limiter, limits = in_modes()
+    pushing = {0: Rate("effort", 1.0)}
+    limiter.step([0.0], DT, rates=pushing)
+    limiter.observe(np.array([0.1]), np.array([0.8]), 0)
+    for _ in range(100):  # such as of a device that is slower than the loop
+        limiter.step([0.0], DT, rates=pushing)
+    held = limiter.brake(DT)
+    assert held.modes == ("position",)
+    assert abs(held.positions[0] - (0.1 + 0.8 * 100 * DT)) <= limits.velocity[0] * DT * (1 + EXACT)
+
+
 @pytest.mark.parametrize(
     ("at", "speed", "reason"),
     [

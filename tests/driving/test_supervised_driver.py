@@ -99,3 +99,35 @@ def test_a_joint_that_falls_at_zero_velocity_is_noticed():
         texts.append(check.deviation(at, tick * TICK, tick * TICK))
         check.written(Limited(at, np.zeros(2), (), None, ("velocity", "velocity")), tick * TICK)
     assert any("'lift' has moved by -0.3" in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("modes", "tick_ns"),
+    [
+        ([("velocity", "velocity"), ("position", "velocity")], TICK),  # of another joint
+        ([("position", "velocity"), ("position", "position")], TICK),  # of this joint
+        ([("position", "velocity")], SECOND // 5),  # a slow loop
+    ],
+)
+@pytest.mark.parametrize(("ratio", "is_found"), [(0.0, True), (-1.0, True), (1.0, False)])
+def test_a_joint_is_compared_also_while_modes_change_and_in_slow_loops(modes, tick_ns, ratio, is_found):
+    check = FollowingCheck(LIMITS, 0.2, SECOND)
+    position, dt_s = 0.0, tick_ns * 1e-9
+    texts: list[str] = []
+    for tick in range(2 * SECOND // tick_ns):
+        texts.append(check.deviation(np.array([0.0, position]), tick * tick_ns, tick * tick_ns))
+        now_in = modes[tick % len(modes)]
+        expected = np.array([0.0, position + dt_s])  # positions start from the measured ones
+        check.written(Limited(expected, np.array([0.0, 1.0]), (), None, now_in), tick * tick_ns)
+        position += ratio * dt_s
+    assert any("'elbow' has moved by" in text for text in texts) == is_found
+
+
+def test_what_a_joint_does_while_the_host_is_frozen_is_not_compared():
+    check = FollowingCheck(LIMITS, 0.2, SECOND)
+    for tick in range(50):
+        at = np.array([0.0, tick * 0.01])
+        assert check.deviation(at, tick * TICK, tick * TICK) == ""
+        check.written(Limited(at, np.array([0.0, 1.0]), (), None, ("position", "velocity")), tick * TICK)
+    later = 3 * SECOND
+    assert check.deviation(np.array([0.0, 3.0]), later, later) == ""

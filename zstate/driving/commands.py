@@ -257,8 +257,8 @@ class Targets:
         self._first_deadline = self._last_deadline = NO_DEADLINE
         self._last_seqs: BoundedDict[int, int] = BoundedDict()
         self._rates: dict[int, Rate | None] = {}
-        self._gone: BoundedDict[int, None] = BoundedDict()
-        """Commanders that have closed."""
+        self._gone: BoundedDict[int, int] = BoundedDict()
+        """When the tokens of commanders have gone [ns, monotonic]."""
         self.session = 0
         """The session of the newest command; 0 before the first."""
         self.arrived = 0
@@ -283,21 +283,24 @@ class Targets:
 
     def check_session(self, session: int, now: int, name_of: Callable[[int], str]) -> None:
         """Raise MessageError for another session than the active one, unless that is gone."""
-        if session != self.session and self.session not in self._gone and self.is_live(now):
+        if session != self.session and not self.is_gone(self.session) and self.is_live(now):
             left = format_duration(self._last_deadline - now)
             text = f"it came from {name_of(session)}, while commands of {name_of(self.session)} are valid"
             raise MessageError(f"{text} for {left} more", reason="second commander")
 
-    def set_announced(self, session: int, alive: bool) -> None:
+    def set_announced(self, session: int, alive: bool, now: int) -> None:
         """The commander of ``session`` is announced, or has closed: others need not wait; for any thread."""
         if alive:
             self._gone.pop(session, None)
         else:
-            self._gone[session] = None
+            self._gone[session] = now
 
     def is_gone(self, session: int) -> bool:
-        """Whether the commander of ``session`` has closed."""
-        return session in self._gone
+        """Whether the active commander, of ``session``, has closed: it has sent nothing since its token went.
+
+        A token may vanish for a moment, as with a router, while its commander goes on.
+        """
+        return self._gone.get(session, NO_DEADLINE) >= self.arrived
 
     def merged(self, command: Command, present: Floats) -> Floats:
         """The positions of ``command``; ``present`` ones for all other joints."""

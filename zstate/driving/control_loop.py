@@ -124,6 +124,8 @@ class ControlLoop:
         """Sessions that have commanded a stopped robot: a release by another does not move it for them."""
         self._measured: Floats | None = None
         self._measured_at = self._wrote_at = 0
+        self._read_stamp: int | None = None
+        """Of the last reading, if the driver gives stamps."""
         self._offset = 0
         """Of the system clock ahead of ``clock`` [ns], at the last tick."""
         self._faults_in_row = 0
@@ -178,6 +180,8 @@ class ControlLoop:
         return None
 
     def _check_and_publish(self, reading: JointReading, stamp: int) -> None:
+        if reading.stamp is not None and reading.stamp == self._read_stamp:
+            return  # a driver that repeats its last reading has lost its device
         vector = self._limits.vector
         positions = vector(reading.positions, "measured positions")
         velocities = reading.velocities
@@ -187,7 +191,7 @@ class ControlLoop:
         if efforts is not None:
             efforts = vector(efforts, "measured efforts")
         self._publish(positions, velocities, efforts, stamp if reading.stamp is None else reading.stamp)
-        self._measured, self._measured_at = positions, self._now()
+        self._measured, self._measured_at, self._read_stamp = positions, self._now(), reading.stamp
         self._limiter.observe(positions, velocities, self._measured_at)
         if self.state.reason == NO_READING:
             self._change("ready", "")

@@ -72,6 +72,7 @@ class Driver(Protocol):
     def read(self, stamp: int) -> JointReading | None:
         """The joints at ``stamp`` [ns], the present instant; None when there is nothing new.
 
+        A reading with the stamp of the last one counts as nothing new, too.
         Blocks until the device has a new reading if the device sets the pace of its host (``rate_hz=None``),
         or until some milliseconds have passed without one. Raises any exception for a reading that cannot be
         used, which the host counts.

@@ -348,4 +348,4 @@ class DriverHost(Closeable):
         session = announced.writer.session
         if alive:  # also for messages about a commander that has gone
             self._programs[session] = str(announced.writer)
-        self._loop.targets.set_announced(session, alive)
+        self._loop.targets.set_announced(session, alive, time.monotonic_ns())

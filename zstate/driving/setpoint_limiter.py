@@ -148,6 +148,10 @@ class _Joint:
             least = 0.0
         return min(max(wanted, least), most)
 
+    def moved(self, position: float, velocity: float, dt_s: float) -> float:
+        """Where the joint is expected ``dt_s`` later, at the velocity limit at most."""
+        return position + min(max(velocity, -self._velocity), self._velocity) * dt_s
+
     def is_exceeded(self, position: float, velocity: float) -> bool:
         """Whether the joint is outside its range, or too fast."""
         is_inside = self._lower - ROUNDING <= position <= self._upper + ROUNDING
@@ -245,8 +249,8 @@ class SetpointLimiter:
     def observe(self, positions: Floats, velocities: Floats | None, now: int) -> None:
         """The joints were measured at ``positions`` (n,), at ``now`` [ns, monotonic].
 
-        Joints in other modes than "position" are there now. Velocities of joints in mode "effort" are derived
-        from the positions if not given.
+        Joints in other modes than "position" are there now, and move on until the next call. Velocities of
+        joints in mode "effort" are derived from the positions if not given.
         """
         before, self._observed = self._observed, (positions.tolist(), now)
         if self._has_positions_only or self._positions is None:
@@ -346,6 +350,7 @@ class SetpointLimiter:
             mode, before, wish = self._modes[column], velocities[column], 0.0 if rate is None else rate.value
             if mode == "effort":
                 self._efforts[column] = joint.push(here, before, wish)
+                positions[column] = joint.moved(here, before, dt_s)
                 left = wish - self._efforts[column]
             elif mode == "velocity":
                 positions[column], velocities[column] = joint.turn(here, before, wish, dt_s)

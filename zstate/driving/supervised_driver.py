@@ -19,11 +19,12 @@ _LOG = logging.getLogger("zstate")
 
 _TRAVEL_NS = 1_000_000_000
 _TRAVEL_SHARE = 0.25
-_LONGEST_GAP_NS = 100_000_000
+_LONGEST_GAP_NS = 300_000_000
 _LAG_S = 0.1
 """Joints in mode "velocity" are compared each second; they may differ by a share of the way, and a lag.
 
-After a longer gap between two setpoints the comparison begins again.
+After a longer gap between two setpoints the comparison begins again: up to that, the share and the lag
+cover a device that stops by itself in the gap.
 """
 
 
@@ -141,10 +142,10 @@ class FollowingCheck:
     def written(self, setpoint: Limited, now: int) -> None:
         """``setpoint`` has been written at ``now``."""
         before, elapsed = self._setpoint, now - self._written_at
-        if before is None or before.modes != setpoint.modes or elapsed > _LONGEST_GAP_NS:
+        if before is None or elapsed > _LONGEST_GAP_NS:
             self._travel = None  # devices stop by themselves in a pause, or move on
         elif self._travel is not None:
-            self._travel.add(before.velocities, elapsed * 1e-9)
+            self._travel.add(before, setpoint, elapsed * 1e-9)
         self._setpoint, self._written_at = setpoint, now
 
     def stopped(self) -> None:
@@ -161,7 +162,7 @@ class FollowingCheck:
         if measured_at < self._written_at:
             return ""
         errors = measured - setpoint.positions
-        if setpoint.modes.count("position") < len(setpoint.modes):
+        if self._travel is not None or setpoint.modes.count("position") < len(setpoint.modes):
             errors[[mode != "position" for mode in setpoint.modes]] = 0.0
             if text := self._travel_text(setpoint, measured, now):
                 return text
@@ -180,16 +181,18 @@ class FollowingCheck:
         )
 
     def _travel_text(self, setpoint: Limited, measured: NDArray[np.float64], now: int) -> str:
-        """Why a joint in mode "velocity" does not follow, once a second."""
+        """Why a joint does not follow that has been in mode "velocity", once a second."""
+        if now - self._written_at > _LONGEST_GAP_NS:
+            self._travel = None
         travel = self._travel
         if travel is None or now - travel.since > _TRAVEL_NS:
-            self._travel = _Travel(now, measured)
+            self._travel = _Travel(now, measured, setpoint) if "velocity" in setpoint.modes else None
         if travel is None or now - travel.since <= _TRAVEL_NS:
             return ""
         moved = measured - travel.start
         allowed = self._most + _TRAVEL_SHARE * travel.path + _LAG_S * travel.fastest
         errors = np.abs(moved - travel.commanded) - allowed
-        errors[[mode != "velocity" for mode in setpoint.modes]] = 0.0
+        errors[travel.excluded] = 0.0
         row = int(errors.argmax())
         if errors[row] <= 0.0:
             return ""
@@ -202,19 +205,38 @@ class FollowingCheck:
 
 
 class _Travel:
-    """What velocities of setpoints add up to since the instant ``since``, at the measured ``start``."""
+    """What setpoints add up to since the instant ``since``, at the measured ``start``.
 
-    def __init__(self, since: int, start: NDArray[np.float64]) -> None:
+    It goes on when joints change their modes: a change each second would end every comparison.
+    """
+
+    def __init__(self, since: int, start: NDArray[np.float64], setpoint: Limited) -> None:
         self.since, self.start = since, start
         self.commanded = np.zeros(len(start))
         self.path = np.zeros(len(start))
         self.fastest = np.zeros(len(start))
+        self._turned = _in_mode(setpoint, "velocity")
+        self._pushed = _in_mode(setpoint, "effort")
 
-    def add(self, velocities: NDArray[np.float64], dt_s: float) -> None:
-        speeds = np.abs(velocities)
-        self.commanded += velocities * dt_s
-        self.path += speeds * dt_s
-        np.maximum(self.fastest, speeds, out=self.fastest)
+    @property
+    def excluded(self) -> NDArray[np.bool_]:
+        """The joints that were in mode "effort", or never in mode "velocity": (n,)."""
+        return self._pushed | ~self._turned
+
+    def add(self, before: Limited, after: Limited, dt_s: float) -> None:
+        """``after`` has been written ``dt_s`` [s] after ``before``."""
+        self._turned |= _in_mode(after, "velocity")
+        self._pushed |= _in_mode(after, "effort")
+        is_placed = _in_mode(before, "position") & _in_mode(after, "position")
+        steps = np.where(is_placed, after.positions - before.positions, before.velocities * dt_s)
+        self.commanded += steps
+        self.path += np.abs(steps)
+        np.maximum(self.fastest, np.abs(before.velocities), out=self.fastest)
+
+
+def _in_mode(setpoint: Limited, mode: Mode) -> NDArray[np.bool_]:
+    """Which joints are in ``mode``: (n,)."""
+    return np.array([one == mode for one in setpoint.modes or ("position",) * len(setpoint.positions)])
 
 
 def check_arguments(
