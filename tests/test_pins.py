@@ -40,7 +40,7 @@ from zstate.cli.main import group
 from zstate.extension import REVISION
 from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
-from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
+from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
 from zstate.wire.native import ENCODINGS
 
 PACKAGE = Path(__file__).parent.parent / "zstate"
@@ -130,12 +130,13 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
         if wire == "native":
             odometry = opened.enter_context(TransformPublisher(writer, "r1", "odometry", program="driver"))
             odometry.publish([Transform("odom", "world", (1.0, 0.0, 0.0), UPRIGHT)])
-        wheels, imu, flow = (
+        wheels, imu, flow, mocap = (
             opened.enter_context(kind(writer, "r1", name, (wire,), program="driver"))
             for kind, name in (
                 (OdometryPublisher, "odom"),
                 (ImuPublisher, "chest"),
                 (VelocityPublisher, "flow"),
+                (PosePublisher, "mocap"),
             )
         )
 
@@ -145,6 +146,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
             wheels.publish(Transform("start", "odom", (1.0, 0.0, 0.0), UPRIGHT), [0, 0, 0], [0, 0, 0])
             imu.publish([0, 0, 0], [0, 0, 9.81])
             flow.publish([0, 0, 0])
+            mocap.publish(Transform("map", "odom", (1.0, 0.0, 0.0), UPRIGHT))
 
         with repeated(publish):
             yield

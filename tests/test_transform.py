@@ -269,8 +269,20 @@ def test_a_transform_survives_json_and_pickle() -> None:
     ):
         assert again == transform
         assert again.kind == "interpolated"
+        assert again.covariance is None
+    assert "covariance" not in transform.to_dict()
     with pytest.raises(InvalidInput, match="needs target"):
         Transform.from_dict({"source": "b"})
+
+
+def test_covariance_survives_json() -> None:
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    transform = Transform("a", "b", (0.1, 0.2, 0.3), TURN, 5).with_covariance(covariance)
+    again = Transform.from_dict(json.loads(json.dumps(transform.to_dict())))
+    assert again == transform
+    assert np.array_equal(again.covariance, covariance)
+    with pytest.raises(InvalidInput, match=r"shape \(6, 6\)"):
+        Transform.from_dict({**transform.to_dict(), "covariance": [1.0]})
 
 
 def test_age_is_measured_by_the_clock_and_is_zero_if_static() -> None:

@@ -328,7 +328,12 @@ class Transform(TransformFields):
         return 0.0 if self.stamp is None else (clock.now() - self.stamp) * 1e-9
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain names, lists and numbers, ready for JSON; ``from_dict`` reads them back."""
+        """Plain names, lists and numbers, ready for JSON; ``from_dict`` reads them back.
+
+        The covariance is there if it is known.
+        """
+        covariance = self.covariance
+        known: dict[str, Any] = {} if covariance is None else {"covariance": covariance.tolist()}
         return {
             "target": self.target,
             "source": self.source,
@@ -336,6 +341,7 @@ class Transform(TransformFields):
             "kind": self.kind,
             "translation": list(self._pose[:3]),
             "rotation": list(self._pose[3:]),
+            **known,
         }
 
     @classmethod
@@ -345,7 +351,9 @@ class Transform(TransformFields):
         missing = [name for name in names if name not in values]
         if missing:
             raise InvalidInput(f"a transform needs {', '.join(missing)}; got {sorted(values)}")
-        return cls(*(values[name] for name in names), kind=values.get("kind"))
+        transform = cls(*(values[name] for name in names), kind=values.get("kind"))
+        covariance = values.get("covariance")
+        return transform if covariance is None else transform.with_covariance(covariance)
 
     def __reduce__(self) -> tuple[Any, ...]:
         fields = (self.target, self.source, self._pose, self.stamp, self.kind, self.predicted_s)

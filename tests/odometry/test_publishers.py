@@ -17,13 +17,14 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
+from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
 from zstate.transform import Transform
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     Imu,
     Message,
     Odometry,
+    Pose,
     Velocity,
     covariance_matrix,
     covariances_of,
@@ -94,6 +95,21 @@ def test_velocity_arrives_as_it_was_published(sessions):
     assert both.covariance is not None
     assert covariance_matrix(both.covariance).tolist() == TWIST_COVARIANCE.tolist()
     assert covariance_matrix(velocities[-1].covariance).tolist() == np.eye(3).tolist()
+
+
+def test_pose_arrives_as_it_was_published(sessions):
+    writer, reader = sessions
+    poses = Messages(reader, "pose")
+    with PosePublisher(writer, "r1", "mocap", clock=ManualClock(7)) as publisher:
+        known = poses.first(lambda: publisher.publish(base(1.0, 5).with_covariance(POSE_COVARIANCE)))
+        publisher.publish(base(2.0))
+        until(lambda: poses[-1].covariance is None)
+    assert isinstance(known, Pose)
+    assert (known.stamp, known.parent, known.child) == (5, "odom", "base_link")
+    assert from_block(known.pose).tolist() == base(1.0).pose7.tolist()
+    assert known.covariance is not None
+    assert covariance_matrix(known.covariance).tolist() == POSE_COVARIANCE.tolist()
+    assert (poses[-1].stamp, from_block(poses[-1].pose)[0]) == (7, 2.0)
 
 
 @pytest.mark.parametrize(

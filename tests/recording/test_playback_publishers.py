@@ -24,7 +24,7 @@ from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
+from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
 from zstate.recording.decode import ODOMETRY_STREAMS, SCAN_STREAMS, DecodedRecording
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
@@ -49,6 +49,7 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
 
 COUNT = 20
+SENSORS = ("imu/chest", "velocity/flow", "pose/mocap", "odometry/wheels")
 CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
 
 
@@ -142,6 +143,7 @@ def test_transforms_are_played_by_writers_of_the_same_names(sessions, tracked: P
         closing(SampleCollector(sessions[0], "zstate/cart/transforms/odometry")) as odometry,
         closing(SampleCollector(sessions[0], "zstate/cart/transforms/camera")) as camera,
     ):
+        wait_for_stream_readers(sessions[1], "cart", "transforms/odometry", "transforms/camera")
         assert replay(sessions[1], tracked) == 2 * COUNT
         for collector, edge, column in ((odometry, ("odom", "base"), 1), (camera, ("odom", "ball"), 0)):
             payloads = collector.payloads(COUNT)
@@ -392,23 +394,25 @@ def test_an_active_sensor_is_not_replayed(sessions, scanned: Path):
 
 @pytest.fixture
 def driven(sessions, tmp_path: Path) -> Path:
-    """A cart with an IMU, a velocity and odometry, recorded from the native wire."""
+    """A cart with an IMU, a velocity, poses and odometry, recorded from the native wire."""
     writer, reader = sessions
     path = tmp_path / "driven.mcap"
     with (
         ImuPublisher(writer, "cart", "chest") as imu,
         VelocityPublisher(writer, "cart", "flow") as velocity,
         OdometryPublisher(writer, "cart", "wheels") as odometry,
+        PosePublisher(writer, "cart", "mocap") as mocap,
         Recorder(reader, path, ["cart"]) as recorder,
     ):
-        wait_for_stream_readers(writer, "cart", "imu/chest", "velocity/flow", "odometry/wheels")
+        wait_for_stream_readers(writer, "cart", *SENSORS)
         for n in range(COUNT):
             stamp = START + n * 10 * MS
             imu.publish([n, 0, 0], [0, 0, 9.81], stamp)
             velocity.publish([n, 0, 0], stamp=stamp)
             base = Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1]).with_covariance(np.eye(6) * (n + 1))
             odometry.publish(base, [n, 0, 0], [0, 0, 0], stamp)
-        until(lambda: measured(recorder) == 3 * COUNT)
+            mocap.publish(base, stamp)
+        until(lambda: measured(recorder) == 4 * COUNT)
     return path
 
 
@@ -433,12 +437,12 @@ def test_sensors_and_odometry_are_replayed_as_they_were_recorded(sessions, drive
         TransformListener(reader, "cart") as listener,
         Recorder(reader, again, ["cart"]) as recorder,
     ):
-        wait_for_stream_readers(writer, "cart", "imu/chest", "velocity/flow", "odometry/wheels")
+        wait_for_stream_readers(writer, "cart", *SENSORS)
         with Player(writer, driven) as player:
             report = player.run()
-        until(lambda: measured(recorder) == 3 * COUNT)
+        until(lambda: measured(recorder) == 4 * COUNT)
         found = listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=SOON_S)
-    assert (report.samples, report.refused) == (3 * COUNT, {})
+    assert (report.samples, report.refused) == (4 * COUNT, {})
     assert messages(again) == messages(driven)
     assert found.translation[0] == 5.0
     assert found.covariance == pytest.approx(np.eye(6) * 6)
@@ -454,7 +458,7 @@ def test_odometry_is_replayed_to_ros_with_its_edge_on_tf(sessions, driven: Path)
     ):
         for stream, name in (("odometry", "wheels"), ("tf", "")):
             wait_for_reader(writer, RmwKeys(Ros2Options()).key("cart", stream, name))
-        assert player.run().samples == 4 * COUNT
+        assert player.run().samples == 5 * COUNT
         assert listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=SOON_S).translation[0] == 5.0
         until(lambda: len(samples) == COUNT)
 

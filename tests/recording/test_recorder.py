@@ -32,7 +32,8 @@ from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
+from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+from zstate.recording.decode import ODOMETRY_STREAMS
 from zstate.recording.info import read_info, recorded_robots
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
@@ -45,6 +46,7 @@ from zstate.wire.messages import (
     ClockMessage,
     JointCommand,
     JointState,
+    covariance_matrix,
     from_block,
     order_digest,
     to_block,
@@ -676,9 +678,10 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
         ImuPublisher(writer, "r1", "imu", [wire], frame="chest") as imu,
         VelocityPublisher(writer, "r1", "flow", [wire]) as velocity,
         OdometryPublisher(writer, "r1", "odom", [wire]) as odometry,
+        PosePublisher(writer, "r1", "mocap", [wire]) as mocap,
         Recorder(reader, path, ["r1"], wire=wire) as recorder,
     ):
-        for stream, name in (("imu", "imu"), ("velocity", "flow"), ("odometry", "odom")):
+        for stream, name in (("imu", "imu"), ("velocity", "flow"), ("pose", "mocap"), ("odometry", "odom")):
             keys = {"native": f"zstate/r1/{stream}/{name}", "ros2": ROS_KEYS.key("r1", stream, name)}
             wait_for_reader(writer, keys[wire])
         for k in range(5):
@@ -686,7 +689,8 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
             velocity.publish([k, 1, 2], stamp=now + k, covariance=np.eye(3))
             pose = Transform("odom", "base", [k, 0, 0], UPRIGHT).with_covariance(covariance * (k + 1))
             odometry.publish(pose, [k, 0, 0], [0, 0, 1], now + k * PERIOD, twist_covariance=covariance)
-        until(lambda: [count(recorder, "r1", one) for one in ("imu", "velocity", "odometry")] == [5] * 3)
+            mocap.publish(pose, now + k)
+        until(lambda: [count(recorder, "r1", one) for one in ODOMETRY_STREAMS] == [5] * 4)
         until(lambda: count(recorder, "r1", {"native": "transforms", "ros2": "tf"}[wire]) == 5)
         live = [listener.buffer.wait("odom", "base", at, SOON_S) for at in (now + PERIOD // 2, now + PERIOD)]
     assert (recorder.stats.missed, recorder.stats.refused) == (0, {})
@@ -696,20 +700,28 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
             by_topic.setdefault(topic, []).append(message)
         assert [one.angular_velocity.x for one in by_topic["/imu"]] == list(range(5))
         assert [one.twist.twist.linear.x for one in by_topic["/flow"]] == list(range(5))
+        assert [one.pose.pose.position.x for one in by_topic["/mocap"]] == list(range(5))
         assert [one.pose.pose.position.x for one in by_topic["/odom"]] == list(range(5))
         assert [one.transforms[0].child_frame_id for one in by_topic["/tf"]] == ["base"] * 5
     with Recording(path) as recording:
         readings, velocities = list(recording.imu("r1", "imu")), list(recording.velocities())
-        samples = list(recording.odometry("r1", "odom"))
+        samples, poses = list(recording.odometry("r1", "odom")), list(recording.poses("r1", "mocap"))
         buffer = recording.buffer()
         recorded = [buffer.lookup("odom", "base", at) for at in (now + PERIOD // 2, now + PERIOD)]
         streams = {one.stream for one in recorded_robots(recording.info)[0].streams}
     assert [(one.stamp, one.frame) for one in readings] == [(now + k, "r1/chest") for k in range(5)]
     assert [from_block(one.linear)[0] for one in velocities] == list(range(5))
     assert velocities[0].angular is None
+    child = {"native": "r1/base", "ros2": ""}[wire]
+    assert [(one.stamp, one.parent, one.child) for one in poses] == [
+        (now + k, "r1/odom", child) for k in range(5)
+    ]
+    assert [covariance_matrix(one.covariance)[5, 5] for one in poses] == pytest.approx(
+        [6e-3 * (k + 1) for k in range(5)]
+    )
     assert from_block(velocities[0].covariance).tolist() == [1, 0, 0, 1, 0, 1]
     assert [from_block(one.twist).tolist() for one in samples] == [[k, 0, 0, 0, 0, 1] for k in range(5)]
-    assert {"imu", "velocity", "odometry"} <= streams
+    assert set(ODOMETRY_STREAMS) <= streams
     for there, here in zip(live, recorded, strict=True):
         assert (there.pose7 == here.pose7).all()
         assert (here.kind, np.array_equal(there.covariance, here.covariance)) == (there.kind, True)

@@ -26,11 +26,11 @@ from zstate import Recording, TransformBuffer, UnknownFrame
 from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
 from zstate.transform import Transform
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import Imu, LaserScan, OccupancyGrid, to_block, to_float32_block
+from zstate.wire.messages import Imu, LaserScan, OccupancyGrid, Pose, to_block, to_float32_block
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
-from zstate.wire.ros2.types import IMU, LASER_SCAN, OCCUPANCY_GRID
+from zstate.wire.ros2.types import IMU, LASER_SCAN, OCCUPANCY_GRID, POSE_WITH_COVARIANCE
 
 
 def test_repr_has_duration_and_robots(tmp_path: Path):
@@ -310,6 +310,19 @@ def test_sensors_of_a_bag_are_those_of_its_robots_whatever_their_namespace(tmp_p
         (of_all,) = recording.imu("ros", "imu_data")
     assert (of_r1.frame, of_all.frame) == ("r1/imu_link", "ros/imu_link")
     assert of_r1.gyro == reading.gyro
+
+
+def test_covariances_of_edges_in_a_converted_recording_are_no_poses(tmp_path: Path):
+    encoder = RosStreamEncoder(FrameNames(Ros2Options(), "ros"), SampleLayout())
+    pose = Pose(START, 0, 1, "odom", "", to_block([1, 2, 3, 0, 0, 0, 1]))
+    message = STORE.deserialize_cdr(encoder.encode(pose), POSE_WITH_COVARIANCE.name)
+    with Bag(tmp_path / "bag") as bag:
+        for topic in ("/pose_with_covariance/base", "/r1/pose_with_covariance/base", "/mocap/pose"):
+            bag.write(topic, START, message, POSE_WITH_COVARIANCE.name)
+    with Recording(tmp_path / "bag") as recording:
+        (found,) = recording.poses()
+        assert [found] == list(recording.poses("ros", "mocap_pose"))
+    assert (found.parent, found.child, found.pose) == ("ros/odom", "", pose.pose)
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])

@@ -111,6 +111,7 @@ def test_every_key_of_a_robot_lies_under_its_own_prefix():
     assert keys.stream_key("hall", "map", "map") == "zstate/hall/map/map"
     assert keys.stream_key("r1", "imu", "imu") == "zstate/r1/imu/imu"
     assert keys.stream_key("r1", "velocity", "wheels") == "zstate/r1/velocity/wheels"
+    assert keys.stream_key("r1", "pose", "mocap") == "zstate/r1/pose/mocap"
     assert keys.stream_key("r1", "odometry", "odometry") == "zstate/r1/odometry/odometry"
     assert keys.lookup_key("panda") == "zstate/panda/lookup"
     assert keys.writer_key("panda", "tf", "x") == "zstate/panda/@writer/tf/x"

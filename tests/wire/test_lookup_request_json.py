@@ -20,6 +20,11 @@ def test_a_transform_survives_json_with_every_nanosecond() -> None:
     copy = from_json(to_json(transform))
     assert copy == transform
     assert copy.kind == "exact"
+    assert copy.covariance is None
+    covariance = [[float(row == column) for column in range(6)] for row in range(6)]
+    known = from_json(to_json(transform.with_covariance(covariance))).covariance
+    assert known is not None
+    assert known.tolist() == covariance
 
 
 def test_the_fields_have_the_names_of_the_constructor() -> None:

@@ -17,6 +17,7 @@ from zstate.wire.messages import (
     Message,
     OccupancyGrid,
     Odometry,
+    Pose,
     StaticTransforms,
     TransformSample,
     Velocity,
@@ -30,6 +31,7 @@ from zstate.wire.messages import (
     poses_from_block,
     to_block,
     to_float32_block,
+    with_full_names,
 )
 from zstate.wire.native import encode
 
@@ -167,6 +169,11 @@ def velocity(**changed: Any) -> Velocity:
     return Velocity(**{**fields, "linear": to_block([1, 0, 0]), **changed})
 
 
+def pose(**changed: Any) -> Pose:
+    fields: dict[str, Any] = {"stamp": 5, "seq": 0, "session": 1, "parent": "map", "child": "base"}
+    return Pose(**{**fields, "pose": to_block([1, 2, 3, 0, 0, 0, 1]), **changed})
+
+
 def odometry(**changed: Any) -> Odometry:
     edge = (("odom", "base"),)
     fields: dict[str, Any] = {
@@ -191,6 +198,11 @@ def odometry(**changed: Any) -> Odometry:
         (velocity, {"angular": to_block([np.inf, 0, 0])}, "finite numbers"),
         (velocity, {"covariance": to_block(range(21))}, "of 6 numbers take 48 bytes, not 168"),
         (velocity, {"angular": bytes(24), "covariance": bytes(48)}, "of 21 numbers take 168 bytes, not 48"),
+        (pose, {"parent": ""}, "1 to 1024 characters, not 0"),
+        (pose, {"child": "a" * 1025}, "1 to 1024 characters, not 1025"),
+        (pose, {"pose": bytes(56)}, "length 1, not 0"),
+        (pose, {"pose": to_block([np.nan, 0, 0, 0, 0, 0, 1])}, "a pose of finite numbers"),
+        (pose, {"covariance": to_block([-1.0, *range(20)])}, "variances of a pose are not negative"),
         (odometry, {"edges": None}, "odometry has one edge"),
         (odometry, {"poses": bytes(112)}, "1 edges need as many poses, not 2"),
         (odometry, {"covariances": bytes(168 * 2)}, "21 numbers of covariance each"),
@@ -210,6 +222,13 @@ def test_messages_of_sensors_and_odometry_fit_the_limit_of_their_streams():
     edge = ((frame, frame),)
     largest = odometry(edges=edge, order=order_digest(edge), covariances=six, twist_covariance=six)
     assert max(len(encode(one)) for one in (imu(frame=frame), largest)) <= MAX_BYTES["odometry"]
+
+
+def test_frames_of_a_measurement_get_their_full_names():
+    assert with_full_names(imu(), "r1").frame == "r1/imu"
+    placed = with_full_names(pose(parent="hall/map"), "r1")
+    assert (placed.parent, placed.child) == ("hall/map", "r1/base")
+    assert with_full_names(pose(child=""), "r1").child == ""  # of the base
 
 
 def test_odometry_is_a_sample_of_its_edge():

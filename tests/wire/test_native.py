@@ -27,6 +27,7 @@ from zstate.wire.messages import (
     MotionReply,
     OccupancyGrid,
     Odometry,
+    Pose,
     Release,
     RobotDescription,
     StaticTransforms,
@@ -221,6 +222,14 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + bin8(struct.pack("<3d", 1, 2, 3))
         + NIL
         + bin8(struct.pack("<6d", *range(6))),
+    ),
+    "pose": (
+        Pose(STAMP, 300, 2**63 + 5, "map", "base", to_block([1, 2, 3, 0, 0, 0, 1]), to_block(range(21))),
+        header(7)[:-10]
+        + fixstr("map")
+        + fixstr("base")
+        + bin8(struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1))
+        + bin8(struct.pack("<21d", *range(21))),
     ),
     "odometry": (
         Odometry(

@@ -402,9 +402,10 @@ class BufferCore:
         return inserted
 
     def insert_static(self, transform: Transform, *, writer: str | None = None) -> None:
-        """An edge that never moves, valid at every instant; its stamp is not used.
+        """An edge that never moves, valid at every instant; its stamp is not used, nor is its covariance.
 
-        Replaces the earlier edge of the child on that parent. Raises InsertRefused as ``insert``.
+        Static edges count as exact: the covariance of a lookup is that of its moving edges. Replaces the
+        earlier edge of the child on that parent. Raises InsertRefused as ``insert``.
         """
         with self._lock, self._tree.transaction():
             edge = self._pose_tracks.check_edge(transform.target, transform.source, writer)

@@ -62,8 +62,8 @@ class RobotInfo:
 
     ``static_names`` are (name, writer) for the names under which static edges are written, and
     ``transform_names`` and ``part_names`` the same for moving edges, and for drivers of some of its joints;
-    ``scan_names`` are its laser scanners, ``imu_names`` and ``velocity_names`` other sensors, ``map_names``
-    its maps, and ``odometry_names`` its writers of odometry.
+    ``scan_names`` are its laser scanners, ``imu_names``, ``velocity_names`` and ``pose_names`` other
+    sensors, ``map_names`` its maps, and ``odometry_names`` its writers of odometry.
     """
 
     name: str
@@ -75,6 +75,7 @@ class RobotInfo:
     map_names: tuple[tuple[str, WriterId], ...] = ()
     imu_names: tuple[tuple[str, WriterId], ...] = ()
     velocity_names: tuple[tuple[str, WriterId], ...] = ()
+    pose_names: tuple[tuple[str, WriterId], ...] = ()
     odometry_names: tuple[tuple[str, WriterId], ...] = ()
 
     def __repr__(self) -> str:
@@ -94,6 +95,7 @@ class RobotInfo:
             "map": self.map_names,
             "imu": self.imu_names,
             "velocity": self.velocity_names,
+            "pose": self.pose_names,
             "odometry": self.odometry_names,
         }.get(stream, ())
         return tuple(name for name, owner in names if owner == writer)
@@ -221,6 +223,7 @@ def by_robot(found: Iterable[Announcement]) -> tuple[RobotInfo, ...]:
             sorted_names(robot, "map"),
             sorted_names(robot, "imu"),
             sorted_names(robot, "velocity"),
+            sorted_names(robot, "pose"),
             sorted_names(robot, "odometry"),
         )
         for robot in sorted(writers)

@@ -130,10 +130,10 @@ class StaticPublisher(ValuePublisher):
     def set(self, transform: Transform) -> None:
         """Publish or replace the edge that places ``transform.source`` on ``transform.target``.
 
-        Raises InsertRefused for a self edge, a loop or a second parent among this writer's edges; on the
-        native wire also for an edge that contradicts an announced model, or that places a frame of another
-        robot if that robot, or a third one, places it. Raises InvalidInput for names that cannot be frames,
-        SecondWriter and Closed.
+        Static edges count as exact: its covariance is not published. Raises InsertRefused for a self edge, a
+        loop or a second parent among this writer's edges; on the native wire also for an edge that
+        contradicts an announced model, or that places a frame of another robot if that robot, or a third one,
+        places it. Raises InvalidInput for names that cannot be frames, SecondWriter and Closed.
         """
         parent = full_name(self.robot, transform.target)
         child = full_name(self.robot, transform.source)

@@ -7,7 +7,7 @@ from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThreshold
 from zstate.odometry.listener import SensorListener
 from zstate.odometry.map_correction import MapCorrection
 from zstate.odometry.node import OdometryNode
-from zstate.odometry.publishers import ImuPublisher, OdometryPublisher, VelocityPublisher
+from zstate.odometry.publishers import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
 from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
 from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
@@ -26,6 +26,7 @@ __all__ = [
     "Mecanum",
     "OdometryNode",
     "OdometryPublisher",
+    "PosePublisher",
     "SensorListener",
     "SimulatedRover",
     "SimulatedWheels",

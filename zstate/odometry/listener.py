@@ -1,4 +1,4 @@
-"""SensorListener: the inertial measurements and the velocities of a robot, handed to callbacks."""
+"""SensorListener: the inertial measurements, velocities and poses of a robot, handed to callbacks."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from zstate.errors import InvalidInput
 from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
-from zstate.wire.keys import Stream, check_robot, full_name, shortened
-from zstate.wire.messages import Imu, Velocity, in_frame
+from zstate.wire.keys import Stream, check_robot, shortened
+from zstate.wire.messages import Imu, Pose, Velocity, with_full_names
 from zstate.wire.registry import get_wire
 
 
 class SensorListener(Closeable):
-    """Calls ``on_imu(sensor, message)`` and ``on_velocity(sensor, message)`` for each message of a robot.
+    """Calls ``on_imu``, ``on_velocity`` or ``on_pose`` with the sensor's name and each message of a robot.
 
-    The frame of a message has its full name. Each callback has a thread of its own, and gets the messages in
-    the order of their arrival; a stream without a callback is not subscribed. If a callback is slow, the
-    oldest messages are lost. ``refused`` counts, by reason, messages that cannot be used and those that a
-    callback refuses by raising InvalidInput; the first of each reason is also logged. A context manager.
+    The frames of a message have their full names; the child of a pose is empty for the base of the robot.
+    Each callback has a thread of its own, and gets the messages in the order of their arrival; a stream
+    without a callback is not subscribed. If a callback is slow, the oldest messages are lost. ``refused``
+    counts, by reason, messages that cannot be used and those that a callback refuses by raising InvalidInput;
+    the first of each reason is also logged. A context manager.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class SensorListener(Closeable):
         *,
         on_imu: Callable[[str, Imu], object] | None = None,
         on_velocity: Callable[[str, Velocity], object] | None = None,
+        on_pose: Callable[[str, Pose], object] | None = None,
         wire: str = "native",
     ) -> None:
         self.robot = check_robot(robot)
@@ -45,6 +47,8 @@ class SensorListener(Closeable):
             callbacks["imu"] = on_imu
         if on_velocity is not None:
             callbacks["velocity"] = on_velocity
+        if on_pose is not None:
+            callbacks["pose"] = on_pose
         with ExitStack() as opening:
             for stream, callback in callbacks.items():
                 on_messages = partial(self._on_messages, callback)
@@ -61,11 +65,9 @@ class SensorListener(Closeable):
 
     def _on_messages(self, callback: Callable[[str, Any], object], received: list[Received]) -> None:
         for robot, key, message in received:
-            assert isinstance(message, Imu | Velocity)
+            assert isinstance(message, Imu | Velocity | Pose)
             try:
-                frame = full_name(robot, message.frame)
-                sensor = self._wire.edge_writer_name(key) or frame
-                callback(sensor, in_frame(message, frame))
+                callback(self._wire.edge_writer_name(key) or "", with_full_names(message, robot))
             except InvalidInput as error:
                 self._refusals.count("refused", f"{shortened(key)}: {error}")
 

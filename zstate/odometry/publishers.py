@@ -1,4 +1,4 @@
-"""Publishers of inertial measurements, of velocities, and of odometry."""
+"""Publishers of inertial measurements, of velocities and poses, and of odometry."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from zstate.errors import InvalidInput
 from zstate.net.session import Session
 from zstate.nodes.sample_publisher import SensorPublisher
 from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
-from zstate.transform import Transform, check_covariance
+from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
 from zstate.wire.keys import full_name
-from zstate.wire.messages import Imu, Odometry, Velocity, to_block
+from zstate.wire.messages import Imu, Odometry, Pose, Velocity, to_block
 
 
 class ImuPublisher(SensorPublisher):
@@ -118,6 +118,44 @@ class VelocityPublisher(SensorPublisher):
             triangle = _covariance(covariance, "covariance", 3 if angular is None else 6)
             vector = _numbers(linear, "linear", 3)
             self._publish_message(Velocity(stamp, 0, 0, self.frame, vector, turn, triangle))
+
+
+class PosePublisher(SensorPublisher):
+    """Publishes the poses that one sensor of a robot measures: motion capture, a marker, a scan matcher.
+
+    They are measurements, no edges: no lookup uses them. In ROS the message names the parent alone, and
+    readers take the child for the base of the robot. Sensors, writers and threads are those of
+    ``ImuPublisher``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        sensor: str = "pose",
+        wires: str | Sequence[str] = ("native",),
+        *,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        super().__init__(session, robot, "pose", sensor, wires=wires, clock=clock, program=program)
+
+    def publish(self, parent_from_child: Transform, stamp: int | None = None) -> None:
+        """Publish one pose, with its covariance if that is known, at ``stamp`` [ns].
+
+        The default stamp is that of the transform, or now if it has none. Bare frame names are the robot's
+        own. Raises as ``ImuPublisher.publish``.
+        """
+        with self._refusals_counted():
+            if stamp is None:
+                stamp = self._clock.now() if parent_from_child.stamp is None else parent_from_child.stamp
+            check_stamp(stamp)
+            parent, child = parent_from_child.target, parent_from_child.source
+            for frame in (parent, child):
+                full_name(self.robot, frame)
+            pose, covariance = to_block(parent_from_child.pose7), parent_from_child.covariance
+            triangle = None if covariance is None else to_block(covariance[UPPER_TRIANGLE])
+            self._publish_message(Pose(stamp, 0, 0, parent, child, pose, triangle))
 
 
 class OdometryPublisher(EdgePublisher):

@@ -58,6 +58,11 @@ def covariance_topic(namespace: str, child: str) -> str:
     return f"/{namespace}{topic}" if namespace else topic
 
 
+def is_covariance_topic(topic: str) -> bool:
+    """Whether ``topic`` is one of covariances, also in a file without metadata of ours."""
+    return topic.rpartition("/")[0].endswith("/pose_with_covariance")
+
+
 def child_frame(channel: Channel) -> str | None:
     """The child frame of a channel of covariances, as it is named in /tf; None for other channels."""
     if channel.type_name != POSE_WITH_COVARIANCE.name or EDGE_WRITER not in channel.metadata:

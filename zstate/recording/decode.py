@@ -14,9 +14,9 @@ from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance
+from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance, is_covariance_topic
 from zstate.recording.driver_messages import DRIVER_TYPES, decode_command, decode_status, driver_stream
-from zstate.recording.encode import TOPICS, StaticAccumulator
+from zstate.recording.encode import POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
 from zstate.wire.keys import Stream
@@ -24,9 +24,11 @@ from zstate.wire.messages import (
     JointState,
     Message,
     OccupancyGrid,
+    Pose,
     RobotDescription,
     StaticTransforms,
     TransformSample,
+    with_child,
 )
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
@@ -41,7 +43,7 @@ joint_states with such a name."""
 SCAN_STREAMS: tuple[Stream, ...] = ("scan", "map")
 """Further streams that can be decoded: the channels of these types, whatever their topic is."""
 
-ODOMETRY_STREAMS: tuple[Stream, ...] = ("imu", "velocity", "odometry")
+ODOMETRY_STREAMS: tuple[Stream, ...] = ("imu", "velocity", "pose", "odometry")
 """Likewise. The edges of odometry are recorded on tf as well, and read from there."""
 
 _NAMED: dict[Stream, Stream] = {topic: named for named, topic in TOPICS.items()}
@@ -75,8 +77,8 @@ class RecordedWriter:
     def from_channel(cls, channel: Channel, robots: Collection[str] = ()) -> RecordedWriter | None:
         """The writer of ``channel``; None if it is no stream of a robot.
 
-        Topics of IMUs, velocities and odometry in a bag are those of one of ``robots``, or of "ros": their
-        namespace may be that of a sensor.
+        Topics of IMUs, velocities, poses and odometry in a bag are those of one of ``robots``, or of "ros":
+        their namespace may be that of a sensor.
         """
         stream: Stream = "transforms"
         name, facts = channel.topic.rpartition("/")[2], channel.metadata
@@ -95,6 +97,8 @@ class RecordedWriter:
             stream = _NAMED.get(stream, stream)
         digest = blake2b(channel.topic.encode(), digest_size=4).digest()
         robot = robot_from_topic(channel.topic) if foreign else facts.get(ROBOT, "")
+        if foreign and stream == "pose" and is_covariance_topic(channel.topic):
+            return None
         if foreign and stream in ODOMETRY_STREAMS:
             robot, name = _sensor_from_topic(channel.topic, robots)
         return cls(
@@ -247,7 +251,8 @@ class DecodedRecording:
             self._refuse(error.reason, f"{record.topic}: {error}")
             return
         for message in messages:
-            yield DecodedMessage(writer, message, record.log_time)
+            content = with_child(message, channel.posed) if isinstance(message, Pose) else message
+            yield DecodedMessage(writer, content, record.log_time)
 
     def records(
         self,
@@ -284,7 +289,11 @@ class DecodedRecording:
                 options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))
                 names = FrameNames(options, writer.robot or SHARED)
                 topic = TOPICS.get(writer.stream, writer.stream)
-                decoder = ChannelDecoder(writer, topic, names, RosDecoder(), child_frame(channel) or "")
+                posed = channel.metadata.get(POSED_FRAME, "")
+                decoder = ChannelDecoder(
+                    *(writer, topic, names, RosDecoder(), child_frame(channel) or ""),
+                    posed and names.to_zstate(posed),
+                )
             self._known[channel] = decoder
         return self._known[channel]
 
@@ -292,7 +301,8 @@ class DecodedRecording:
 class ChannelDecoder(NamedTuple):
     """The writer of a channel, the stream that its topic is named after, and the decoder of its messages.
 
-    A channel of covariances has those of the child frame ``covariances_of``, by its name in ROS.
+    A channel of covariances has those of the child frame ``covariances_of``, by its name in ROS; one of
+    poses, those of the frame ``posed``, empty for the base of the robot.
     """
 
     writer: RecordedWriter
@@ -300,6 +310,7 @@ class ChannelDecoder(NamedTuple):
     names: FrameNames
     ros: RosDecoder
     covariances_of: str
+    posed: str
 
 
 class LatchedState:

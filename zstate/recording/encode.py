@@ -41,6 +41,7 @@ from zstate.wire.messages import (
     Message,
     OccupancyGrid,
     Odometry,
+    Pose,
     RobotDescription,
     Sample,
     StampedMessage,
@@ -87,6 +88,7 @@ _STREAMS: dict[type[Message], Stream] = {
     LaserScan: "scan",
     Imu: "imu",
     Velocity: "velocity",
+    Pose: "pose",
     Odometry: "odometry",
     OccupancyGrid: "map",
     ClockMessage: "clock",
@@ -101,6 +103,9 @@ _NAMED_STREAMS: dict[type[Message], Stream] = {
 
 TOPICS: dict[Stream, Stream] = {"transforms": "tf", "partial_joint_states": "joint_states"}
 """The streams after which the topics of others are named: ROS has no topics of single writers."""
+
+POSED_FRAME = "zstate.posed_frame"
+"""Channel metadata key of the frame whose measured poses a channel has, as it is named in /tf."""
 
 NO_MAP = OccupancyGrid(0, 1, "map", 1.0, 0, 0, to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), b"")
 """Recorded when a map is withdrawn."""
@@ -226,7 +231,8 @@ class RecordingEncoder:
             edges = sample_names.moving_edges if message.edges is None else message.edges
             for one in known_covariances(message, edges):
                 self._write_covariance(robot, message, one, log_time, edge_writer)
-        channel = self._channel(robot, stream, message.session, log_time, edge_writer)
+        child = message.child if isinstance(message, Pose) else ""
+        channel = self._channel(robot, stream, message.session, log_time, edge_writer, child=child)
         payload = channel.encode(message, sample_names)
         # MCAP begins in 1970; the payload keeps an earlier stamp.
         publish_time = max(message.stamp, 0)
@@ -255,7 +261,7 @@ class RecordingEncoder:
         """Write the covariance of one edge, before its sample."""
         try:
             channel = self._channel(
-                robot, "transforms", sample.session, log_time, edge_writer, covariances_of=covariance.child
+                robot, "transforms", sample.session, log_time, edge_writer, child=covariance.child
             )
         except _TooManyWriters as error:  # the sample itself may have a channel
             self._refuse("too many writers", f"{robot!r}, covariance of {covariance.child!r}: {error}")
@@ -334,11 +340,11 @@ class RecordingEncoder:
         log_time: int,
         edge_writer: str = "",
         *,
-        covariances_of: str = "",
+        child: str = "",
         program: str = "",
     ) -> ChannelEncoder:
-        """The channel of a writer's stream, or of the covariances of one of its child frames."""
-        key = (stream, session, edge_writer, covariances_of)
+        """The channel of a writer's stream; with ``child`` of the covariances, or measured poses, of it."""
+        key = (stream, session, edge_writer, child)
         opened = self._channels[robot]
         channel = opened.find(key)
         if channel is not None:
@@ -361,9 +367,11 @@ class RecordingEncoder:
         else:
             topic, kind = RmwKeys(options).topic(robot, carrier, ros_name(edge_writer)), ros_type(carrier)
             qos = STREAM_QOS[carrier]
-        if covariances_of:
-            metadata[CHILD_FRAME] = child = names.to_ros(covariances_of)
-            topic, kind = covariance_topic(options.namespace, names.to_zstate(child)), POSE_WITH_COVARIANCE
+        if child and stream == "pose":
+            metadata[POSED_FRAME] = names.to_ros(child)
+        elif child:
+            metadata[CHILD_FRAME] = in_ros = names.to_ros(child)
+            topic, kind = covariance_topic(options.namespace, names.to_zstate(in_ros)), POSE_WITH_COVARIANCE
         number = self._writer.channel(topic, kind, qos, metadata)
         channel = ChannelEncoder(number, stream, names)
         for unused in opened.add(key, channel, self._latched.get(robot, {}).values()):

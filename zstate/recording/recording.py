@@ -66,6 +66,7 @@ from zstate.wire.messages import (
     LaserScan,
     OccupancyGrid,
     Odometry,
+    Pose,
     RobotDescription,
     Sample,
     StaticTransforms,
@@ -73,8 +74,8 @@ from zstate.wire.messages import (
     TransformSample,
     Velocity,
     covariances_of,
-    in_frame,
     poses_from_block,
+    with_full_names,
 )
 
 # A buffer that keeps a whole recording: 28 years, on any clock.
@@ -83,7 +84,7 @@ HISTORY_S = 9e8
 _BATCH = 4096
 _UNNAMED = "a ROS node"
 
-_Measurement = TypeVar("_Measurement", Imu, Velocity)
+_Measurement = TypeVar("_Measurement", Imu, Velocity, Pose)
 
 
 class Recording(Closeable):
@@ -242,6 +243,10 @@ class Recording(Closeable):
         """The measured velocities of ``robot``, likewise."""
         return self._measurements(Velocity, robot, "velocity", sensor)
 
+    def poses(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Pose]:
+        """The measured poses of ``robot``, likewise. The child is empty for its base, as in ROS."""
+        return self._measurements(Pose, robot, "pose", sensor)
+
     def odometry(self, robot: str | None = None, writer: str | None = None) -> Iterator[Odometry]:
         """The odometry of ``robot``, by default of all robots, or of one ``writer``, likewise.
 
@@ -259,7 +264,7 @@ class Recording(Closeable):
         for writer, message, _ in self._messages(robot, stream, refusals):
             if isinstance(message, kind) and sensor in (None, writer.edge_writer):
                 try:
-                    yield in_frame(message, full_name(writer.robot, message.frame))
+                    yield with_full_names(message, writer.robot)
                 except InvalidInput as error:
                     refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
 

@@ -10,6 +10,7 @@
 ``zstate/<robot>/scan/<sensor>``                  LaserScan, each scan; the sensor is the writer's name
 ``zstate/<robot>/imu/<sensor>``                   Imu, each reading; the sensor is the writer's name
 ``zstate/<robot>/velocity/<sensor>``              Velocity, each measurement; likewise
+``zstate/<robot>/pose/<sensor>``                  Pose, each measurement; likewise
 ``zstate/<robot>/odometry/<writer>``              Odometry, each sample; a query returns a HistoryPage
 ``zstate/<robot>/map/<writer>``                   OccupancyGrid, latched
 ``zstate/<robot>/joint_commands``                 JointCommand, to a driver
@@ -58,6 +59,7 @@ Stream = Literal[
     "map",
     "imu",
     "velocity",
+    "pose",
     "odometry",
     "clock",
 ]
@@ -66,14 +68,17 @@ CLOCK_KEY = "zstate/clock"
 ANY = "*"
 
 NAMED_STREAMS: frozenset[Stream] = frozenset(
-    {"tf_static", "transforms", "partial_joint_states", "stop", "scan", "map", "imu", "velocity", "odometry"}
+    {
+        *("tf_static", "transforms", "partial_joint_states", "odometry", "map"),
+        *("scan", "imu", "velocity", "pose", "stop"),
+    }
 )
 """The streams with one key for each of the writer names of a robot."""
 
 EDGE_STREAMS: tuple[Stream, ...] = ("transforms", "odometry")
 """The streams of moving edges under the names of their writers."""
 
-SENSOR_STREAMS: tuple[Stream, ...] = ("scan", "imu", "velocity")
+SENSOR_STREAMS: tuple[Stream, ...] = ("scan", "imu", "velocity", "pose")
 """The streams of sensors under their names."""
 
 LATCHED_STREAMS: frozenset[Stream] = frozenset({"robot_description", "tf_static", "map"})

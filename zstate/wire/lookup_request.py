@@ -95,6 +95,7 @@ class TransformJson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rotation: tuple[float, float, float, float]
     stamp: int | None = None
     kind: Literal["static", "exact", "interpolated", "predicted"] | None = None
+    covariance: list[list[float]] | None = None
 
 
 _DECODER = msgspec.json.Decoder(TransformJson)

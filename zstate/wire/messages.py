@@ -22,7 +22,7 @@ from msgspec import Meta, Struct
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, Stream
+from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, Stream, full_name
 
 Edges = tuple[tuple[str, str], ...]
 Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -534,10 +534,7 @@ class Imu(StampedMessage, frozen=True, array_like=True, gc=False):
         _check_covariance("accelerations", self.accel_covariance, 3)
         _check_covariance("an orientation", self.orientation_covariance, 3)
         if self.orientation is not None:
-            quaternion = _finite_numbers("an orientation", self.orientation, 4)
-            length = sqrt(sum(number * number for number in quaternion))
-            if not abs(length - 1.0) <= _UNIT_TOLERANCE:
-                raise InvalidInput(f"an orientation is a quaternion of length 1, not {length:.6g}")
+            _check_quaternion(_finite_numbers("an orientation", self.orientation, 4))
         elif self.orientation_covariance is not None:
             raise InvalidInput("the covariance of an orientation needs an orientation")
 
@@ -563,12 +560,41 @@ class Velocity(StampedMessage, frozen=True, array_like=True, gc=False):
         _check_covariance("velocities", self.covariance, 3 if self.angular is None else 6)
 
 
-_InFrame = TypeVar("_InFrame", bound="Imu | Velocity")
+class Pose(StampedMessage, frozen=True, array_like=True, gc=False):
+    """A measured pose of ``child`` in ``parent``, which are named as in edges; it is no edge of the tree.
+
+    ``child`` is empty for the base of the robot, which ROS does not name. ``pose`` is a block of
+    ``parent_from_child``: x y z [m], qx qy qz qw. ``covariance`` is a block of the upper triangle, 21 numbers
+    as in WriterTransforms, or None if it is not known.
+    """
+
+    parent: str
+    child: str
+    pose: bytes
+    covariance: bytes | None = None
+
+    def __post_init__(self) -> None:
+        _check_frame(self.parent)
+        if self.child:
+            _check_frame(self.child)
+        _check_quaternion(_finite_numbers("a pose", self.pose, 7)[3:])
+        _check_covariance("a pose", self.covariance, 6)
 
 
-def in_frame(message: _InFrame, frame: str) -> _InFrame:
-    """The same message with another name of its frame."""
-    return msgspec.structs.replace(message, frame=frame)
+def with_child(pose: Pose, child: str) -> Pose:
+    """The same pose of another frame."""
+    return msgspec.structs.replace(pose, child=child)
+
+
+_Measurement = TypeVar("_Measurement", bound="Imu | Velocity | Pose")
+
+
+def with_full_names(message: _Measurement, robot: str) -> _Measurement:
+    """The same message of ``robot`` with the full names of its frames. Raises InvalidInput."""
+    if isinstance(message, Pose):
+        parent, child = full_name(robot, message.parent), message.child and full_name(robot, message.child)
+        return msgspec.structs.replace(message, parent=parent, child=child)
+    return msgspec.structs.replace(message, frame=full_name(robot, message.frame))
 
 
 def covariance_matrix(triangle: bytes) -> NDArray[np.float64]:
@@ -700,6 +726,12 @@ def _finite_numbers(what: str, block: bytes, count: int) -> tuple[float, ...]:
     return numbers
 
 
+def _check_quaternion(quaternion: Sequence[float]) -> None:
+    length = sqrt(sum(number * number for number in quaternion))
+    if not abs(length - 1.0) <= _UNIT_TOLERANCE:
+        raise InvalidInput(f"an orientation is a quaternion of length 1, not {length:.6g}")
+
+
 def _check_covariance(what: str, triangle: bytes | None, size: int) -> None:
     """Raise InvalidInput unless it is None or the upper triangle of a covariance of ``size`` numbers."""
     if triangle is None:
@@ -752,6 +784,7 @@ MAX_BYTES: Mapping[Stream, int] = {
     "scan": SCAN_BYTES,
     "imu": SENSOR_BYTES,
     "velocity": SENSOR_BYTES,
+    "pose": SENSOR_BYTES,
     "odometry": SENSOR_BYTES,
     "tf_static": 1_000_000,
     "robot_description": LATCHED_BYTES,

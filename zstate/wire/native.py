@@ -34,6 +34,7 @@ from zstate.wire.messages import (
     MotionReply,
     OccupancyGrid,
     Odometry,
+    Pose,
     Release,
     RobotDescription,
     StaticTransforms,
@@ -69,6 +70,7 @@ ENCODINGS: dict[type[Message], str] = {
     OccupancyGrid: "zstate/OccupancyGrid;v=1",
     Imu: "zstate/Imu;v=1",
     Velocity: "zstate/Velocity;v=1",
+    Pose: "zstate/Pose;v=1",
     Odometry: "zstate/Odometry;v=1",
     ClockMessage: "zstate/Clock;v=1",
     Status: "zstate/Status;v=1",
@@ -89,6 +91,7 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "map": OccupancyGrid,
     "imu": Imu,
     "velocity": Velocity,
+    "pose": Pose,
     "odometry": Odometry,
     "clock": ClockMessage,
 }

@@ -111,8 +111,8 @@ class Wire(WriterTokens, Protocol):
 
     A stream carries the same messages in each: JointState on ``joint_states``, TransformSample on ``tf``,
     StaticTransforms on ``tf_static``, RobotDescription on ``robot_description``, LaserScan on ``scan``,
-    OccupancyGrid on ``map``, Imu on ``imu``, Velocity on ``velocity``, Odometry on ``odometry``, Clock on
-    ``clock``.
+    OccupancyGrid on ``map``, Imu on ``imu``, Velocity on ``velocity``, Pose on ``pose``, Odometry on
+    ``odometry``, Clock on ``clock``.
     Decoding may keep state, so each reader has an instance of its own.
     """
 

@@ -16,7 +16,7 @@ from helpers.robots import SampleCollector, wait_for_reader
 
 from zstate import Transform, connect
 from zstate.cli.output.joint_state_text import ChangeFilter
-from zstate.odometry import ImuPublisher, OdometryPublisher, VelocityPublisher
+from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
 
 pytestmark = pytest.mark.processes
 
@@ -236,6 +236,13 @@ def test_a_topic_of_ros_leads_to_its_wire(command: str):
                 "pose_sigma": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
             },
         ),
+        (
+            "pose",
+            {
+                **{"parent": "r1/odom", "child": "r1/base", "translation": [1.0, 0.0, 0.0]},
+                **{"rotation": [0.0, 0.0, 0.0, 1.0], "pose_sigma": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]},
+            },
+        ),
         ("imu", {"frame": "r1/chest", "gyro": [0.0, 0.0, 0.25], "accel": [0.0, 0.0, 9.81]}),
         ("velocity", {"frame": "r1/flow", "linear": [0.5, 0.0, 0.0], "velocity_sigma": [2.0, 2.0, 2.0]}),
     ],
@@ -248,12 +255,14 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
         OdometryPublisher(session, "r1") as odometry,
         ImuPublisher(session, "r1", frame="chest") as imu,
         VelocityPublisher(session, "r1", "flow") as velocity,
+        PosePublisher(session, "r1", "mocap") as mocap,
     ):
 
         def publish() -> None:
             odometry.publish(base, [0.5, 0, 0], [0, 0, 0.25])
             imu.publish([0, 0, 0.25], [0, 0, 9.81])
             velocity.publish([0.5, 0, 0], covariance=np.eye(3) * 4)
+            mocap.publish(base)
 
         with repeated(publish):
             document = json.loads(zstate("echo", "r1", "--stream", stream, "--once", "--json").stdout)
@@ -262,7 +271,7 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
     assert {name: value for name, value in document.items() if name not in ("stamp", "seq")} == expected
     assert rate["rate_hz"] > 1.0
     names = {writer["stream"]: writer["names"] for writer in listed[0]["writers"]}
-    assert names == {"odometry": ["odometry"], "imu": ["imu"], "velocity": ["flow"]}
+    assert names == {"odometry": ["odometry"], "imu": ["imu"], "velocity": ["flow"], "pose": ["mocap"]}
     assert all(writer["rate_hz"] for writer in listed[0]["writers"])
 
 

@@ -21,6 +21,7 @@ from zstate.clock import ManualClock, SystemClock
 from zstate.driving import Commander, stop
 from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.odometry import ImuPublisher, OdometryPublisher
 from zstate.wire.keys import Stream
 
 pytestmark = pytest.mark.processes
@@ -207,6 +208,27 @@ def test_stamps_of_one_of_several_drivers_are_reported():
     assert found["name"] == "stamps"
     assert found["text"].startswith("gripper.py@")
     assert "in the future" in found["text"]
+
+
+def test_robot_with_odometry_and_an_imu_is_sound_if_the_frame_of_the_imu_is_placed():
+    base = Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    with (
+        connect() as session,
+        OdometryPublisher(session, "cart", "wheels") as odometry,
+        ImuPublisher(session, "cart", "chest", frame="base_imu") as imu,
+        repeated(lambda: odometry.publish(base, [0, 0, 0], [0, 0, 0])),
+        repeated(lambda: imu.publish([0, 0, 0], [0, 0, 9.81])),
+    ):
+        found = broken_link("cart")
+        assert "the readings of 'chest' are in 'cart/base_imu', which no writer places" in found["text"]
+        with StaticPublisher(session, "cart", "mount") as statics:
+            statics.set(Transform("base", "base_imu", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
+            report = diagnosed("cart", code=0)
+    texts = {check["name"]: check["text"] for check in report["checks"]}
+    assert report["sound"]
+    assert re.search(r"Hz from .* as 'wheels'", texts["odometry"])
+    assert re.search(r"Hz from .* as 'chest'", texts["imu"])
+    assert re.fullmatch(r"3 frames in one tree; cart/base(_imu)? in cart/odom is known", texts["poses"])
 
 
 def test_robot_with_transforms_only_is_sound():

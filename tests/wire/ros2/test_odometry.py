@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import Imu, Message, Odometry, Velocity, from_block, order_digest, to_block
+from zstate.wire.messages import Imu, Message, Odometry, Pose, Velocity, from_block, order_digest, to_block
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
-from zstate.wire.ros2.types import IMU, ODOMETRY, TWIST_WITH_COVARIANCE
+from zstate.wire.ros2.types import IMU, ODOMETRY, POSE_WITH_COVARIANCE, TWIST_WITH_COVARIANCE
 
 STAMP = 1_700_000_000_123_456_789
 PLAIN, PREFIXED = FrameNames(Ros2Options(), "r1"), FrameNames(Ros2Options(frame_prefix="r1/"), "r1")
@@ -69,14 +69,21 @@ def rosbags_velocity(numbers: Any, covariance: Any, frame: str = "base", **optio
     )
 
 
+def rosbags_pose_part(covariance: Any, rotation: Any = POSE[3:]) -> object:
+    pose = STORE.types["geometry_msgs/msg/Pose"](vector("Point", POSE[:3]), vector("Quaternion", rotation))
+    matrix = np.array(covariance, dtype=float).ravel()
+    return STORE.types["geometry_msgs/msg/PoseWithCovariance"](pose, matrix)
+
+
+def rosbags_pose(covariance: Any, rotation: Any = POSE[3:], frame: str = "map") -> bytes:
+    return rosbags_cdr(POSE_WITH_COVARIANCE.name, header(frame), rosbags_pose_part(covariance, rotation))
+
+
 def rosbags_odometry(
     pose_covariance: Any, twist_covariance: Any, parent: str = "odom", **options: bool
 ) -> bytes:
-    pose = STORE.types["geometry_msgs/msg/Pose"](vector("Point", POSE[:3]), vector("Quaternion", POSE[3:]))
-    matrix = np.array(pose_covariance, dtype=float).ravel()
-    with_covariance = STORE.types["geometry_msgs/msg/PoseWithCovariance"](pose, matrix)
-    twist = rosbags_twist(TWIST, twist_covariance)
-    return rosbags_cdr(ODOMETRY.name, header(parent), "base", with_covariance, twist, **options)
+    parts = rosbags_pose_part(pose_covariance), rosbags_twist(TWIST, twist_covariance)
+    return rosbags_cdr(ODOMETRY.name, header(parent), "base", *parts, **options)
 
 
 def encoded(message: Message, names: FrameNames = PLAIN) -> bytes:
@@ -128,6 +135,12 @@ CASES = [
         Odometry(*ODOMETRY_HEAD, triangle(symmetric(6)), to_block(TWIST), triangle(symmetric(6, 50))),
         rosbags_odometry(symmetric(6), symmetric(6, 50)),
     ),
+    (
+        "pose",
+        Pose(*HEAD, "map", "", to_block(POSE), triangle(symmetric(6))),
+        rosbags_pose(symmetric(6)),
+    ),
+    ("pose", Pose(*HEAD, "map", "", to_block(POSE)), rosbags_pose(np.zeros((6, 6)))),
     (
         "odometry",
         Odometry(*ODOMETRY_HEAD, None, to_block(TWIST), None),
@@ -186,6 +199,8 @@ def test_orientation_of_zeros_is_none():
         ("velocity", rosbags_velocity(TWIST, -symmetric(6)), "malformed", "variances .* not negative"),
         ("velocity", rosbags_velocity(TWIST, LINEAR_ONLY), "malformed", "symmetric and finite"),
         ("velocity", rosbags_velocity([*NAN3, *NAN3], LINEAR_ONLY), "malformed", "finite numbers"),
+        ("pose", rosbags_pose(symmetric(6), [0, 0, 0, 0]), "malformed", "length 1, not 0"),
+        ("pose", rosbags_pose(-symmetric(6)), "malformed", "variances of a pose are not negative"),
         ("odometry", rosbags_odometry(symmetric(6) * np.inf, symmetric(6)), "malformed", "finite"),
     ],
 )
@@ -228,7 +243,7 @@ def test_a_velocity_is_the_same_after_ros(numbers: list[float], has_angular: boo
     assert decoded("velocity", encoded(velocity)) == velocity
 
 
-@given(st.binary(max_size=400), st.sampled_from(["imu", "velocity", "odometry"]), st.booleans())
+@given(st.binary(max_size=400), st.sampled_from(["imu", "velocity", "pose", "odometry"]), st.booleans())
 def test_arbitrary_bytes_raise_only_message_error(data: bytes, stream: Any, has_header: bool):
     payload = b"\x00\x01\x00\x00" + data if has_header else data
     try:

@@ -203,6 +203,7 @@ STREAMS = st.sampled_from(
         "map",
         "imu",
         "velocity",
+        "pose",
         "odometry",
         "clock",
     ]

@@ -33,7 +33,7 @@ def _check_amount(amount: float) -> float:
     type=click.Choice(
         [
             *("joint_states", "partial_joint_states", "joint_setpoints", "transforms", "odometry"),
-            *("imu", "velocity", "scan", "map"),
+            *("imu", "velocity", "pose", "scan", "map"),
         ]
     ),
     default="joint_states",
@@ -76,7 +76,7 @@ def echo_command(
     ROBOT may be left out if only one robot is announced. Transforms, and partial joint states, are those of
     all their writers; on a ROS wire these are all messages of /tf, or /joint_states. Joint setpoints are what
     the program that owns the robot's hardware writes to it, while it moves or holds the joints. Of known
-    covariances of odometry, IMUs and velocities the standard deviations are printed, in the same units. A
+    covariances of odometry and measurements the standard deviations are printed, in the same units. A
     scan or a map is a summary: geometry and counts; --json, --csv and --field also have the ranges of a scan
     [m], null where nothing was measured.
 
@@ -100,6 +100,7 @@ def echo_command(
         imu_document,
         map_document,
         odometry_document,
+        pose_document,
         scan_document,
         select_field,
         transforms_document,
@@ -137,6 +138,7 @@ def echo_command(
             "map": map_document,
             "imu": imu_document,
             "velocity": velocity_document,
+            "pose": pose_document,
             "odometry": odometry_document,
         }
         if stream == "scan":

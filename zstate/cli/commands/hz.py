@@ -27,7 +27,7 @@ _SETTLING_S = 0.1
     type=click.Choice(
         [
             *("joint_states", "partial_joint_states", "joint_setpoints", "tf", "transforms", "odometry"),
-            *("imu", "velocity", "scan"),
+            *("imu", "velocity", "pose", "scan"),
         ]
     ),
     default="joint_states",

@@ -47,7 +47,7 @@ _HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
 _OPTIONAL = ("since", "age")
 _MEASURED: tuple[Stream, ...] = (
     *("joint_states", "partial_joint_states", "transforms", "odometry"),
-    *("scan", "imu", "velocity"),
+    *("scan", "imu", "velocity", "pose"),
 )
 
 

@@ -63,7 +63,7 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
         yield _samples_check(probe)
     yield from named_writers_checks(probe, "transforms", probe.transforms, probe.info.transform_names)
     yield from named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names)
-    yield from scan_frames_checks(probe)
+    yield from sensor_frames_checks(probe)
     yield from measured_checks(probe)
     yield clocks_check(probe)
     yield stamps_check(probe, session)
@@ -301,12 +301,17 @@ def named_writers_checks(
 
 
 def measured_checks(probe: RobotProbe, command: str = "") -> Iterator[Check]:
-    """Whether each writer of odometry, each IMU and each sensor of velocities publishes.
+    """Whether each writer of odometry, each IMU and each sensor of velocities or poses publishes.
 
     ``command`` shows rates, without its stream; default: that of the native wire.
     """
     info = probe.info
-    names = {"odometry": info.odometry_names, "imu": info.imu_names, "velocity": info.velocity_names}
+    names = {
+        "odometry": info.odometry_names,
+        "imu": info.imu_names,
+        "velocity": info.velocity_names,
+        "pose": info.pose_names,
+    }
     for stream, samples in probe.measured.items():
         hz = f"{command or f'zstate hz {info.name}'} --stream {stream}"
         yield from named_writers_checks(probe, stream, samples, names[stream], hz)
@@ -325,19 +330,26 @@ def maps_checks(probe: RobotProbe, patient: str) -> Iterator[Check]:
             yield ok("map", f"{name!r}: {size} in {frame!r}, from {writer}")
 
 
-def scan_frames_checks(probe: RobotProbe) -> Iterator[Check]:
-    """Findings for scans in frames of the robot that it does not have: no reader can place them."""
-    robot, scans = probe.info.name, probe.scans.writers
+def sensor_frames_checks(probe: RobotProbe) -> Iterator[Check]:
+    """Findings for measurements in frames of the robot that it does not have: no reader can place them."""
+    robot, info, measured = probe.info.name, probe.info, probe.measured
     frames = {frame.name for frame in probe.listener.buffer.frames()}
-    for sensor, writer in probe.info.scan_names:
-        for frame in scans[writer.session].names if writer.session in scans else ():
-            full = full_name(robot, frame)
-            if full.startswith(f"{robot}/") and full not in frames:
-                near = similar_frames(full, frames)
-                hint = f"; {near[0]!r} is similar" if near else ""
-                text = f"the scans of {sensor!r} are in {full!r}, which no writer places{hint}"
-                then = f"zstate static TARGET {full} --xyz X Y Z  # or start {writer} with another --frame"
-                yield broken("scan", text, then)
+    for stream, what, samples, names in (
+        ("scan", "scans", probe.scans.writers, info.scan_names),
+        ("imu", "readings", measured["imu"].writers, info.imu_names),
+        ("velocity", "velocities", measured["velocity"].writers, info.velocity_names),
+    ):
+        for sensor, writer in names:
+            for frame in samples[writer.session].names if writer.session in samples else ():
+                full = full_name(robot, frame)
+                if full.startswith(f"{robot}/") and full not in frames:
+                    near = similar_frames(full, frames)
+                    hint = f"; {near[0]!r} is similar" if near else ""
+                    text = f"the {what} of {sensor!r} are in {full!r}, which no writer places{hint}"
+                    then = (
+                        f"zstate static TARGET {full} --xyz X Y Z  # or start {writer} with another --frame"
+                    )
+                    yield broken(stream, text, then)
 
 
 def _no_writer_check(probe: RobotProbe) -> Check:
@@ -429,7 +441,8 @@ def poses_check(probe: RobotProbe, model: RobotModel | None) -> Check:
     if not frames:
         return skipped("poses", "no frame is known")
     ends = representative_links(model, 1) if model is not None else ()
-    target, source = roots[0], f"{robot}/{ends[0]}" if ends else frames[-1].name
+    placed = [frame.name for frame in frames if frame.parent is not None]
+    target, source = roots[0], f"{robot}/{ends[0]}" if ends else (placed or roots)[-1]
     try:
         probe.listener.buffer.lookup(target, source)
     except LookupFailed as error:

@@ -44,7 +44,7 @@ from zstate.wire.registry import get_wire
 _MIN_WINDOW_S = 1.2  # writers publish their status once a second
 _REPLY_WITHIN_S = 0.4
 _ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf")
-_MEASURED: tuple[Stream, ...] = ("imu", "velocity", "odometry")
+_MEASURED: tuple[Stream, ...] = ("imu", "velocity", "pose", "odometry")
 _ALL = ""
 
 

@@ -16,7 +16,7 @@ from zstate.cli.doctor.robot_checks import (
     named_writers_checks,
     poses_check,
     refused_check,
-    scan_frames_checks,
+    sensor_frames_checks,
     statics_check,
 )
 from zstate.cli.doctor.robot_probe import RobotProbe
@@ -70,7 +70,7 @@ class _RosChecks:
         yield self._transforms_check() if publishers else self._no_transforms_check()
         hz = f"zstate hz{self._robot} --stream scan"
         yield from named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names, hz)
-        yield from scan_frames_checks(probe)
+        yield from sensor_frames_checks(probe)
         yield from measured_checks(probe, f"zstate hz{self._robot}")
         yield stamps_check(probe, self._session)
         if model is not None:

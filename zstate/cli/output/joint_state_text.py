@@ -30,6 +30,7 @@ from zstate.wire.messages import (
     LaserScan,
     OccupancyGrid,
     Odometry,
+    Pose,
     RobotDescription,
     TransformSample,
     Velocity,
@@ -203,6 +204,20 @@ def velocity_document(message: Velocity, robot: str) -> dict[str, Any]:
     if message.angular is not None:
         document["angular"] = _list(message.angular)
     return document | _sigmas([("velocity", message.covariance)])
+
+
+def pose_document(message: Pose, robot: str) -> dict[str, Any]:
+    """A measured pose of ``robot``: stamp [ns], frames, pose [m], and sigmas [m, rad] if known.
+
+    Without a child it is that of the robot's base.
+    """
+    pose = _list(message.pose)
+    document: dict[str, Any] = {"stamp": message.stamp, "seq": message.seq}
+    document["parent"] = full_name(robot, message.parent)
+    if message.child:
+        document["child"] = full_name(robot, message.child)
+    document |= {"translation": pose[:3], "rotation": pose[3:]}
+    return document | _sigmas([("pose", message.covariance)])
 
 
 def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:

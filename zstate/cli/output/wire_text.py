@@ -102,7 +102,7 @@ class NativeMessages:
         elif stream != "transforms":
             command = publish_command_for("joints" if stream == "joint_states" else "publish", robot)
         start = f"start one: `{command}`"
-        if stream in ("imu", "velocity"):
+        if stream in ("imu", "velocity", "pose"):
             start = (
                 f"start the program of the sensor, with its zstate.odometry.{stream.capitalize()}Publisher"
             )

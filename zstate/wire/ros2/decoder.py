@@ -24,6 +24,7 @@ from zstate.wire.messages import (
     Message,
     OccupancyGrid,
     Odometry,
+    Pose,
     RobotDescription,
     StaticTransforms,
     TransformSample,
@@ -42,7 +43,7 @@ from zstate.wire.ros2.cdr import (
     decode_string,
     unpack_stamps,
 )
-from zstate.wire.ros2.odometry import decode_imu, decode_odometry, decode_velocity
+from zstate.wire.ros2.odometry import decode_imu, decode_odometry, decode_pose, decode_velocity
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
     FLOAT64_MULTI_ARRAY,
@@ -58,9 +59,10 @@ FLOAT_BYTES = 4
 CELL_BYTES = 1
 """Of a cell of a grid."""
 
-_MEASUREMENTS: dict[Stream, Callable[[bytes, int, int, FrameNames], Imu | Velocity | Odometry]] = {
+_MEASUREMENTS: dict[Stream, Callable[[bytes, int, int, FrameNames], Imu | Velocity | Pose | Odometry]] = {
     "imu": decode_imu,
     "velocity": decode_velocity,
+    "pose": decode_pose,
     "odometry": decode_odometry,
 }
 _SCAN_FLOATS = 7

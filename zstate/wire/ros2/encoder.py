@@ -23,6 +23,7 @@ from zstate.wire.messages import (
     Message,
     OccupancyGrid,
     Odometry,
+    Pose,
     RobotDescription,
     StaticTransforms,
     TransformSample,
@@ -39,7 +40,7 @@ from zstate.wire.ros2.decoder import (
     read_tf_message,
 )
 from zstate.wire.ros2.graph import pack_attachment
-from zstate.wire.ros2.odometry import encode_imu, encode_odometry, encode_velocity
+from zstate.wire.ros2.odometry import encode_imu, encode_odometry, encode_pose, encode_velocity
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
@@ -101,7 +102,7 @@ class RosStreamEncoder:
         """
         if isinstance(message, JointState):
             return self._encode_joints(message)
-        if isinstance(message, LaserScan | Imu | Velocity | Odometry):
+        if isinstance(message, LaserScan | Imu | Velocity | Pose | Odometry):
             return self._encode_measurement(message)
         if isinstance(message, TransformSample):
             edges = self._sample_names.moving_edges if message.edges is None else message.edges
@@ -118,12 +119,14 @@ class RosStreamEncoder:
             raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
         return payload
 
-    def _encode_measurement(self, message: LaserScan | Imu | Velocity | Odometry) -> bytes:
+    def _encode_measurement(self, message: LaserScan | Imu | Velocity | Pose | Odometry) -> bytes:
         _checked_stamp(message.stamp)
         if isinstance(message, Imu):
             return encode_imu(message, self._names)
         if isinstance(message, Velocity):
             return encode_velocity(message, self._names)
+        if isinstance(message, Pose):
+            return encode_pose(message, self._names)
         if isinstance(message, Odometry):
             return encode_odometry(message, self._names)
         return encode_scan(message, self._names)

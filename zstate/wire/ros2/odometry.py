@@ -1,4 +1,4 @@
-"""IMUs, velocities and odometry as ROS 2 messages.
+"""IMUs, velocities, poses and odometry as ROS 2 messages.
 
 ROS has matrices where zstate has upper triangles or None. A covariance of zeros is not known
 (sensor_msgs/Imu), and so is what a first number of -1 precedes: an IMU without orientation, or one that
@@ -13,6 +13,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import (
     Imu,
     Odometry,
+    Pose,
     Velocity,
     covariance_matrix,
     from_block,
@@ -21,7 +22,7 @@ from zstate.wire.messages import (
 )
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.topics import FrameNames
-from zstate.wire.ros2.types import IMU, ODOMETRY, TWIST_WITH_COVARIANCE
+from zstate.wire.ros2.types import IMU, ODOMETRY, POSE_WITH_COVARIANCE, TWIST_WITH_COVARIANCE
 
 _IDENTITY = to_block([0.0, 0.0, 0.0, 1.0])
 _ABSENT = to_block([-1.0, *[0.0] * 8])
@@ -106,6 +107,26 @@ def decode_velocity(payload: bytes, session: int, seq: int, names: FrameNames) -
         covariance = to_block(from_block(covariance).reshape(6, 6)[:3, :3])
     try:
         return Velocity(stamp, seq, session, frame, linear, angular, _triangle(covariance, size))
+    except InvalidInput as error:
+        raise reader.malformed(str(error)) from None
+
+
+def encode_pose(pose: Pose, names: FrameNames) -> bytes:
+    """The geometry_msgs/PoseWithCovarianceStamped of a pose, which has no child; raises as ``encode_imu``."""
+    writer = CdrWriter()
+    writer.stamp(pose.stamp)
+    writer.text(names.to_ros(pose.parent))
+    writer.numbers(pose.pose + _matrix(pose.covariance, 6))
+    return writer.payload()
+
+
+def decode_pose(payload: bytes, session: int, seq: int, names: FrameNames) -> Pose:
+    """The pose of the robot's base in a PoseWithCovarianceStamped; raises as ``decode_velocity``."""
+    reader = CdrReader(payload, POSE_WITH_COVARIANCE.name)
+    stamp, parent = reader.stamp(), names.to_zstate(reader.text())
+    pose, covariance = reader.numbers(7), reader.numbers(36)
+    try:
+        return Pose(stamp, seq, session, parent, "", pose, _triangle(covariance, 6))
     except InvalidInput as error:
         raise reader.malformed(str(error)) from None
 

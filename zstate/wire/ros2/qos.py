@@ -127,6 +127,7 @@ STREAM_QOS: dict[Stream, Qos] = {
     # As the broadcasters of ros2_control: readers of sensor data request best effort, others reliable.
     "imu": Qos(depth=10),
     "velocity": Qos(depth=10),
+    "pose": Qos(depth=10),
     "odometry": Qos(depth=10),
     # Readers request best effort (rclcpp's ClockQoS) or reliable (a plain subscription). DDS matches a
     # reliable writer with both, a best-effort writer with the former only. An old time is useless.

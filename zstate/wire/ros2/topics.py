@@ -11,6 +11,7 @@ tf, tf_static        tf2_msgs/TFMessage                        ``/tf``; ``/r1/tf
 scan                 sensor_msgs/LaserScan                     ``/r1/<sensor>``, such as ``/r1/scan``
 imu                  sensor_msgs/Imu                           ``/r1/<sensor>``, such as ``/r1/imu``
 velocity             geometry_msgs/TwistWithCovarianceStamped  ``/r1/<sensor>``, such as ``/r1/velocity``
+pose                 geometry_msgs/PoseWithCovarianceStamped   ``/r1/<sensor>``, such as ``/r1/pose``
 odometry             nav_msgs/Odometry                         ``/r1/<name>``, such as ``/r1/odom``
 map                  nav_msgs/OccupancyGrid                    ``/r1/<name>``, such as ``/r1/map``
 clock                rosgraph_msgs/Clock                       ``/clock``
@@ -35,6 +36,7 @@ from zstate.wire.ros2.types import (
     LASER_SCAN,
     OCCUPANCY_GRID,
     ODOMETRY,
+    POSE_WITH_COVARIANCE,
     STRING,
     TF_MESSAGE,
     TWIST_WITH_COVARIANCE,
@@ -56,11 +58,12 @@ _TYPES: dict[Stream, RosType] = {
     "map": OCCUPANCY_GRID,
     "imu": IMU,
     "velocity": TWIST_WITH_COVARIANCE,
+    "pose": POSE_WITH_COVARIANCE,
     "odometry": ODOMETRY,
     "clock": CLOCK,
 }
 
-NAMED_TOPICS: frozenset[Stream] = frozenset({"scan", "map", "imu", "velocity", "odometry"})
+NAMED_TOPICS: frozenset[Stream] = frozenset({"scan", "map", "imu", "velocity", "pose", "odometry"})
 """The streams whose topics are named by their writers."""
 
 _CACHED_ORDERS = 64
