@@ -4,9 +4,23 @@ from pathlib import Path
 
 import pytest
 
-from zstate.cli.odometry_file import OdometrySettings, parse_diff_drive, read_settings
+from zstate.cli.odometry_file import (
+    LegSettings,
+    OdometrySettings,
+    parse_diff_drive,
+    parse_feet,
+    read_settings,
+)
 from zstate.errors import ConfigError, InvalidInput
-from zstate.odometry import Ackermann, DiffDrive, ImuNoise, WheelNoise
+from zstate.odometry import (
+    Ackermann,
+    DiffDrive,
+    ForceThresholds,
+    ImuNoise,
+    LegNoise,
+    SpeedThresholds,
+    WheelNoise,
+)
 
 ROVER = """
 imu = "body"
@@ -48,6 +62,45 @@ def test_file_has_the_settings_of_one_robot(tmp_path: Path):
 def test_other_wheels_have_tables_of_their_own_names(tmp_path: Path):
     text = '[ackermann]\nleft="l"\nright="r"\nsteering="s"\nradius=0.3\ntrack=1.2\nwheelbase=2.5\n'
     assert read_settings(written(tmp_path, text)).wheels == Ackermann("l", "r", "s", 0.3, 1.2, 2.5)
+
+
+LEGS = """
+[legs]
+feet = ["l_foot", "r_foot"]
+noise = { slip = 0.02 }
+force = { touchdown = 40.0, liftoff = 20.0 }
+"""
+
+
+def test_legs_have_feet_noise_and_the_thresholds_of_contacts(tmp_path: Path):
+    assert read_settings(written(tmp_path, LEGS)).legs == LegSettings(
+        feet=("l_foot", "r_foot"), noise=LegNoise(slip=0.02), force=ForceThresholds(40.0, 20.0)
+    )
+    by_speed = LEGS.replace(
+        "force = { touchdown = 40.0, liftoff = 20.0 }", "speed = { touchdown = 0.2, liftoff = 0.3 }"
+    )
+    legs = read_settings(written(tmp_path, by_speed)).legs
+    assert legs is not None
+    assert legs.speed == SpeedThresholds(0.2, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "error"),
+    [
+        ("slip", "slop", r"rover.toml:4: legs.noise.slop: unknown key; did you mean 'slip'\?"),
+        ("20.0", "50.0", "legs.force: forces of contacts are 0 < liftoff < touchdown"),
+        ("[legs]", "[legs]\nspeed = { touchdown = 0.1, liftoff = 0.2 }", "by force or by speed; give one"),
+    ],
+)
+def test_each_mistake_of_legs_has_its_reason(tmp_path: Path, before: str, after: str, error: str):
+    with pytest.raises(ConfigError, match=error):
+        read_settings(written(tmp_path, LEGS.replace(before, after, 1)))
+
+
+def test_feet_of_a_command_line_are_links():
+    assert parse_feet("a, b") == LegSettings(feet=("a", "b"))
+    with pytest.raises(InvalidInput, match="names of links"):
+        parse_feet("a,,b")
 
 
 @pytest.mark.parametrize(

@@ -122,6 +122,18 @@ def test_origins_move_by_their_jacobians_as_twists_state() -> None:
         np.testing.assert_allclose(jacobians @ velocities, twists, atol=1e-9)
 
 
+def test_origins_of_a_robot_with_one_joint_have_one_column() -> None:
+    text = """<robot name="one"><link name="root"/><link name="arm"/><link name="tip"/>
+      <joint name="turn" type="continuous"><parent link="root"/><child link="arm"/><axis xyz="0 0 1"/></joint>
+      <joint name="end" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="2 0 0"/></joint>
+      </robot>"""
+    kinematics = Kinematics(parse_urdf(text, "one.urdf"))
+    points, jacobians = kinematics.origins(["tip"], np.array([np.pi / 2]), "root")
+    # 2 m from the axis, on y: it moves to -x.
+    np.testing.assert_allclose(points, [[0.0, 2.0, 0.0]], atol=TOLERANCE)
+    np.testing.assert_allclose(jacobians, [[[-2.0], [0.0], [0.0]]], atol=TOLERANCE)
+
+
 def test_a_thousand_turns_give_the_same_pose_as_none() -> None:
     kinematics = local_model("diffbot")
     turned = kinematics.link_poses([0.3 + 2000 * pi, -0.4 - 2000 * pi])

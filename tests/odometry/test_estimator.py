@@ -12,7 +12,7 @@ from zstate.model.load import load_model
 from zstate.odometry import BaseEstimator, BaseState, DiffDrive, SourceHealth
 from zstate.odometry.health import chi_square_quantile
 from zstate.odometry.invariant_filter import Floats
-from zstate.odometry.legs import Legs
+from zstate.odometry.legs import ForceThresholds, Legs, SpeedThresholds
 
 SIGMA = 0.02
 LEVEL = Transform("base_link", "imu_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -309,3 +309,96 @@ def test_measurements_that_are_not_finite_are_refused_with_the_name_of_their_sou
 def test_the_mount_of_a_sensor_that_is_missing_is_an_unknown_frame_with_near_misses():
     with pytest.raises(UnknownFrame, match="imu_link"):
         BaseEstimator(odom="odom", base="base_link", imu="imu_lnk", buffer=mounted(LEVEL), imu_noise=NOISE)
+
+
+def test_an_initial_pose_is_where_the_base_is_at_its_first_event_without_rest():
+    start = Transform("odom", "base_link", (2.0, -1.0, 0.0), (0.0, 0.0, math.sin(0.4), math.cos(0.4)))
+    base = estimator(initial_pose=start)
+    drive(base, 2.0, speed=0.5)
+    moved = start.inverse() @ base.state().odom_from_base
+    assert moved.translation[0] == pytest.approx(0.5 * 1.99, abs=0.05)
+    assert moved.rpy[2] == pytest.approx(0.0, abs=0.02)
+
+
+def test_poses_bound_the_drift_of_wheels():
+    """Wheels that are half too fast, 0.2 m in 8 s, and a motion capture at 10 Hz that is good to 1 cm."""
+    base = estimator()
+    t = drive(base, 2.0)
+    for step in range(80):
+        drive(base, 0.1, start=t + 0.1 * step, speed=0.05, slip=0.025)
+        pose = Transform("odom", "base_link", (0.005 * step, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        base.pose(stamp_at(t + 0.1 * step), pose, 1e-4 * np.eye(6), source="mocap")
+    state = base.state()
+    assert state.odom_from_base.translation[0] == pytest.approx(0.05 * 7.99, abs=0.03)
+    assert state.pose_covariance[0, 0] < 0.01**2
+    assert health_of(base, "mocap").accepted == 80
+
+
+def test_of_two_headings_that_disagree_the_worse_one_is_named():
+    """A base that turns by 0.5 rad/s, and two compasses, of which one has a hard iron of 0.5 rad."""
+    base, random = estimator(), np.random.default_rng(3)
+    drive(base, 2.0)
+    for step in range(200):
+        t = 2.0 + 0.1 * step
+        yaw = 0.05 * step
+        drive(base, 0.1, start=t, yaw_rate=0.5)
+        base.heading(stamp_at(t), yaw + 1.0 + random.normal(0.0, 0.02), 0.02, source="good")
+        base.heading(stamp_at(t), yaw + 0.5 * math.sin(yaw), 0.02, source="bad")
+    good, bad = health_of(base, "good"), health_of(base, "bad")
+    assert bad.nis_mean > 10.0 * good.nis_mean
+    assert good.rejected == 0
+    assert "off by about" in bad.sentence
+    assert "sigmas are about" in bad.sentence
+    assert base.state().odom_from_base.rpy[2] == pytest.approx(
+        math.remainder(0.5 * 19.99, math.tau), abs=0.03
+    )
+
+
+def test_wheels_that_spin_on_the_spot_are_rejected_and_reported():
+    """For a second both wheels of a standing base turn with 0.8 m/s."""
+    base = estimator(wheels=WHEELS, history_s=5.0)
+    rate, angle = WHEELS.joint_velocities([0.8, 0.0, 0.0], [0.0, 0.0, 0.0])["left"], 0.0
+    drive(base, 4.0, wheels=False)
+    for step in range(200):
+        angle += 0.02 * rate * (step >= 150)
+        base.joints(stamp_at(0.02 * step), {"left": angle, "right": angle})
+    assert base.state().odom_from_base.translation[0] < 0.1
+    wheels = health_of(base, "wheels")
+    assert wheels.rejected >= 40
+    assert "were rejected" in wheels.sentence
+
+
+@pytest.mark.parametrize("detection", [ForceThresholds(40.0, 20.0), SpeedThresholds(0.1, 0.2)])
+def test_feet_that_are_detected_on_the_ground_push_the_base_forward(
+    detection: ForceThresholds | SpeedThresholds,
+):
+    """One foot carries 50 N and slides back by 0.2 m under the base, the other swings ahead at 0.5 m/s."""
+    legs = Legs(load_model(LEGGED), ["foot1", "foot2"], imu="base_link", detection=detection)
+    base = estimator(legs=legs)
+    for step in range(401):
+        t = 0.01 * step
+        moves = max(0.0, t - 2.0)
+        base.imu(stamp_at(t), (0.0, 0.0, 0.0), (0.0, 0.0, 9.80665))
+        base.joints(
+            stamp_at(t),
+            {"slide1": -0.1 * moves, "slide2": 0.5 * moves},
+            velocities={"slide1": -0.1 * (moves > 0.0), "slide2": 0.5 * (moves > 0.0)},
+            efforts={"slide1": 50.0, "slide2": 50.0 * (moves == 0.0)},
+        )
+    # The slip of one foot for 2 s has a sigma of 0.014 m.
+    assert base.state().odom_from_base.translation[0] == pytest.approx(0.2, abs=0.03)
+
+
+def test_a_replay_of_the_same_calls_is_the_same_bit_for_bit_whenever_states_are_read():
+    _, calls = calls_of(4, 3.0)
+    live, replayed = estimator(tilted_mount()), estimator(tilted_mount())
+    for call in calls:
+        feed(live, [call])
+        if call[0] > 2.0:
+            live.state()
+    feed(replayed, calls)
+    one, other = live.state(), replayed.state()
+    assert one.odom_from_base.pose7.tobytes() == other.odom_from_base.pose7.tobytes()
+    assert one.pose_covariance.tobytes() == other.pose_covariance.tobytes()
+    assert one.twist_covariance.tobytes() == other.twist_covariance.tobytes()
+    assert live.health() == replayed.health()

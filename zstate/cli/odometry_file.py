@@ -1,8 +1,8 @@
 """What the odometry of one robot is computed from, and the TOML file that holds it: one setting for all runs.
 
 Its keys are those of OdometrySettings, with the keywords of ImuNoise in ``[imu_noise]``, of DiffDrive,
-Ackermann or Mecanum in ``[diff_drive]``, ``[ackermann]`` or ``[mecanum]``, and of WheelNoise in their
-``noise``. models/rover.toml is an example.
+Ackermann or Mecanum in ``[diff_drive]``, ``[ackermann]`` or ``[mecanum]``, of WheelNoise in their ``noise``,
+and of LegSettings in ``[legs]``. models/rover.toml is an example.
 """
 
 from __future__ import annotations
@@ -16,12 +16,17 @@ from zstate._util.format import did_you_mean
 from zstate.buffer.buffer import TransformBuffer
 from zstate.cli.up.template import TomlFile
 from zstate.errors import InvalidInput
+from zstate.model.robot import RobotModel
 from zstate.odometry import (
     Ackermann,
     BaseEstimator,
     DiffDrive,
+    ForceThresholds,
     ImuNoise,
+    LegNoise,
+    Legs,
     Mecanum,
+    SpeedThresholds,
     WheelNoise,
     Wheels,
 )
@@ -30,14 +35,42 @@ from zstate.wire.keys import check_writer, full_name
 MEMS_NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)
 """That of an inexpensive IMU, for robots without another setting."""
 
+DEFAULT_SPEEDS = SpeedThresholds(touchdown=0.1, liftoff=0.2)
+"""Those of the feet of walking robots without another setting."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LegSettings:
+    """The keywords of Legs. Contacts of ``feet`` are detected by ``force`` or, by default, by ``speed``.
+
+    Speeds need joint states with velocities, forces those with efforts. Raises InvalidInput for both.
+    """
+
+    feet: tuple[str, ...]
+    noise: LegNoise | None = None
+    force: ForceThresholds | None = None
+    speed: SpeedThresholds | None = None
+
+    def __post_init__(self) -> None:
+        if self.force is not None and self.speed is not None:
+            raise InvalidInput("contacts of feet are detected by force or by speed; give one of them")
+
+    def legs(self, model: RobotModel, imu: str) -> Legs:
+        """The legs of ``model``, with its IMU on the link ``imu``. Raises InvalidInput as Legs."""
+        detection = self.force or self.speed or DEFAULT_SPEEDS
+        return Legs(model, self.feet, imu=imu, noise=self.noise, detection=detection)
+
+
 _PARTS: Mapping[str, type[Any]] = {
     "imu_noise": ImuNoise,
     "diff_drive": DiffDrive,
     "ackermann": Ackermann,
     "mecanum": Mecanum,
+    "legs": LegSettings,
 }
-
-T = TypeVar("T")
+_WHEELS = ("diff_drive", "ackermann", "mecanum")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,13 +87,29 @@ class OdometrySettings:
     history_s: float = 1.0
     imu_noise: ImuNoise = MEMS_NOISE
     wheels: Wheels | None = None
+    legs: LegSettings | None = None
 
     def __post_init__(self) -> None:
         for sensor in (self.imu, *self.velocities):
             check_writer(sensor)
 
-    def estimator(self, robot: str, base: str, imu_frame: str, buffer: TransformBuffer) -> BaseEstimator:
-        """The estimator of ``robot``. Raises InvalidInput, and LookupFailed for unknown mounts."""
+    @property
+    def has_joints(self) -> bool:
+        """Whether it needs joint states."""
+        return self.wheels is not None or self.legs is not None
+
+    def estimator(
+        self, robot: str, base: str, imu_frame: str, buffer: TransformBuffer, model: RobotModel | None
+    ) -> BaseEstimator:
+        """The estimator of ``robot``; legs need its ``model``.
+
+        Raises InvalidInput, and LookupFailed for unknown mounts.
+        """
+        legs = None
+        if self.legs is not None:
+            if model is None:
+                raise InvalidInput(f"legs need the model of {robot!r}, and there is none")
+            legs = self.legs.legs(model, imu_frame.removeprefix(f"{robot}/"))
         return BaseEstimator(
             odom=full_name(robot, self.odom),
             base=full_name(robot, base),
@@ -69,6 +118,7 @@ class OdometrySettings:
             imu_noise=self.imu_noise,
             history_s=self.history_s,
             wheels=self.wheels,
+            legs=legs,
         )
 
 
@@ -79,12 +129,12 @@ def read_settings(path: str) -> OdometrySettings:
     for key, value in file.tables.items():
         if key in _PARTS:
             part = _built(_PARTS[key], value, file, key)
-            kind = key if key == "imu_noise" else "wheels"
+            kind = "wheels" if key in _WHEELS else key
             if kind in values:
                 raise file.error(key, "a robot has wheels of one kind")
             values[kind] = part
         else:
-            values[key] = tuple(cast("list[Any]", value)) if isinstance(value, list) else value
+            values[key] = value
     return _built(OdometrySettings, values, file, "")
 
 
@@ -92,7 +142,11 @@ def _built(kind: type[T], table: object, file: TomlFile, place: str) -> T:
     """``kind(**table)``, with errors at ``place``."""
     if not isinstance(table, dict):
         raise file.error(place, f"a table of keys and values is needed, not {table!r}")
-    values = cast("dict[str, Any]", table)
+    lists = cast("dict[str, Any]", table)
+    values: dict[str, Any] = {
+        key: tuple(cast("list[Any]", value)) if isinstance(value, list) else value
+        for key, value in lists.items()
+    }
     known = {one.name: one for one in fields(cast("Any", kind))}
     for key in values:
         if key not in known:
@@ -102,12 +156,25 @@ def _built(kind: type[T], table: object, file: TomlFile, place: str) -> T:
     ]
     if missing := [name for name in required if name not in values]:
         raise file.error(place, f"{', '.join(missing)} missing")
-    if isinstance(values.get("noise"), dict):
-        values = {**values, "noise": _built(WheelNoise, values["noise"], file, f"{place}.noise")}
+    inner: dict[str, type[Any]] = {
+        "noise": LegNoise if kind is LegSettings else WheelNoise,
+        "force": ForceThresholds,
+        "speed": SpeedThresholds,
+    }
+    for key in inner.keys() & values.keys():
+        values[key] = _built(inner[key], values[key], file, f"{place}.{key}")
     try:
         return kind(**values)
     except (InvalidInput, TypeError) as error:
         raise file.error(place, str(error)) from None
+
+
+def parse_feet(text: str) -> LegSettings:
+    """``LINK,LINK...``: feet whose contacts are detected by their speed. Raises InvalidInput."""
+    feet = tuple(part.strip() for part in text.split(","))
+    if not all(feet):
+        raise InvalidInput(f"feet are names of links with commas between them, not {text!r}")
+    return LegSettings(feet=feet)
 
 
 def parse_diff_drive(text: str) -> DiffDrive:

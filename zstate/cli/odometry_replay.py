@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from operator import itemgetter
@@ -19,6 +19,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.cli.commands.plot import new_figure
 from zstate.cli.odometry_file import OdometrySettings
 from zstate.errors import InvalidInput, NoData
+from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, SourceHealth
 from zstate.odometry.node import add_imu, add_velocity
@@ -83,11 +84,11 @@ def replay(path: str, robot: str, settings: OdometrySettings) -> ReplayedOdometr
 
     Raises RecordingError, LookupFailed for unknown mounts, and InvalidInput without readings of the IMU.
     """
-    mounts, root = TransformBuffer(HISTORY_S), ""
+    mounts, model = TransformBuffer(HISTORY_S), None
     with Recording(path, robot) as recording:
         for _, message, _ in recording.fill(mounts):
-            if isinstance(message, RobotDescription) and not root:
-                root = parse_urdf(message.urdf, f"the URDF of {robot!r}").root
+            if isinstance(message, RobotDescription) and model is None:
+                model = parse_urdf(message.urdf, f"the URDF of {robot!r}")
         readings = list(recording.imu(robot, settings.imu))
         events: list[Event] = [(one.stamp, True, partial(add_imu, message=one)) for one in readings]
         for sensor in settings.velocities:
@@ -95,22 +96,35 @@ def replay(path: str, robot: str, settings: OdometrySettings) -> ReplayedOdometr
                 (one.stamp, False, partial(add_velocity, sensor=sensor, message=one))
                 for one in recording.velocities(robot, sensor)
             ]
-        joints = recording.joint_states(robot) if settings.wheels is not None else None
+        joints = recording.joint_states(robot) if settings.has_joints else None
     if not readings:
         raise InvalidInput(
             f"{path} has no reading of the IMU {settings.imu!r} of {robot!r}; `zstate info` shows its streams"
         )
     if joints is not None:
-        for stamp, row in zip(joints.stamps.tolist(), joints.positions.tolist(), strict=True):
-            positions = dict(zip(joints.coordinates, row, strict=True))
-            events.append((stamp, False, partial(_add_joints, stamp=stamp, positions=positions)))
-    base = settings.base or root
-    estimator = settings.estimator(robot, base, readings[0].frame, mounts)
+        events += [
+            (stamp, False, partial(_add_joints, joints=joints, row=row))
+            for row, stamp in enumerate(joints.stamps.tolist())
+        ]
+    base = settings.base or ("" if model is None else model.root)
+    estimator = settings.estimator(robot, base, readings[0].frame, mounts, model)
     return _run(estimator, base, sorted(events, key=itemgetter(0)))
 
 
-def _add_joints(base: BaseEstimator, stamp: int, positions: Mapping[str, float]) -> None:
-    base.joints(stamp, positions)
+def _add_joints(base: BaseEstimator, joints: JointTrajectory, row: int) -> None:
+    names = joints.velocity_coordinates
+    base.joints(
+        int(joints.stamps[row]),
+        dict(zip(joints.coordinates, joints.positions[row].tolist(), strict=True)),
+        velocities=_by_name_if_known(names, joints.velocities, row),
+        efforts=_by_name_if_known(names, joints.efforts, row),
+    )
+
+
+def _by_name_if_known(names: Sequence[str], block: Floats | None, row: int) -> dict[str, float] | None:
+    if block is None or np.isnan(block[row]).any():
+        return None
+    return dict(zip(names, block[row].tolist(), strict=True))
 
 
 def _run(base: BaseEstimator, frame: str, events: Sequence[Event]) -> ReplayedOdometry:
@@ -154,7 +168,8 @@ def health_text(health: SourceHealth) -> str:
     if health.dimension:
         low, high = health.nis_band
         text += (
-            f", NIS {health.nis_mean:.2f} for {health.dimension} numbers (expected {low:.2f} to {high:.2f}), "
+            f", NIS {health.nis_mean:.2f} for {health.dimension} numbers "
+            f"({low:.2f} to {high:.2f} if its sigmas are exact), "
             f"{health.accepted} accepted, {health.rejected} rejected, {health.too_late} too late"
         )
     return f"{text}; {health.sentence}" if health.sentence else text

@@ -38,7 +38,7 @@ _ACCELERATION = 20.0
 """Limit of the wheels, of which the URDF has none [rad/s^2]."""
 
 _SCAN_HZ, _RAY_COUNT, _RANGE_M, _RANGE_NOISE_M = 10.0, 720, 8.0, 0.005
-_REST_NS = 1_000_000_000
+_REST_NS = 3_000_000_000
 """The rover rests so long after its first odometry, which begins where it stands."""
 
 

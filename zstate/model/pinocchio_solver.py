@@ -163,7 +163,8 @@ class PinocchioSolver:
         """The pose of a link in the root, and its Jacobian in the root's axes: (6, nv), linear first."""
         pose = self._pin.updateFramePlacement(self._model, self._data, link + 1).copy()
         axes = self._pin.LOCAL_WORLD_ALIGNED
-        return pose, self._pin.getFrameJacobian(self._model, self._data, link + 1, axes)
+        jacobian = self._pin.getFrameJacobian(self._model, self._data, link + 1, axes)
+        return pose, jacobian.reshape(6, self._model.nv)  # Pinocchio makes one column a vector
 
     def _velocity_jacobian(self, positions: Floats) -> Floats:
         """``_velocity(positions, v)`` is this matrix times v: (nv, n)."""

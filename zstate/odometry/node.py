@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 
 from zstate._util.closeable import Closeable
@@ -14,6 +14,7 @@ from zstate.model.robot import POSITION_COUNTS, RobotModel
 from zstate.net.session import Session
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
+from zstate.odometry.invariant_filter import Floats
 from zstate.odometry.listener import SensorListener
 from zstate.odometry.publishers import OdometryPublisher
 from zstate.sources import JointReading, JointStateListener
@@ -46,15 +47,26 @@ def add_velocity(base: BaseEstimator, sensor: str, message: Velocity) -> None:
 
 
 def add_joints(base: BaseEstimator, model: RobotModel, reading: JointReading) -> None:
-    """Pass the joints of ``model`` that have one position each to ``base``."""
+    """Pass the joints of ``model`` that have one position each to ``base``, with what is known of them."""
     assert reading.stamp is not None
-    columns = [
-        (joint.name, model.columns[joint.name])
-        for joint in model.driven_joints
-        if POSITION_COUNTS[joint.type] == 1
-    ]
-    positions = reading.positions.tolist()
-    base.joints(reading.stamp, {name: positions[column] for name, column in columns})
+    names = [joint.name for joint in model.driven_joints if POSITION_COUNTS[joint.type] == 1]
+    base.joints(
+        reading.stamp,
+        _by_name(names, model.columns, reading.positions),
+        velocities=_by_name_if_known(names, model.velocity_columns, reading.velocities),
+        efforts=_by_name_if_known(names, model.velocity_columns, reading.efforts),
+    )
+
+
+def _by_name(names: Sequence[str], columns: Mapping[str, int], vector: Floats) -> dict[str, float]:
+    values = vector.tolist()
+    return {name: values[columns[name]] for name in names}
+
+
+def _by_name_if_known(
+    names: Sequence[str], columns: Mapping[str, int], vector: Floats | None
+) -> dict[str, float] | None:
+    return None if vector is None else _by_name(names, columns, vector)
 
 
 class OdometryNode(Closeable):
@@ -91,15 +103,14 @@ class OdometryNode(Closeable):
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._imu_stamp = self._due = self._newest = self._assessed = 0
+        self._joints: JointStateListener | None = None
         with ExitStack() as opening:
             self._publisher = opening.enter_context(
                 OdometryPublisher(session, robot, writer, program=program)
             )
-            self._joints = (
-                opening.enter_context(JointStateListener(session, robot, on_reading=self._on_joints))
-                if has_joints
-                else None
-            )
+            if has_joints:
+                joints = JointStateListener(session, robot, on_reading=self._on_joints)
+                self._joints = opening.enter_context(joints)
             self._sensors = opening.enter_context(
                 SensorListener(
                     session,
@@ -154,7 +165,8 @@ class OdometryNode(Closeable):
                 self._publish_without_imu(message.stamp)
 
     def _on_joints(self, reading: JointReading) -> None:
-        assert self._joints is not None
+        if self._joints is None:  # a reading during its opening
+            return
         assert self._joints.model is not None
         assert reading.stamp is not None
         with self._lock:

@@ -56,7 +56,7 @@ class PlanarPose(NamedTuple):
 class ImuReading(NamedTuple):
     """Angular velocity [rad/s] and specific force [m/s^2], (3,), in the axes of the IMU.
 
-    They are the means of the interval that ends at ``stamp`` [ns].
+    They are the means of an interval whose middle is ``stamp`` [ns].
     """
 
     stamp: int
@@ -225,7 +225,7 @@ class _Imu:
         """The reading of the interval that ends at ``stamp``; the next interval begins there."""
         if not self._count:
             return None
-        dt_s = self._count * _STEP_S
+        middle, dt_s = stamp - self._count * _STEP_NS // 2, self._count * _STEP_S
         motion = (
             np.array([(0.0, 0.0, self._turned), (self._ahead, self._left, _GRAVITY * self._count)])
             / self._count
@@ -238,7 +238,7 @@ class _Imu:
             motion @ self._imu_from_base.T + self._biases + white * self._random.standard_normal((2, 3))
         )
         self.skip()
-        return ImuReading(stamp, gyro, accel)
+        return ImuReading(middle, gyro, accel)
 
 
 class _Setpoint(Protocol):

@@ -57,7 +57,7 @@ _REFRESH_S = 0.1
 _RECENT_NS = 1_000_000_000
 # The least terminal width that has room for angles.
 _WIDTH_WITH_ANGLES = 72
-_NOUNS: dict[SampleKind, str] = {"joint_states": "joint state", "transforms": "transform"}
+_NOUNS: dict[SampleKind, str] = {"joint_states": "joint state", "transforms": "odometry sample"}
 
 _ROVER = "rover"
 # The robot with a laser in a room, and the map of that, next to its URDF file.

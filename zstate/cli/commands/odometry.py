@@ -17,7 +17,7 @@ from zstate.errors import LookupFailed
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from zstate.cli.odometry_file import OdometrySettings
+    from zstate.cli.odometry_file import LegSettings, OdometrySettings
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
@@ -29,6 +29,12 @@ def _parse_diff_drive(text: str) -> DiffDrive:
     from zstate.cli.odometry_file import parse_diff_drive
 
     return parse_diff_drive(text)
+
+
+def _parse_feet(text: str) -> LegSettings:
+    from zstate.cli.odometry_file import parse_feet
+
+    return parse_feet(text)
 
 
 def _parse_plot(file: str) -> Path:
@@ -51,6 +57,11 @@ def _parse_plot(file: str) -> Path:
     "--diff-drive",
     type=options.Checked("WHEELS", _parse_diff_drive),
     help="Wheels on one axle: left=JOINT,right=JOINT,radius=M,track=M; several on a side are repeated.",
+)
+@click.option(
+    "--feet",
+    type=options.Checked("LINK,LINK,...", _parse_feet),
+    help="Links that touch the ground in turn; needs velocities in the joint states.",
 )
 @click.option(
     "--file",
@@ -86,6 +97,7 @@ def odometry_command(
     imu: str | None,
     velocities: tuple[str, ...],
     diff_drive: DiffDrive | None,
+    feet: LegSettings | None,
     file: str | None,
     odom: str | None,
     base: str | None,
@@ -100,7 +112,8 @@ def odometry_command(
 
     The estimate has a pose, a velocity and the covariances of both, and corrects the biases of the IMU. The
     mounts of the sensors are those of the robot's model. Data may be late and out of order. The robot should
-    stand still for a second at first: gravity aligns the IMU.
+    stand still for a few seconds at first: gravity aligns the IMU, and its gyro is zeroed. Later rests zero
+    it if the robot has wheels or velocities; feet alone do not show that it rests.
 
     Each source has a NIS, the mean square of what it contradicts in units of its sigmas. `zstate monitor` and
     `zstate doctor` show the sentences about sources whose sigmas are wrong. The settings of a robot with the
@@ -108,6 +121,7 @@ def odometry_command(
 
     \b
     zstate odometry r1 --imu imu --diff-drive left=lw,right=rw,radius=0.08,track=0.32
+    zstate odometry go2 --feet FL_foot,FR_foot,RL_foot,RR_foot
     zstate odometry r1 --file r1.toml
     zstate odometry r1 --file r1.toml --replay run.mcap --plot run.png
     """
@@ -122,11 +136,12 @@ def odometry_command(
         "odom": odom,
         "base": base,
         "wheels": diff_drive,
+        "legs": feet,
     }
     settings = replace(settings, **{key: value for key, value in given.items() if value is not None})
-    if settings.wheels is None and not settings.velocities:
+    if not (settings.has_joints or settings.velocities):
         raise click.UsageError(
-            "an IMU alone drifts by metres in seconds; give --diff-drive, --velocity or --file"
+            "an IMU alone drifts by metres in seconds; give --diff-drive, --feet, --velocity or --file"
         )
     if replay is not None:
         _replay(replay, robot, settings, plot)
@@ -151,15 +166,15 @@ def _publish(
 
     with ExitStack() as opened:
         listener = opened.enter_context(TransformListener(session, robot))
-        base, imu_frame = _wait_for_sensors(session, robot, settings, listener)
+        base, imu_frame, model = _wait_for_sensors(session, robot, settings, listener)
         node = opened.enter_context(
             OdometryNode(
                 session,
                 robot,
-                settings.estimator(robot, base, imu_frame, listener.buffer),
+                settings.estimator(robot, base, imu_frame, listener.buffer, model),
                 imu=settings.imu,
                 velocities=settings.velocities,
-                has_joints=settings.wheels is not None,
+                has_joints=settings.has_joints,
                 writer=writer,
                 rate_hz=rate_hz,
             )
@@ -178,16 +193,22 @@ def _publish(
 
 def _wait_for_sensors(
     session: Session, robot: str, settings: OdometrySettings, listener: TransformListener
-) -> tuple[str, str]:
-    """The frames of the base and of the IMU, once its mount is known; what is missing is printed."""
+) -> tuple[str, str, RobotModel | None]:
+    """The frames of the base and of the IMU, and the model, once the mount is known.
+
+    What is missing is printed. There may be no model with ``settings.base`` and without legs.
+    """
     from zstate.cli.waiting import ConditionWaiter
     from zstate.odometry import SensorListener
     from zstate.sources.joint_state_listener import DescriptionSubscriber
     from zstate.wire.keys import full_name
 
     waiter = ConditionWaiter()
-    bases = {} if settings.base is None else {robot: settings.base}
+    models: dict[str, RobotModel] = {}
     frames: dict[str, str] = {}
+
+    def base() -> str:
+        return settings.base or models[robot].root
 
     def on_imu(sensor: str, message: Imu) -> None:
         if sensor not in frames:
@@ -195,17 +216,19 @@ def _wait_for_sensors(
             waiter.notify()
 
     def on_description(name: str, model: RobotModel) -> None:
-        bases.setdefault(name, model.root)
+        models.setdefault(name, model)
         waiter.notify()
 
     def reason() -> str:
         if settings.imu not in frames:
             others = f"; there is {', '.join(sorted(frames))}" if frames else ""
             return f"{robot!r} has no reading of the IMU {settings.imu!r}{others}"
-        if robot not in bases:
+        if robot not in models and settings.legs is not None:
+            return f"the model of {robot!r}, which feet need, has no publisher; start it"
+        if robot not in models and settings.base is None:
             return f"the model of {robot!r} has no publisher; start it, or give --base"
         try:
-            listener.buffer.lookup(full_name(robot, bases[robot]), frames[settings.imu])
+            listener.buffer.lookup(full_name(robot, base()), frames[settings.imu])
         except LookupFailed as missing:
             return str(missing)
         return ""
@@ -216,12 +239,13 @@ def _wait_for_sensors(
         DescriptionSubscriber(session, robot, on_description),
     ):
         waiter.wait_for(lambda: not reason(), None, reason)
-    return bases[robot], frames[settings.imu]
+    return base(), frames[settings.imu], models.get(robot)
 
 
 def _sources_text(settings: OdometrySettings) -> str:
     wheels = ["its wheels"] if settings.wheels is not None else []
-    return ", ".join([f"its IMU {settings.imu!r}", *wheels, *map(repr, settings.velocities)])
+    feet = ["its feet"] if settings.legs is not None else []
+    return ", ".join([f"its IMU {settings.imu!r}", *wheels, *feet, *map(repr, settings.velocities)])
 
 
 def _end_lines(node: OdometryNode) -> Iterator[str]:
