@@ -425,11 +425,11 @@ class Ratchet:
 RATCHETS = (
     Ratchet("dialect words", dialect_words, 7, 150),
     Ratchet("banned methods", banned_methods, 2, 0),  # `tell` of a file, which mcap calls; `Limits.of`
-    Ratchet("single importers", single_importers, 33, 25),
+    Ratchet("single importers", single_importers, 38, 25),
     Ratchet("modules in largest folder", modules_in_largest_folder, 18, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
-    Ratchet("modules", lambda: len(modules()), 270, 270),
-    Ratchet("lines", lines, 57_600, 36_000),  # 40,026 before moving frames, drivers, scans, driving
+    Ratchet("modules", lambda: len(modules()), 290, 270),  # 270 before odometry, which has 15
+    Ratchet("lines", lines, 64_900, 36_000),  # 40,026 before moving frames, drivers, scans, driving, odometry
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
 

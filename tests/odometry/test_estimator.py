@@ -9,7 +9,7 @@ from helpers.base_motion import NOISE, START, WHEEL_HZ, Motion, NoisyImu, mounte
 
 from zstate import InFuture, InvalidInput, NoData, Transform, UnknownFrame, se3
 from zstate.model.load import load_model
-from zstate.odometry import BaseEstimator, BaseState, DiffDrive, SourceHealth
+from zstate.odometry import BaseEstimator, BaseState, DiffDrive, ImuNoise, SourceHealth
 from zstate.odometry.health import chi_square_quantile
 from zstate.odometry.invariant_filter import Floats
 from zstate.odometry.legs import ForceThresholds, Legs, SpeedThresholds
@@ -89,6 +89,18 @@ def test_errors_are_as_large_as_their_covariances_with_a_source_late_and_shuffle
     low, high = (chi_square_quantile(p, 3 * runs) / runs for p in (0.001, 0.999))
     for mean in np.mean(errors, axis=0).tolist():
         assert low < mean < high
+
+
+def test_the_rate_of_a_twist_has_the_noise_of_one_sample():
+    noise = ImuNoise(gyro=5e-3, accel=2e-2, gyro_bias=0.0, accel_bias=0.0)
+    base = BaseEstimator(
+        odom="odom", base="base_link", imu="imu_link", buffer=mounted(LEVEL), imu_noise=noise
+    )
+    for number in range(300):
+        base.imu(stamp_at(number / 200), [0.0] * 3, [0.0, 0.0, 9.80665])
+    # A density of 5e-3 is a variance of 5e-3^2 * 200 in a sample at 200 Hz; the bias adds 0.01^2.
+    variances = np.diag(base.state().twist_covariance)[3:]
+    np.testing.assert_allclose(variances, 5e-3**2 * 200 + 0.01**2, rtol=0.01)
 
 
 def test_the_order_of_arrival_does_not_matter_nor_when_states_are_read():

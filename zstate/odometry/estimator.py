@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
@@ -17,9 +18,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from zstate import se3
 from zstate._util.format import did_you_mean
 from zstate.buffer.buffer import TransformBuffer, check_duration
-from zstate.checks import real_numbers
 from zstate.clock import check_stamp
 from zstate.errors import InFuture, InPast, InvalidInput, NoData
 from zstate.odometry.alignment import Alignment, align, start_at
@@ -39,18 +40,22 @@ from zstate.odometry.fusion import (
 from zstate.odometry.health import Outcome, SourceHealth, SourceRecord
 from zstate.odometry.invariant_filter import FilterState, Floats, ImuNoise, Measurement
 from zstate.odometry.legs import Legs
-from zstate.odometry.measurements import body_velocity, frame_pose, frame_twist, pose
+from zstate.odometry.measurements import (
+    body_velocity,
+    checked_noise,
+    checked_vector,
+    frame_pose,
+    frame_twist,
+    pose,
+)
 from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions
-from zstate.transform import Transform
+from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
 
 IMU, WHEELS, FEET, CONTACTS = "imu", "wheels", "feet", "contacts"
 """The names of these sources in ``BaseEstimator.health``."""
 
 COAST_NS = 500_000_000
 """No state is later than the newest event by more than this."""
-
-_TWIST_WINDOW_S = 0.01
-"""The time over which the noise of the rate in a twist is averaged."""
 
 _MOST_UNFUSED = 2000
 _PRUNED_AT_ONCE = 64
@@ -155,14 +160,14 @@ class BaseEstimator:
         self._newest: int | None = None
         self._rotations: list[tuple[int, dict[str, float]]] = []
         """Readings of the wheels, by stamp."""
-        self._sources: dict[str, SourceRecord] = {}
+        self._sources: defaultdict[str, SourceRecord] = defaultdict(SourceRecord)
 
     def imu(self, stamp: int, gyro: ArrayLike, accel: ArrayLike) -> None:
         """A sample of the IMU at ``stamp`` [ns]: rate [rad/s] and specific force [m/s^2] in its axes, (3,).
 
         Raises InvalidInput for other shapes, NaN and infinity.
         """
-        rate, force = _vector(gyro, IMU, "gyro"), _vector(accel, IMU, "accel")
+        rate, force = checked_vector(gyro, IMU, "gyro"), checked_vector(accel, IMU, "accel")
         self._insert(_Event(IMU, Inertia(check_stamp(stamp), rate, force), (*rate.tolist(), *force.tolist())))
 
     def velocity(
@@ -184,9 +189,9 @@ class BaseEstimator:
         Raises InvalidInput, which names the source, for NaN and for what is no covariance; UnknownFrame for
         the frame.
         """
-        vector = _vector(linear, source, "velocity")
-        rate = None if angular is None else _vector(angular, source, "angular velocity")
-        noise = _noise(sigma, covariance, 3, source)
+        vector = checked_vector(linear, source, "velocity")
+        rate = None if angular is None else checked_vector(angular, source, "angular velocity")
+        noise = checked_noise(sigma, covariance, 3, source)
         measured = WheelVelocity(vector, np.zeros(3) if rate is None else rate, noise)
         if not 0.0 <= scale < math.inf:
             raise InvalidInput(
@@ -224,7 +229,7 @@ class BaseEstimator:
                 raise InvalidInput(f"positions of legs must be finite; got {dict(positions)}")
             if not self._has_contacts:
                 self._legs.check_detection(velocities, efforts)
-            self._source(FEET).has_bounds = True
+            self._sources[FEET].has_bounds = True
             self._insert(_Event(FEET, steps, numbers))
 
     def contacts(self, stamp: int, touching: Mapping[str, bool]) -> None:
@@ -257,7 +262,7 @@ class BaseEstimator:
                 f"poses of source {source!r} are in {odom_from_base.target!r}; they must be in {self.odom!r}"
             )
         mount = self._mount(odom_from_base.source)
-        noise = _noise(None, covariance, 6, source)
+        noise = checked_noise(None, covariance, 6, source)
         matrix = odom_from_base.matrix
 
         def measure(state: FilterState, _: Floats) -> Measurement:
@@ -352,14 +357,11 @@ class BaseEstimator:
             self._mounts[frame] = transform.matrix
         return self._mounts[frame]
 
-    def _source(self, name: str) -> SourceRecord:
-        return self._sources.setdefault(name, SourceRecord())
-
     def _is_too_late(self, source: str, stamp: int) -> bool:
         """Whether an event is older than what is kept, in which case it is counted."""
         if self._newest is None or stamp >= self._newest - self._history_ns:
             return False
-        self._source(source).too_late += 1
+        self._sources[source].too_late += 1
         return True
 
     def _insert_rotations(self, wheels: Wheels, stamp: int, found: dict[str, float]) -> None:
@@ -377,7 +379,7 @@ class BaseEstimator:
         for first, second in ((before, (stamp, found)), ((stamp, found), after)):
             if first and second:
                 self._insert_displacement(wheels, first, second)
-        self._source(WHEELS).has_bounds = True
+        self._sources[WHEELS].has_bounds = True
 
     def _insert_displacement(
         self, wheels: Wheels, first: tuple[int, dict[str, float]], second: tuple[int, dict[str, float]]
@@ -418,7 +420,7 @@ class BaseEstimator:
         stamp = event.reading.stamp
         if self._is_too_late(event.source, stamp):
             return
-        self._source(event.source).stamps.append(stamp)
+        self._sources[event.source].stamps.append(stamp)
         if self._newest is None or stamp > self._newest:
             self._newest = stamp
         if not self._log or event.key >= self._log[-1].key:
@@ -427,14 +429,24 @@ class BaseEstimator:
         else:
             place = bisect_right(self._log, event.key, key=_key)
             self._log.insert(place, event)
-        self._rewind(place)
         if isinstance(event.reading, Inertia):
-            # Events since the previous sample were fused without this one.
-            while place and not isinstance(self._log[place - 1].reading, Inertia):
-                place -= 1
-            self._rewind(place)
+            place = self._first_between_samples(place)
+        self._rewind(place)
         if len(self._log) - self._fused > _MOST_UNFUSED:
             self._fuse()
+
+    def _first_between_samples(self, place: int) -> int:
+        """The first event before a new sample at ``place`` that was fused without it.
+
+        Events after the previous sample were, unless they have its stamp.
+        """
+        first = place
+        while first and not isinstance(self._log[first - 1].reading, Inertia):
+            first -= 1
+        if not first:
+            return 0
+        sampled = self._log[first - 1].reading.stamp
+        return bisect_right(self._log, sampled, first, place, key=lambda event: event.reading.stamp)
 
     def _remove(self, source: str, stamp: int) -> None:
         """Remove a displacement that a reading in its middle has divided."""
@@ -483,7 +495,7 @@ class BaseEstimator:
         return self._fusion.after_reading(estimate, event.source, reading, following)
 
     def _count_standstill(self, stamp: int) -> None:
-        record = self._source(STANDSTILL)
+        record = self._sources[STANDSTILL]
         record.has_bounds = True
         if not record.stamps or stamp > record.stamps[-1]:  # else it is replayed
             record.stamps.append(stamp)
@@ -512,7 +524,7 @@ class BaseEstimator:
         self._is_settled = True
         for event in self._log[:count]:
             if event.outcome is not None:
-                self._source(_outcome_source(event)).keep(event.outcome)
+                self._sources[_outcome_source(event)].keep(event.outcome)
         self._forget(count)
 
     def _too_old(self) -> int:
@@ -545,12 +557,14 @@ class BaseEstimator:
         settled = self._fusion.settled(estimate)
         matrix, pose_covariance = frame_pose(settled.state, self._imu_from_base)
         density = COASTING_RATE_DENSITY if estimate.is_coasting else self._noise.gyro
-        variance = density * density / _TWIST_WINDOW_S
+        variance = density * density / estimate.sampled_s
         twist, twist_covariance = frame_twist(settled.state, self._imu_from_base, estimate.rate, variance)
-        transform = Transform.from_matrix(self.odom, self.base, matrix, estimate.stamp)
+        pose7 = (*matrix[:3, 3].tolist(), *se3.quaternion_from_matrix(matrix[:3, :3]))
+        # Names and numbers are our own: checks would take as long as a prediction.
+        transform = Transform.trusted(self.odom, self.base, pose7, estimate.stamp, "exact")
         return BaseState(
             estimate.stamp,
-            transform.with_covariance(pose_covariance),
+            PoseWithCovariance.of_pose(transform, pose_covariance[UPPER_TRIANGLE].tolist()),
             BaseTwist(twist[:3], twist[3:]),
             pose_covariance,
             twist_covariance,
@@ -562,43 +576,3 @@ class BaseEstimator:
 
 def _outcome_source(event: _Event) -> str:
     return STANDSTILL if isinstance(event.reading, Inertia) else event.source
-
-
-def _vector(values: ArrayLike, source: str, what: str) -> Floats:
-    vector = real_numbers(values, f"the {what} of source {source!r}")
-    if vector.shape != (3,):
-        raise InvalidInput(f"the {what} of source {source!r} has shape (3,); got {vector.shape}")
-    if not math.isfinite(sum(vector.tolist())):
-        raise InvalidInput(f"the {what} of source {source!r} must be finite; got {vector.tolist()}")
-    return vector.copy()
-
-
-def _noise(sigma: ArrayLike | None, covariance: ArrayLike | None, size: int, source: str) -> Floats:
-    """The covariance, (size, size), that is given as such or by standard deviations."""
-    if (sigma is None) == (covariance is None):
-        raise InvalidInput(f"the noise of source {source!r} is given by sigma or by covariance, one of both")
-    if sigma is not None:
-        sigmas = real_numbers(sigma, f"the sigma of source {source!r}")
-        if sigmas.shape != (size,) or not (np.isfinite(sigmas) & (sigmas > 0.0)).all():
-            raise InvalidInput(
-                f"the sigma of source {source!r} is {size} standard deviations above zero; got "
-                f"{sigmas.tolist()}"
-            )
-        return np.diag(sigmas * sigmas)
-    assert covariance is not None
-    matrix = real_numbers(covariance, f"the covariance of source {source!r}")
-    if matrix.shape != (size, size):
-        raise InvalidInput(
-            f"the covariance of source {source!r} has shape ({size}, {size}); got {matrix.shape}"
-        )
-    if not np.isfinite(matrix).all():
-        raise InvalidInput(f"the covariance of source {source!r} must be finite; got {matrix.tolist()}")
-    if np.abs(matrix - matrix.T).max() > 1e-6 * np.abs(matrix).max():
-        raise InvalidInput(f"the covariance of source {source!r} is symmetric; got {matrix.tolist()}")
-    smallest = float(np.linalg.eigvalsh(matrix)[0])
-    if smallest <= 0.0:
-        raise InvalidInput(
-            f"the covariance of source {source!r} has no eigenvalue of zero or less; got {smallest:g}. A "
-            "variance of 0 is no exact measurement but an unknown noise: state what the sensor has"
-        )
-    return 0.5 * (matrix + matrix.T)

@@ -36,6 +36,7 @@ from zstate.odometry.invariant_filter import (
     Floats,
     ImuNoise,
     Measurement,
+    corrected,
     innovation,
     predict,
     updated,
@@ -62,6 +63,8 @@ _REST_FORCE = 0.5
 """[m/s^2] The specific force of a base at rest differs from gravity by less; a bias is part of it."""
 
 _DEVIATION_S = 20.0
+_SAMPLED_S, _SAMPLED_GAIN = 0.01, 0.05
+"""The time between samples of the IMU before it is known, and how fast its mean follows."""
 
 _YAW = ROTATION.start + 2
 
@@ -167,8 +170,8 @@ class Estimate(NamedTuple):
 
     ``rate`` and ``force`` are those of the IMU at ``stamp``, interpolated, or assumed if ``is_coasting``.
     ``moved_at`` is the stamp of the last velocity that was not zero, ``angular`` the rate by wheels in the
-    IMU's axes [rad/s], ``wheels_at`` their stamp. ``touching`` are the feet on the ground,
-    if measured.
+    IMU's axes [rad/s], ``wheels_at`` their stamp. ``touching`` are the feet on the ground, if measured.
+    ``sampled_s`` is the mean time between samples of the IMU, over which the noise of a rate is averaged.
     """
 
     stamp: int
@@ -179,6 +182,7 @@ class Estimate(NamedTuple):
     rest: Rest
     drift: Drift
     is_coasting: bool = False
+    sampled_s: float = _SAMPLED_S
     wheels_at: int | None = None
     moved_at: int = 0
     angular: Floats | None = None
@@ -202,16 +206,23 @@ class Fusion:
 
     def after_inertia(self, before: Estimate, sample: Inertia) -> tuple[Estimate, Outcome | None]:
         """The estimate at a sample of the IMU; with an outcome if the base was found to stand."""
-        estimate = self.predicted(before, sample.stamp, sample)._replace(
-            imu=sample, rate=sample.gyro, force=sample.accel, is_coasting=False
+        estimate = self.predicted(before, sample.stamp, sample)
+        start, size, gyro, accel, was_still = estimate.rest
+        rest = Rest(start, size + 1, gyro + sample.gyro, accel + sample.accel, was_still)
+        sampled_s = estimate.sampled_s
+        if before.imu is not None and not estimate.is_coasting:
+            sampled_s += _SAMPLED_GAIN * ((sample.stamp - before.imu.stamp) * 1e-9 - sampled_s)
+        estimate = estimate._replace(
+            imu=sample,
+            rate=sample.gyro,
+            force=sample.accel,
+            is_coasting=False,
+            rest=rest,
+            sampled_s=sampled_s,
         )
-        rest = estimate.rest
-        rest = rest._replace(
-            size=rest.size + 1, gyro=rest.gyro + sample.gyro, accel=rest.accel + sample.accel
-        )
-        if sample.stamp - rest.start < _REST_NS:
-            return estimate._replace(rest=rest), None
-        return self._at_end_of_rest(estimate, rest)
+        if sample.stamp - start < _REST_NS:
+            return estimate, None
+        return self._at_end_of_rest(estimate)
 
     def after_reading(
         self, before: Estimate, source: str, reading: Reading, following: Inertia | None
@@ -295,11 +306,12 @@ class Fusion:
         instead.
         """
         state, drift = estimate.state, estimate.drift
-        by_wheels, by_gyro = np.zeros((2, len(state.covariance)))
+        shifts = np.zeros((2, len(state.covariance)))
+        by_wheels, by_gyro = shifts
         by_wheels[POSITION] = drift.scale * (state.position - drift.origin)
         by_gyro[_YAW] = self.noise.gyro_scale * drift.turned
         by_gyro[POSITION] = self.noise.gyro_scale * drift.shift
-        covariance = state.covariance + np.outer(by_wheels, by_wheels) + np.outer(by_gyro, by_gyro)
+        covariance = state.covariance + shifts.T @ shifts
         return estimate._replace(
             state=state._replace(covariance=covariance), drift=Drift(state.position, drift.scale)
         )
@@ -345,9 +357,9 @@ class Fusion:
             stamp=stamp, state=state, rate=rate, force=force, is_coasting=True, rest=_new_rest(stamp)
         )
 
-    def _at_end_of_rest(self, estimate: Estimate, rest: Rest) -> tuple[Estimate, Outcome | None]:
+    def _at_end_of_rest(self, estimate: Estimate) -> tuple[Estimate, Outcome | None]:
         """The estimate with a zero velocity, if the base stood in this interval and in the one before."""
-        stamp, state = estimate.stamp, estimate.state
+        stamp, state, rest = estimate.stamp, estimate.state, estimate.rest
         gyro, accel = rest.gyro / rest.size, rest.accel / rest.size
         wheels_at = estimate.wheels_at
         wheels_stand = (
@@ -404,11 +416,13 @@ def _interpolated(last: Inertia | None, following: Inertia | None, stamp: int) -
 
 def _gated(estimate: Estimate, source: str, measurement: Measurement) -> tuple[Estimate, Outcome]:
     state, dimension = estimate.state, len(measurement.residual)
-    nis = innovation(state, measurement).nis
+    found = innovation(state, measurement)
+    nis = found.nis
     if nis <= gate(dimension):
         if source in estimate.runs:
             estimate = _with_run(estimate, source, None)
-        return estimate._replace(state=updated(state, measurement)), Outcome("accepted", nis, dimension)
+        state = corrected(state, measurement, found)
+        return estimate._replace(state=state), Outcome("accepted", nis, dimension)
     run = _continued(estimate, source, measurement)
     if run.length < _REACQUIRE_COUNT or estimate.stamp - run.start < _REACQUIRE_NS:
         return _with_run(estimate, source, run), Outcome("rejected", nis, dimension)

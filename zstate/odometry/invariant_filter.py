@@ -42,10 +42,13 @@ GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
 _STANDARD_GRAVITY = -float(GRAVITY[2])
 _HALF_GRAVITY = 0.5 * GRAVITY
 _IDENTITY = np.eye(3)
-# Of a constant rate over the whole step, and of the two nodes of Gauss-Legendre quadrature, for a step of 1.
+_ROOT_HALF = math.sqrt(0.5)
 _NODES = np.array([0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)])
-_MEAN_TIMES = np.array([0.5, *_NODES])[:, None]
-_MEAN_HALF_SQUARES = np.array([1.0 / 3.0, *_NODES**2])[:, None] / 2.0
+"""Of Gauss-Legendre quadrature, for a step of 1."""
+_INNER_TIMES = np.array([(0.5, 1.0 / 6.0), *((node, 0.5 * node**2) for node in _NODES)])
+"""u and u^2 / 2 of a constant rate over the whole step, and of the nodes, for a step of 1: (3, 2)."""
+_NODE_SHIFTS = np.kron(_NODES, _IDENTITY)
+"""What a push at each of the nodes moves until the end of a step of 1: (3, 6)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +111,7 @@ class Measurement(NamedTuple):
 
 
 class Innovation(NamedTuple):
-    """The residual of a measurement with its expected covariance, (m, m).
+    """The residual of a measurement with its expected covariance, (m, m), and the gain of Kalman, (n, m).
 
     ``nis``, the normalised innovation squared, follows the chi-square distribution of m degrees of freedom if
     noise and estimate are as their covariances state (Bar-Shalom, Li, Kirubarajan, 2001, 5.4).
@@ -116,6 +119,7 @@ class Innovation(NamedTuple):
 
     residual: Floats
     covariance: Floats
+    gain: Floats
     nis: float
 
 
@@ -170,7 +174,7 @@ def predict(
     pushes: Floats = turned[1:] @ (accel - state.accel_bias)
     velocity = state.velocity + (pushes[0] + GRAVITY) * dt_s
     position = state.position + state.velocity * dt_s + (pushes[1] + _HALF_GRAVITY) * (dt_s * dt_s)
-    skews = _inner_skews(velocity, position, state.contacts, pushes[0], dt_s)
+    skews = _inner_skews(velocity, position, pushes[0], dt_s)
 
     size = len(state.covariance)
     transition = _identity(size).copy()
@@ -181,14 +185,18 @@ def predict(
     transition[7, 0] = -0.5 * fall * dt_s
     transition[6, 3] = transition[7, 4] = transition[8, 5] = dt_s
     turn = turned[1] * -dt_s
-    by_gyro_bias: Floats = skews[0] @ turn
     transition[ROTATION, GYRO_BIAS] = transition[VELOCITY, ACCEL_BIAS] = turn
     transition[POSITION, ACCEL_BIAS] = turned[2] * (-dt_s * dt_s)
-    transition[3:9, GYRO_BIAS] = by_gyro_bias[:6]
-    transition[15:, GYRO_BIAS] = by_gyro_bias[6:]
+    transition[3:9, GYRO_BIAS] = skews[0] @ turn
 
-    covariance: Floats = transition @ state.covariance @ transition.T
-    _add_noise(covariance, skews[1:], dt_s, noise, contact_noise)
+    effects = _noise_effects(noise, contact_noise, size).copy()
+    effects[3:9, :3], effects[3:9, 3:6] = (_ROOT_HALF * noise.gyro) * skews[1:]
+    effects[POSITION, 6:12] = _NODE_SHIFTS * (_ROOT_HALF * noise.accel * dt_s)
+    if state.feet:
+        contact_skews = (state.contacts @ SKEW).reshape(-1, 3)
+        transition[15:, GYRO_BIAS] = contact_skews @ turn
+        effects[15:, :3] = effects[15:, 3:6] = (_ROOT_HALF * noise.gyro) * contact_skews
+    covariance: Floats = transition @ state.covariance @ transition.T + (effects @ effects.T) * dt_s
     return FilterState(
         turned[0],
         velocity,
@@ -202,24 +210,31 @@ def predict(
 
 
 def innovation(state: FilterState, measurement: Measurement) -> Innovation:
-    """The residual of ``measurement``, its expected covariance and its NIS."""
+    """What ``measurement`` has that is new to the state: all that a gate and ``corrected`` need."""
     residual, jacobian, noise = measurement
-    covariance: Floats = jacobian @ state.covariance @ jacobian.T + noise
-    return Innovation(residual, covariance, float(residual @ np.linalg.solve(covariance, residual)))
+    crossed: Floats = jacobian @ state.covariance
+    covariance: Floats = crossed @ jacobian.T + noise
+    right = np.concatenate((crossed, residual[:, None]), axis=1)
+    solved = np.asarray(np.linalg.solve(covariance, right), dtype=np.float64)
+    return Innovation(residual, covariance, solved[:, :-1].T, float(residual @ solved[:, -1]))
 
 
 def updated(state: FilterState, measurement: Measurement) -> FilterState:
-    """The state after ``measurement``: the estimate moves by ``exp`` of gain times residual.
+    """The state after ``measurement``."""
+    return corrected(state, measurement, innovation(state, measurement))
+
+
+def corrected(state: FilterState, measurement: Measurement, found: Innovation) -> FilterState:
+    """The state after ``measurement``, whose innovation was ``found``: it moves by ``exp`` of gain times
+    residual.
 
     The covariance has Joseph's form, which stays symmetric and positive semidefinite (Bucy, Joseph, 1968).
     """
     residual, jacobian, noise = measurement
-    crossed: Floats = state.covariance @ jacobian.T
-    gain = np.linalg.solve(jacobian @ crossed + noise, crossed.T).T
+    gain = found.gain
     rest = _identity(len(state.covariance)) - gain @ jacobian
     covariance: Floats = rest @ state.covariance @ rest.T + gain @ noise @ gain.T
-    moved = _moved(state, gain @ residual)
-    return moved._replace(covariance=0.5 * (covariance + covariance.T))
+    return _moved(state, gain @ residual, 0.5 * (covariance + covariance.T))
 
 
 def with_contact(state: FilterState, foot: str, offset: Floats, covariance: Floats) -> FilterState:
@@ -264,12 +279,11 @@ def contact_row(state: FilterState, foot: str) -> int:
     return 15 + 3 * state.feet.index(foot)
 
 
-def _moved(state: FilterState, error: Floats) -> FilterState:
-    """The estimate ``exp(error) X'`` and the biases plus theirs; the covariance is left as it is."""
+def _moved(state: FilterState, error: Floats, covariance: Floats) -> FilterState:
+    """The estimate ``exp(error) X'`` and the biases plus theirs, with ``covariance``."""
     rotation, left_jacobian, _ = gammas(error[ROTATION])
-    points, shifts = np.empty((2, 2 + len(state.contacts), 3))
-    points[0], points[1], points[2:] = state.velocity, state.position, state.contacts
-    shifts[:2], shifts[2:] = error[3:9].reshape(2, 3), error[15:].reshape(-1, 3)
+    points = np.concatenate((state.velocity, state.position, state.contacts.ravel())).reshape(-1, 3)
+    shifts = np.concatenate((error[3:9], error[15:])).reshape(-1, 3)
     points = points @ rotation.T + shifts @ left_jacobian.T
     turned: Floats = rotation @ state.rotation
     # A step of Newton's iteration towards the nearest rotation keeps rounding from accumulating.
@@ -282,50 +296,21 @@ def _moved(state: FilterState, error: Floats) -> FilterState:
         state.accel_bias + error[ACCEL_BIAS],
         state.feet,
         points[2:],
-        state.covariance,
+        covariance,
     )
 
 
-def _inner_skews(
-    velocity: Floats, position: Floats, contacts: Floats, acceleration: Floats, dt_s: float
-) -> Floats:
-    """What turns inside a step do to velocity, position and contacts at its end: (3, 6 + 3k, 3).
+def _inner_skews(velocity: Floats, position: Floats, acceleration: Floats, dt_s: float) -> Floats:
+    """What turns inside a step do to velocity and position at its end: (3, 6, 3).
 
-    A turn at the time u before the end has the effects [v - a u], [p - a u^2 / 2] and [c], with
-    ``acceleration`` a the mean specific force in the world. The first matrices are the effect of a constant
-    rate over the whole step, where u is dt/2 and u^2 is dt^2 / 3 in the mean (the next term is of dt^3), the
-    others those at the two nodes of Gauss-Legendre quadrature.
+    A turn at the time u before the end has the effects [v - a u] and [p - a u^2 / 2], with ``acceleration`` a
+    the mean specific force in the world; that on contacts is always [c]. The first matrices are the effect of
+    a constant rate over the whole step, where u is dt/2 and u^2 is dt^2 / 3 in the mean (the next term is of
+    dt^3), the others those at the two nodes of Gauss-Legendre quadrature.
     """
-    points = np.empty((3, 2 + len(contacts), 3))
-    points[:, 0] = velocity - _MEAN_TIMES * (acceleration * dt_s)
-    points[:, 1] = position - _MEAN_HALF_SQUARES * (acceleration * (dt_s * dt_s))
-    points[:, 2:] = contacts
-    return (points.reshape(-1, 3) @ SKEW).reshape(3, -1, 3)
-
-
-def _add_noise(covariance: Floats, skews: Floats, dt_s: float, noise: ImuNoise, contact_noise: float) -> None:
-    """Adds the noise of a step to a covariance, (n, n). ``skews`` (2, 6 + 3k, 3) are those of the two nodes.
-
-    The white noises are isotropic, so that the orientation does not matter. The quadrature integrates the
-    squares of the gyro's effects exactly up to u^3.
-    """
-    size = len(covariance)
-    gyro, accel = noise.gyro * noise.gyro, noise.accel * noise.accel
-    # Columns of node 0, then of node 1.
-    effects = np.zeros((size, 6))
-    effects[0, 0] = effects[1, 1] = effects[2, 2] = effects[0, 3] = effects[1, 4] = effects[2, 5] = 1.0
-    effects[3:9, :3], effects[3:9, 3:] = skews[0, :6], skews[1, :6]
-    effects[15:, :3], effects[15:, 3:] = skews[0, 6:], skews[1, 6:]
-    covariance += (effects @ effects.T) * (0.5 * gyro * dt_s)
-    flat = covariance.ravel()
-    flat[:: size + 1] += _variances_per_second(noise, contact_noise, size) * dt_s
-    # Position by the noise of the accelerometer: dt^3 / 3, and dt^2 / 2 with velocity.
-    for start, variance in (
-        (6 * size + 6, accel * dt_s**3 / 3.0),
-        (6 * size + 3, accel * dt_s**2 / 2.0),
-        (3 * size + 6, accel * dt_s**2 / 2.0),
-    ):
-        flat[start : start + 3 * size : size + 1] += variance
+    times = _INNER_TIMES * (dt_s, dt_s * dt_s)
+    points = np.array((velocity, position)) - times[:, :, None] * acceleration
+    return (points @ SKEW).reshape(3, 6, 3)
 
 
 def _invariant_from_plain(state: FilterState) -> Floats:
@@ -343,7 +328,17 @@ def _identity(size: int) -> Floats:
 
 
 @cache
-def _variances_per_second(noise: ImuNoise, contact_noise: float, size: int) -> Floats:
-    """What the diagonal of a covariance gains per second, but for the white noise of the gyro: (size,)."""
-    densities = (0.0, noise.accel, 0.0, noise.gyro_bias, noise.accel_bias, contact_noise)
-    return np.repeat(densities, (3, 3, 3, 3, 3, size - 15)) ** 2
+def _noise_effects(noise: ImuNoise, contact_noise: float, size: int) -> Floats:
+    """What unit white noises do to a state of ``size`` numbers, but for what depends on the step: (size, n).
+
+    The columns are the noise of the gyro at the two nodes of Gauss-Legendre quadrature, that of the
+    accelerometer likewise, then the walks of biases and contacts. The sum over the nodes integrates the
+    squares of effects exactly up to u^3. The white noises are isotropic, so that the orientation does not
+    matter.
+    """
+    effects = np.zeros((size, size + 3))
+    effects[ROTATION, :6] = np.tile(_IDENTITY, 2) * (_ROOT_HALF * noise.gyro)
+    effects[VELOCITY, 6:12] = np.tile(_IDENTITY, 2) * (_ROOT_HALF * noise.accel)
+    walks = np.repeat((noise.gyro_bias, noise.accel_bias, contact_noise), (3, 3, size - 15))
+    effects[9:, 12:] = np.diag(walks)
+    return effects

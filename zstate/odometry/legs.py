@@ -21,8 +21,8 @@ from zstate.model.kinematics import Kinematics
 from zstate.model.robot import Joint, RobotModel, near_joint
 from zstate.odometry.invariant_filter import (
     FilterState,
+    corrected,
     innovation,
-    updated,
     with_contact,
     without_contact,
 )
@@ -233,9 +233,10 @@ def updated_by_feet(
         if foot.name not in state.feet:
             continue
         measurement = contact(state, foot.name, foot.offset, foot.covariance)
-        squares[foot.name] = innovation(state, measurement).nis
-        if squares[foot.name] <= gate:
-            state = updated(state, measurement)
+        found = innovation(state, measurement)
+        squares[foot.name] = found.nis
+        if found.nis <= gate:
+            state = corrected(state, measurement, found)
         else:
             state = without_contact(state, foot.name)
     for foot in on_ground:

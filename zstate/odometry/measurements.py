@@ -2,7 +2,7 @@
 
 Each function linearises one kind of measurement at a state. ``imu_from_frame``, (4, 4), is the mount of the
 frame that was measured. The derivatives are by the right-invariant error (``invariant_filter.py``), whose
-order they have. Numbers are not checked here.
+order they have. Numbers are those that ``checked_vector`` and ``checked_noise`` have let pass.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from zstate import se3
+from zstate.checks import real_numbers
 from zstate.errors import InvalidInput
 from zstate.odometry.invariant_filter import (
     GYRO_BIAS,
@@ -141,6 +143,50 @@ def frame_twist(
     # White noise of the rate acts as a bias of this instant.
     covariance: Floats = jacobian @ state.covariance @ jacobian.T + by_bias @ by_bias.T * gyro_variance
     return twist, covariance
+
+
+def checked_vector(values: ArrayLike, source: str, what: str) -> Floats:
+    """A copy of ``values``, (3,). Raises InvalidInput, which names the source, for other shapes and NaN."""
+    vector = real_numbers(values, f"the {what} of source {source!r}")
+    if vector.shape != (3,):
+        raise InvalidInput(f"the {what} of source {source!r} has shape (3,); got {vector.shape}")
+    if not math.isfinite(sum(vector.tolist())):
+        raise InvalidInput(f"the {what} of source {source!r} must be finite; got {vector.tolist()}")
+    return vector.copy()
+
+
+def checked_noise(sigma: ArrayLike | None, covariance: ArrayLike | None, size: int, source: str) -> Floats:
+    """The covariance, (size, size), that is given as such or by standard deviations.
+
+    Raises InvalidInput, which names the source, unless it is finite, symmetric and positive definite.
+    """
+    if (sigma is None) == (covariance is None):
+        raise InvalidInput(f"the noise of source {source!r} is given by sigma or by covariance, one of both")
+    if sigma is not None:
+        sigmas = real_numbers(sigma, f"the sigma of source {source!r}")
+        if sigmas.shape != (size,) or not (np.isfinite(sigmas) & (sigmas > 0.0)).all():
+            raise InvalidInput(
+                f"the sigma of source {source!r} is {size} standard deviations above zero; got "
+                f"{sigmas.tolist()}"
+            )
+        return np.diag(sigmas * sigmas)
+    assert covariance is not None
+    matrix = real_numbers(covariance, f"the covariance of source {source!r}")
+    if matrix.shape != (size, size):
+        raise InvalidInput(
+            f"the covariance of source {source!r} has shape ({size}, {size}); got {matrix.shape}"
+        )
+    if not np.isfinite(matrix).all():
+        raise InvalidInput(f"the covariance of source {source!r} must be finite; got {matrix.tolist()}")
+    if np.abs(matrix - matrix.T).max() > 1e-6 * np.abs(matrix).max():
+        raise InvalidInput(f"the covariance of source {source!r} is symmetric; got {matrix.tolist()}")
+    smallest = float(np.linalg.eigvalsh(matrix)[0])
+    if smallest <= 0.0:
+        raise InvalidInput(
+            f"the covariance of source {source!r} has no eigenvalue of zero or less; got {smallest:g}. A "
+            "variance of 0 is no exact measurement but an unknown noise: state what the sensor has"
+        )
+    return 0.5 * (matrix + matrix.T)
 
 
 def _world_from_frame(state: FilterState, imu_from_frame: Floats) -> Floats:
