@@ -198,6 +198,18 @@ def test_without_imu_the_wheels_predict_and_the_state_is_marked():
     assert "silent" in health_of(base, "imu").sentence
 
 
+def test_a_turn_while_all_sources_are_silent_is_inside_the_claim():
+    base = estimator()
+    t = drive(base, 3.0)
+    t = drive(base, 2.0, start=t, speed=0.5)
+    gap_s, yaw_rate = 0.4, 0.9
+    drive(base, 1.0, start=t + gap_s, speed=0.5, yaw_rate=yaw_rate)
+    state = base.state()
+    error = yaw_rate * (gap_s + 1.0) - state.odom_from_base.rpy[2]
+    assert error == pytest.approx(yaw_rate * gap_s, abs=0.05)  # nothing measured it
+    assert abs(error) < 3.0 * math.sqrt(state.pose_covariance[5, 5])
+
+
 def test_no_state_is_later_than_half_a_second_after_the_newest_event():
     base = estimator()
     drive(base, 2.0)

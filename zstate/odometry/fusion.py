@@ -4,8 +4,8 @@
 kept.
 
 - Between events the IMU is interpolated, and predicts. Without samples for more than 0.1 s, the base keeps
-  the
-  velocity in its own axes, and the yaw rate of the wheels, with large noise.
+  its velocity in its own axes, and turns at the rate of the wheels, with large noise. If the wheels are
+  silent, too, it turns at the last rate, give or take a constant 1 rad/s.
 - A reading whose NIS exceeds the 99.9 % gate is rejected. After two seconds of rejections that agree with one
   another, the estimate follows: the variance of what they measure grows by their squared residual.
 - If wheels and gyro agree for 0.1 s that the base stands, its velocity is zero, and the gyro measures its own
@@ -70,6 +70,10 @@ _YAW = ROTATION.start + 2
 
 COASTING_RATE_DENSITY, _COASTING_FORCE_DENSITY = 0.1, 1.0
 """Of the rate by wheels [rad/s/sqrt(Hz)], and of unknown accelerations [m/s^2/sqrt(Hz)]."""
+_COASTING_WHEELS_NS = 100_000_000
+"""The rate of the wheels is used for so long."""
+_UNKNOWN_RATE = 1.0
+"""[rad/s] The standard deviation of a rate that neither IMU nor wheels measure, about the last one."""
 
 
 class Inertia(NamedTuple):
@@ -340,11 +344,14 @@ class Fusion:
 
     def _coasted(self, before: Estimate, stamp: int) -> Estimate:
         state = before.state
-        angular = before.angular
-        is_known = before.wheels_at is not None and stamp - before.wheels_at <= _WHEELS_VALID_NS
+        angular, density = before.angular, COASTING_RATE_DENSITY
+        is_known = before.wheels_at is not None and stamp - before.wheels_at <= _COASTING_WHEELS_NS
         if angular is None or not is_known:
-            angular = np.zeros(3)
-        noise = replace(self.noise, gyro=COASTING_RATE_DENSITY, accel=_COASTING_FORCE_DENSITY)
+            angular = before.rate - state.gyro_bias
+            # The angle of an unknown constant rate has the variance (s t)^2, whose growth is 2 s^2 t.
+            silent_s = 0.0 if before.imu is None else (stamp - before.imu.stamp) * 1e-9
+            density = max(density, _UNKNOWN_RATE * math.sqrt(2.0 * silent_s))
+        noise = replace(self.noise, gyro=density, accel=_COASTING_FORCE_DENSITY)
         left = (stamp - before.stamp) * 1e-9
         count = max(1, math.ceil(left / _LONGEST_STEP_S))
         rate = angular + state.gyro_bias
