@@ -62,9 +62,9 @@ def squared_errors(motion: Motion, state: BaseState) -> tuple[float, float, floa
     estimated = state.odom_from_base.matrix
     turn = se3.quaternion_from_matrix(rotation @ estimated[:3, :3].T)
     errors = (
-        (position - estimated[:3, 3], state.pose_covariance[:3, :3]),
-        (np.array(se3.rotation_vector(turn, se3.SCALARS)), state.pose_covariance[3:, 3:]),
-        (rotation.T @ velocity - state.twist.linear, state.twist_covariance[:3, :3]),
+        (position - estimated[:3, 3], state.covariance.pose[:3, :3]),
+        (np.array(se3.rotation_vector(turn, se3.SCALARS)), state.covariance.pose[3:, 3:]),
+        (rotation.T @ velocity - state.twist.linear, state.covariance.twist[:3, :3]),
     )
     position_nees, attitude, speed = (
         float(error @ np.linalg.solve(covariance, error)) for error, covariance in errors
@@ -99,7 +99,7 @@ def test_the_rate_of_a_twist_has_the_noise_of_one_sample():
     for number in range(300):
         base.imu(stamp_at(number / 200), [0.0] * 3, [0.0, 0.0, 9.80665])
     # A density of 5e-3 is a variance of 5e-3^2 * 200 in a sample at 200 Hz; the bias adds 0.01^2.
-    variances = np.diag(base.state().twist_covariance)[3:]
+    variances = np.diag(base.state().covariance.twist)[3:]
     np.testing.assert_allclose(variances, 5e-3**2 * 200 + 0.01**2, rtol=0.01)
 
 
@@ -115,7 +115,7 @@ def test_the_order_of_arrival_does_not_matter_nor_when_states_are_read():
         one, other = in_order.state(at), shuffled.state(at)
         assert one.stamp == other.stamp
         np.testing.assert_allclose(one.odom_from_base.pose7, other.odom_from_base.pose7, atol=1e-9)
-        np.testing.assert_allclose(one.pose_covariance, other.pose_covariance, atol=1e-9)
+        np.testing.assert_allclose(one.covariance.pose, other.covariance.pose, atol=1e-9)
         np.testing.assert_allclose(one.twist, other.twist, atol=1e-9)
 
 
@@ -194,7 +194,7 @@ def test_without_imu_the_wheels_predict_and_the_state_is_marked():
     moved = before.odom_from_base.inverse() @ state.odom_from_base
     assert moved.translation[0] == pytest.approx(0.5 / 0.3 * math.sin(0.3), abs=0.05)
     assert moved.rpy[2] == pytest.approx(0.3, abs=0.03)
-    assert state.pose_covariance[5, 5] > 10 * before.pose_covariance[5, 5]
+    assert state.covariance.pose[5, 5] > 10 * before.covariance.pose[5, 5]
     assert "silent" in health_of(base, "imu").sentence
 
 
@@ -207,7 +207,7 @@ def test_a_turn_while_all_sources_are_silent_is_inside_the_claim():
     state = base.state()
     error = yaw_rate * (gap_s + 1.0) - state.odom_from_base.rpy[2]
     assert error == pytest.approx(yaw_rate * gap_s, abs=0.05)  # nothing measured it
-    assert abs(error) < 3.0 * math.sqrt(state.pose_covariance[5, 5])
+    assert abs(error) < 3.0 * math.sqrt(state.covariance.pose[5, 5])
 
 
 def test_no_state_is_later_than_half_a_second_after_the_newest_event():
@@ -299,7 +299,7 @@ def wander(compass: bool, hard_iron: float) -> tuple[float, float, BaseEstimator
         yaw += rate * 0.02
     state = base.state()
     error = math.remainder(state.odom_from_base.rpy[2] - yaw, math.tau)
-    return error, math.sqrt(state.pose_covariance[5, 5]), base
+    return error, math.sqrt(state.covariance.pose[5, 5]), base
 
 
 def test_a_compass_with_hard_iron_of_35_degrees_is_no_worse_than_none():
@@ -354,7 +354,7 @@ def test_poses_bound_the_drift_of_wheels():
         base.pose(stamp_at(t + 0.1 * step), pose, 1e-4 * np.eye(6), source="mocap")
     state = base.state()
     assert state.odom_from_base.translation[0] == pytest.approx(0.05 * 7.99, abs=0.03)
-    assert state.pose_covariance[0, 0] < 0.01**2
+    assert state.covariance.pose[0, 0] < 0.01**2
     assert health_of(base, "mocap").accepted == 80
 
 
@@ -423,6 +423,6 @@ def test_a_replay_of_the_same_calls_is_the_same_bit_for_bit_whenever_states_are_
     feed(replayed, calls)
     one, other = live.state(), replayed.state()
     assert one.odom_from_base.pose7.tobytes() == other.odom_from_base.pose7.tobytes()
-    assert one.pose_covariance.tobytes() == other.pose_covariance.tobytes()
-    assert one.twist_covariance.tobytes() == other.twist_covariance.tobytes()
+    assert one.covariance.pose.tobytes() == other.covariance.pose.tobytes()
+    assert one.covariance.twist.tobytes() == other.covariance.twist.tobytes()
     assert live.health() == replayed.health()

@@ -152,7 +152,7 @@ def report_lines(replayed: ReplayedOdometry) -> Iterator[str]:
     """The path, its end with one standard deviation, and each source."""
     last = replayed.states[-1]
     x, y, z = last.odom_from_base.translation.tolist()
-    sigmas = np.sqrt(np.diag(last.pose_covariance))
+    sigmas = np.sqrt(np.diag(last.covariance.pose))
     yield (
         f"{replayed.way_m:.2f} m in {replayed.seconds[-1]:.1f} s; {replayed.base} ends at "
         f"x {x:.3f} m (sigma {sigmas[0]:.3f}), y {y:.3f} m ({sigmas[1]:.3f}), z {z:.3f} m ({sigmas[2]:.3f}), "
@@ -207,7 +207,7 @@ def _draw_path(panel: Axes, replayed: ReplayedOdometry) -> None:
     for number, state in enumerate(replayed.states):
         if number % step:
             continue
-        covariance: Floats = state.pose_covariance[:2, :2]
+        covariance: Floats = state.covariance.pose[:2, :2]
         values, vectors = np.linalg.eigh(covariance)
         ellipse = (vectors * np.sqrt(np.maximum(values, 0.0))) @ circle
         panel.plot(x[number] + ellipse[0], y[number] + ellipse[1], color="tab:blue", linewidth=0.6)

@@ -1,6 +1,6 @@
 """Odometry: where a robot's base is, from an IMU, wheels, legs and poses, with a covariance."""
 
-from zstate.odometry.estimator import BaseEstimator, BaseState, BaseTwist
+from zstate.odometry.estimator import BaseCovariance, BaseEstimator, BaseState, BaseTwist
 from zstate.odometry.health import SourceHealth
 from zstate.odometry.invariant_filter import ImuNoise
 from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
@@ -13,6 +13,7 @@ from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wh
 
 __all__ = [
     "Ackermann",
+    "BaseCovariance",
     "BaseEstimator",
     "BaseState",
     "BaseTwist",

@@ -68,20 +68,28 @@ class BaseTwist(NamedTuple):
     angular: Floats
 
 
+class BaseCovariance(NamedTuple):
+    """The covariances of a base, (6, 6) each.
+
+    ``pose`` has the order and axes of ``Transform.covariance``; ``twist`` is linear before angular.
+    """
+
+    pose: Floats
+    twist: Floats
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class BaseState:
     """The pose and velocity of a base at ``stamp`` [ns].
 
-    ``odom_from_base`` has the covariance ``pose_covariance``, (6, 6), as ``Transform.covariance``;
-    ``twist_covariance``, (6, 6), is that of ``twist``, linear before angular. ``gyro_bias`` [rad/s] and
+    ``covariance`` is that of ``odom_from_base`` and of ``twist``. ``gyro_bias`` [rad/s] and
     ``accel_bias`` [m/s^2] are those of the IMU in its axes, (3,). ``is_coasting``: the IMU is silent.
     """
 
     stamp: int
     odom_from_base: Transform
     twist: BaseTwist
-    pose_covariance: Floats
-    twist_covariance: Floats
+    covariance: BaseCovariance
     gyro_bias: Floats
     accel_bias: Floats
     is_coasting: bool
@@ -566,8 +574,7 @@ class BaseEstimator:
             estimate.stamp,
             PoseWithCovariance.of_pose(transform, pose_covariance[UPPER_TRIANGLE].tolist()),
             BaseTwist(twist[:3], twist[3:]),
-            pose_covariance,
-            twist_covariance,
+            BaseCovariance(pose_covariance, twist_covariance),
             estimate.state.gyro_bias,
             estimate.state.accel_bias,
             estimate.is_coasting,

@@ -199,7 +199,7 @@ class OdometryNode(Closeable):
         linear, angular = state.twist
         try:
             self._publisher.publish(
-                state.odom_from_base, linear, angular, state.stamp, twist_covariance=state.twist_covariance
+                state.odom_from_base, linear, angular, state.stamp, twist_covariance=state.covariance.twist
             )
         except Closed:
             pass
