@@ -425,4 +425,4 @@ def test_a_replay_of_the_same_calls_is_the_same_bit_for_bit_whenever_states_are_
     assert one.odom_from_base.pose7.tobytes() == other.odom_from_base.pose7.tobytes()
     assert one.covariance.pose.tobytes() == other.covariance.pose.tobytes()
     assert one.covariance.twist.tobytes() == other.covariance.twist.tobytes()
-    assert live.health() == replayed.health()
+    assert repr(live.health()) == repr(replayed.health())  # NaN equals NaN
