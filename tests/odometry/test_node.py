@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import threading
+import time
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 
@@ -23,6 +24,7 @@ from zstate.odometry import (
     ImuNoise,
     ImuPublisher,
     OdometryNode,
+    PosePublisher,
     VelocityPublisher,
 )
 from zstate.odometry.simulated_rover import SimulatedRover
@@ -160,6 +162,22 @@ def test_velocities_without_covariance_are_refused_and_counted():
             return node.refused.get("refused", 0)
 
         until(refused)
+
+
+def test_measured_poses_place_the_base():
+    with (
+        rover_with_odometry(poses=("mocap",)) as (_, node, listener, session),
+        PosePublisher(session, "r1", "mocap") as mocap,
+    ):
+        measured = Transform(ODOM, BASE, [0.02, 0.0, 0.0], [0, 0, 0, 1]).with_covariance(1e-6 * np.eye(6))
+
+        def is_there() -> bool:
+            mocap.publish(measured, time.time_ns())
+            x = listener.buffer.lookup(ODOM, BASE).translation[0]
+            return bool(x == pytest.approx(0.02, abs=0.005))
+
+        until(is_there)
+        assert "mocap" in {source.name for source in node.health()}
 
 
 def test_second_node_of_a_name_is_refused_with_the_first():

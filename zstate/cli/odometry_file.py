@@ -82,6 +82,7 @@ class OdometrySettings:
 
     imu: str = "imu"
     velocities: tuple[str, ...] = ()
+    poses: tuple[str, ...] = ()
     odom: str = "odom"
     base: str | None = None
     history_s: float = 1.0
@@ -90,7 +91,7 @@ class OdometrySettings:
     legs: LegSettings | None = None
 
     def __post_init__(self) -> None:
-        for sensor in (self.imu, *self.velocities):
+        for sensor in (self.imu, *self.velocities, *self.poses):
             check_writer(sensor)
 
     @property

@@ -22,7 +22,7 @@ from zstate.errors import InvalidInput, NoData
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, SourceHealth
-from zstate.odometry.node import add_imu, add_velocity
+from zstate.odometry.node import add_imu, add_pose, add_velocity
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.wire.messages import RobotDescription
 
@@ -95,6 +95,11 @@ def replay(path: str, robot: str, settings: OdometrySettings) -> ReplayedOdometr
             events += [
                 (one.stamp, False, partial(add_velocity, sensor=sensor, message=one))
                 for one in recording.velocities(robot, sensor)
+            ]
+        for sensor in settings.poses:
+            events += [
+                (one.stamp, False, partial(add_pose, sensor=sensor, message=one))
+                for one in recording.poses(robot, sensor)
             ]
         joints = recording.joint_states(robot) if settings.has_joints else None
     if not readings:

@@ -18,7 +18,8 @@ from zstate.odometry.invariant_filter import Floats
 from zstate.odometry.listener import SensorListener
 from zstate.odometry.publishers import OdometryPublisher
 from zstate.sources import JointReading, JointStateListener
-from zstate.wire.messages import Imu, Velocity, covariance_matrix, from_block
+from zstate.transform import Transform
+from zstate.wire.messages import Imu, Pose, Velocity, covariance_matrix, from_block
 
 _SILENT_NS = 100_000_000
 """After this time without its IMU, a node publishes at the stamps of other sources."""
@@ -44,6 +45,14 @@ def add_velocity(base: BaseEstimator, sensor: str, message: Velocity) -> None:
         frame=message.frame,
         source=sensor,
     )
+
+
+def add_pose(base: BaseEstimator, sensor: str, message: Pose) -> None:
+    """Pass one measured pose of ``sensor`` to ``base``. Raises InvalidInput for one without covariance."""
+    if message.covariance is None:
+        raise InvalidInput(f"poses of {sensor!r} have no covariance: publish them with one")
+    measured = Transform.from_pose7(message.parent, message.child or base.base, from_block(message.pose))
+    base.pose(message.stamp, measured, covariance_matrix(message.covariance), source=sensor)
 
 
 def add_joints(base: BaseEstimator, model: RobotModel, reading: JointReading) -> None:
@@ -72,11 +81,11 @@ def _by_name_if_known(
 class OdometryNode(Closeable):
     """Feeds ``base`` with the sensors of ``robot``, and publishes its odometry as ``writer``.
 
-    ``base`` gets the readings of the IMU ``imu``, of the sensors ``velocities``, and with ``has_joints`` the
-    joint states, from the threads of their subscriptions. Each reading of the IMU publishes the newest state,
-    at most ``rate_hz`` of them a second. If the IMU is silent for 0.1 s, readings of the other sources do; if
-    all are silent, nothing is published. The sentences of ``base.health()`` are the warning in the status of
-    the writer.
+    ``base`` gets the readings of the IMU ``imu``, of the sensors ``velocities`` and ``poses``, and with
+    ``has_joints`` the joint states, from the threads of their subscriptions. Each reading of the IMU
+    publishes the newest state, at most ``rate_hz`` of them a second. If the IMU is silent for 0.1 s, readings
+    of the other sources do; if all are silent, nothing is published. The sentences of ``base.health()`` are
+    the warning in the status of the writer.
 
     Raises SecondWriter as ``OdometryPublisher``. While it runs, that becomes its ``failure``, and
     ``has_failed`` is set. A context manager.
@@ -90,6 +99,7 @@ class OdometryNode(Closeable):
         *,
         imu: str = "imu",
         velocities: Collection[str] = (),
+        poses: Collection[str] = (),
         has_joints: bool = False,
         writer: str = "odometry",
         rate_hz: float | None = None,
@@ -99,7 +109,7 @@ class OdometryNode(Closeable):
         self.failure: Exception | None = None
         self.has_failed = fork_safe(threading.Event())
         self._refusals = Refusals("joint states")
-        self._imu, self._velocities = imu, frozenset(velocities)
+        self._imu, self._velocities, self._poses = imu, frozenset(velocities), frozenset(poses)
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._imu_stamp = self._due = self._newest = self._assessed = 0
@@ -117,6 +127,7 @@ class OdometryNode(Closeable):
                     robot,
                     on_imu=self._on_imu,
                     on_velocity=self._on_velocity if velocities else None,
+                    on_pose=self._on_pose if poses else None,
                 )
             )
             self._opened = opening.pop_all()
@@ -162,6 +173,12 @@ class OdometryNode(Closeable):
         if sensor in self._velocities:
             with self._lock:
                 add_velocity(self.base, sensor, message)
+                self._publish_without_imu(message.stamp)
+
+    def _on_pose(self, sensor: str, message: Pose) -> None:
+        if sensor in self._poses:
+            with self._lock:
+                add_pose(self.base, sensor, message)
                 self._publish_without_imu(message.stamp)
 
     def _on_joints(self, reading: JointReading) -> None:

@@ -105,7 +105,7 @@ def test_what_is_missing_is_printed_while_it_waits(spawn: Spawn):
 def test_unusable_options_are_explained(tmp_path: Path):
     wheels = "left=l,right=r,radius=0.1,track=0.5"
     for arguments, error in (
-        ((), "an IMU alone drifts by metres in seconds; give --diff-drive, --feet, --velocity or --file"),
+        ((), "an IMU alone drifts by metres in seconds; add --diff-drive, --feet, --velocity, --pose or"),
         (("--diff-drive", "left=l"), "right, radius, track missing"),
         (("--diff-drive", wheels, "--plot", "a.png"), "--plot needs --replay RECORDING"),
     ):

@@ -54,6 +54,13 @@ def _parse_plot(file: str) -> Path:
     help="A further stream of measured velocities. Repeatable.",
 )
 @click.option(
+    "--pose",
+    "poses",
+    multiple=True,
+    metavar="SENSOR",
+    help="A further stream of measured poses in the frame of the odometry. Repeatable.",
+)
+@click.option(
     "--diff-drive",
     type=options.Checked("WHEELS", _parse_diff_drive),
     help="Wheels on one axle: left=JOINT,right=JOINT,radius=M,track=M; several on a side are repeated.",
@@ -96,6 +103,7 @@ def odometry_command(
     robot: str,
     imu: str | None,
     velocities: tuple[str, ...],
+    poses: tuple[str, ...],
     diff_drive: DiffDrive | None,
     feet: LegSettings | None,
     file: str | None,
@@ -133,15 +141,16 @@ def odometry_command(
     given = {
         "imu": imu,
         "velocities": velocities or None,
+        "poses": poses or None,
         "odom": odom,
         "base": base,
         "wheels": diff_drive,
         "legs": feet,
     }
     settings = replace(settings, **{key: value for key, value in given.items() if value is not None})
-    if not (settings.has_joints or settings.velocities):
+    if not (settings.has_joints or settings.velocities or settings.poses):
         raise click.UsageError(
-            "an IMU alone drifts by metres in seconds; give --diff-drive, --feet, --velocity or --file"
+            "an IMU alone drifts by metres in seconds; add --diff-drive, --feet, --velocity, --pose or --file"
         )
     if replay is not None:
         _replay(replay, robot, settings, plot)
@@ -174,6 +183,7 @@ def _publish(
                 settings.estimator(robot, base, imu_frame, listener.buffer, model),
                 imu=settings.imu,
                 velocities=settings.velocities,
+                poses=settings.poses,
                 has_joints=settings.has_joints,
                 writer=writer,
                 rate_hz=rate_hz,
@@ -245,7 +255,9 @@ def _wait_for_sensors(
 def _sources_text(settings: OdometrySettings) -> str:
     wheels = ["its wheels"] if settings.wheels is not None else []
     feet = ["its feet"] if settings.legs is not None else []
-    return ", ".join([f"its IMU {settings.imu!r}", *wheels, *feet, *map(repr, settings.velocities)])
+    return ", ".join(
+        [f"its IMU {settings.imu!r}", *wheels, *feet, *map(repr, (*settings.velocities, *settings.poses))]
+    )
 
 
 def _end_lines(node: OdometryNode) -> Iterator[str]:
