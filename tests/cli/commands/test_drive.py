@@ -179,6 +179,11 @@ def test_driver_that_fails_three_times_in_a_row_ends_the_command_stopped(
         (("ARM:Arm", "--plant", "lag"), 2, "--plant is of `sim`"),
         (("sim", "--velocity", "elbow=fast"), 2, "'elbow=fast' is not JOINT=VALUE with a number"),
         (("sim", "--velocity", "9"), 1, "velocity 9 of 'shoulder' is above 2.5, the limit in the URDF"),
+        (("sim", "--effort", "elbow=99"), 1, "effort 99 of 'elbow' is above 30, the limit in the URDF"),
+        (
+            ("sim", "--wire", "native", "--wire", "ros2", "--ros2-controller", "c", "--ros2-mode", "effort"),
+            *(1, "ros2_mode='effort' is none of the driver's modes, ['position', 'velocity']"),
+        ),
         (("sim", "--velocity", "1", "--velocity", "elbow=2"), 2, "--velocity is one number for all joints"),
     ],
 )

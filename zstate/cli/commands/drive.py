@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from zstate.driving.driver_state import Spread
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
+    from zstate.wire.messages import Mode
     from zstate.wire.protocol import SerializedSample
 
 _SIMULATED = "sim"
@@ -145,12 +146,26 @@ _LIMIT = options.Checked("[JOINT=]V", _parse_limit)
     multiple=True,
     help="The same for the acceleration, of which a URDF has none [rad/s^2 or m/s^2]. Repeatable.",
 )
+@click.option(
+    "--effort",
+    "efforts",
+    type=_LIMIT,
+    multiple=True,
+    help="The same for the effort [Nm or N]; default: that of the URDF. Repeatable.",
+)
 @options.wires_option
 @click.option(
     "--ros2-controller",
     metavar="NAME",
     help="With `--wire ros2`: ROS 2 nodes command the joints as a controller of this name, on NAME/commands "
-    "(std_msgs/Float64MultiArray, positions) and NAME/joint_trajectory (trajectory_msgs/JointTrajectory).",
+    "(std_msgs/Float64MultiArray) and NAME/joint_trajectory (trajectory_msgs/JointTrajectory).",
+)
+@click.option(
+    "--ros2-mode",
+    type=click.Choice(("position", "velocity", "effort")),
+    default="position",
+    show_default=True,
+    help="What the numbers on NAME/commands are.",
 )
 @options.seconds_option
 @options.name_option
@@ -168,8 +183,10 @@ def drive_command(
     on_silence: Literal["hold", "relax"],
     velocities: tuple[_Limit, ...],
     accelerations: tuple[_Limit, ...],
+    efforts: tuple[_Limit, ...],
     wires: tuple[str, ...],
     ros2_controller: str | None,
+    ros2_mode: Mode,
     seconds: float | None,
     name: str | None,
     network: SessionOptions,
@@ -213,7 +230,7 @@ def drive_command(
     inputs = _controller_text(wires, robot_name, ros2_controller) if ros2_controller else ""
     given = dict(parameters) | ({} if plant is None else {"plant": plant})
     hardware = _new_driver(driver, model, given)
-    limits = _limits(model, hardware, velocities, accelerations)
+    limits = _limits(model, hardware, velocities, accelerations, efforts)
     with open_session(network, wires) as session, ExitStack() as opened:
         with _failures_of(driver):
             host = opened.enter_context(
@@ -225,6 +242,7 @@ def drive_command(
                     on_silence=on_silence,
                     wires=wires,
                     ros2_controller=ros2_controller or "",
+                    ros2_mode=ros2_mode,
                     realtime=realtime,
                 )
             )
@@ -317,14 +335,23 @@ class _StateLines(Closeable):
 
 
 def _limits(
-    model: RobotModel, driver: Driver, velocities: Sequence[_Limit], accelerations: Sequence[_Limit]
+    model: RobotModel,
+    driver: Driver,
+    velocities: Sequence[_Limit],
+    accelerations: Sequence[_Limit],
+    efforts: Sequence[_Limit],
 ) -> Limits:
     """The limits of the joints of ``driver``: those of the URDF, and those of the options."""
     from zstate.driving import Limits
 
     names = model.part(driver.joint_names).joint_names
-    velocity, acceleration = _by_joint(velocities, "--velocity"), _by_joint(accelerations, "--acceleration")
-    limits = Limits.of(model, names, velocity=velocity, acceleration=acceleration)
+    limits = Limits.of(
+        model,
+        names,
+        velocity=_by_joint(velocities, "--velocity"),
+        acceleration=_by_joint(accelerations, "--acceleration"),
+        effort=_by_joint(efforts, "--effort"),
+    )
     unlimited = [name for name, most in zip(names, limits.velocity.tolist(), strict=True) if most == math.inf]
     if unlimited:
         raise click.UsageError(
