@@ -61,6 +61,7 @@ class BrowserTab:
 
     def pixels(self) -> NDArray[np.uint8]:
         """A screenshot: (H, W, 3)."""
+        import numpy as np
         from PIL import Image
 
         shot = self.tab.screenshot(timeout=TIMEOUT_MS)
