@@ -223,6 +223,7 @@ class ControlLoop:
             if failure is not None:
                 self._change("stopped", f"the driver has not stopped yet: {failure!r}; {reason}")
                 return failure
+        self.obeyed = latched  # before the state that is published with it
         if reason:
             self._change("stopped", reason)
         if not latched.stops and self.state.name == "stopped":
@@ -230,7 +231,6 @@ class ControlLoop:
             releaser, _ = self._stops.released_by
             self._barred.pop(releaser, None)
             self._change("ready", f"released by {self._name_of(releaser)}")
-        self.obeyed = latched
         return None
 
     def _bar_active(self) -> None:
