@@ -5,7 +5,7 @@ kept.
 
 - Between events the IMU is interpolated, and predicts. Without samples for more than 0.1 s, the base keeps
   its velocity in its own axes, and turns at the rate of the wheels, with large noise. If the wheels are
-  silent, too, it turns at the last rate, give or take a constant 1 rad/s.
+  silent, too, it turns at the last rate, give or take a constant 0.5 rad/s.
 - A reading whose NIS exceeds the 99.9 % gate is rejected. After two seconds of rejections that agree with one
   another, the estimate follows: the variance of what they measure grows by their squared residual.
 - If wheels and gyro agree for 0.1 s that the base stands, its velocity is zero, and the gyro measures its own
@@ -72,7 +72,7 @@ COASTING_RATE_DENSITY, _COASTING_FORCE_DENSITY = 0.1, 1.0
 """Of the rate by wheels [rad/s/sqrt(Hz)], and of unknown accelerations [m/s^2/sqrt(Hz)]."""
 _COASTING_WHEELS_NS = 100_000_000
 """The rate of the wheels is used for so long."""
-_UNKNOWN_RATE = 1.0
+_UNKNOWN_RATE = 0.5
 """[rad/s] The standard deviation of a rate that neither IMU nor wheels measure, about the last one."""
 
 
