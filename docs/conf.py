@@ -9,13 +9,18 @@ from __future__ import annotations
 import os
 import re
 import sys
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.util.inspect import TypeAliasForwardRef
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 sys.path.insert(0, str(DOCS))
+
+from command_reference import command_reference  # noqa: E402
 
 import zstate  # noqa: E402
 
@@ -29,16 +34,30 @@ extensions = ["myst_parser", "sphinx.ext.autodoc"]
 exclude_patterns = ["requirements*.txt"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
+smartquotes = False  # they turn -- of options into dashes
+_ALIASES = ("ArrayLike", "ConfigSource", "Floats", "Mode", "OutcomeName", "Stream")
 nitpicky = True
+# Inventories of other projects are on other hosts, so that names of theirs are no links.
+nitpick_ignore_regex = [
+    ("py:.*", r"(collections|numpy|os|pathlib|threading|zenoh)\..*"),
+    ("py:class", r"|".join(("msgspec.Meta", r"(.*\.)?(S|M|_\w+)", *_ALIASES))),
+]
+
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_typehints_format = "short"
+autodoc_type_aliases = {name: name for name in _ALIASES}
+TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # as printed in a union, such as Floats | None
+python_maximum_signature_line_length = 88
 
 html_theme = "furo"
 html_title = f"zstate {version}"
-html_theme_options = {
-    "source_repository": f"{REPOSITORY}/",
-    "source_branch": "main",
-    "source_directory": "docs/",
-}
+html_theme_options = {"top_of_page_buttons": []}
+html_static_path = ["site.css"]
+html_css_files = ["site.css"]
 html_copy_source = False
+
+# The modules whose names are the API.
+PUBLIC = ("zstate", "zstate.driving", "zstate.errors", "zstate.odometry", "zstate.scans", "zstate.sources")
 
 # Files of the repository that are pages of the site; links to other files lead to the repository.
 PAGES = {
@@ -76,6 +95,8 @@ def _read_page(app: Sphinx, name: str, content: list[str]) -> None:
         content[0] = re.sub(
             r"^(\S+\*)\n", lambda m: m[0] if any(DOCS.glob(m[1])) else "", content[0], flags=re.MULTILINE
         )
+    if name == "commands":
+        content[0] = command_reference()
     if page.suffix == ".md":
         content[0] = _with_links(content[0], page, page)
 
@@ -84,7 +105,17 @@ def _include(app: Sphinx, included: Path, parent: str, content: list[str]) -> No
     content[0] = _with_links(content[0], Path(os.path.normpath(DOCS / included)), DOCS / app.env.docname)
 
 
+def _shorten_constructor(*event: Any) -> tuple[str, str] | None:
+    """Classes outside of the public modules are received, not made: only their fields are shown."""
+    _, what, name, given, *_ = event
+    if what != "class" or name.rpartition(".")[0] in PUBLIC or is_dataclass(given):
+        return None
+    fields = getattr(given, "__struct_fields__", ())
+    return (f"({', '.join(fields)})" if fields else "", "")
+
+
 def setup(app: Sphinx) -> None:
     """Registers what this file adds to Sphinx."""
     app.connect("source-read", _read_page)
     app.connect("include-read", _include)
+    app.connect("autodoc-process-signature", _shorten_constructor)

@@ -307,7 +307,7 @@ def _started(start: _Array, direction: _Array, shape: tuple[int, ...]) -> _Array
 def dummy_scan(stamp: int, frame: str = "single_rrbot_hokuyo_link") -> Scan:
     """The scan of ROS 2's dummy_laser at ``stamp`` [ns], a function of the stamp alone.
 
-    All rays have the range |sin(3 rad/s t)| [m] and the stamp of the scan.
+    All rays have the range ``abs(sin(3 rad/s t))`` [m] and the stamp of the scan.
     """
     phase = math.pi * (stamp % _DUMMY_PERIOD_NS) / _DUMMY_PERIOD_NS
     ranges = np.full(DUMMY_RAY_COUNT, math.sin(phase))
