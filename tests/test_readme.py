@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from helpers.pages import commands, programs, section
 from helpers.processes import DEADLINE_S, Child
 from helpers.recording_builder import MS, START, RecordingBuilder, pose
 
@@ -24,18 +25,7 @@ README = ROOT / "README.md"
 TEXT = README.read_text()
 
 
-def blocks(language: str, text: str = TEXT) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-
-
-PROGRAMS = {block.split("\n", 1)[0].removeprefix("# "): block for block in blocks("python")}
-
-
-def commands(section: str) -> list[list[str]]:
-    """Every ``$ zstate ...`` line of a section, without comments."""
-    text = TEXT.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
-    lines = [line for block in blocks("console", text) for line in block.splitlines()]
-    return [line.split("#")[0].split()[1:] for line in lines]
+PROGRAMS = programs(TEXT)
 
 
 @pytest.fixture
@@ -122,7 +112,7 @@ def test_scan_is_placed_and_its_end_explained(spawn: Callable[..., Child]) -> No
 def test_three_terminals_print_the_pose_of_the_hand(
     start: Callable[[list[str]], subprocess.Popen[str]],
 ) -> None:
-    joints, publish, tf = commands("Three terminals")
+    joints, publish, tf = commands(section(TEXT, "## Three terminals"))
     first, second, third = start(joints), start(publish), start(tf)
     lines: list[str] = []
     assert third.stdout
@@ -144,7 +134,7 @@ def test_a_simulated_robot_is_driven_stopped_and_released(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    drive, *others = commands("Drive")
+    drive, *others = commands(section(TEXT, "## Drive"))
     host = start(drive)
     assert host.stdout
     assert host.stdout.readline().startswith("driving 'rrbot' (2 joints, sim)")
@@ -165,7 +155,7 @@ def test_estimator_of_a_base_needs_no_network(spawn: Callable[..., Child]) -> No
 
 @pytest.mark.robots
 def test_view_with_sliders_prints_its_address(start: Callable[[list[str]], subprocess.Popen[str]]) -> None:
-    _, sliders, _ = commands("See it")
+    _, sliders, _ = commands(section(TEXT, "## See it"))
     view = start([*sliders, "--port", "0"])
     assert view.stdout is not None
     assert view.stdout.readline().startswith("the view is at http://127.0.0.1:")
@@ -176,7 +166,7 @@ def test_router_commands_work_with_this_host_as_the_other(
 ) -> None:
     router, publish, tf = (
         [re.sub(r"tcp/[\d.]+:\d+", f"tcp/127.0.0.1:{free_port}", word) for word in command]
-        for command in commands("Behind routers")[:3]
+        for command in commands(section(TEXT, "## Behind routers"))[:3]
     )
     running = start(router)
     assert running.stdout
@@ -193,7 +183,7 @@ def test_ros_commands_work_with_another_router_address(
     start: Callable[[list[str]], subprocess.Popen[str]], free_port: int
 ) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    router, publish, tf = commands("With ROS 2, without ROS")[:3]
+    router, publish, tf = commands(section(TEXT, "## With ROS 2, without ROS"))[:3]
     running = start([*router, "--listen", endpoint])
     assert running.stdout
     assert str(free_port) in running.stdout.readline()
@@ -212,7 +202,7 @@ def test_recording_commands_record_describe_look_up_and_replay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    record, info, replay = commands("Recordings")[:3]
+    record, info, replay = commands(section(TEXT, "## Recordings"))[:3]
     robot = start(["zstate", "publish", "panda", "--source", "sine"])
     recorder = start(record)
     assert recorder.wait(DEADLINE_S) == 0, recorder.communicate()[1]
