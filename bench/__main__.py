@@ -15,9 +15,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from bench import results
+from bench.page import PAGE, with_current_tables
 from bench.plots import PlotsMissing, write_plots
 from bench.process import ROOT
-from bench.readme import with_current_tables
 from bench.report import write_report
 from bench.run import Turn, estimated_seconds, plan_turns, run
 from bench.scenario import FULL, QUICK, select_scenarios
@@ -149,13 +149,12 @@ def _summary(facts: Facts) -> str:
 @main.command()
 @click.argument("folder", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option(
-    "--readme", is_flag=True, help="Rewrite the tables of README.md, each from the folder it names."
+    "--page", is_flag=True, help="Rewrite the tables of docs/benchmarks.md, each from the folder it names."
 )
-def report(*, folder: Path | None, readme: bool) -> None:
+def report(*, folder: Path | None, page: bool) -> None:
     """Rewrite the tables and plots of the last run, or of the run in FOLDER."""
-    if readme:
-        path = ROOT / "README.md"
-        path.write_text(with_current_tables(path.read_text(encoding="utf-8")), encoding="utf-8")
+    if page:
+        PAGE.write_text(with_current_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
     else:
         _report(folder or results.newest())
 

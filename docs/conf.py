@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+import tomllib
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,9 @@ project = "zstate"
 author = "the zstate authors"
 project_copyright = author
 version = release = zstate.__version__
-REPOSITORY = "https://github.com/zstate/zstate"
+_URLS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+SITE, REPOSITORY = _URLS["Documentation"], _URLS["Homepage"]
+RAW = REPOSITORY.replace("github.com", "raw.githubusercontent.com") + "/main"
 
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 exclude_patterns = ["requirements*.txt"]
@@ -66,27 +69,38 @@ PAGES = {
     "README.md": "index.md",
     "bench/README.md": "benchmarks.md",
     "deploy/README.md": "deploy.md",
+    "models/tutorial/DRIVING.md": "driving.md",
     "models/tutorial/README.md": "ros2.md",
 }
 
 
-def _link(file: Path, page: Path, target: str) -> str:
-    """``target``, a relative link in ``file``, as a link of ``page``, the page that shows the file."""
-    path, hash_, anchor = target.partition("#")
-    named = Path(os.path.normpath(file.parent / path))
-    if not named.exists() or not named.is_relative_to(ROOT):
-        return target
-    inside = named.relative_to(ROOT).as_posix()
-    shown = DOCS / PAGES[inside] if inside in PAGES else named
-    if shown.is_relative_to(DOCS) and shown.suffix in (".md", ".png", ".svg"):
-        return os.path.relpath(shown, page.parent) + hash_ + anchor
-    return f"{REPOSITORY}/{'tree' if named.is_dir() else 'blob'}/main/{inside}{hash_}{anchor}"
+def _target(file: Path, link: str) -> Path | None:
+    """The file of the repository that ``link`` in ``file`` leads to; None for others."""
+    path = link.partition("#")[0]
+    if path.startswith(f"{SITE}/en/latest/"):
+        return DOCS / Path(path).relative_to(f"{SITE}/en/latest").with_suffix(".md")
+    if path.startswith(f"{RAW}/"):
+        return ROOT / Path(path).relative_to(RAW)
+    target = Path(os.path.normpath(file.parent / path))
+    return target if path and target.exists() and target.is_relative_to(ROOT) else None
+
+
+def _for_page(file: Path, page: Path, link: str) -> str:
+    """``link`` of ``file`` as a link of ``page``, which shows the file: to a page, or to the repository."""
+    target = _target(file, link)
+    if target is None:
+        return link
+    _, hash_, anchor = link.partition("#")
+    inside = target.relative_to(ROOT).as_posix()
+    target = DOCS / PAGES[inside] if inside in PAGES else target
+    is_shown = target.suffix in (".png", ".svg") or (target.suffix == ".md" and target.is_relative_to(DOCS))
+    if is_shown:
+        return os.path.relpath(target, page.parent) + hash_ + anchor
+    return f"{REPOSITORY}/{'tree' if target.is_dir() else 'blob'}/main/{inside}{hash_}{anchor}"
 
 
 def _with_links(text: str, file: Path, page: Path) -> str:
-    return re.sub(
-        r"(?<=[^!]\[)([^\]]*)\]\(([^):\s]+)\)", lambda m: f"{m[1]}]({_link(file, page, m[2])})", text
-    )
+    return re.sub(r"(?<=\]\()([^()\s]+)(?=\))", lambda link: _for_page(file, page, link[1]), text)
 
 
 def _read_page(app: Sphinx, name: str, content: list[str]) -> None:
@@ -97,12 +111,12 @@ def _read_page(app: Sphinx, name: str, content: list[str]) -> None:
         )
     if name == "commands":
         content[0] = command_reference()
-    if page.suffix == ".md":
-        content[0] = _with_links(content[0], page, page)
+    content[0] = _with_links(content[0], page, page)
 
 
-def _include(app: Sphinx, included: Path, parent: str, content: list[str]) -> None:
-    content[0] = _with_links(content[0], Path(os.path.normpath(DOCS / included)), DOCS / app.env.docname)
+def _read_included(app: Sphinx, included: Path, parent: str, content: list[str]) -> None:
+    page = Path(app.env.doc2path(app.env.docname))
+    content[0] = _with_links(content[0], Path(os.path.normpath(DOCS / included)), page)
 
 
 def _shorten_constructor(*event: Any) -> tuple[str, str] | None:
@@ -117,5 +131,5 @@ def _shorten_constructor(*event: Any) -> tuple[str, str] | None:
 def setup(app: Sphinx) -> None:
     """Registers what this file adds to Sphinx."""
     app.connect("source-read", _read_page)
-    app.connect("include-read", _include)
+    app.connect("include-read", _read_included)
     app.connect("autodoc-process-signature", _shorten_constructor)

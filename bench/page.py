@@ -1,4 +1,4 @@
-"""The README's table, generated from the committed results folder that the line before it names."""
+"""The table of docs/benchmarks.md, generated from the results folder that the line before it names."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from bench.report import REFERENCE
 from bench.results import Results
 
 ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "benchmarks.md"
 END = "<!-- end of bench -->"
 # The most informative robot and rate: Python readers of ROS do not keep up with it.
 ROBOT, RATE_HZ = "talos", 1000.0

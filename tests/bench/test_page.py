@@ -4,24 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from helpers.fake_results import TITLES, write_results
 
-from bench.readme import END, short_table, with_current_tables
+from bench.page import END, PAGE, short_table, with_current_tables
 
-ROOT = Path(__file__).parents[2]
 FOLDER = "bench/results/2026-01-02-abc1234"
 FACTORS = {"zstate_peer": 1.0, "ros1": 4.0, "raw_zenoh": 0.8}
 
 
-@pytest.mark.parametrize("name", ["README.md", "bench/README.md"])
-def test_tables_in_documents_match_the_results_they_name(name: str) -> None:
-    text = (ROOT / name).read_text(encoding="utf-8")
-    assert with_current_tables(text, ROOT) == text, "python -m bench report --readme rewrites them"
+def test_tables_of_the_page_match_the_results_they_name() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    assert END in text
+    assert with_current_tables(text) == text, "python -m bench report --page rewrites them"
 
 
 def test_every_bench_mark_has_an_end_mark() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
     assert text.count("<!-- bench: ") == text.count(END)
 
 
