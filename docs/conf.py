@@ -38,12 +38,15 @@ exclude_patterns = ["requirements*.txt"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
 smartquotes = False  # they turn -- of options into dashes
-_ALIASES = ("ArrayLike", "ConfigSource", "Floats", "Mode", "OutcomeName", "Stream")
+_ALIASES = ("ArrayLike", "ConfigSource", "Floats", "Mode", "OutcomeName", "Points", "Positions", "Stream")
 nitpicky = True
 # Inventories of other projects are on other hosts, so that names of theirs are no links.
 nitpick_ignore_regex = [
     ("py:.*", r"(collections|numpy|os|pathlib|threading|zenoh)\..*"),
-    ("py:class", r"|".join(("msgspec.Meta", r"(.*\.)?(S|M|_\w+)", *_ALIASES))),
+    (
+        "py:class",
+        r"|".join(("NDArray", "msgspec.Meta", r"(.*\.)?(S|M|_\w+)", *_ALIASES)),
+    ),
 ]
 
 autodoc_default_options = {"members": True, "member-order": "bysource"}
@@ -61,6 +64,8 @@ html_copy_source = False
 
 # The modules whose names are the API.
 PUBLIC = ("zstate", "zstate.driving", "zstate.errors", "zstate.odometry", "zstate.scans", "zstate.sources")
+
+_ARRAY = r"~?numpy\.ndarray\[tuple\[~?typing\.Any, \.\.\.\], ~?numpy\.dtype\[(~?numpy\.\w+)\]\]"
 
 # Files of the repository that are pages of the site; links to other files lead to the repository.
 PAGES = {
@@ -119,17 +124,20 @@ def _read_included(app: Sphinx, included: Path, parent: str, content: list[str])
     content[0] = _with_links(content[0], Path(os.path.normpath(DOCS / included)), page)
 
 
-def _shorten_constructor(*event: Any) -> tuple[str, str] | None:
-    """Classes outside of the public modules are received, not made: only their fields are shown."""
-    _, what, name, given, *_ = event
-    if what != "class" or name.rpartition(".")[0] in PUBLIC or is_dataclass(given):
+def _shorten_signature(*event: Any) -> tuple[str, str] | None:
+    """Arrays by the name of their type; of classes outside of the public modules only their fields."""
+    _, what, name, given, _, arguments, result = event
+    if arguments is None:
         return None
-    fields = getattr(given, "__struct_fields__", ())
-    return (f"({', '.join(fields)})" if fields else "", "")
+    if what == "class" and name.rpartition(".")[0] not in PUBLIC and not is_dataclass(given):
+        fields = getattr(given, "__struct_fields__", ())  # of messages
+        arguments = f"({', '.join(fields)})" if fields else ""
+    texts = (re.sub(_ARRAY, r"NDArray[\1]", text or "") for text in (arguments, result))
+    return next(texts), next(texts)
 
 
 def setup(app: Sphinx) -> None:
     """Registers what this file adds to Sphinx."""
     app.connect("source-read", _read_page)
     app.connect("include-read", _read_included)
-    app.connect("autodoc-process-signature", _shorten_constructor)
+    app.connect("autodoc-process-signature", _shorten_signature)

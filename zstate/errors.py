@@ -1,35 +1,35 @@
 """Every exception of zstate, as one tree::
 
-  ZStateError
-  ├── InvalidInput (ValueError)          an unusable argument; nothing was changed
-  │   ├── FrameMismatch                  ``a_from_b @ c_from_d`` with b != c
-  │   ├── InsertRefused                  the buffer rejected a transform            .reason .edge
-  │   └── ConfigError                    a configuration file or option             .path
-  ├── ModelError (ValueError)            an unusable robot model                    .source .findings
-  │   └── UnknownModel                   no model of that name                      .name .near_misses
-  ├── LibraryMissing (ImportError)       a library to install first
-  ├── MessageError (ValueError)          a payload that cannot be decoded           .reason
-  ├── SecondWriter                       another writer is active already           .first .robot .stream .edge
-  ├── DriverFault                        a driver that failed too often, and stopped    .robot
-  ├── MotionRefused                      a motion that a driver must not make       .findings
-  ├── MotionTimeout (TimeoutError)       a motion that is still under way           .progress
-  ├── RecordingError                     a file that cannot be read or written      .path
-  ├── NetworkError                       Zenoh reports a failure
-  │   ├── Unreachable (TimeoutError)     no answer from the endpoints               .endpoints
-  │   ├── AccessDenied                   the endpoint rejects this session          .reason .endpoint
-  │   ├── NoClock (TimeoutError)         simulated time is not published            .waited_s
-  │   ├── PortBusy                       the endpoint is in use                     .endpoint
-  │   └── Closed                         used after close(), or after fork
-  └── LookupFailed                       .target .source .edge .requested .oldest .newest .track .rate_hz ...
-      ├── UnknownFrame                   a frame that is not in the buffer          .name .near_misses
-      ├── AmbiguousFrame                 a bare name that several robots have       .name .candidates
-      ├── Disconnected                   two trees                                  .roots .gone_s
-      ├── ClockMismatch                  stamps of two clocks on one path           .edges .robots .domains
-      ├── NoData                         an edge without any sample
-      ├── InFuture                       after the newest sample of an edge
-      ├── InPast                         before the oldest sample of an edge
-      ├── Stale                          too old for ``max_age_s``, or silent       .age_s .max_age_s .other
-      └── NotFinite                      numbers too large to compute with
+ ZStateError
+ ├── InvalidInput (ValueError)          an unusable argument; nothing was changed
+ │   ├── FrameMismatch                  a_from_b @ c_from_d with b != c
+ │   ├── InsertRefused                  the buffer rejected a transform            .reason .edge
+ │   └── ConfigError                    a configuration file or option             .path
+ ├── ModelError (ValueError)            an unusable robot model                    .source .findings
+ │   └── UnknownModel                   no model of that name                      .name .near_misses
+ ├── LibraryMissing (ImportError)       a library to install first
+ ├── MessageError (ValueError)          a payload that cannot be decoded           .reason
+ ├── SecondWriter                       another writer is active already           .first .robot .stream .edge
+ ├── DriverFault                        a driver that failed too often, and stopped   .robot
+ ├── MotionRefused                      a motion that a driver must not make       .findings
+ ├── MotionTimeout (TimeoutError)       a motion that is still under way           .progress
+ ├── RecordingError                     a file that cannot be read or written      .path
+ ├── NetworkError                       Zenoh reports a failure
+ │   ├── Unreachable (TimeoutError)     no answer from the endpoints               .endpoints
+ │   ├── AccessDenied                   the endpoint rejects this session          .reason .endpoint
+ │   ├── NoClock (TimeoutError)         simulated time is not published            .waited_s
+ │   ├── PortBusy                       the endpoint is in use                     .endpoint
+ │   └── Closed                         used after close(), or after fork
+ └── LookupFailed                       .target .source .edge .requested .oldest .newest .track .rate_hz ...
+     ├── UnknownFrame                   a frame that is not in the buffer          .name .near_misses
+     ├── AmbiguousFrame                 a bare name that several robots have       .name .candidates
+     ├── Disconnected                   two trees                                  .roots .gone_s
+     ├── ClockMismatch                  stamps of two clocks on one path           .edges .robots .domains
+     ├── NoData                         an edge without any sample
+     ├── InFuture                       after the newest sample of an edge
+     ├── InPast                         before the oldest sample of an edge
+     ├── Stale                          too old for max_age_s, or silent           .age_s .max_age_s .other
+     └── NotFinite                      numbers too large to compute with
 
 A wait that times out raises the last reason for waiting, as a subclass that is also
 ``WaitTimeout`` (a TimeoutError): ``except InFuture`` and ``except TimeoutError`` both catch it.

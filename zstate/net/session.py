@@ -84,7 +84,7 @@ def connect(
     commands: ``ZSTATE_MODE``, ``ZSTATE_CONNECT`` and ``ZSTATE_LISTEN`` (endpoints separated by blanks; a
     client if only ZSTATE_CONNECT is set), ``ZSTATE_CONFIG``, and the credentials: ``ZSTATE_CERTS`` with
     ``ZSTATE_IDENTITY``, ``ZSTATE_USER`` with ``ZSTATE_PASSWORD`` or ``ZSTATE_PASSWORD_FILE``. So programs
-    started by `zstate up` join its network.
+    started by ``zstate up`` join its network.
 
     Raises InvalidInput or ConfigError for unusable arguments; a client also raises Unreachable if no router
     answers and AccessDenied if all that answer deny it; PortBusy, NetworkError. The other modes retry; a
