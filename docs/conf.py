@@ -34,19 +34,16 @@ SITE, REPOSITORY = _URLS["Documentation"], _URLS["Homepage"]
 RAW = REPOSITORY.replace("github.com", "raw.githubusercontent.com") + "/main"
 
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
-exclude_patterns = ["requirements*.txt"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
 smartquotes = False  # they turn -- of options into dashes
+# Aliases of types; they are shown by name.
 _ALIASES = ("ArrayLike", "ConfigSource", "Floats", "Mode", "OutcomeName", "Points", "Positions", "Stream")
 nitpicky = True
 # Inventories of other projects are on other hosts, so that names of theirs are no links.
 nitpick_ignore_regex = [
     ("py:.*", r"(collections|numpy|os|pathlib|threading|zenoh)\..*"),
-    (
-        "py:class",
-        r"|".join(("NDArray", "msgspec.Meta", r"(.*\.)?(S|M|_\w+)", *_ALIASES)),
-    ),
+    ("py:class", "|".join(("NDArray", "msgspec.Meta", r"(.*\.)?(S|M|_\w+)", *_ALIASES))),
 ]
 
 autodoc_default_options = {"members": True, "member-order": "bysource"}
@@ -70,7 +67,6 @@ _ARRAY = r"~?numpy\.ndarray\[tuple\[~?typing\.Any, \.\.\.\], ~?numpy\.dtype\[(~?
 # Files of the repository that are pages of the site; links to other files lead to the repository.
 PAGES = {
     "CHANGELOG.md": "changelog.md",
-    "CONTRIBUTING.md": "contributing.md",
     "README.md": "index.md",
     "bench/README.md": "benchmarks.md",
     "deploy/README.md": "deploy.md",
@@ -84,8 +80,9 @@ def _target(file: Path, link: str) -> Path | None:
     path = link.partition("#")[0]
     if path.startswith(f"{SITE}/en/latest/"):
         return DOCS / Path(path).relative_to(f"{SITE}/en/latest").with_suffix(".md")
-    if path.startswith(f"{RAW}/"):
-        return ROOT / Path(path).relative_to(RAW)
+    for base in (RAW, f"{REPOSITORY}/blob/main"):
+        if path.startswith(f"{base}/"):
+            return ROOT / Path(path).relative_to(base)
     target = Path(os.path.normpath(file.parent / path))
     return target if path and target.exists() and target.is_relative_to(ROOT) else None
 
