@@ -16,6 +16,7 @@ def test_request_is_parsed_from_its_own_parameters():
     for asked in (LookupRequest("map", "r1/tool"), LookupRequest("a", "b", -5)):
         pairs = dict(part.split("=") for part in asked.parameters().split(";"))
         assert LookupRequest.parse(pairs) == asked
+        assert LookupRequest.parse({**pairs, "_anyke": ""}) == asked  # Zenoh's, for replies on any key
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ class LookupRequest:
     def parse(cls, parameters: Mapping[str, str]) -> LookupRequest:
         """The request in the parameters of a selector. Raises InvalidInput with the parameter at fault."""
         for name in parameters:
-            if name not in _NAMES:
+            if name not in _NAMES and not name.startswith("_"):  # those are Zenoh's, such as _anyke
                 raise InvalidInput(f"a lookup has no parameter {shortened(name)!r}; {_FORM}")
         for name in ("target", "source"):
             if not parameters.get(name):

@@ -99,8 +99,7 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
 # The smallest limit: most payloads pass with one comparison.
 _MIN_LIMIT_BYTES = 1_000
 
-# Of messages without a stream.
-_MAX_BYTES: dict[type[Message], int] = {
+MAX_MESSAGE_BYTES: dict[type[Message], int] = {
     Status: 64_000,
     DriverState: 256_000,
     Stop: 8_000,
@@ -110,6 +109,7 @@ _MAX_BYTES: dict[type[Message], int] = {
     MotionReply: 256_000,
     HistoryPage: 4 * SAMPLE_BYTES,
 }
+"""The limits of messages that are not, or not only, received on a stream."""
 
 _DEFLATED_BYTES = 64_000
 _DEFLATED = b"\x78"
@@ -141,7 +141,7 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     """
     if encoding != ENCODINGS[kind]:
         raise _foreign_error(encoding, kind)
-    if len(payload) > _MIN_LIMIT_BYTES and len(payload) > _MAX_BYTES.get(kind, LATCHED_BYTES):
+    if len(payload) > _MIN_LIMIT_BYTES and len(payload) > MAX_MESSAGE_BYTES.get(kind, LATCHED_BYTES):
         raise MessageError(f"a {_type_name(kind)} of {len(payload)} bytes", reason="too large")
     if kind is OccupancyGrid and payload.startswith(_DEFLATED):
         payload = _inflated(payload)
