@@ -104,6 +104,7 @@ SIGNATURES = {
     "Transform.apply": "(points)",
     "Transform.from_matrix": "(target, source, matrix, stamp=None)",
     "Transform.from_pose7": "(target, source, pose7, stamp=None)",
+    "Transform.from_se3": "(target, source, placement, stamp=None)",
     "Transform.from_rpy": "(target, source, translation, rpy, stamp=None)",
     "TransformBuffer": "(history_s=10.0, clock=None)",
     "TransformBuffer.add_robot": "(model, prefix='', *, interpolation='linear')",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import pickle
+import sys
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.clock import ManualClock
-from zstate.errors import FrameMismatch, InvalidInput
+from zstate.errors import FrameMismatch, InvalidInput, LibraryMissing
 from zstate.transform import Transform, Twist, combine_kinds
 
 NAN, INF = math.nan, math.inf
@@ -169,6 +170,63 @@ def test_the_constructors_agree_on_one_pose() -> None:
         assert_close(other, expected)
         np.testing.assert_allclose(other.rpy, (0, 0, math.pi / 2), atol=1e-15)
         np.testing.assert_allclose(other.pose7, (1, 2, 3, 0, 0, half, half), atol=1e-15)
+
+
+def test_numpy_reads_a_transform_as_its_matrix() -> None:
+    a_from_b, b_from_c = Transform("a", "b", (1, 2, 3), TURN, 7), Transform("b", "c", (0, -1, 0.5), TURN)
+    np.testing.assert_array_equal(np.asarray(a_from_b), a_from_b.matrix)
+    assert np.asarray(a_from_b, dtype=np.float32).dtype == np.float32
+    np.testing.assert_array_equal(np.stack([a_from_b, b_from_c])[1], b_from_c.matrix)
+    np.testing.assert_array_equal(np.asarray([a_from_b, b_from_c])[0], a_from_b.matrix)
+    with pytest.raises(ValueError, match="read-only"):
+        np.asarray(a_from_b)[0, 3] = 9.0
+    own = np.array(a_from_b)
+    own[0, 3] = 9.0
+    assert a_from_b.translation[0] == 1.0
+    with pytest.raises(ValueError, match="no array without a copy"):
+        np.asarray(a_from_b, copy=False)
+
+
+def test_a_transform_is_no_array_in_sums_products_and_points() -> None:
+    a_from_b, b_from_c = Transform("a", "b", (1, 2, 3), TURN), Transform("b", "c", (0, -1, 0.5), TURN)
+    for points in (b_from_c, [b_from_c, b_from_c]):
+        with pytest.raises(InvalidInput, match="product of transforms"):
+            a_from_b.apply(points)
+    with pytest.raises(InvalidInput, match="points of shape"):
+        _ = a_from_b @ [b_from_c]
+    for operation in (np.add, np.matmul):
+        with pytest.raises(TypeError):
+            operation(np.eye(4), a_from_b)
+    assert a_from_b != a_from_b.matrix
+
+
+def test_a_placement_of_pinocchio_is_a_transform_and_back() -> None:
+    pin = pytest.importorskip("pinocchio")
+    o_m_i = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 3.0), np.array([1.0, 2.0, 3.0]))
+    o_from_i = Transform.from_se3("o", "i", o_m_i, 7)
+    assert (o_from_i.target, o_from_i.source, o_from_i.stamp) == ("o", "i", 7)
+    np.testing.assert_allclose(o_from_i.rpy, (0.1, -0.2, 3.0), atol=1e-15)
+    point = np.array([0.5, 0.25, -2.0])
+    np.testing.assert_allclose(o_from_i @ point, o_m_i.act(point), atol=1e-15)
+    np.testing.assert_allclose(o_from_i.se3.homogeneous, o_m_i.homogeneous, atol=1e-15)
+    assert (o_from_i.se3.inverse() * o_m_i).isIdentity(1e-14)
+    with pytest.raises(InvalidInput, match=r"takes a pinocchio\.SE3; got ndarray: from_matrix takes arrays"):
+        Transform.from_se3("o", "i", np.eye(4))
+
+
+def test_without_pinocchio_the_error_names_the_command_that_installs_it(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    with pytest.raises(LibraryMissing, match="`pip install pin`"):
+        _ = Transform("a", "b", (0, 0, 0), TURN).se3
+
+
+def test_scipy_reads_and_writes_quaternions_in_the_same_order() -> None:
+    rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+    transform = Transform.from_rpy("a", "b", (1, 2, 3), (0.1, -0.2, 3.0))
+    scipys = rotation.from_quat(transform.rotation)
+    np.testing.assert_allclose(scipys.as_matrix(), transform.matrix[:3, :3], atol=1e-15)
+    np.testing.assert_allclose(scipys.as_euler("xyz"), transform.rpy, atol=1e-15)
+    assert_close(Transform("a", "b", (1, 2, 3), scipys.as_quat()), transform)
 
 
 @pytest.mark.parametrize("norm", [0.9991, 1.0, 1.0009])

@@ -1,4 +1,4 @@
-"""Checks of arguments: frame names and arrays of real numbers.
+"""Checks of arguments: frame names and arrays of real numbers, also of values that are copied.
 
 numpy converts silently: it parses a string of digits, and drops the imaginary part of a complex number and
 the mask of a masked array. A silent conversion of a pose is a wrong pose.
@@ -6,6 +6,7 @@ the mask of a masked array. A silent conversion of a pose is a wrong pose.
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -91,6 +92,11 @@ def check_points(points: ArrayLike) -> Points:
             "of more columns pass points[:, :3], of an image of points points.reshape(-1, 3)"
         )
     return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def reduced_to_fields(self: Any) -> tuple[Any, ...]:
+    """``__reduce__`` of a dataclass whose constructor checks its fields and makes its arrays read-only."""
+    return self.__class__, tuple(getattr(self, field.name) for field in fields(self))
 
 
 def is_masked(values: object) -> bool:

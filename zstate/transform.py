@@ -11,12 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, cast, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from zstate import se3
+from zstate._util.format import html_table
 from zstate.checks import check_names, real_numbers
 from zstate.clock import Clock, check_stamp, format_stamp
-from zstate.errors import FrameMismatch, InvalidInput, format_duration
+from zstate.errors import FrameMismatch, InvalidInput, LibraryMissing, format_duration
 from zstate.extension import kernel
 
 Array: TypeAlias = NDArray[np.float64]
@@ -115,7 +116,11 @@ class Transform(TransformFields):
     "interpolated" or "predicted", the last ``predicted_s`` seconds beyond the newest sample. Immutable,
     and so are its arrays. Raises InvalidInput if the numbers are not a pose or a name is not a frame name.
 
-    ``transform @ points`` is ``apply``: ``p_a = a_from_b @ p_b``.
+    ``transform @ points`` is ``apply``: ``p_a = a_from_b @ p_b``. ``np.asarray(transform)`` is ``matrix``.
+
+    Two transforms are equal if frames, stamp and all seven numbers are, where q and -q are the same rotation;
+    ``kind`` and ``covariance`` are not compared. Equal transforms have one hash. Copies and pickles are equal
+    and keep ``kind`` and ``covariance``.
     """
 
     __slots__ = ()
@@ -170,6 +175,20 @@ class Transform(TransformFields):
         if np.abs(array[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
             raise InvalidInput(f"the last row of a transform's matrix is 0 0 0 1; got {array[3].tolist()}")
         return cls(target, source, array[:3, 3], se3.quaternion_from_matrix(rotation), stamp)
+
+    @classmethod
+    def from_se3(cls, target: str, source: str, placement: Any, stamp: int | None = None) -> Transform:
+        """From a ``pinocchio.SE3``, the placement of ``source`` in ``target``.
+
+        ``oMi`` is ``from_se3("o", "i", oMi)``. Raises InvalidInput for other types, and if its rotation is
+        off orthonormal by more than 1e-3.
+        """
+        matrix = getattr(placement, "homogeneous", None)
+        if matrix is None:
+            raise InvalidInput(
+                f"from_se3 takes a pinocchio.SE3; got {type(placement).__name__}: from_matrix takes arrays"
+            )
+        return cls.from_matrix(target, source, matrix, stamp)
 
     @classmethod
     def from_rpy(
@@ -235,6 +254,26 @@ class Transform(TransformFields):
         matrix.flags.writeable = False
         return matrix
 
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        """``matrix`` for NumPy; a list of N transforms is (N, 4, 4). Read-only unless requested as a copy."""
+        if copy is False:
+            raise InvalidInput("the matrix of a Transform is computed, so there is no array without a copy")
+        matrix = np.array(self.matrix, dtype=dtype)
+        matrix.flags.writeable = copy is True
+        return matrix
+
+    @property
+    def se3(self) -> Any:
+        """The pose as a ``pinocchio.SE3``. Raises LibraryMissing if Pinocchio cannot be loaded."""
+        try:
+            import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs] - on request
+        except ImportError as error:
+            command = "pip install pin"
+            text = f"Pinocchio cannot be loaded: {error}; `{command}` installs it"
+            raise LibraryMissing(text, command=command) from error
+        solver: Any = pinocchio
+        return solver.SE3(self.matrix)
+
     @property
     def rpy(self) -> Array:
         """Roll pitch yaw [rad] as in URDF: (3,)."""
@@ -252,8 +291,8 @@ class Transform(TransformFields):
         carried = se3.carry_covariance(covariance, pose[3:], pose[:3])
         return PoseWithCovariance.of_pose(inverse, carried[UPPER_TRIANGLE].tolist())
 
-    @overload
-    def __matmul__(self, other: Transform) -> Transform: ...
+    @overload  # a Transform is ArrayLike, too; its product is not that of its matrix
+    def __matmul__(self, other: Transform) -> Transform: ...  # pyright: ignore[reportOverlappingOverload]
     @overload
     def __matmul__(self, other: ArrayLike) -> Array: ...
     def __matmul__(self, other: Transform | ArrayLike) -> Transform | Array:
@@ -315,6 +354,8 @@ class Transform(TransformFields):
 
     def apply(self, points: ArrayLike) -> Array:
         """Points given in ``source``, in ``target``: (3,), (..., 3), or homogeneous (4,), (..., 4)."""
+        if _has_transforms(points):  # whose matrices have four columns
+            raise InvalidInput("a transform is no point: a_from_b @ b_from_c is the product of transforms")
         array = real_numbers(points, "points")
         if array.ndim == 0 or array.shape[-1] not in (3, 4):
             raise InvalidInput(f"points have 3 or 4 (homogeneous) columns; got shape {array.shape}")
@@ -381,6 +422,19 @@ class Transform(TransformFields):
             f"<pose of {self.source} in {self.target} {when}: xyz [{x:.4f}, {y:.4f}, {z:.4f}] m, "
             f"quaternion xyzw [{quaternion}], {how or self.kind}>"
         )
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("translation xyz [m]", _vector_text(self.translation)),
+            ("rotation xyzw", _vector_text(self.rotation)),
+            ("roll pitch yaw [deg]", _vector_text(np.degrees(self.rpy))),
+            ("stamp [ns]", "at any time" if self.stamp is None else str(self.stamp)),
+            ("kind", self.kind),
+        ]
+        if self.covariance is not None:
+            deviations = np.sqrt(self.covariance.diagonal())
+            rows.append(("standard deviations [m, rad]", _vector_text(deviations)))
+        return html_table(f"pose of {self.source} in {self.target}", rows)
 
 
 Triangle: TypeAlias = Sequence[float]
@@ -473,6 +527,9 @@ class Twist:
         self.angular = _frozen(angular)
         self.stamp = stamp
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Twist, (self.frame, self.reference, self.linear, self.angular, self.stamp))
+
     @property
     def expressed_in(self) -> str:
         """The frame in whose axes both vectors are given."""
@@ -489,6 +546,11 @@ class Twist:
             f"<twist of {self.frame} in {self.reference}{when}: linear {_vector_text(self.linear)} m/s, "
             f"angular {_vector_text(self.angular)} rad/s>"
         )
+
+
+def _has_transforms(points: object) -> bool:
+    elements = cast("Sequence[object]", points) if isinstance(points, (list, tuple)) else (points,)
+    return any(isinstance(one, Transform) for one in elements)
 
 
 def _vector_text(vector: NDArray[np.float64]) -> str:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from functools import partial
 from numbers import Real
 from operator import attrgetter
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,6 +84,12 @@ class TransformBuffer(BufferCore):
         named = f" of {', '.join(robots[:3])}{more}" if robots else ""
         kept = "of a recording" if self.is_recording else f"{self.history_s:g} s of history"
         return f"<TransformBuffer: {len(self._tree.frames)} frames{named}, {kept}>"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a TransformBuffer is not copied or pickled: it is filled by threads of its process. Open a "
+            "TransformListener or a Recording in each process, or pass the arrays of lookup_many"
+        )
 
     def lookup(
         self,

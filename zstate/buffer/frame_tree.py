@@ -15,6 +15,7 @@ from operator import itemgetter
 from typing import Literal, NamedTuple
 
 from zstate import se3
+from zstate._util.format import html_of_fields
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage
 from zstate.checks import name_problem
@@ -74,6 +75,9 @@ class FrameInfo:
     count: int
     domain: str | None = None
     joint: str | None = None
+
+    def _repr_html_(self) -> str:
+        return html_of_fields(self)
 
     def newest_in(self, domain: str) -> int | None:
         """The newest stamp [ns] if it can be compared with a clock of ``domain``, else None."""

@@ -19,7 +19,7 @@ StopMode: TypeAlias = Literal["hold", "relax"]
 """How a driver stops: it holds its joints where they are, or switches their torque off."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class Setpoint:
     """What a driver writes to its joints at one tick, in the order of its ``joint_names``.
 

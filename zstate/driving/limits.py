@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate._util.format import suggestion_text
-from zstate.checks import real_numbers
+from zstate.checks import real_numbers, reduced_to_fields
 from zstate.errors import InvalidInput
 from zstate.model.robot import POSITION_COUNTS, Joint, RobotModel, near_joint
 from zstate.wire.keys import shortened
@@ -65,6 +65,8 @@ class Limits:
             object.__setattr__(self, name, values)
         if problems := self._problems():
             raise InvalidInput(f"joint limits: {'; '.join(problems)}")
+
+    __reduce__ = reduced_to_fields
 
     def _problems(self) -> list[str]:
         ranges = zip(self.joint_names, self.lower.tolist(), self.upper.tolist(), strict=True)

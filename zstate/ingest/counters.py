@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from zstate._util.bounded import MAX_ENTRIES, BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
+from zstate._util.format import html_of_fields
 from zstate._util.refusals import Refusals
 
 _LOG = logging.getLogger("zstate")
@@ -36,6 +37,9 @@ class ListenerStats:
     refused: dict[str, int]
     recalled: int = 0
     off_clock: int = 0
+
+    def _repr_html_(self) -> str:
+        return html_of_fields(self)
 
 
 class Counters:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from random import Random
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,6 +44,9 @@ class Kinematics:
 
     def __repr__(self) -> str:
         return f"<Kinematics of {self.model.name!r}, {len(self.model.links)} links>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Kinematics, (self.model,)
 
     def edge_poses(self, positions: ArrayLike, out: Floats | None = None) -> Floats:
         """The pose of every link but the root in its parent.

@@ -25,7 +25,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from difflib import get_close_matches
 from functools import cached_property
 from itertools import accumulate
@@ -34,8 +34,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate._util.format import suggestion_text
-from zstate.checks import real_numbers
+from zstate._util.format import html_table, suggestion_text
+from zstate.checks import real_numbers, reduced_to_fields
 from zstate.errors import FindingLike, InvalidInput
 
 Pose7 = tuple[float, float, float, float, float, float, float]
@@ -54,6 +54,9 @@ VELOCITY_COUNTS: dict[JointType, int] = {**POSITION_COUNTS, "floating": 6}
 
 NORM_TOLERANCE = 1e-3
 """A floating joint's quaternion is normalised if its length is this close to 1, else refused."""
+
+_SHOWN_JOINTS = 40
+"""The joints in the table of a notebook; larger robots have the most."""
 
 _SEPARATORS = re.compile(r"[^a-z0-9]+")
 _COORDINATES = {
@@ -122,6 +125,14 @@ class RobotModel:
 
     def __repr__(self) -> str:
         return f"RobotModel({self.name!r}, {len(self.links)} links, {len(self.joint_names)} driven joints)"
+
+    __reduce__ = reduced_to_fields  # without what is cached
+
+    def _repr_html_(self) -> str:
+        headings = ("joint", "type", "parent", "child", "lower", "upper", "velocity", "effort")
+        rows = [_shown_cells(joint) for joint in self.driven_joints[:_SHOWN_JOINTS]]
+        more = len(self.driven_joints) - len(rows)
+        return html_table(repr(self), [*rows, *[(f"and {more} more",)] * bool(more)], headings)
 
     @cached_property
     def driven_joints(self) -> tuple[Joint, ...]:
@@ -281,6 +292,11 @@ class RobotModel:
             return f"{name!r} is {kind} and takes no position"
         near = near_joint(name, missing) or near_joint(name, self.joint_names)
         return f"unknown joint {name!r}{suggestion_text(near)}"
+
+
+def _shown_cells(joint: Joint) -> tuple[str, ...]:
+    limits = (f"{limit:.4g}" if math.isfinite(limit) else "" for limit in astuple(joint.limits))
+    return (joint.name, joint.type, joint.parent, joint.child, *limits)
 
 
 def near_joint(name: object, joints: Sequence[str]) -> str | None:

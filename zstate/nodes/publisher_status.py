@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zstate._util.fork_safe import fork_safe
+from zstate._util.format import html_of_fields
 from zstate.errors import format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.rate import RateReport
@@ -61,6 +62,9 @@ class PublisherStats:
     last_excess: str = ""
     kinematics: str = ""
     warning: str = ""
+
+    def _repr_html_(self) -> str:
+        return html_of_fields(self)
 
 
 class LimitWatch:

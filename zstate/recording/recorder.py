@@ -17,6 +17,7 @@ from typing import NamedTuple
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
+from zstate._util.format import html_of_fields
 from zstate.clock import SystemClock, wait_interruptible
 from zstate.errors import Closed, InvalidInput, MessageError, RecordingError
 from zstate.ingest.counters import Counters, GapCounter
@@ -135,6 +136,9 @@ class RecorderStats:
     missed: int
     refused: Mapping[str, int]
     unwritten: int
+
+    def _repr_html_(self) -> str:
+        return html_of_fields(self)
 
 
 class Recorder(Closeable):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.checks import check_names, real_numbers
+from zstate.checks import check_names, real_numbers, reduced_to_fields
 from zstate.clock import check_stamp
 from zstate.errors import InvalidInput
 from zstate.scans.map_files import read_cells, scale_image, write_map
@@ -67,6 +67,8 @@ class Grid:
         fields["origin"] = _checked_origin(origin, frame)
         fields["frame"] = frame
         fields["stamp"] = check_stamp(stamp)
+
+    __reduce__ = reduced_to_fields
 
     @property
     def size(self) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.checks import check_names, real_numbers
+from zstate.checks import check_names, real_numbers, reduced_to_fields
 from zstate.clock import check_stamp, format_stamp
 from zstate.errors import InvalidInput
 from zstate.wire.keys import full_name
@@ -119,6 +119,8 @@ class Scan:
                 "the limits of a scan are 0 <= range_min <= range_max [m]; got "
                 f"range_min={self.range_min!r}, range_max={self.range_max!r}"
             )
+
+    __reduce__ = reduced_to_fields
 
     @property
     def is_rigid(self) -> bool:

@@ -21,7 +21,7 @@ _LARGEST_SWING = {"revolute": 1.2, "continuous": math.pi, "prismatic": 0.5, "pla
 _PHASE_STEP = 0.5
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class JointReading:
     """The joints of a robot at one instant, in the order of its model's ``joint_names``.
 
