@@ -572,7 +572,7 @@ class BaseEstimator:
         transform = Transform.trusted(self.odom, self.base, pose7, estimate.stamp, "exact")
         return BaseState(
             estimate.stamp,
-            PoseWithCovariance.of_pose(transform, pose_covariance[UPPER_TRIANGLE].tolist()),
+            PoseWithCovariance.of_pose(transform, lambda: pose_covariance[UPPER_TRIANGLE].tolist()),
             BaseTwist(twist[:3], twist[3:]),
             BaseCovariance(pose_covariance, twist_covariance),
             estimate.state.gyro_bias,

@@ -310,12 +310,14 @@ class Fusion:
         instead.
         """
         state, drift = estimate.state, estimate.drift
+        if not (drift.scale or self.noise.gyro_scale):
+            return estimate._replace(drift=Drift(state.position))
         shifts = np.zeros((2, len(state.covariance)))
         by_wheels, by_gyro = shifts
         by_wheels[POSITION] = drift.scale * (state.position - drift.origin)
         by_gyro[_YAW] = self.noise.gyro_scale * drift.turned
         by_gyro[POSITION] = self.noise.gyro_scale * drift.shift
-        covariance = state.covariance + shifts.T @ shifts
+        covariance = state.covariance + shifts.T.dot(shifts)
         return estimate._replace(
             state=state._replace(covariance=covariance), drift=Drift(state.position, drift.scale)
         )

@@ -24,8 +24,8 @@ from zstate.odometry.invariant_filter import (
     Floats,
     Measurement,
     contact_row,
-    skew,
 )
+from zstate.odometry.rotations import IDENTITY, skew
 
 _LEVEL = 0.1
 """The shortest level part of a unit vector that has a heading: 84 degrees of pitch."""
@@ -40,10 +40,10 @@ def body_velocity(
     IMU's rate at this instant [rad/s], less its bias. ``covariance`` (3, 3) is in the axes of the frame.
     """
     frame_from_imu, lever = imu_from_frame[:3, :3].T, imu_from_frame[:3, 3]
-    frame_from_world: Floats = frame_from_imu @ state.rotation.T
+    frame_from_world: Floats = frame_from_imu.dot(state.rotation.T)
     # omega x r = -[r] omega; a bias lowers omega.
-    by_bias: Floats = frame_from_imu @ skew(lever)
-    expected = frame_from_world @ state.velocity - by_bias @ (gyro - state.gyro_bias)
+    by_bias: Floats = frame_from_imu.dot(skew(lever))
+    expected: Floats = frame_from_world.dot(state.velocity) - by_bias.dot(gyro - state.gyro_bias)
     jacobian = np.zeros((3, len(state.covariance)))
     jacobian[:, VELOCITY] = frame_from_world
     jacobian[:, GYRO_BIAS] = by_bias
@@ -57,7 +57,7 @@ def zero_velocity(state: FilterState, gyro: Floats, velocity_sigma: float, rate_
     """
     jacobian = np.zeros((6, len(state.covariance)))
     jacobian[:3, VELOCITY] = state.rotation.T
-    jacobian[3:, GYRO_BIAS] = np.eye(3)
+    jacobian[3:, GYRO_BIAS] = IDENTITY
     residual = np.concatenate((-(state.rotation.T @ state.velocity), gyro - state.gyro_bias))
     return Measurement(residual, jacobian, np.diag(np.repeat((velocity_sigma, rate_sigma), 3) ** 2))
 
@@ -120,7 +120,7 @@ def frame_pose(state: FilterState, imu_from_frame: Floats) -> tuple[Floats, Floa
     """world_from_frame, (4, 4), and its covariance, (6, 6), that of ``Transform.covariance``."""
     world_from_frame = _world_from_frame(state, imu_from_frame)
     jacobian = _pose_jacobian(state, world_from_frame)
-    return world_from_frame, jacobian @ state.covariance @ jacobian.T
+    return world_from_frame, jacobian.dot(state.covariance).dot(jacobian.T)
 
 
 def frame_twist(
@@ -133,15 +133,16 @@ def frame_twist(
     each axis: the squared density of ``ImuNoise`` times the bandwidth.
     """
     frame_from_imu, lever = imu_from_frame[:3, :3].T, imu_from_frame[:3, 3]
-    frame_from_world: Floats = frame_from_imu @ state.rotation.T
-    by_bias = np.concatenate((frame_from_imu @ skew(lever), -frame_from_imu))
-    twist: Floats = -by_bias @ (gyro - state.gyro_bias)
-    twist[:3] += frame_from_world @ state.velocity
+    frame_from_world: Floats = frame_from_imu.dot(state.rotation.T)
+    by_bias = np.concatenate((frame_from_imu.dot(skew(lever)), -frame_from_imu))
+    twist: Floats = by_bias.dot(state.gyro_bias - gyro)
+    twist[:3] += frame_from_world.dot(state.velocity)
     jacobian = np.zeros((6, len(state.covariance)))
     jacobian[:3, VELOCITY] = frame_from_world
     jacobian[:, GYRO_BIAS] = by_bias
     # White noise of the rate acts as a bias of this instant.
-    covariance: Floats = jacobian @ state.covariance @ jacobian.T + by_bias @ by_bias.T * gyro_variance
+    covariance: Floats = jacobian.dot(state.covariance).dot(jacobian.T)
+    covariance += by_bias.dot(by_bias.T) * gyro_variance
     return twist, covariance
 
 
@@ -190,22 +191,22 @@ def checked_noise(sigma: ArrayLike | None, covariance: ArrayLike | None, size: i
 
 
 def _world_from_frame(state: FilterState, imu_from_frame: Floats) -> Floats:
-    world_from_imu = np.eye(4)
-    world_from_imu[:3, :3], world_from_imu[:3, 3] = state.rotation, state.position
-    return world_from_imu @ imu_from_frame
+    world_from_frame = state.rotation.dot(imu_from_frame[:3])
+    world_from_frame[:, 3] += state.position
+    return np.concatenate((world_from_frame, imu_from_frame[3:]))
 
 
 def _point_jacobian(state: FilterState, point: Floats) -> Floats:
     """The derivative of a point of the body, given in the world: (3, n). ``-[point] phi + xi_p``."""
     jacobian = np.zeros((3, len(state.covariance)))
     jacobian[:, ROTATION] = -skew(point)
-    jacobian[:, POSITION] = np.eye(3)
+    jacobian[:, POSITION] = IDENTITY
     return jacobian
 
 
 def _pose_jacobian(state: FilterState, world_from_frame: Floats) -> Floats:
     """The derivative of position and rotation about world axes of a frame on the body: (6, n)."""
     jacobian = np.zeros((6, len(state.covariance)))
-    jacobian[:3] = _point_jacobian(state, world_from_frame[:3, 3])
-    jacobian[3:, ROTATION] = np.eye(3)
+    jacobian[:3, ROTATION] = -skew(world_from_frame[:3, 3])
+    jacobian[:3, POSITION] = jacobian[3:, ROTATION] = IDENTITY
     return jacobian

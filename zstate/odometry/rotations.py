@@ -19,9 +19,12 @@ SKEW[1, 2], SKEW[1, 6] = 1.0, -1.0
 SKEW[2, 1], SKEW[2, 3] = -1.0, 1.0
 
 
+IDENTITY = np.eye(3)
+
+
 def skew(vector: Floats) -> Floats:
     """The matrix [v] of the cross product: ``skew(v) @ u = v x u``. (3, 3)"""
-    return (vector @ SKEW).reshape(3, 3)
+    return vector.dot(SKEW).reshape(3, 3)
 
 
 def rotation_exp(vector: Floats) -> Floats:
