@@ -56,9 +56,9 @@ class Rover:
     def _run(self) -> None:
         with self._joints, self._imu:
             for tick, stamp in enumerate(Rate(200.0, SystemClock(), self.stop)):
-                reading = self.truth.imu(stamp)
-                if reading is not None and self.has_imu.is_set():
-                    self._imu.publish(reading.gyro, reading.accel, reading.stamp)
+                for reading in self.truth.imu(stamp):
+                    if self.has_imu.is_set():
+                        self._imu.publish(reading.gyro, reading.accel, reading.stamp)
                 if tick % 4 == 0 and self.has_joints.is_set():
                     joints = self.truth.joints(stamp)
                     self._joints.publish(joints.positions, joints.velocities, stamp=joints.stamp)

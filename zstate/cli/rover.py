@@ -133,8 +133,7 @@ def _publish_imu(publisher: ImuPublisher, rover: SimulatedRover, stop: threading
     from zstate.rate import Rate
 
     for stamp in Rate(_IMU_HZ, SystemClock(), stop):
-        reading = rover.imu(stamp)
-        if reading is not None:
+        for reading in rover.imu(stamp):
             publisher.publish(reading.gyro, reading.accel, reading.stamp)
 
 

@@ -34,7 +34,10 @@ _STEP_NS = 1_000_000
 _STEP_S = 1e-9 * _STEP_NS
 _HISTORY_NS = 2_000_000_000
 _LONGEST_NS = 10_000_000_000
-"""What is simulated at most at once: the rover stands still for the rest of a longer pause."""
+"""What is simulated at most at once: after a longer pause the rover stands where it was."""
+
+_IMU_NS = 5_000_000
+"""The period of the IMU, which has its own clock: a late reader finds all readings, none of them longer."""
 
 _MOTOR_S, _SLIP_S = 0.05, 0.5
 """Time constants of the wheels and of their slip."""
@@ -56,7 +59,7 @@ class PlanarPose(NamedTuple):
 class ImuReading(NamedTuple):
     """Angular velocity [rad/s] and specific force [m/s^2], (3,), in the axes of the IMU.
 
-    They are the means of an interval whose middle is ``stamp`` [ns].
+    They are the means of 5 ms, whose middle is ``stamp`` [ns].
     """
 
     stamp: int
@@ -89,7 +92,6 @@ class SimulatedRover:
         self._wheels = wheels
         self._imu = _Imu(base_from_imu, noise, gyro_bias, accel_bias, seed)
         self._slip = slip
-        # The slip has a generator of its own: the path does not depend on how often the IMU is read.
         self._random = Random(seed)
         self._slips = [0.0, 0.0]
         self._targets = [0.0, 0.0]
@@ -124,10 +126,11 @@ class SimulatedRover:
             last = self._advance(stamp)
             return JointReading(np.array(self._angles), np.array(self._rates), stamp=last)
 
-    def imu(self, stamp: int) -> ImuReading | None:
-        """The IMU since the last call, until the last step before ``stamp`` [ns]; None without a step."""
+    def imu(self, stamp: int) -> list[ImuReading]:
+        """The readings of the IMU until ``stamp`` [ns] since the last call, of 2 s at most."""
         with self._lock:
-            return self._imu.read(self._advance(stamp))
+            self._advance(stamp)
+            return self._imu.take()
 
     def poses(self, stamps: ArrayLike) -> Floats:
         """Where the rover truly was at ``stamps`` [ns], (N,) of the last 2 s: (N, 3), x y [m], yaw [rad].
@@ -155,13 +158,15 @@ class SimulatedRover:
         if stamp - self._stamp > _LONGEST_NS:
             self._stamp = stamp
             self._poses = deque([self.pose], self._poses.maxlen)
+            self._rates = [0.0, 0.0]
+            self._speed = self._yaw_rate = 0.0
             self._imu.skip()
         while self._stamp + _STEP_NS <= stamp:
             self._stamp += _STEP_NS
-            self._step()
+            self._step(self._stamp)
         return self._stamp
 
-    def _step(self) -> None:
+    def _step(self, stamp: int) -> None:
         fade = math.exp(-_STEP_S / _SLIP_S)
         scatter = self._slip * math.sqrt(1.0 - fade * fade)
         ways: list[float] = []
@@ -173,6 +178,7 @@ class SimulatedRover:
         left, right = ways
         speed, yaw_rate = 0.5 * (left + right), (right - left) / self._wheels.track_m
         self._imu.add(
+            stamp,
             0.5 * (self._speed + speed),
             0.5 * (self._yaw_rate + yaw_rate),
             (speed - self._speed) / _STEP_S,
@@ -192,7 +198,7 @@ class SimulatedRover:
 
 
 class _Imu:
-    """Means of the motion since the last reading, with white noise and biases that walk at random."""
+    """Means of the motion over periods of 5 ms, with white noise and biases that walk at random."""
 
     def __init__(
         self,
@@ -207,25 +213,32 @@ class _Imu:
         self._noise = noise
         self._biases = np.array([gyro_bias, accel_bias], dtype=np.float64)
         self._random = np.random.default_rng(seed)
+        self._readings: deque[ImuReading] = deque(maxlen=_HISTORY_NS // _IMU_NS)
         self.skip()
 
     def skip(self) -> None:
-        """Begin a new interval."""
+        """Begin a new period."""
         self._count = 0
         self._turned = self._ahead = self._left = 0.0
 
-    def add(self, speed: float, yaw_rate: float, acceleration: float, turning: float) -> None:
-        """One step of the motion of the base, with its accelerations [m/s^2], [rad/s^2]."""
+    def take(self) -> list[ImuReading]:
+        """The readings that were not taken yet."""
+        readings = list(self._readings)
+        self._readings.clear()
+        return readings
+
+    def add(self, stamp: int, speed: float, yaw_rate: float, acceleration: float, turning: float) -> None:
+        """A step of the motion of the base until ``stamp`` [ns]; accelerations in [m/s^2] and [rad/s^2]."""
         self._count += 1
         self._turned += yaw_rate
         self._ahead += acceleration - yaw_rate**2 * self._x - turning * self._y
         self._left += speed * yaw_rate + turning * self._x - yaw_rate**2 * self._y
+        if self._count * _STEP_NS == _IMU_NS:
+            self._readings.append(self._read(stamp - _IMU_NS // 2))
+            self.skip()
 
-    def read(self, stamp: int) -> ImuReading | None:
-        """The reading of the interval that ends at ``stamp``; the next interval begins there."""
-        if not self._count:
-            return None
-        middle, dt_s = stamp - self._count * _STEP_NS // 2, self._count * _STEP_S
+    def _read(self, middle: int) -> ImuReading:
+        dt_s = 1e-9 * _IMU_NS
         motion = (
             np.array([(0.0, 0.0, self._turned), (self._ahead, self._left, _GRAVITY * self._count)])
             / self._count
@@ -237,7 +250,6 @@ class _Imu:
         gyro, accel = (
             motion @ self._imu_from_base.T + self._biases + white * self._random.standard_normal((2, 3))
         )
-        self.skip()
         return ImuReading(middle, gyro, accel)
 
 
