@@ -7,6 +7,7 @@ import json
 import re
 import struct
 from collections.abc import Callable
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,7 +22,7 @@ from zstate.net.sample_history import MAX_PAGE_BYTES
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import LATCHED_STREAMS, NAMED_STREAMS, Stream
-from zstate.wire.messages import MAX_BYTES, HistoryPage, Message, MotionOutcome
+from zstate.wire.messages import MAX_BYTES, HistoryPage, Message, MotionOutcome, order_digest
 from zstate.wire.native import ENCODINGS, MAX_MESSAGE_BYTES, STREAM_TYPES, NativeWire, decode, encode
 from zstate.wire.protocol import SerializedSample
 
@@ -267,6 +268,17 @@ def test_the_page_lists_every_stream_with_its_key_its_message_and_how_it_is_deli
         assert row[0].endswith(">`") is (stream in NAMED_STREAMS)
         assert (row[2] == "latched") is (stream in {*LATCHED_STREAMS, "driver", "stop"})
     assert f"\n{','.join(get_args(Stream))}\n" in section("Liveliness tokens")
+
+
+def test_the_digest_in_the_page_is_that_of_its_names():
+    form = r"digest of `(.*?)` is that of the bytes `(.*?)`: `(.*?)`"
+    names, payload, digest = re.findall(form, section("Framing").replace("\n", " "))[0]
+    assert pack_value("str[]", json.loads(names)).hex(" ") == payload
+    assert (
+        order_digest(json.loads(names)).hex()
+        == digest
+        == blake2b(bytes.fromhex(payload), digest_size=8).hexdigest()
+    )
 
 
 def test_the_size_limits_of_the_page_are_those_of_the_code():
