@@ -1,4 +1,7 @@
+import re
 import threading
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -8,6 +11,7 @@ from helpers.robots import wait_for_reader
 from zstate.errors import Closed, InvalidInput
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.session import connect
+from zstate.net.streams import StreamPublisher
 from zstate.wire.protocol import SerializedSample
 
 ENCODING = "zstate/StaticTransforms;v=1"
@@ -241,6 +245,65 @@ def test_large_values_reach_advanced_subscribers_of_zenoh_once_as_those_of_ros_n
         assert [payload for number, payload in received if number == 1] == [b"a1", b"b", b"a2", b"a3"]
         assert sorted(payload for number, payload in received if number == 2) == [b"a2", b"a3", b"b"]
         del subscribers
+
+
+@pytest.mark.parametrize("is_large", [False, True])
+def test_a_plain_client_of_zenoh_reads_a_value_by_the_rules_of_the_wire_specification(is_large: bool):
+    with connect() as writer, LatchedPublisher(writer, key("a"), ENCODING, is_large=is_large) as value:
+        value.set(b"1")
+        with connect() as session:
+            client = session.zenoh
+
+            def cached(selector: str) -> list[tuple[str, bytes, str]]:
+                replies = client.get(f"{selector}?_max=1", accept_replies=zenoh.ReplyKeyExpr.ANY)
+                found = [reply.ok for reply in replies if reply.ok is not None]
+                return [(str(one.key_expr), one.payload.to_bytes(), str(one.encoding)) for one in found]
+
+            tokens: list[str] = []
+            while not tokens:
+                replies = client.liveliness().get(f"{ALL}/@adv/pub/**")
+                tokens = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+            (token,) = tokens
+            form = r"/@adv/pub/[0-9a-f]+/" + (r"uhlc/\d+" if is_large else r"\d+/_")
+            assert re.fullmatch(re.escape(key("a")) + form, token)
+            assert cached(token) == cached(f"{key('a')}/@adv/**") == [(key("a"), b"1", ENCODING)]
+            value.withdraw()
+            assert [payload for _, payload, _ in cached(token)] == [b""]
+
+
+def test_values_and_samples_are_sent_as_the_wire_specification_lists():
+    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text().partition("\n## Delivery\n")[2]
+    page = page.partition("\n## ")[0]
+    with connect() as writer, connect() as reader, ExitStack() as opened:
+        received: dict[str, zenoh.Sample] = {}
+        opened.enter_context(
+            reader.zenoh.declare_subscriber("k/*", lambda one: received.update({str(one.key_expr): one}))
+        )
+        sample = opened.enter_context(StreamPublisher(writer, "k/stream", ENCODING))
+        values = [
+            opened.enter_context(LatchedPublisher(writer, "k/value", ENCODING)),
+            opened.enter_context(LatchedPublisher(writer, "k/large", ENCODING, is_large=True)),
+            opened.enter_context(LatchedPublisher(writer, "k/urgent", ENCODING, urgent=True)),
+        ]
+        until(lambda: sample.has_readers)
+        sample.put(b"1")
+        for value in values:
+            value.set(b"1")
+        until(lambda: len(received) == 4)
+        for name, row in (
+            ("stream", "all streams, `status`, `release`"),
+            ("value", "`robot_description`, `tf_static`, `map`, `driver`"),
+            ("large", "`robot_description`, `tf_static`, `map`, `driver`"),
+            ("urgent", "`stop`"),
+        ):
+            one = received[f"k/{name}"]
+            priority, congestion = (
+                str(value).partition(".")[2].lower().replace("_", " ")
+                for value in (one.priority, one.congestion_control)
+            )
+            express = "yes" if one.express else "no"
+            (delivery,) = re.findall(rf"^\| {re.escape(row)} \| (.*) \|$", page, re.MULTILINE)
+            assert re.sub(r" \(\d\)", "", delivery) == f"{priority} | {congestion} | {express}"
 
 
 @pytest.mark.parametrize("is_large", [False, True])
