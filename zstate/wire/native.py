@@ -1,4 +1,4 @@
-"""Native wire format: plain keys, MessagePack arrays, type and version in the Zenoh encoding.
+"""Native wire format: plain keys, MessagePack arrays, type and version in the Zenoh encoding. See docs/wire.md.
 
 The payload of an OccupancyGrid above 64 kB is deflated (zlib, RFC 1950). Its first byte is then 0x78, with
 which no array of MessagePack begins.
