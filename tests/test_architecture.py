@@ -28,7 +28,7 @@ PACKAGE = Path(__file__).parent.parent / "zstate"
 FLOORS = (
     {"_util", "_kernel"},
     {"errors"},
-    {"checks", "extension"},
+    {"checks", "extension", "web_access"},
     {"clock"},
     {"se3", "rate"},
     {"transform"},
@@ -40,7 +40,7 @@ FLOORS = (
     {"scans", "driving", "odometry"},
     {"bridges", "recording"},
     {"zstate"},
-    {"metrics"},
+    {"metrics", "foxglove"},
     {"view", "cli"},
     {"__main__"},
 )
@@ -72,7 +72,7 @@ HOMES = {
     "tf2_msgs": "bridges",
     "prometheus_client": "metrics",
     "viser": "view",
-    "websockets": "view",  # what viser's server is made of
+    "websockets": "foxglove",
     "trimesh": "view",
     "collada": "view",
     "PIL": "view",
@@ -90,7 +90,7 @@ GUESTS = {
     ("cli/up/cell.py", "msgspec"),
     ("cli/commands/drive.py", "msgspec"),  # so is --param, into the types that a driver annotates
     ("scans/map_files.py", "PIL"),
-    ("transform.py", "pinocchio"),  # `Transform.se3`, when it is read
+    ("view/server.py", "websockets"),  # what viser's server is made of
     # each reads one kind of file in YAML
     ("cli/up/static_edges.py", "yaml"),
     ("scans/map_metadata.py", "yaml"),

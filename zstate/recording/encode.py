@@ -1,10 +1,11 @@
-"""Encodes robot messages as ROS 2 messages and writes them to a recording."""
+"""Encodes robot messages as ROS 2 messages, for a recording or for the clients of a server."""
 
 from __future__ import annotations
 
 from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
+from typing import Protocol
 
 from zstate._util.bounded import BoundedQueue
 from zstate._util.fork_safe import fork_safe_lock
@@ -26,7 +27,7 @@ from zstate.recording.driver_messages import (
     encode_status,
     program_of,
 )
-from zstate.recording.mcap.writer import ChannelId, RecordingWriter
+from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.storage import EDGE_WRITER, ROBOT
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
@@ -58,7 +59,7 @@ from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS, Qos
 from zstate.wire.ros2.topics import SHARED, FrameNames, RmwKeys, ros_type
-from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
+from zstate.wire.ros2.types import POSE_WITH_COVARIANCE, RosType
 
 MAX_LATCHED = 256
 """Latched messages of one robot: its description, the edges of each static writer, and its maps."""
@@ -113,6 +114,47 @@ NO_MAP = OccupancyGrid(0, 1, "map", 1.0, 0, 0, to_block([0.0, 0.0, 0.0, 0.0, 0.0
 _NAMED = SampleLayout()
 
 
+class MessageOutput(Protocol):
+    """Where encoded messages go: a recording (``RecordingWriter``), or the clients of a server."""
+
+    def channel(
+        self, topic: str, type: RosType, qos: Qos, metadata: Mapping[str, str] | None = None
+    ) -> ChannelId:
+        """Declare a channel; an equal declaration returns the same id."""
+        ...
+
+    def release(self, channel: ChannelId) -> None:
+        """Forget a channel without latched messages."""
+        ...
+
+    def is_read(self, channel: ChannelId) -> bool:
+        """Whether samples of the channel have a reader; they are not encoded without one."""
+        ...
+
+    def write(
+        self, channel: ChannelId, payload: bytes, log_time: int, publish_time: int, *, sequence: int = 0
+    ) -> None:
+        """Write a message."""
+        ...
+
+    def latch(
+        self,
+        channel: ChannelId,
+        key: str,
+        payload: bytes,
+        log_time: int,
+        publish_time: int,
+        *,
+        once_per_file: bool = False,
+    ) -> bool:
+        """Write a message that is in effect until the next of this ``key``; False if it is not written."""
+        ...
+
+    def unlatch(self, channel: ChannelId, key: str) -> None:
+        """End the effect of a latched message."""
+        ...
+
+
 class RecordingEncoder:
     """Writes the messages of robots, each writer's on channels of its own.
 
@@ -131,7 +173,7 @@ class RecordingEncoder:
 
     def __init__(
         self,
-        writer: RecordingWriter,
+        writer: MessageOutput,
         refuse: Callable[[str, str], None],
         *,
         alone: str | None = None,
@@ -233,6 +275,8 @@ class RecordingEncoder:
                 self._write_covariance(robot, message, one, log_time, edge_writer)
         child = message.child if isinstance(message, Pose) else ""
         channel = self._channel(robot, stream, message.session, log_time, edge_writer, child=child)
+        if not self._writer.is_read(channel.number):
+            return
         payload = channel.encode(message, sample_names)
         # MCAP begins in 1970; the payload keeps an earlier stamp.
         publish_time = max(message.stamp, 0)
@@ -265,6 +309,8 @@ class RecordingEncoder:
             )
         except _TooManyWriters as error:  # the sample itself may have a channel
             self._refuse("too many writers", f"{robot!r}, covariance of {covariance.child!r}: {error}")
+            return
+        if not self._writer.is_read(channel.number):
             return
         payload = channel.encode_covariance(covariance)
         self._writer.write(channel.number, payload, log_time, max(sample.stamp, 0), sequence=sample.seq)
@@ -361,12 +407,7 @@ class RecordingEncoder:
         program = program or self._programs.get(session, "")
         if program:
             metadata["zstate.program"] = program
-        carrier, qos = TOPICS.get(stream, stream), Qos()
-        if stream in DRIVER_TYPES:
-            topic, kind = driver_topic(options.namespace, stream), DRIVER_TYPES[stream]
-        else:
-            topic, kind = RmwKeys(options).topic(robot, carrier, ros_name(edge_writer)), ros_type(carrier)
-            qos = STREAM_QOS[carrier]
+        topic, kind, qos = self.topic(robot, stream, edge_writer)
         if child and stream == "pose":
             metadata[POSED_FRAME] = names.to_ros(child)
         elif child:
@@ -377,6 +418,19 @@ class RecordingEncoder:
         for unused in opened.add(key, channel, self._latched.get(robot, {}).values()):
             self._writer.release(unused.number)
         return channel
+
+    def topic(self, robot: str, stream: Stream, writer_name: str = "") -> tuple[str, RosType, Qos]:
+        """The topic that carries a stream of ``robot``, its type and its QoS.
+
+        ``writer_name`` is the name of a sensor, of odometry or of a map. Covariances, and measured poses of
+        a child, have further topics. Raises InvalidInput for an invalid name.
+        """
+        options = self._options(robot)
+        if stream in DRIVER_TYPES:
+            return driver_topic(options.namespace, stream), DRIVER_TYPES[stream], Qos()
+        carrier = TOPICS.get(stream, stream)
+        topic = RmwKeys(options).topic(robot, carrier, ros_name(writer_name))
+        return topic, ros_type(carrier), STREAM_QOS[carrier]
 
     def _options(self, robot: str) -> Ros2Options:
         """The namespace and the frame prefix of a robot. Raises InvalidInput for an invalid name."""

@@ -33,7 +33,7 @@ from zstate.recording.mcap.writer import RecordingWriter
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, LATCHED_STREAMS, NAMED_STREAMS, SENSOR_STREAMS, Stream, check_robot
 from zstate.wire.messages import Message, Odometry, StampedMessage, edge_of
-from zstate.wire.protocol import SerializedSample
+from zstate.wire.protocol import SerializedSample, Wire
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.topics import SHARED
 
@@ -71,18 +71,26 @@ class Batch(NamedTuple):
 
 
 class MessageQueue(Closeable):
-    """Samples of several subscriptions, with their time of reception, in one queue for one thread."""
+    """Samples of several subscriptions, with their time of reception, in one queue for one thread.
 
-    def __init__(self, session: Session) -> None:
+    ``on_batch()`` is called after each batch that was queued.
+    """
+
+    def __init__(self, session: Session, on_batch: Callable[[], object] = lambda: None) -> None:
         self._session = session
+        self._on_batch = on_batch
         self._batches: list[Batch] = []
         self._waiting = self._bytes = 0
         self._has_room = fork_safe(threading.Condition())
         self._is_open = True
-        self._opened = ExitStack()
+        self._subscribers: dict[Stream, Closeable] = {}
 
     def subscribe(self, stream: Stream, expressions: Sequence[str], robot: str | None) -> None:
-        """Subscribe to a stream; an empty payload of a latched one is a withdrawn value."""
+        """Subscribe to a stream, in place of the last subscription to it.
+
+        An empty payload of a latched stream is a withdrawn value.
+        """
+        self.unsubscribe(stream)
         capacity = capacity_for(expressions)
 
         def put(arrivals: list[SerializedSample]) -> None:
@@ -96,12 +104,19 @@ class MessageQueue(Closeable):
                     self._batches.append(batch)
                     self._waiting += len(arrivals)
                     self._bytes += sum(len(arrival.payload) for arrival in arrivals)
+            self._on_batch()
 
         if stream in LATCHED_STREAMS:
             subscriber = LatchedSubscriber(self._session, expressions, lambda arrival: put([arrival]))
         else:
             subscriber = StreamSubscriber(self._session, expressions, put)
-        self._opened.enter_context(subscriber)
+        self._subscribers[stream] = subscriber
+
+    def unsubscribe(self, stream: Stream) -> None:
+        """End the subscription to a stream; what is in the queue can still be read."""
+        subscriber = self._subscribers.pop(stream, None)
+        if subscriber is not None:
+            subscriber.close()
 
     def pop_all(self) -> list[Batch]:
         """Remove and return all batches, in the order of reception."""
@@ -116,7 +131,65 @@ class MessageQueue(Closeable):
         with self._has_room:
             self._is_open = False
             self._has_room.notify_all()
-        self._opened.close()
+        for stream in list(self._subscribers):
+            self.unsubscribe(stream)
+
+
+class SampleWriter:
+    """Decodes received samples of ``wire``, and writes their messages with a RecordingEncoder."""
+
+    def __init__(self, wire: Wire, counters: Counters) -> None:
+        self._wire = wire
+        self._counters = counters
+        self._gaps = GapCounter(counters)
+
+    def start_batch(self, batch: Batch) -> None:
+        """Begin with the samples of ``batch``."""
+        self._gaps.start_batch(overflowed=batch.overflowed)
+
+    def robot_of(self, batch: Batch, arrival: SerializedSample) -> str | None:
+        """The robot of a sample; None, and counted, if its key has no valid names."""
+        try:
+            if batch.stream in NAMED_STREAMS:
+                self._wire.edge_writer_name(arrival.key)  # raises for a key without one
+            return self._wire.robot_from_key(arrival.key) if batch.robot is None else batch.robot
+        except InvalidInput as error:
+            self._counters.count_refusal("foreign", str(error))
+            return None
+
+    def write(
+        self, encoder: RecordingEncoder, robot: str, batch: Batch, arrival: SerializedSample
+    ) -> Sequence[Message]:
+        """Write the messages of a sample of ``batch``, and return them."""
+        stream, stamp = batch.stream, batch.stamp
+        edge_writer = self._wire.edge_writer_name(arrival.key) if stream in NAMED_STREAMS else None
+        if not arrival.payload and stream in LATCHED_STREAMS:
+            if edge_writer is not None:
+                encoder.withdraw(robot, stream, edge_writer, stamp)
+            return ()
+        messages: Sequence[Message] = ()
+        try:
+            messages = self._wire.decode(stream, arrival, robot)
+        except MessageError as error:
+            self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
+        for message in messages:
+            is_known = encoder.write_message(robot, message, stamp, edge_writer)
+            if isinstance(message, Odometry) and stream in self._wire.edges:
+                # On /tf, where ROS tools and readers of recordings find edges; ROS nodes publish it there.
+                encoder.write_message(robot, edge_of(message), stamp, edge_writer)
+            if is_known and isinstance(message, StampedMessage):
+                self._gaps.add((robot, stream, message.session), message.seq)
+        return messages
+
+
+def recorded_streams(wire: Wire) -> tuple[Stream, ...]:
+    """The streams of robots that a recording of ``wire`` holds; the clock belongs to no robot."""
+    # On a ROS wire all moving edges are on tf, and all joints on joint_states.
+    named = wire.partial_joint_states, wire.transforms
+    latched: tuple[Stream, ...] = ("robot_description", "tf_static", "map")
+    driving = tuple(DRIVER_TYPES) if wire.name == "native" else ()
+    samples: tuple[Stream, ...] = ("joint_states", "tf", *named, *SENSOR_STREAMS, "odometry", *driving)
+    return tuple(dict.fromkeys((*latched, *samples)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,14 +243,9 @@ class Recorder(Closeable):
         selected = (robots,) if isinstance(robots, str) else tuple(dict.fromkeys(robots))
         self._selected = tuple(map(check_robot, selected))
         self._wire = get_wire(wire)
-        # On a ROS wire all moving edges are on tf, and all joints on joint_states.
-        named = self._wire.partial_joint_states, self._wire.transforms
-        latched: tuple[Stream, ...] = ("robot_description", "tf_static", "map")
-        driving = tuple(DRIVER_TYPES) if wire == "native" else ()
-        samples: tuple[Stream, ...] = ("joint_states", "tf", *named, *SENSOR_STREAMS, "odometry", *driving)
-        self._streams: tuple[Stream, ...] = tuple(dict.fromkeys((*latched, *samples)))
+        self._streams = recorded_streams(self._wire)
         self._counters = Counters()
-        self._gaps = GapCounter(self._counters)
+        self._samples = SampleWriter(self._wire, self._counters)
         self._programs: BoundedDict[int, str] = BoundedDict()
         self._discovered: set[str] = set()
         self._pending: list[Batch] = []
@@ -287,12 +355,12 @@ class Recorder(Closeable):
         if self._encoder is None:
             return
         for batch in self._pending:
-            self._gaps.start_batch(overflowed=batch.overflowed)
+            self._samples.start_batch(batch)
             for arrival in batch.arrivals:
                 if time.monotonic() > self._ends_at:
                     self._counters.count("dropped")
                     continue
-                robot = self._robot(batch, arrival)
+                robot = self._samples.robot_of(batch, arrival)
                 if robot is None:
                     continue
                 if batch.stream in LATCHED_STREAMS and self._large.accepts(robot, len(arrival.payload)):
@@ -307,7 +375,7 @@ class Recorder(Closeable):
         if not robots:
             for batch in self._pending:
                 if batch.stream != "clock":
-                    named = (self._robot(batch, arrival) for arrival in batch.arrivals)
+                    named = (self._samples.robot_of(batch, arrival) for arrival in batch.arrivals)
                     robots.update(robot for robot in named if robot is not None)
             robots |= self._discovered.copy()
             if robots and self._starts_at is None:
@@ -322,34 +390,8 @@ class Recorder(Closeable):
         )
 
     def _write_arrival(self, robot: str, batch: Batch, arrival: SerializedSample) -> None:
-        encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
-        assert encoder is not None
-        edge_writer = self._wire.edge_writer_name(arrival.key) if stream in NAMED_STREAMS else None
-        if not arrival.payload and stream in LATCHED_STREAMS:
-            if edge_writer is not None:
-                encoder.withdraw(robot, stream, edge_writer, stamp)
-            return
-        messages: Sequence[Message] = ()
-        try:
-            messages = self._wire.decode(stream, arrival, robot)
-        except MessageError as error:
-            self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
-        for message in messages:
-            is_known = encoder.write_message(robot, message, stamp, edge_writer)
-            if isinstance(message, Odometry) and stream in self._wire.edges:
-                # On /tf, where ROS tools and readers of recordings find edges; ROS nodes publish it there.
-                encoder.write_message(robot, edge_of(message), stamp, edge_writer)
-            if is_known and isinstance(message, StampedMessage):
-                self._gaps.add((robot, stream, message.session), message.seq)
-
-    def _robot(self, batch: Batch, arrival: SerializedSample) -> str | None:
-        try:
-            if batch.stream in NAMED_STREAMS:
-                self._wire.edge_writer_name(arrival.key)  # raises for a key without one
-            return self._wire.robot_from_key(arrival.key) if batch.robot is None else batch.robot
-        except InvalidInput as error:
-            self._counters.count_refusal("foreign", str(error))
-            return None
+        assert self._encoder is not None
+        self._samples.write(self._encoder, robot, batch, arrival)
 
 
 class _LargeValues:

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import functools
 import io
 import logging
 import math
 import os
 import shutil
-import socket
 import subprocess
 import tempfile
 import threading
@@ -31,13 +29,11 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from zstate._util.closeable import Closeable
-from zstate._util.endpoint import format_host
 from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, LibraryMissing, ZStateError
-from zstate.view.access import AccessCheck, is_websocket
+from zstate.web_access import AccessCheck, is_websocket, listen
 
 PORT = 8080
-_PORTS_TRIED = 100
 # A browser that has vanished (a suspended laptop, a lost network) does not answer the closing handshake.
 _CLOSE_TIMEOUT_S = 0.3
 _PING_PERIOD_S = 0.5
@@ -97,7 +93,7 @@ class ViewServer(Closeable):
 
     def __init__(self, host: str = "127.0.0.1", port: int | None = None) -> None:
         self.host = host
-        self._socket = _listen(host, port)
+        self._socket = listen(host, port, PORT)
         self.port: int = self._socket.getsockname()[1]
         self.access = AccessCheck.at(host, self.port)
         self.connected = threading.Event()
@@ -120,9 +116,7 @@ class ViewServer(Closeable):
     @property
     def url(self) -> str:
         """The address to open in a browser."""
-        query = "" if self.access.token is None else f"/?token={self.access.token}"
-        is_any = self.host in ("", "0.0.0.0", "::")
-        return f"http://{socket.gethostname() if is_any else format_host(self.host)}:{self.port}{query}"
+        return self.access.url("http")
 
     def is_answering(self, client_id: int) -> bool:
         """Whether the browser ``client_id`` shows the page, and has answered a ping in the last 3 s.
@@ -214,28 +208,6 @@ class _Server(viser.ViserServer):
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
-
-
-def _listen(host: str, port: int | None) -> socket.socket:
-    """A socket that listens at ``port``, or at the first free one."""
-    ports = range(PORT, PORT + _PORTS_TRIED) if port is None else (port,)
-    for tried in ports:
-        bound = _bind(host, tried)
-        if bound is not None:
-            return bound
-    taken = f"port {port} is taken" if port is not None else f"ports {ports[0]} to {ports[-1]} are taken"
-    raise InvalidInput(f"{taken} at {host!r}; name a free one with --port, or 0 for any")
-
-
-def _bind(host: str, port: int) -> socket.socket | None:
-    """A socket that listens at ``port``; None if the port is taken."""
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        return socket.create_server((host, port), family=family)
-    except (OSError, OverflowError) as error:
-        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
-            return None
-        raise InvalidInput(f"cannot listen at {host!r}, port {port}: {error}") from None
 
 
 def _no_output() -> contextlib.redirect_stdout[io.StringIO]:

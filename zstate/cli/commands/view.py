@@ -156,10 +156,10 @@ def view_command(
 
     from zstate.cli.processes import BackgroundCall
     from zstate.model.load import is_path
-    from zstate.view.access import is_loopback
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
     from zstate.view.view import View
+    from zstate.web_access import is_loopback
 
     models = parse_models(robots)
     files = [Path(one) for one in models if Path(one).suffix in _RECORDINGS or Path(one).is_dir()]

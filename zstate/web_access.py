@@ -1,8 +1,9 @@
-"""Access checks for requests to the page.
+"""Access checks for requests to web servers (the view and Foxglove), and their sockets.
 
 A browser lets any page on the internet open a websocket to a port of the machine it runs on. So:
 
-- a websocket is opened only for a page from this server (its Origin equals its Host);
+- a websocket is opened only for a page from this server (its Origin equals its Host), or from an allowed
+  site;
 - on loopback, Host must be a loopback address or ``localhost``, with the port of this server; otherwise
   another site could let its own name resolve to 127.0.0.1 (DNS rebinding);
 - a request with two of a header that decides is refused;
@@ -11,16 +12,21 @@ A browser lets any page on the internet open a websocket to a port of the machin
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import secrets
+import socket
 from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
+from typing import Protocol
 from urllib.parse import parse_qs, urlsplit
 
-from websockets.datastructures import Headers
+from zstate._util.endpoint import format_host
+from zstate.errors import InvalidInput
 
+_PORTS_TRIED = 100
 _HTTP_PORT = 80
 _UNIQUE = ("Host", "Origin", "Upgrade", "Cookie")
 _COOKIE = "zstate_view_"  # and the port, because a host has the same cookies at all its ports
@@ -34,6 +40,12 @@ _HEADERS = {
 }
 
 
+class Headers(Protocol):
+    """The headers of a request: their values by name, in any case."""
+
+    def get_all(self, key: str, /) -> list[str]: ...
+
+
 @dataclass(frozen=True, slots=True)
 class AccessDeniedResponse:
     """Why a request is refused, as text for the user of the browser."""
@@ -44,16 +56,32 @@ class AccessDeniedResponse:
 
 @dataclass(frozen=True, slots=True)
 class AccessCheck:
-    """Decides which requests a server at ``host`` and ``port`` answers; ``token`` is needed unless None."""
+    """Decides which requests a server at ``host`` and ``port`` answers; ``token`` is needed unless None.
+
+    ``origins`` are sites whose pages may open a websocket as well, as "https://app.example". ``command`` runs
+    the server; refusals name it.
+    """
 
     host: str
     port: int
     token: str | None = None
+    origins: tuple[str, ...] = ()
+    command: str = "zstate view"
 
     @classmethod
-    def at(cls, host: str, port: int) -> AccessCheck:
+    def at(
+        cls, host: str, port: int, *, origins: tuple[str, ...] = (), command: str = "zstate view"
+    ) -> AccessCheck:
         """Without a token on loopback, elsewhere with a random one."""
-        return cls(host, port, None if is_loopback(host) else secrets.token_urlsafe(16))
+        token = None if is_loopback(host) else secrets.token_urlsafe(16)
+        return cls(host, port, token, origins, command)
+
+    def url(self, scheme: str) -> str:
+        """The address of the server, with the token if one is needed."""
+        query = "" if self.token is None else f"/?token={self.token}"
+        is_any = self.host in ("", "0.0.0.0", "::")
+        name = socket.gethostname() if is_any else format_host(self.host)
+        return f"{scheme}://{name}:{self.port}{query}"
 
     def check(self, path: str, headers: Headers) -> AccessDeniedResponse | None:
         """Why a request for ``path``, query included, is refused; None if it is answered."""
@@ -61,20 +89,22 @@ class AccessCheck:
         if repeated:
             text = f"a request has at most one {repeated[0]} header"
             return AccessDeniedResponse(HTTPStatus.BAD_REQUEST, text)
-        host = headers.get("Host", "")
+        host = _first(headers, "Host")
         name, port = _name_and_port(host)
         if is_loopback(self.host) and not (is_loopback(name) and port == self.port):
             text = (
-                f"this view is for this machine only, at port {self.port}, and was requested as {host!r}; "
-                f"forward the same port (ssh -L {self.port}:127.0.0.1:{self.port} HOST), or open the view to "
-                "others with `zstate view --host`"
+                f"`{self.command}` is for this machine only, at port {self.port}, and was requested as "
+                f"{host!r}; forward the same port (ssh -L {self.port}:127.0.0.1:{self.port} HOST), or open "
+                f"it to others with `{self.command} --host`"
             )
             return AccessDeniedResponse(HTTPStatus.FORBIDDEN, text)
-        origin = headers.get("Origin")
-        if is_websocket(headers) and origin is not None and not _is_same_host(origin, host):
-            return AccessDeniedResponse(HTTPStatus.FORBIDDEN, f"a page of {origin!r} may not use this view")
+        origin = next(iter(headers.get_all("Origin")), None)
+        is_allowed = origin is None or origin in self.origins or _is_same_host(origin, host)
+        if is_websocket(headers) and not is_allowed:
+            text = f"a page of {origin!r} may not use `{self.command}`"
+            return AccessDeniedResponse(HTTPStatus.FORBIDDEN, text)
         if not self._has_token(path, headers):
-            text = "this view asks for its token; open the address that `zstate view` printed"
+            text = f"`{self.command}` requires its token; open the address that it printed"
             return AccessDeniedResponse(HTTPStatus.UNAUTHORIZED, text)
         return None
 
@@ -94,7 +124,7 @@ class AccessCheck:
             return True
         tokens = parse_qs(path.partition("?")[2]).get("token", [])
         try:
-            cookies = SimpleCookie(headers.get("Cookie", ""))
+            cookies = SimpleCookie(_first(headers, "Cookie"))
         except CookieError:
             cookies = SimpleCookie()
         tokens += [morsel.value for name, morsel in cookies.items() if name.startswith(_COOKIE)]
@@ -112,7 +142,37 @@ def is_loopback(host: str) -> bool:
 
 def is_websocket(headers: Headers) -> bool:
     """Whether a request asks for a websocket."""
-    return headers.get("Upgrade", "").lower() == "websocket"
+    return _first(headers, "Upgrade").lower() == "websocket"
+
+
+def _first(headers: Headers, name: str) -> str:
+    """The first header of this name; empty if there is none."""
+    return next(iter(headers.get_all(name)), "")
+
+
+def listen(host: str, port: int | None, default: int) -> socket.socket:
+    """A socket that listens at ``port``; for None at the first free one from ``default`` on.
+
+    Raises InvalidInput if ``host`` or ``port`` cannot be used.
+    """
+    ports = range(default, default + _PORTS_TRIED) if port is None else (port,)
+    for tried in ports:
+        bound = _bind(host, tried)
+        if bound is not None:
+            return bound
+    taken = f"port {port} is taken" if port is not None else f"ports {ports[0]} to {ports[-1]} are taken"
+    raise InvalidInput(f"{taken} at {host!r}; name a free one with --port, or 0 for any")
+
+
+def _bind(host: str, port: int) -> socket.socket | None:
+    """A socket that listens at ``port``; None if the port is taken."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family)
+    except (OSError, OverflowError) as error:
+        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+            return None
+        raise InvalidInput(f"cannot listen at {host!r}, port {port}: {error}") from None
 
 
 def _name_and_port(host: str) -> tuple[str, int]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pytest
 from websockets.datastructures import Headers
 
-from zstate.view.access import AccessCheck, AccessDeniedResponse, is_loopback
+from zstate.web_access import AccessCheck, AccessDeniedResponse, is_loopback
 
 UPGRADE = {"Upgrade": "websocket", "Connection": "Upgrade"}
 HERE = AccessCheck.at("127.0.0.1", 8080)
