@@ -308,7 +308,7 @@ class FoxgloveServer(Closeable):
                 yield _status(_ERROR, "a request is a JSON object in a text frame")
                 return
             yield from self._answer(client, cast("dict[str, Any]", fields))
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
+        except (KeyError, TypeError, ValueError, RecursionError, struct.error) as error:
             yield _status(_ERROR, f"an invalid request: {error!r}")
 
     def _answer(self, client: _Client, fields: dict[str, Any]) -> Iterable[dict[str, object]]:
@@ -342,7 +342,7 @@ class FoxgloveServer(Closeable):
             return f"there is no channel {number}"
         if number in client.subscriptions or client.channels_of({subscription}):
             return f"channel {number} or subscription {subscription} is subscribed already"
-        _MESSAGE.pack(1, subscription, 0)
+        _MESSAGE.pack(1, subscription, 0)  # raises for a number of another size
         client.subscriptions[number] = subscription
         self._readers[number] += 1
         for message in self._latched.values():
