@@ -186,7 +186,7 @@ def test_poses_models_frames_and_counts_are_shown_as_tables() -> None:
 def test_a_table_is_small_well_formed_and_has_the_colours_of_the_page(value: Any) -> None:
     html = value._repr_html_()
     assert len(html) < 4096
-    assert ElementTree.fromstring(html).tag == "table"
+    assert ElementTree.fromstring(html).find("table") is not None
     assert not re.search(r"color|background|src=|href=|url\(|https?:", html)
 
 

@@ -15,8 +15,8 @@ _SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * _SECOND_NS
 _UNITS = (("seconds", _SECOND_NS), ("milliseconds", 1_000_000), ("microseconds", 1_000))
 
-# Notebooks align cells to the right, and collapse spaces.
-_CELL = 'style="text-align:left;white-space:pre-wrap"'
+# Notebooks align cells to the right and collapse line breaks; a page of documentation leaves no room.
+_CELL = 'style="text-align:left;white-space:pre-wrap;padding:0.1em 0.6em 0.1em 0"'
 
 # A clock that was set shows 1980 or later; no simulation lasts ten years.
 _FIRST_DECADE_NS = 3650 * DAY_NS
@@ -109,7 +109,8 @@ def html_table(title: str, rows: Iterable[Sequence[str]], headings: Sequence[str
 
     lines = [line(headings, len(headings))] * bool(headings) + [line(row, 1) for row in rows]
     body = "".join(f"<tr>{cells}</tr>" for cells in lines)
-    return f"<table><caption {_CELL}>{escape(title)}</caption>{body}</table>"
+    table = f"<table><caption {_CELL}>{escape(title)}</caption>{body}</table>"
+    return f'<div style="overflow-x:auto;font-size:0.9em">{table}</div>'
 
 
 def _value_text(value: object) -> str:
