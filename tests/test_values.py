@@ -14,8 +14,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from helpers.recording_builder import START, RecordingBuilder
 
-from zstate import JointReading, Kinematics, Transform, TransformBuffer, Twist
+from zstate import JointReading, Kinematics, Recording, Transform, TransformBuffer, Twist
 from zstate.driving import DriverReport, Limits, Outcome, Setpoint
 from zstate.driving.driver_state import Spread
 from zstate.ingest.counters import ListenerStats
@@ -154,9 +155,22 @@ def test_kinematics_of_a_copy_are_those_of_the_model() -> None:
 
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
-def test_a_buffer_refuses_to_be_copied_and_names_what_can_be_passed_on(copied: Any) -> None:
+def test_buffers_and_what_is_open_refuse_to_be_copied(copied: Any, sessions) -> None:
     with pytest.raises(TypeError, match=r"not copied or pickled.*Recording in each process.*lookup_many"):
         copied(filled_buffer())
+    with pytest.raises(TypeError, match=r"a Session is not copied or pickled: .*open one in each"):
+        copied(sessions[0])
+
+
+def test_a_copy_of_a_recording_reads_the_same_file(tmp_path: Path) -> None:
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as builder:
+        builder.describe("arm")
+        builder.joints("arm", START, [0.1, 0.2])
+    with Recording(tmp_path / "run.mcap", "arm") as recording:
+        sent = pickle.dumps(recording)
+    with pickle.loads(sent) as again:
+        assert again.robot == "arm"
+        assert again.joint_states().positions.tolist() == [[0.1, 0.2]]
 
 
 SHOWN = [value for value in EXAMPLES if hasattr(value, "_repr_html_")]

@@ -90,7 +90,7 @@ def suggestion_text(*names: str | None) -> str:
 def html_of_fields(value: Any) -> str:
     """The fields of a dataclass that have a value, as HTML."""
     named = {field.name: getattr(value, field.name) for field in fields(value)}
-    rows = [(name, _value_text(one)) for name, one in named.items() if one is not None]
+    rows = [(name, _value_text(one)) for name, one in named.items() if one not in (None, "")]
     return html_table(type(value).__name__, rows)
 
 
@@ -114,10 +114,12 @@ def html_table(title: str, rows: Iterable[Sequence[str]], headings: Sequence[str
 
 
 def _value_text(value: object) -> str:
-    """A number with six digits, a mapping with a line for each key, and other values as they are printed."""
+    """A number with six digits, a line for each item of a mapping or tuple, and other values as printed."""
     if isinstance(value, Mapping):
         items = cast("Mapping[Any, Any]", value).items()
         return "\n".join(f"{_key_text(key)}: {one}" for key, one in items) or "none"
+    if type(value) is tuple:
+        return "\n".join(map(str, cast("tuple[object, ...]", value)))
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 

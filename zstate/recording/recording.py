@@ -22,7 +22,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -91,7 +91,8 @@ class Recording(Closeable):
     """A recorded MCAP file or bag, restricted to ``robot`` if one is given.
 
     ``robots`` are the names of the robots in it, ``info`` describes the file. Raises RecordingError if it
-    cannot be read, and InvalidInput if it has no ``robot``. A context manager.
+    cannot be read, and InvalidInput if it has no ``robot``. A context manager. Copies and pickles open the
+    file again, by the same path.
     """
 
     def __init__(self, path: str | Path, robot: str | None = None) -> None:
@@ -110,6 +111,9 @@ class Recording(Closeable):
     def __repr__(self) -> str:
         robots = ", ".join(map(repr, self.robots)) or "none"
         return f"<Recording {str(self.info.path)!r}: {self.info.duration_s:g} s, robots {robots}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Recording, (self.info.path, self.robot)
 
     def joint_states(self, robot: str | None = None) -> JointTrajectory:
         """All joint states of ``robot``, by default of the only one: those of its last history, see above.
