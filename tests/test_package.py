@@ -5,12 +5,20 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
+from itertools import chain
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
+FILES_ON_GITHUB = (
+    r"https://(?:github\.com/zstate/zstate/(?:blob|tree)|raw\.githubusercontent\.com/zstate/zstate)/main/"
+)
+DOCUMENTATION = r"https://zstate\.readthedocs\.io/en/latest/"
 
 
 def build(kind: str, source: Path, folder: Path) -> Path:
@@ -33,10 +41,14 @@ def names_in(wheel: Path) -> set[str]:
     return set(zipfile.ZipFile(wheel).namelist())
 
 
+def ignored_by_git() -> set[str]:
+    return {line.strip("/") for line in (ROOT / ".gitignore").read_text().splitlines()}
+
+
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy to build in, because a build leaves files behind."""
-    ignored = shutil.ignore_patterns(".*", "__pycache__", "build", "*.egg-info", "*.so")
+    """A copy to build in, because a build leaves files behind: the repository without what git ignores."""
+    ignored = shutil.ignore_patterns(".git", *(Path(name).name for name in ignored_by_git()))
     return shutil.copytree(ROOT, tmp_path_factory.mktemp("source") / "zstate", ignore=ignored)
 
 
@@ -83,26 +95,51 @@ def test_wheel_without_a_compiler_lacks_only_the_extension(
     assert names_in(made) == names_in(wheel) - extension(wheel)
 
 
-def test_sdist_holds_the_files_of_the_tests(sdist: Path):
+def test_sdist_holds_every_file_of_the_repository(source: Path, sdist: Path):
     with tarfile.open(sdist) as archive:
-        names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {
-        "tests/conftest.py",
-        "README.md",
-        "CHANGELOG.md",
-        "Dockerfile",
-        "models/rrbot.urdf",
-        "setup.py",
-        "zstate/buffer/_kernel.c",
-        "zstate/buffer/_kernel/path.h",
-    } <= names
+        shipped = {one.name.partition("/")[2] for one in archive if one.isfile()}
+    built = ("build/", "zstate.egg-info/")
+    repository = {path.relative_to(source).as_posix() for path in source.rglob("*") if path.is_file()}
+    assert {name for name in repository if not name.startswith(built) and not name.endswith(".so")} <= shipped
 
 
-def test_changelog_begins_with_this_version():
+def test_changelog_and_citation_name_this_version():
     import zstate
 
     versions = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert versions[0] == zstate.__version__
+    assert f"\nversion: {zstate.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_lock_has_a_version_of_each_requirement_within_its_bounds():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    texts = chain(project["dependencies"], *project["optional-dependencies"].values())
+    lines = (ROOT / ".ci" / "constraints.txt").read_text().splitlines()
+    locked = [Requirement(line) for line in lines if not line.startswith("#")]
+    for requirement in map(Requirement, texts):
+        name = canonicalize_name(requirement.name)
+        versions = [one.version for lock in locked if lock.name == name for one in lock.specifier]
+        permitted = list(requirement.specifier.filter(versions))
+        assert name == "zstate" or (versions and permitted == versions), (
+            f"{requirement}: run the command in the first lines of .ci/constraints.txt"
+        )
+
+
+def test_readme_on_pypi_has_only_absolute_links_and_they_lead_somewhere():
+    from readme_renderer import markdown
+
+    page = markdown.render((ROOT / "README.md").read_text())
+    assert page
+    headings = set(re.findall(r'id="user-content-([^"]*)"', page))
+    for target in re.findall(r'(?:href|src)="([^"]*)"', page):
+        if target.startswith("#"):
+            assert target.removeprefix("#user-content-") in headings, target
+            continue
+        assert target.startswith("https://"), f"{target} is relative, which PyPI cannot show"
+        in_repository = re.fullmatch(rf"{FILES_ON_GITHUB}([^#]*)(?:#.*)?", target)
+        assert not in_repository or (ROOT / in_repository[1]).exists(), target
+        in_documentation = re.fullmatch(rf"{DOCUMENTATION}([^#]*)\.html(?:#.*)?", target)
+        assert not in_documentation or list((ROOT / "docs").glob(f"{in_documentation[1]}.*")), target
 
 
 def test_docker_test_stage_runs_the_test_command_of_the_readme():
@@ -111,8 +148,7 @@ def test_docker_test_stage_runs_the_test_command_of_the_readme():
 
 
 def test_dockerignore_covers_gitignore():
-    ignored_by_git = {line.strip("/") for line in (ROOT / ".gitignore").read_text().splitlines()}
     ignored_by_docker = {
         line.removeprefix("**/") for line in (ROOT / ".dockerignore").read_text().splitlines()
     }
-    assert ignored_by_git <= ignored_by_docker
+    assert ignored_by_git() <= ignored_by_docker
