@@ -23,7 +23,7 @@ def write_plots(results: Results) -> list[Path]:
     try:
         from bench import charts, drawing  # noqa: PLC0415 - tables need no matplotlib
     except ImportError as error:
-        raise PlotsMissing(f"plots need matplotlib ({error}): pip install -e '.[robots,bench]'") from error
+        raise PlotsMissing(f"plots need matplotlib ({error}): pip install -e '.[bench]'") from error
     rates = [one for one in find_scenarios(results, group="rate", robot=ROBOT) if one.rate_hz]
     talk = [one for one in rates if one.rate_hz == TALK_RATE_HZ]
     robots = [

@@ -19,6 +19,7 @@ CPU is the process's own (all threads) over the window, in % of one core.
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import re
 import subprocess
@@ -29,11 +30,11 @@ import urllib.parse
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-import imageio.v3
 import msgspec
 import numpy as np
 import viser
 from numpy.typing import NDArray
+from PIL import Image
 from playwright.sync_api import sync_playwright
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as connect_websocket
@@ -238,7 +239,7 @@ def _first_picture() -> None:
         with running_command("view", "panda", "--sliders", "--port", "0") as (_, first_line):
             address_s = time.monotonic() - begin
             tab.goto(first_line.rpartition(" ")[2].strip())
-            while not _shows_robot(imageio.v3.imread(tab.screenshot(), extension=".png")):
+            while not _shows_robot(np.asarray(Image.open(io.BytesIO(tab.screenshot())))):
                 time.sleep(0.02)
             picture_s = time.monotonic() - begin
         browser.close()

@@ -8,7 +8,7 @@ from importlib.metadata import version
 from bench.job import Job
 from bench.subjects.subject import Service
 
-INSTALL = ("pip install -e '.[robots,bench]'",)
+INSTALL = ("pip install -e '.[bench]'",)
 PACKAGES = ("zstate", "eclipse-zenoh", "numpy", "pin", "msgspec")
 
 ROLE_SETTINGS = (

@@ -46,7 +46,7 @@ SUBJECT = Subject(
         "certificate of `zstate certs` and verifies the peer; native wire",
         *ROLE_SETTINGS,
     ),
-    install=("pip install -e '.[robots,bench,certs]'",),
+    install=("pip install -e '.[bench]'",),
     python=lambda: this_python() if find_spec(LIBRARY) else None,
     versions=lambda: {**zstate_versions(), LIBRARY: version(LIBRARY)},
     load=_load,
