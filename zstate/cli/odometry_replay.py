@@ -22,6 +22,8 @@ from zstate.errors import InvalidInput, NoData
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, SourceHealth
+from zstate.odometry.fusion import STANDSTILL
+from zstate.odometry.health import WINDOW
 from zstate.odometry.node import add_imu, add_pose, add_velocity
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.wire.messages import RobotDescription
@@ -41,7 +43,11 @@ _RADIUS_95 = math.sqrt(-2.0 * math.log(0.05))
 
 _PATH, _PANEL = 6.0, 2.0
 """Heights of the path and of each source [inch]."""
+_FEW_LABELS = 1000.0
+"""The range of a logarithmic axis up to which 2 and 5 have labels as well."""
 
+_REST_S = 5.0
+"""A robot that was at rest at its start was found to stand by then: alignment takes 0.5 s of it."""
 
 Event = tuple[int, bool, Callable[[BaseEstimator], None]]
 """A stamp, whether it is that of a reading of the IMU, and what passes the data to an estimator."""
@@ -163,8 +169,23 @@ def report_lines(replayed: ReplayedOdometry) -> Iterator[str]:
         f"x {x:.3f} m (sigma {sigmas[0]:.3f}), y {y:.3f} m ({sigmas[1]:.3f}), z {z:.3f} m ({sigmas[2]:.3f}), "
         f"yaw {math.degrees(last.odom_from_base.rpy[2]):.1f} deg ({math.degrees(sigmas[5]):.1f})"
     )
+    if sentence := _rest_text(replayed):
+        yield sentence
     for one in replayed.health:
         yield health_text(one)
+
+
+def _rest_text(replayed: ReplayedOdometry) -> str:
+    """Why the yaw is uncertain, if the robot did not stand at the start; empty if it did."""
+    stood = replayed.nis.get(STANDSTILL)
+    first_s = stood[0][0] if stood else math.inf
+    if first_s <= _REST_S:
+        return ""
+    found = f"it was first found to stand after {first_s:.1f} s" if stood else "it was never found to stand"
+    return (
+        f"no rest at the start: {found}, so the bias of its gyro is not known, and the sigma of "
+        "the yaw grows; begin a recording with 3 s at rest, which wheels or velocities show, and feet do not"
+    )
 
 
 def health_text(health: SourceHealth) -> str:
@@ -192,20 +213,35 @@ def odometry_figure(replayed: ReplayedOdometry, title: str) -> Figure:
     _draw_path(above, replayed)
     for panel, (name, points) in zip(panels, replayed.nis.items(), strict=True):
         seconds, mean, low, high = np.array(points).T
-        panel.fill_between(seconds, low, high, color="tab:green", alpha=0.2, label="95 % of such means")
-        panel.plot(seconds, mean, color="tab:blue", linewidth=1.3)
-        panel.set_ylabel(f"NIS of {name}")
-        panel.set_yscale("log")
-        panel.grid(visible=True, alpha=0.3)
-        panel.legend(fontsize="small")
+        panel.fill_between(
+            seconds, low, high, color="tab:green", alpha=0.2, label="95 % of means,\nif sigmas are exact"
+        )
+        panel.plot(
+            seconds, mean, color="tab:blue", linewidth=1.3, label=f"mean of the last\n{WINDOW} readings"
+        )
+        panel.set(ylabel="NIS", xlim=(0.0, replayed.seconds[-1]))
+        panel.set_title(f"NIS of {name}", fontsize="medium")
+        _set_log_scale(panel, float(min(mean.min(), low.min())), float(max(mean.max(), high.max())))
+        panel.grid(visible=True, which="both", alpha=0.3)
+        panel.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     if panels:
         panels[-1].set_xlabel("time since the first state [s]")
     return figure
 
 
+def _set_log_scale(panel: Axes, least: float, greatest: float) -> None:
+    """A logarithmic axis with plain numbers at 1, 2 and 5, or at powers of ten if it has many."""
+    bottom, top = 0.5 * max(least, 1e-6), 2.0 * greatest
+    subs = [2, 5] if top < _FEW_LABELS * bottom else []
+    panel.set_yscale("log", subs=subs)
+    panel.set_ylim(bottom, top)
+    panel.yaxis.set_major_formatter("{x:g}")
+    panel.yaxis.set_minor_formatter("{x:g}")
+
+
 def _draw_path(panel: Axes, replayed: ReplayedOdometry) -> None:
     x, y = replayed.positions[:, :2].T
-    panel.plot(x, y, color="0.4", linewidth=1.0)
+    panel.plot(x, y, color="0.4", linewidth=1.0, label="path")
     turn = np.linspace(0.0, math.tau, 60)
     circle = _RADIUS_95 * np.stack((np.cos(turn), np.sin(turn)))
     step = max(1, len(x) // _ELLIPSES)
@@ -215,11 +251,14 @@ def _draw_path(panel: Axes, replayed: ReplayedOdometry) -> None:
         covariance: Floats = state.covariance.pose[:2, :2]
         values, vectors = np.linalg.eigh(covariance)
         ellipse = (vectors * np.sqrt(np.maximum(values, 0.0))) @ circle
-        panel.plot(x[number] + ellipse[0], y[number] + ellipse[1], color="tab:blue", linewidth=0.6)
+        label = None if number else "95 % of positions"
+        panel.plot(
+            x[number] + ellipse[0], y[number] + ellipse[1], color="tab:blue", linewidth=0.6, label=label
+        )
     panel.plot(x[:1], y[:1], "o", color="tab:green", label="first")
     panel.plot(x[-1:], y[-1:], "s", color="tab:red", label="last")
     panel.set(xlabel="x [m]", ylabel="y [m]")
-    panel.set_title("from above, with ellipses of 95 %", fontsize="medium")
+    panel.set_title(f"{replayed.base} in the frame of the odometry, from above", fontsize="medium")
     panel.set_aspect("equal", adjustable="datalim")
-    panel.legend(fontsize="small")
+    panel.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     panel.grid(visible=True, alpha=0.3)
