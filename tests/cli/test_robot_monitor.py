@@ -48,7 +48,7 @@ def test_robot_that_publishes_only_transforms_is_monitored(spawn: Spawn):
     assert "following zstate/rrbot/tf" in command.stderr
 
 
-def test_joint_states_and_transforms_have_separate_rates(spawn: Spawn):
+def test_joint_states_transforms_and_odometry_have_separate_rates(sessions, spawn: Spawn):
     """Also if the transforms were there first: then the joint states are followed when they appear."""
     command = started(spawn, "monitor", "--robots", "--json")
     odometry = started(spawn, "transform", "odom", "world", "--xyz", "1", "0", "0", "--robot", "rrbot")
@@ -57,6 +57,12 @@ def test_joint_states_and_transforms_have_separate_rates(spawn: Spawn):
     with published_robot():
         until(lambda: "following zstate/rrbot/{joint_states,transforms}" in command.stderr)
         until(lambda: json.loads(command.line())["transforms_hz"])
+        with OdometryPublisher(sessions[0], "rrbot", program="odometry") as wheels:
+            base = Transform("world", "cart", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            with repeated(lambda: wheels.publish(base, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])):
+                until(lambda: json.loads(command.line())["odometry_hz"])
+            until(lambda: json.loads(command.line())["odometry_hz"] == 0.0)
+            assert json.loads(command.line())["transforms_hz"] > 0.0
         line = zstate("monitor", "--robots", "--once").stdout.decode()
         assert re.match(r"rrbot  [\d.]+ Hz  transforms [\d.]+ Hz  age ", line)
         interrupted(odometry)
@@ -120,7 +126,8 @@ def test_warning_of_a_writer_has_a_line_until_it_is_withdrawn(sessions, spawn: S
         odometry.warning = text
         base = Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         with repeated(lambda: odometry.publish(base, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])):
-            _, line = zstate("monitor", "--robots", "--once").stdout.decode().splitlines()
+            rates, line = zstate("monitor", "--robots", "--once").stdout.decode().splitlines()
+            assert re.match(r"cart  [\d.]+ Hz  odometry [\d.]+ Hz  age ", rates)
             assert re.fullmatch(rf"cart  warn  odometry@\S+ pid {os.getpid()}: {re.escape(text)}", line)
             command = started(spawn, "monitor", "--robots", "--json")
             until(lambda: [fault["text"] for fault in json.loads(command.line())["faults"]] == [text])

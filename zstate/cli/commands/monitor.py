@@ -33,12 +33,14 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, Stream, check_robot
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from zstate.buffer.frame_tree import FrameInfo
     from zstate.cli.edge_statistics import EdgeRow, EdgeStatistics
     from zstate.clock import Clock
     from zstate.driving.driver_state import ReceivedState
     from zstate.ingest.counters import ListenerStats
-    from zstate.metrics.buffer import MeteredBuffer
+    from zstate.metrics.buffer import MeteredBuffer, RobotMeasure
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.session import Session
     from zstate.net.topic_statistics import IntervalStatistics
@@ -48,7 +50,9 @@ if TYPE_CHECKING:
 _FIRST_AFTER_S = 1.0
 # Discovery takes less.
 _DISCOVERY_S = 0.3
-_SCANS_WITHIN_NS = 2_000_000_000
+_WITHIN_NS = 2_000_000_000
+_OWN_RATES: dict[Stream, str] = {"transforms": "transforms", "odometry": "odometry", "scan": "scans"}
+"""The streams that have a rate of their own beside that of the joint states, and its column."""
 
 
 @click.command("monitor")
@@ -88,9 +92,10 @@ def monitor_command(
     With --robots each robot has a line per second: rate, age of its newest sample, latency until a sample can
     be looked up, and counts since the start: received, dropped here, missed on the way, late (older than the
     history), refused, and off the clock (stamped more than a minute away from the time here). Rate, age and
-    latency are those of its joint states, if it has any; transforms besides them, and scans, have a rate of
-    their own. A robot with a driver has a second line, with the driver's state, and a line for each writer
-    that reports a fault: late ticks, refused samples, no new ones, or odometry whose sensors contradict it.
+    latency are those of its joint states, if it has any; transforms besides them, odometry and scans have a
+    rate of their own. A robot with a driver has a second line, with the driver's state, and a line for each
+    writer that reports a fault: late ticks, refused samples, no new ones, or odometry whose sensors
+    contradict it.
     On a ROS wire this is /tf, all nodes together; with --robot, the joint states of a robot that has a
     description.
 
@@ -306,9 +311,13 @@ class RobotMonitor(Closeable):
         self.drivers = self._opened.enter_context(DriverStateListener(session, robot))
         """Those of the native wire; other wires have none."""
         self._statuses = self._opened.enter_context(StatusMonitor(session, robot))
-        scans = TopicStatistics(session, get_wire(wire), sources=lambda name, _, __: (name,), clock=clock)
-        self._scans = self._opened.enter_context(scans)
-        scans.subscribe("scan", robot)
+        counted = TopicStatistics(
+            session, get_wire(wire), sources=lambda name, stream, _: ((name, stream),), clock=clock
+        )
+        self._counted = self._opened.enter_context(counted)
+        # On a ROS wire the edges of odometry are on /tf, which the listener counts.
+        for stream in ("scan",) if is_ros(wire) else _OWN_RATES:
+            counted.subscribe(stream, robot)
 
     def close(self) -> None:
         self._opened.close()
@@ -367,21 +376,16 @@ class RobotMonitor(Closeable):
         for one in self.robots():
             measure, stats = one.buffer.measure(one.robot), one.stats
             driver = drivers.get(one.robot)
-            scans = self._scans.get(one.robot)
-            window = None if scans is None else scans.recent(_SCANS_WITHIN_NS)
-            scans_hz = None if window is None else window.rate_hz
+            rates = self._own_rates(one.robot, measure)
             faulty = [status for status in self._statuses.recent(one.robot) if status.level != "ok"]
             if as_json:
-                facts = {"robot": one.robot, **asdict(measure), "scans_hz": scans_hz, **asdict(stats)}
+                facts = {"robot": one.robot, **asdict(measure), **_rate_facts(rates), **asdict(stats)}
                 facts["driver"] = None if driver is None else _driver_facts(driver)
                 print_json({**facts, "faults": list(map(_fault_facts, faulty))})
                 continue
             rate = _rate_text(one.buffer.statistics_of(one.robot), measure.rate_hz)
-            if measure.transforms_hz is not None:
-                transforms = one.buffer.statistics_of(one.robot, "transforms")
-                rate += f"  transforms {_rate_text(transforms, measure.transforms_hz)}"
-            if scans is not None:
-                rate += f"  scans {_rate_text(scans, scans_hz)}"
+            for stream, rate_hz in rates.items():
+                rate += f"  {_OWN_RATES[stream]} {rate_text(rate_hz) if rate_hz else 'silent'}"
             reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
             print_wrapped(
                 f"{one.robot}  {rate}  "
@@ -395,6 +399,24 @@ class RobotMonitor(Closeable):
                 print_wrapped(f"{one.robot}  driver {_driver_text(driver)}")
             for status in faulty:
                 print_wrapped(f"{one.robot}  {status.level}  {_program(status)}: {status.text}")
+
+    def _own_rates(self, robot: str, measure: RobotMeasure) -> dict[Stream, float]:
+        """The rates of streams beside the joint states, 0 for those that are silent."""
+        rates: dict[Stream, float] = {}
+        for stream in _OWN_RATES:
+            counted = self._counted.get((robot, stream))
+            if counted is not None:
+                window = counted.recent(_WITHIN_NS)
+                rates[stream] = 0.0 if window is None or counted.is_stale() else window.rate_hz or 0.0
+        if measure.transforms_hz is None:
+            rates.pop("transforms", None)  # they are its samples
+        elif is_ros(self._wire):
+            rates["transforms"] = measure.transforms_hz
+        return rates
+
+
+def _rate_facts(rates: Mapping[Stream, float]) -> dict[str, float | None]:
+    return {f"{column}_hz": rates.get(stream) for stream, column in _OWN_RATES.items()}
 
 
 def _program(status: Status) -> str:
