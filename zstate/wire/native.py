@@ -1,4 +1,6 @@
-"""Native wire format: plain keys, MessagePack arrays, type and version in the Zenoh encoding. See docs/wire.md.
+"""Native wire format: plain keys, MessagePack arrays, type and version in the Zenoh encoding.
+
+docs/wire.md is its specification.
 
 The payload of an OccupancyGrid above 64 kB is deflated (zlib, RFC 1950). Its first byte is then 0x78, with
 which no array of MessagePack begins.
