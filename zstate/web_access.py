@@ -48,10 +48,11 @@ class Headers(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class AccessDeniedResponse:
-    """Why a request is refused, as text for the user of the browser."""
+    """Why a request is refused, as text for the user of the browser; ``origin`` if that is the reason."""
 
     status: HTTPStatus
     text: str
+    origin: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +103,7 @@ class AccessCheck:
         is_allowed = origin is None or origin in self.origins or _is_same_host(origin, host)
         if is_websocket(headers) and not is_allowed:
             text = f"a page of {origin!r} may not use `{self.command}`"
-            return AccessDeniedResponse(HTTPStatus.FORBIDDEN, text)
+            return AccessDeniedResponse(HTTPStatus.FORBIDDEN, text, origin or "")
         if not self._has_token(path, headers):
             text = f"`{self.command}` requires its token; open the address that it printed"
             return AccessDeniedResponse(HTTPStatus.UNAUTHORIZED, text)

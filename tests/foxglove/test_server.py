@@ -167,7 +167,7 @@ def test_pages_of_other_sites_are_refused_with_a_reason_for_the_user():
         page.close()
         until(lambda: any("refused" in event for event in events))
     (refusal,) = [event for event in events if "refused" in event]
-    assert "a page of 'https://evil.example' may not use `zstate foxglove`" in refusal
+    assert "a page of 'https://evil.example' may not use `zstate foxglove`; --allow-origin" in refusal
 
 
 def test_beyond_loopback_clients_need_the_token():

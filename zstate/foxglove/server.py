@@ -44,7 +44,7 @@ PORT = 8765
 SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
 
 ORIGINS = ("https://app.foxglove.dev", "file://")
-"""Foxglove in a browser, and desktop programs whose pages are files."""
+"""Foxglove in a browser, and desktop programs made with Electron; browsers send "null" for files."""
 
 BACKLOG = 1024
 """Messages that wait for one client; the oldest are dropped beyond it."""
@@ -58,6 +58,8 @@ _WARN_PERIOD_S = 1.0
 _CLOSE_TIMEOUT_S = 0.3
 _JOIN_WITHIN_S = 0.9
 _MAX_REQUEST_BYTES = 1 << 20
+_MAX_REFUSALS = 1000
+"""Different refusals that are reported, each once."""
 
 # websockets logs a traceback for each connection that a client opens and drops.
 _SILENT = logging.getLogger("zstate.foxglove.http")
@@ -267,9 +269,12 @@ class FoxgloveServer(Closeable):
     def _process_request(self, connection: ServerConnection, request: Request) -> Response | None:
         denied = self.access.check(request.path, request.headers)
         if denied is not None:
-            if denied.text not in self._refused and len(self._refused) < BACKLOG:
+            if denied.text not in self._refused and len(self._refused) < _MAX_REFUSALS:
                 self._refused.add(denied.text)
-                self._on_event(f"refused {_name_of(connection)}: {printable(denied.text)}")
+                # Any page can take the origin "null", in a sandboxed frame.
+                is_site = denied.origin not in ("", "null")
+                allowing = f"; --allow-origin {denied.origin} allows it" if is_site else ""
+                self._on_event(printable(f"refused {_name_of(connection)}: {denied.text}{allowing}"))
             return connection.respond(denied.status, denied.text + "\n")
         if not is_websocket(request.headers):
             text = f"This is no page. Open {self.access.url('ws')} in Foxglove, as a Foxglove WebSocket.\n"
