@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
+import subprocess
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -16,7 +20,7 @@ from helpers.robots import RRBOT, STAMP, UPRIGHT, wait_for_stream_readers
 from mcap.reader import make_reader
 
 from zstate.foxglove.bridge import FoxgloveBridge
-from zstate.foxglove.server import FoxgloveServer
+from zstate.foxglove.server import SUBPROTOCOLS, FoxgloveServer
 from zstate.net.presence import discover_readers
 from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
@@ -31,6 +35,9 @@ from zstate.sources import SineSource
 from zstate.transform import Transform
 
 PERIOD = 10_000_000
+CLIENT = str(Path(__file__).parents[1] / "helpers" / "foxglove_client.js")
+NPM_FOLDER = os.environ.get("ZSTATE_FOXGLOVE_CLIENT")
+NODE = os.environ.get("ZSTATE_NODE") or shutil.which("node") or "node"
 TOPICS = ("/joint_states", "/tf", "/tf_static", "/robot_description")
 
 
@@ -109,6 +116,47 @@ def test_decoded_transforms_joints_and_description_are_those_of_lookups(sessions
         client.until(lambda: client.parameters)
         assert client.parameters == {"/robot_description": RRBOT.urdf}
         assert description.data == RRBOT.urdf
+
+
+@pytest.mark.npm
+@pytest.mark.parametrize("subprotocol", SUBPROTOCOLS)
+def test_the_published_client_decodes_what_lookups_answer(sessions, serve, subprotocol: str):
+    if NPM_FOLDER is None:
+        pytest.skip("ZSTATE_FOXGLOVE_CLIENT is not set: the folder of the packages that the marker npm names")
+    writer, reader = sessions
+    counts = {"/tf": 20, "/joint_states": 20, "/tf_static": 1, "/robot_description": 1}
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        TransformListener(reader, "r1") as listener,
+        subprocess.Popen(
+            [NODE, CLIENT, NPM_FOLDER, serve("r1").url, subprotocol, json.dumps(counts)],
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as node,
+    ):
+        assert node.stdout is not None
+        assert node.stdout.readline() == "subscribed\n"
+        wait_for_stream_readers(writer, "r1", "joint_states", "tf")
+        sent = {STAMP + k * PERIOD: (0.1 * k, -0.05 * k) for k in range(20)}
+        for stamp, positions in sent.items():
+            publisher.publish(positions, stamp=stamp)
+        decoded = json.loads(node.stdout.readline())
+        listener.buffer.lookup("world", "tool", at=max(sent), timeout_s=5.0)
+
+        def edges(message: dict[str, Any]) -> dict[str, tuple[str, np.ndarray]]:
+            poses = {one["child_frame_id"]: one["transform"] for one in message["transforms"]}
+            parents = [one["header"]["frame_id"] for one in message["transforms"]]
+            blocks = [[*pose["translation"].values(), *pose["rotation"].values()] for pose in poses.values()]
+            return dict(zip(poses, zip(parents, map(to_matrix, np.array(blocks)), strict=True), strict=True))
+
+        for stamp, message in zip(sent, decoded["/tf"], strict=True):
+            known = edges(decoded["/tf_static"][0]) | edges(message)
+            for frame in known:
+                looked_up = listener.buffer.lookup("world", frame, at=stamp).matrix
+                assert np.abs(placed(known, "world", frame) - looked_up).max() < 1e-9
+    assert [tuple(message["position"]) for message in decoded["/joint_states"]] == list(sent.values())
+    assert decoded["/robot_description"] == [{"data": RRBOT.urdf}]
+    assert decoded["parameters"] == {"/robot_description": RRBOT.urdf}
 
 
 def test_messages_have_the_bytes_of_a_recording(sessions, serve, tmp_path: Path):
