@@ -142,6 +142,16 @@ def test_readme_on_pypi_has_only_absolute_links_and_they_lead_somewhere():
         assert not in_documentation or list((ROOT / "docs").glob(f"{in_documentation[1]}.*")), target
 
 
+def test_install_page_lists_the_extras_and_the_base_without_pinocchio():
+    page = (ROOT / "docs" / "install.md").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    rows = set(re.findall(r"^\| `(\w+)` \| \d+ \|", page, re.MULTILINE))
+    assert rows == set(project["optional-dependencies"]) - {"docs", "lint"}
+    (without,) = re.findall(r"^pip install (eclipse-zenoh .*)$", page, re.MULTILINE)
+    base = {canonicalize_name(Requirement(text).name) for text in project["dependencies"]}
+    assert set(without.split()) == {name for name in base if name != "pin" and not name.startswith("cmeel-")}
+
+
 def test_docker_test_stage_runs_the_test_command_of_the_readme():
     (in_docker,) = re.findall(r"^RUN (.* -m pytest)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
     assert in_docker in (ROOT / "README.md").read_text().splitlines()
