@@ -10,7 +10,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.odometry import ImuNoise
 from zstate.odometry.invariant_filter import GRAVITY, Floats
 
-NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)
+NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3, gyro_scale=0.0, gyro_bias_shift=0.0)
 START = 1_000_000_000_000
 IMU_HZ, WHEEL_HZ = 200, 50
 

@@ -48,14 +48,17 @@ def load(path: Path) -> Plaza:
 def aligned_error(path: Floats, truth: Floats) -> float:
     """The root mean square distance [m] after the best planar rotation and translation (Umeyama, 1991)."""
     one, other = (points - points.mean(axis=0) for points in (path, truth))
+    return float(np.sqrt(((one - other @ best_turn(one, other).T) ** 2).sum(axis=1).mean()))
+
+
+def best_turn(path: Floats, truth: Floats) -> Floats:
+    """path_from_truth, (2, 2), the rotation about the origin that maps points best to those of the path."""
     # The turn by a maximises a . (cosine, sine).
     cosine, sine = (
-        float((one * other).sum()),
-        float((one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum()),
+        float((path * truth).sum()),
+        float((truth[:, 0] * path[:, 1] - truth[:, 1] * path[:, 0]).sum()),
     )
-    size = float(np.hypot(cosine, sine))
-    turn = np.array([[cosine, sine], [-sine, cosine]]) / size
-    return float(np.sqrt(((one @ turn - other) ** 2).sum(axis=1).mean()))
+    return np.array([[cosine, -sine], [sine, cosine]]) / float(np.hypot(cosine, sine))
 
 
 def _elements(data: bytes, count: int) -> list[tuple[int, bytes]]:

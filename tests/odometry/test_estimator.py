@@ -45,7 +45,7 @@ def feed(base: BaseEstimator, calls: list[Call], **options: Any) -> None:
         if kind == "imu":
             base.imu(stamp_at(t), *values)
         else:
-            base.velocity(stamp_at(t), *values, sigma=[SIGMA] * 3, **options)
+            base.velocity(stamp_at(t), *values, sigma=[SIGMA] * 3, scale=0.0, **options)
 
 
 def late(calls: list[Call], kind: str, seed: int) -> list[Call]:
@@ -92,7 +92,7 @@ def test_errors_are_as_large_as_their_covariances_with_a_source_late_and_shuffle
 
 
 def test_the_rate_of_a_twist_has_the_noise_of_one_sample():
-    noise = ImuNoise(gyro=5e-3, accel=2e-2, gyro_bias=0.0, accel_bias=0.0)
+    noise = ImuNoise(gyro=5e-3, accel=2e-2, gyro_bias=0.0, accel_bias=0.0, gyro_scale=0.0)
     base = BaseEstimator(
         odom="odom", base="base_link", imu="imu_link", buffer=mounted(LEVEL), imu_noise=noise
     )

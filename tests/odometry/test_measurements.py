@@ -82,6 +82,22 @@ def test_the_twist_of_a_frame_has_the_lever_of_its_mount_and_the_noise_of_the_gy
     np.testing.assert_allclose(values, np.concatenate((at_frame, rate)) @ np.kron(np.eye(2), mount()[:3, :3]))
 
 
+def test_positions_with_an_uncertain_yaw_lie_on_an_arc():
+    """A base at (3, 4) m that turned about the origin by an angle of the standard deviation 0.6."""
+    sigma, random = 0.6, np.random.default_rng(1)
+    covariance = np.zeros((6, 6))
+    # To first order the error of the position is t (-4, 3).
+    covariance[:2, 5] = covariance[5, :2] = sigma**2 * np.array([-4.0, 3.0])
+    covariance[:2, :2], covariance[5, 5] = sigma**2 * np.outer([-4.0, 3.0], [-4.0, 3.0]), sigma**2
+    along = (np.cos(random.normal(0.0, sigma, 200_000)) - 1.0) * 5.0
+    direction = np.array([0.6, 0.8])
+    bent = measurements.yaw_curvature(covariance)
+    np.testing.assert_allclose(bent, np.mean(along**2) * np.outer(direction, direction), rtol=0.02)
+    # Both forms meet at small angles, where 1 - cos t is t^2 / 2, whose square has the mean 3/4 sigma^4.
+    small = measurements.yaw_curvature(covariance * (0.0101 / sigma**2))
+    np.testing.assert_allclose(small, 0.75 * 0.0101**2 * 25.0 * np.outer(direction, direction), rtol=0.02)
+
+
 def test_a_measured_pose_moves_the_frame_to_it():
     state = some_state()
     here, _ = measurements.frame_pose(state, mount())

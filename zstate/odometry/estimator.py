@@ -47,6 +47,7 @@ from zstate.odometry.measurements import (
     frame_pose,
     frame_twist,
     pose,
+    yaw_curvature,
 )
 from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions
 from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
@@ -187,13 +188,14 @@ class BaseEstimator:
         covariance: ArrayLike | None = None,
         angular: ArrayLike | None = None,
         frame: str | None = None,
-        scale: float = 0.0,
+        scale: float = 0.02,
         source: str = WHEELS,
     ) -> None:
         """The velocity of the origin of ``frame`` in its own axes at ``stamp``, x y z [m/s], (3,).
 
         Its noise is given by ``sigma``, standard deviations (3,), or by ``covariance``, (3, 3). ``frame`` is
         the base by default. ``angular`` [rad/s] (3,) is used while the IMU is silent, and to know standstill.
+        ``scale`` is the standard deviation of a constant relative error, as of a radius of wheels.
         Raises InvalidInput, which names the source, for NaN and for what is no covariance; UnknownFrame for
         the frame.
         """
@@ -564,6 +566,7 @@ class BaseEstimator:
     def _state_of(self, estimate: Estimate) -> BaseState:
         settled = self._fusion.settled(estimate)
         matrix, pose_covariance = frame_pose(settled.state, self._imu_from_base)
+        pose_covariance[:2, :2] += yaw_curvature(pose_covariance)
         density = COASTING_RATE_DENSITY if estimate.is_coasting else self._noise.gyro
         variance = density * density / estimate.sampled_s
         twist, twist_covariance = frame_twist(settled.state, self._imu_from_base, estimate.rate, variance)
@@ -572,7 +575,7 @@ class BaseEstimator:
         transform = Transform.trusted(self.odom, self.base, pose7, estimate.stamp, "exact")
         return BaseState(
             estimate.stamp,
-            PoseWithCovariance.of_pose(transform, lambda: pose_covariance[UPPER_TRIANGLE].tolist()),
+            PoseWithCovariance.of_pose(transform, pose_covariance[UPPER_TRIANGLE].tolist),
             BaseTwist(twist[:3], twist[3:]),
             BaseCovariance(pose_covariance, twist_covariance),
             estimate.state.gyro_bias,

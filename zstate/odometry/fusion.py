@@ -67,6 +67,7 @@ _SAMPLED_S, _SAMPLED_GAIN = 0.01, 0.05
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
 _YAW = ROTATION.start + 2
+_LEVEL = slice(POSITION.start, POSITION.start + 2)
 
 COASTING_RATE_DENSITY, _COASTING_FORCE_DENSITY = 0.1, 1.0
 """Of the rate by wheels [rad/s/sqrt(Hz)], and of unknown accelerations [m/s^2/sqrt(Hz)]."""
@@ -157,16 +158,16 @@ class Rest(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """What constant relative errors of wheels and gyro do to the pose, since the position was last measured.
+    """What constant errors of wheels and gyro do to the pose, since the position was last measured.
 
-    ``origin`` is that position [m] and ``scale`` the standard deviation of the error of wheels. ``turned`` is
-    the yaw that the base has turned since [rad], and ``shift`` (3,) the integral of ``p x z`` by it [m rad].
+    ``origin`` is that position [m] and ``scale`` the standard deviation of the relative error of wheels.
+    ``turns`` (2, 3) are the integrals of (1, y, -x), what a turn does to yaw, x and y of the right-invariant
+    error: over the yaw turned since [rad], and over the time in motion since [s].
     """
 
     origin: Floats
     scale: float = 0.0
-    turned: float = 0.0
-    shift: Floats = np.zeros(3)
+    turns: Floats = np.zeros((2, 3))
 
 
 class Estimate(NamedTuple):
@@ -302,21 +303,22 @@ class Fusion:
         return estimate, Outcome(fate, sum(squares.values()) / len(squares), 3)
 
     def settled(self, estimate: Estimate) -> Estimate:
-        """The estimate with the error of constant scales in its covariance, which ``drift`` then has no more.
+        """The estimate with constant errors in its covariance, which ``drift`` then has no more.
 
         Wheels that are s too large move the position by s of its way. A gyro that is s too large turns the
-        yaw by s of its turn; in the right-invariant error each part of that turn adds to the position what
-        the base was away from the world's origin then, and nothing later. White noise would average out
-        instead.
+        yaw by s of its turn, and one whose bias is b off by b of the time; in the right-invariant error each
+        part of that turn adds to the position what the base was away from the world's origin then, and
+        nothing later. White noise would average out instead.
         """
-        state, drift = estimate.state, estimate.drift
-        if not (drift.scale or self.noise.gyro_scale):
+        state, drift, noise = estimate.state, estimate.drift, self.noise
+        if not (drift.scale or self._has_drift):
             return estimate._replace(drift=Drift(state.position))
-        shifts = np.zeros((2, len(state.covariance)))
-        by_wheels, by_gyro = shifts
-        by_wheels[POSITION] = drift.scale * (state.position - drift.origin)
-        by_gyro[_YAW] = self.noise.gyro_scale * drift.turned
-        by_gyro[POSITION] = self.noise.gyro_scale * drift.shift
+        shifts = np.zeros((3, len(state.covariance)))
+        shifts[0, POSITION] = drift.scale * (state.position - drift.origin)
+        shifts[1:, _YAW : _YAW + 1] = drift.turns[:, :1]
+        shifts[1:, _LEVEL] = drift.turns[:, 1:]
+        shifts[1] *= noise.gyro_scale
+        shifts[2] *= noise.gyro_bias_shift
         covariance = state.covariance + shifts.T.dot(shifts)
         return estimate._replace(
             state=state._replace(covariance=covariance), drift=Drift(state.position, drift.scale)
@@ -335,10 +337,14 @@ class Fusion:
             before = before._replace(rate=rate, force=force)
         gyro, accel = 0.5 * (before.rate + rate), 0.5 * (before.force + force)
         dt_s = (stamp - before.stamp) * 1e-9
-        if self.noise.gyro_scale:
+        if self._has_drift:
             before = before._replace(drift=_drifted(before, gyro, dt_s))
         state = predict(before.state, gyro, accel, dt_s, self.noise, contact_noise=self._foot_slip)
         return before._replace(stamp=stamp, state=state, rate=rate, force=force, is_coasting=False)
+
+    @property
+    def _has_drift(self) -> bool:
+        return self.noise.gyro_scale > 0.0 or self.noise.gyro_bias_shift > 0.0
 
     @property
     def _foot_slip(self) -> float:
@@ -397,13 +403,13 @@ def is_still(linear: Floats, sigma: float, angular: Floats | None) -> bool:
 
 
 def _drifted(before: Estimate, gyro: Floats, dt_s: float) -> Drift:
-    """The drift after a turn with the mean rate ``gyro``."""
+    """The drift after a turn with the mean rate ``gyro``. At rest the bias is that which was measured."""
     state, drift = before.state, before.drift
-    turn = float(state.rotation[2] @ (gyro - state.gyro_bias)) * dt_s
+    turn = float(state.rotation[2].dot(gyro - state.gyro_bias)) * dt_s
+    moved_s = 0.0 if before.rest.was_still else dt_s
     x, y, _ = state.position.tolist()
-    return drift._replace(
-        turned=drift.turned + turn, shift=drift.shift + np.array([y * turn, -x * turn, 0.0])
-    )
+    turns = np.array((turn, y * turn, -x * turn, moved_s, y * moved_s, -x * moved_s))
+    return Drift(drift.origin, drift.scale, drift.turns + turns.reshape(2, 3))
 
 
 def _new_rest(stamp: int, *, was_still: bool = False) -> Rest:

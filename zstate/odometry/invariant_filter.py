@@ -49,21 +49,23 @@ class ImuNoise:
     """Noise of an IMU, as in its data sheet or by an Allan variance.
 
     ``gyro`` [rad/s/sqrt(Hz)] and ``accel`` [m/s^2/sqrt(Hz)] are the densities of white noise, ``gyro_bias``
-    [rad/s/sqrt(s)] and ``accel_bias`` [m/s^2/sqrt(s)] those of the random walks of the biases. ``gyro_scale``
-    is the standard deviation of the constant relative error of the gyro, 0.01 for a usual one that was not
-    calibrated. Raises InvalidInput unless all are finite, and the first two above zero.
+    [rad/s/sqrt(s)] and ``accel_bias`` [m/s^2/sqrt(s)] those of the random walks of the biases. Constant
+    errors have the standard deviations ``gyro_scale``, relative, and ``gyro_bias_shift`` [rad/s], of the
+    bias in motion against that at rest (temperature, vibration); the defaults are those of a usual gyro that
+    was not calibrated. Raises InvalidInput unless all are finite, and the first two above zero.
     """
 
     gyro: float
     accel: float
     gyro_bias: float
     accel_bias: float
-    gyro_scale: float = 0.0
+    gyro_scale: float = 0.01
+    gyro_bias_shift: float = 5e-4
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            may_be_zero = field.name.endswith(("_bias", "_scale"))
+            may_be_zero = field.name.endswith(("_bias", "_scale", "_shift"))
             if not math.isfinite(value) or value < 0.0 or (value == 0.0 and not may_be_zero):
                 bound = "0 or more" if may_be_zero else "above 0"
                 raise InvalidInput(
@@ -215,7 +217,9 @@ def innovation(state: FilterState, measurement: Measurement) -> Innovation:
     crossed: Floats = jacobian.dot(state.covariance)
     covariance: Floats = crossed.dot(jacobian.T) + noise
     inverse = _inverse(covariance)
-    return Innovation(residual, covariance, crossed.T.dot(inverse), float(residual.dot(inverse).dot(residual)))
+    return Innovation(
+        residual, covariance, crossed.T.dot(inverse), float(residual.dot(inverse).dot(residual))
+    )
 
 
 def updated(state: FilterState, measurement: Measurement) -> FilterState:

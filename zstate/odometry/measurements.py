@@ -123,6 +123,23 @@ def frame_pose(state: FilterState, imu_from_frame: Floats) -> tuple[Floats, Floa
     return world_from_frame, jacobian.dot(state.covariance).dot(jacobian.T)
 
 
+def yaw_curvature(covariance: Floats) -> Floats:
+    """What an error of the yaw adds to the covariance of x and y in the second order: (2, 2).
+
+    ``covariance`` (6, 6) is that of ``frame_pose``, to first order: its error of the position by an error t
+    of the yaw is ``t (z x r)``, with ``z x r`` the covariance of position and yaw by the variance s of the
+    yaw. A turn by t about a point moves what is at r from it by ``(cos t - 1) r`` as well: positions lie on
+    an arc (Long, Wolfe, Mashner, Chirikjian, "The banana distribution is Gaussian", RSS 2012). The mean of
+    (1 - cos t)^2 is ``3/2 - 2 exp(-s / 2) + exp(-2 s) / 2``, nearly 3/4 s^2.
+    """
+    variance = float(covariance[5, 5])
+    x, y = covariance[:2, 5].tolist()
+    # The exponentials cancel: below 0.01 the next term is 1 % of the result.
+    mean = 1.5 - 2.0 * math.exp(-0.5 * variance) + 0.5 * math.exp(-2.0 * variance)
+    factor = 0.75 if variance < 0.01 else mean / (variance * variance)
+    return factor * np.array(((y * y, -x * y), (-x * y, x * x)))
+
+
 def frame_twist(
     state: FilterState, imu_from_frame: Floats, gyro: Floats, gyro_variance: float
 ) -> tuple[Floats, Floats]:

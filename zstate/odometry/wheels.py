@@ -44,7 +44,7 @@ class WheelNoise:
     speed: float = 0.005
     lateral: float = 0.02
     vertical: float = 0.02
-    scale: float = 0.01
+    scale: float = 0.02
 
     def __post_init__(self) -> None:
         for field in fields(self):
