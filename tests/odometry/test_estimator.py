@@ -227,6 +227,12 @@ def test_before_alignment_the_state_is_an_error_with_what_is_missing():
         base.state()
 
 
+def test_an_even_turn_from_the_first_sample_on_is_no_bias_of_the_gyro():
+    base = estimator()
+    drive(base, 3.0, speed=0.3, yaw_rate=0.06)
+    assert base.state().odom_from_base.rpy[2] == pytest.approx(0.06 * 2.99, abs=1e-3)
+
+
 def test_gravity_is_found_through_a_turned_mount():
     """An IMU upside down and turned, at rest: the base is level, at the origin, with the yaw zero."""
     mount = tilted_mount()

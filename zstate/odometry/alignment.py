@@ -38,7 +38,9 @@ _REST_RATE, _REST_FORCE = 0.1, 0.4
 _YAW, _POSITION = 1e-4, 1e-4
 _TILT, _COARSE_TILT = 0.02, 0.2
 _SPEED = 2.0
-_GYRO_BIAS, _ACCEL_BIAS = 0.01, 0.05
+_GYRO_BIAS, _UNKNOWN_GYRO_BIAS, _ACCEL_BIAS = 0.01, 0.02, 0.05
+_TURN = 0.3
+"""Of a turn by wheels, as a part of it: they may slip, or skid."""
 
 
 class Alignment(NamedTuple):
@@ -48,10 +50,14 @@ class Alignment(NamedTuple):
     end: int
 
 
-def align(samples: Sequence[Inertia], imu_from_base: Floats) -> Alignment | str:
+def align(
+    samples: Sequence[Inertia], turns: Sequence[tuple[int, Floats]], imu_from_base: Floats
+) -> Alignment | str:
     """The first estimate by ``samples``, in the order of their stamps; or what is missing.
 
     A robot that moves evenly seems to be at rest, so that its velocity is left open: wheels measure it.
+    ``turns`` are rates by wheels in the IMU's axes [rad/s], (3,), with their stamps. What the gyro measures
+    beyond an even turn is its bias.
     """
     if not samples:
         return "no samples of the IMU yet, which give roll and pitch"
@@ -64,8 +70,13 @@ def align(samples: Sequence[Inertia], imu_from_base: Floats) -> Alignment | str:
         )
     gyro, accel = _mean(chosen)
     rotation = _level(accel, imu_from_base)
-    tilt, gyro_bias = (_TILT, gyro) if is_at_rest else (_COARSE_TILT, np.zeros(3))
-    sigmas = np.repeat((tilt, _SPEED, _POSITION, _GYRO_BIAS, _ACCEL_BIAS), 3)
+    tilt = _TILT if is_at_rest else _COARSE_TILT
+    gyro_bias, bias_sigma = np.zeros(3), _UNKNOWN_GYRO_BIAS
+    if is_at_rest:
+        rates = [rate for stamp, rate in turns if chosen[0].stamp <= stamp <= chosen[-1].stamp]
+        turn = np.mean(rates, axis=0) if rates else np.zeros(3)
+        gyro_bias, bias_sigma = gyro - turn, math.hypot(_GYRO_BIAS, _TURN * math.sqrt(turn @ turn))
+    sigmas = np.repeat((tilt, _SPEED, _POSITION, bias_sigma, _ACCEL_BIAS), 3)
     sigmas[2] = _YAW
     covariance = np.diag(sigmas**2)
     estimate = _started(chosen[0].stamp, rotation, imu_from_base, gyro_bias, covariance)
@@ -74,7 +85,7 @@ def align(samples: Sequence[Inertia], imu_from_base: Floats) -> Alignment | str:
 
 def start_at(stamp: int, odom_from_base: Transform, imu_from_base: Floats) -> Estimate:
     """The estimate at a given pose, whose covariance is that of the transform, or that of ``align``."""
-    covariance = np.diag(np.repeat((_TILT, _SPEED, _POSITION, _GYRO_BIAS, _ACCEL_BIAS), 3) ** 2)
+    covariance = np.diag(np.repeat((_TILT, _SPEED, _POSITION, _UNKNOWN_GYRO_BIAS, _ACCEL_BIAS), 3) ** 2)
     if odom_from_base.covariance is None:
         covariance[2, 2] = _YAW**2
     else:

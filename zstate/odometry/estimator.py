@@ -518,7 +518,9 @@ class BaseEstimator:
         samples = [event.reading for event in self._log if isinstance(event.reading, Inertia)]
         if not samples:
             self._forget(self._too_old())
-        outcome = align(samples, self._imu_from_base)
+        readings = [event.reading for event in self._log if isinstance(event.reading, Reading)]
+        turns = [(one.stamp, one.angular) for one in readings if one.angular is not None]
+        outcome = align(samples, turns, self._imu_from_base)
         if isinstance(outcome, Alignment):
             self._start = outcome.estimate
             self._alignment_end = bisect_right(self._log, outcome.end, key=lambda event: event.reading.stamp)
