@@ -19,6 +19,7 @@ from zstate.model.load import load_model
 from zstate.net.presence import discover
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamSubscriber
+from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
@@ -26,6 +27,7 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import OdometryPublisher
 from zstate.sources import JointStateListener, SineSource
 from zstate.transform import Transform
+from zstate.wire.messages import Odometry, covariance_matrix, from_block
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 
@@ -336,22 +338,38 @@ def edge(child: str, x: float, parent: str = "odom") -> Transform:
     return Transform(parent, child, (x, 0.0, 0.0), UPRIGHT)
 
 
-def test_the_edge_of_odometry_is_carried_to_tf(world):
+def test_odometry_is_carried_to_ros_with_its_velocity_and_covariances_and_to_tf(world):
     world.bridge("r1")
+    received: list[Odometry] = []
+
+    def on_messages(messages: list[Received]) -> None:
+        received.extend(one.message for one in messages if isinstance(one.message, Odometry))
+
+    ros = world.join("ros2")
     with (
         StatePublisher(world.join("native"), RRBOT, "r1") as publisher,
         OdometryPublisher(world.join("native"), "r1") as odometry,
-        TransformListener(world.join("ros2"), "r1", wire="ros2") as carried,
+        TransformListener(ros, "r1", wire="ros2") as carried,
+        subscribe(ros, get_wire("ros2"), "r1", "odometry", on_messages),
     ):
+        pose_covariance, twist_covariance = np.diag(np.arange(1.0, 7.0)), np.diag(np.arange(7.0, 13.0))
+        pose = edge("world", 2.0).with_covariance(pose_covariance)
 
         def move(stamp: int) -> bool:
             publish(publisher, [stamp])
-            odometry.publish(edge("world", 2.0), [0, 0, 0], [0, 0, 0], stamp)
-            return carried.buffer.can_lookup("odom", "tool")
+            odometry.publish(pose, [1, 2, 3], [4, 5, 6], stamp, twist_covariance=twist_covariance)
+            return carried.buffer.can_lookup("odom", "tool") and bool(received)
 
         stamps = iter(range(1, 1_000_000))
         until(lambda: move(next(stamps)))
         assert carried.buffer.lookup("odom", "world").translation[0] == 2.0
+    message = received[-1]
+    assert message.edges == (("odom", "world"),)
+    assert from_block(message.twist).tolist() == [1, 2, 3, 4, 5, 6]
+    assert message.covariances is not None
+    assert message.twist_covariance is not None
+    assert covariance_matrix(message.covariances).tolist() == pose_covariance.tolist()
+    assert covariance_matrix(message.twist_covariance).tolist() == twist_covariance.tolist()
 
 
 @pytest.mark.parametrize("side", ["native", "ros2"])

@@ -31,11 +31,19 @@ from zstate.net.subscription import Received, subscribe
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.odometry import OdometryPublisher
 from zstate.sources.joint_state_listener import DescriptionSubscriber, JointStateListener
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot
-from zstate.wire.messages import Edges, StaticTransforms, TransformSample, poses_from_block, to_block
+from zstate.wire.messages import (
+    Edges,
+    Odometry,
+    StaticTransforms,
+    TransformSample,
+    poses_from_block,
+    to_block,
+)
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.wire import Ros2Wire
@@ -132,8 +140,10 @@ class BridgeSide(NamedTuple):
 class TransformBridge(Closeable):
     """Publishes on ``target`` the moving edges of programs on ``source``, except those of ``model``.
 
-    On the native side they keep the names of their writers; for a ROS node it is its own. Covariances, and
-    the velocities of odometry, are dropped, because /tf has none. Samples of bridges are skipped, and
+    On the native side they keep the names of their writers; for a ROS node it is its own. Native odometry is
+    a nav_msgs/Odometry in ROS, with its velocity and covariances, on a topic of its writer's name, and an
+    edge on /tf. From ROS /tf alone is carried: there, the poses of odometry are measurements and no edges.
+    Other covariances are dropped, because /tf has none. Samples of bridges are skipped, and
     samples of writers that are not announced, which may be bridges. If all robots share /tf, the edges
     whose child is a frame of this robot are published. Subscribes only while there is a writer: on the ROS
     side the bridge itself would be a reader for which it computes /tf.
@@ -152,8 +162,11 @@ class TransformBridge(Closeable):
         def open_publisher(writer: str) -> TransformPublisher:
             return TransformPublisher(target.session, robot, writer, target.wire, program=PROGRAM)
 
+        def open_odometry(writer: str) -> OdometryPublisher:
+            return OdometryPublisher(target.session, robot, writer, target.wire, program=PROGRAM)
+
         with ExitStack() as opening:
-            relay = TransformRelay(robot, model, open_publisher, counters.count_refusal)
+            relay = TransformRelay(robot, model, open_publisher, counters.count_refusal, open_odometry)
             self._relay = opening.enter_context(relay)
             opening.callback(self._unsubscribe)
             opening.enter_context(WriterWatch(source.session, robot, self._on_writer, source.wire))
@@ -202,7 +215,9 @@ class TransformBridge(Closeable):
             for _, _, sample in received:
                 assert isinstance(sample, TransformSample)
                 writer = self._writers.get(sample.session)
-                if writer is not None and sample.edges is not None:
+                if writer is not None and isinstance(sample, Odometry):
+                    self._relay.publish_odometry(writer, sample)
+                elif writer is not None and sample.edges is not None:
                     self._publish(writer, sample.edges, sample)
 
     def _publish(self, writer: str, edges: Edges, sample: TransformSample) -> None:

@@ -5,17 +5,27 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter, ZStateError
 from zstate.model.robot import RobotModel
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.odometry import OdometryPublisher
 from zstate.transform import Transform
 from zstate.wire.joint_order import Floats
 from zstate.wire.keys import full_name
-from zstate.wire.messages import Edges
+from zstate.wire.messages import (
+    Edges,
+    Odometry,
+    covariance_matrix,
+    covariances_of,
+    from_block,
+    poses_from_block,
+)
+
+P = TypeVar("P", TransformPublisher, OdometryPublisher)
 
 RETRY_S = 2.0
 """Edges that another writer owns are tried again after this time: a try takes some round trips."""
@@ -37,7 +47,8 @@ class _Refusal(NamedTuple):
 class TransformRelay(Closeable):
     """Publishes moving edges of ``robot``, except those of its ``model``, for any number of writers.
 
-    ``open_publisher(writer)`` opens the ``TransformPublisher`` of one writer, with its first edge.
+    ``open_publisher(writer)`` opens the ``TransformPublisher`` of one writer, with its first edge, and
+    ``open_odometry(writer)`` the ``OdometryPublisher`` of a writer of odometry.
     ``count_refusal(reason, text)`` is called for each sample that cannot be published, for instance because
     another writer of the robot owns one of its edges; the relay continues. Any thread may call the methods.
     """
@@ -48,15 +59,17 @@ class TransformRelay(Closeable):
         model: RobotModel,
         open_publisher: Callable[[str], TransformPublisher],
         count_refusal: Callable[[str, str], object],
+        open_odometry: Callable[[str], OdometryPublisher] | None = None,
     ) -> None:
         self._robot = robot
         edges = [(joint.parent, joint.child) for joint in model.joints]
         # A link with a slash in its name has another name in ROS without a prefix.
         self._model_edges = {(f"{robot}/{parent}", f"{robot}/{child}") for parent, child in edges}
         self._model_edges |= {(full_name(robot, parent), full_name(robot, child)) for parent, child in edges}
-        self._open_publisher = open_publisher
+        self._open_publisher, self._open_odometry = open_publisher, open_odometry
         self._count_refusal = count_refusal
         self._publishers: dict[str, TransformPublisher] = {}
+        self._odometry: dict[str, OdometryPublisher] = {}
         self._published_at: dict[str, float] = {}
         self._kept: BoundedDict[Edges, tuple[int, ...]] = BoundedDict()
         self._refusals: BoundedDict[tuple[str, Edges], _Refusal] = BoundedDict()
@@ -66,7 +79,7 @@ class TransformRelay(Closeable):
     @property
     def writers(self) -> tuple[str, ...]:
         """The writers with an open publisher."""
-        return tuple(self._publishers)
+        return (*self._publishers, *self._odometry)
 
     def publish(self, writer: str, edges: Edges, poses: Floats, stamp: int) -> bool:
         """Publish one sample of ``writer``; False if nothing of it is published.
@@ -74,16 +87,47 @@ class TransformRelay(Closeable):
         Row i of ``poses`` (n, 7) is ``parent_from_child`` of ``edges[i]``, named as in messages of the robot.
         Raises Closed.
         """
+
+        def publish() -> bool:
+            transforms = [Transform.from_pose7(*edges[row], poses[row]) for row in self._rows(edges)]
+            if transforms:
+                self._opened(self._publishers, self._open_publisher, writer).publish(transforms, stamp)
+            return bool(transforms)
+
+        return self._publish(writer, edges, publish)
+
+    def publish_odometry(self, writer: str, sample: Odometry) -> bool:
+        """Publish one sample of ``writer`` with its velocity and covariances; as ``publish``."""
+        open_odometry, edges = self._open_odometry, sample.edges
+        assert edges is not None
+        if open_odometry is None:
+            return self.publish(writer, edges, poses_from_block(sample.poses), sample.stamp)
+
+        def publish() -> bool:
+            if not self._rows(edges):
+                return False
+            ((parent, child),), twist = edges, from_block(sample.twist)
+            transform = Transform.from_pose7(parent, child, poses_from_block(sample.poses)[0])
+            if covariances_of(sample) is not None:
+                assert sample.covariances is not None
+                transform = transform.with_covariance(covariance_matrix(sample.covariances))
+            triangle = sample.twist_covariance
+            covariance = None if triangle is None else covariance_matrix(triangle)
+            self._opened(self._odometry, open_odometry, writer).publish(
+                transform, twist[:3], twist[3:], sample.stamp, twist_covariance=covariance
+            )
+            return True
+
+        return self._publish(writer, edges, publish)
+
+    def _publish(self, writer: str, edges: Edges, publish: Callable[[], bool]) -> bool:
+        """Call ``publish`` unless these edges were refused lately; refusals are counted."""
         refused = self._refusals.get((writer, edges))
         if refused is not None and time.monotonic() < refused.retry_at:
             self._count_refusal(refused.reason, refused.text)
             return False
         try:
-            rows = self._rows(edges)
-            transforms = [Transform.from_pose7(*edges[row], poses[row]) for row in rows]
-            if transforms:
-                self._publisher(writer).publish(transforms, stamp)
-                self._published_at[writer] = time.monotonic()
+            is_published = publish()
         except Closed:
             raise
         except ZStateError as error:
@@ -97,15 +141,18 @@ class TransformRelay(Closeable):
                 self.remove(writer)  # the other writer has its name
             self._count_refusal(reason, text)
             return False
-        return bool(transforms)
+        if is_published:
+            self._published_at[writer] = time.monotonic()
+        return is_published
 
     def remove(self, writer: str) -> None:
         """Close the publisher of a writer that has left."""
         with self._lock:
-            publisher = self._publishers.pop(writer, None)
+            publishers = self._publishers.pop(writer, None), self._odometry.pop(writer, None)
             self._published_at.pop(writer, None)
-        if publisher is not None:
-            publisher.close()
+        for publisher in publishers:
+            if publisher is not None:
+                publisher.close()
 
     def remove_silent(self, longer_than_s: float) -> None:
         """Close the publishers of writers without a sample for this time: the next one opens them again."""
@@ -118,8 +165,9 @@ class TransformRelay(Closeable):
         """Close all publishers. A second call does nothing."""
         with self._lock:
             self._closed = True
-            while self._publishers:
-                self._publishers.popitem()[1].close()
+            for publishers in (self._publishers, self._odometry):
+                while publishers:
+                    publishers.popitem()[1].close()
 
     def _rows(self, edges: Edges) -> tuple[int, ...]:
         """The rows of the edges that are not those of the model."""
@@ -130,11 +178,11 @@ class TransformRelay(Closeable):
             self._kept[edges] = rows
         return rows
 
-    def _publisher(self, writer: str) -> TransformPublisher:
+    def _opened(self, publishers: dict[str, P], open_publisher: Callable[[str], P], writer: str) -> P:
         with self._lock:
             if self._closed:
                 raise Closed("the bridge is closed")
-            publisher = self._publishers.get(writer)
+            publisher = publishers.get(writer)
             if publisher is None:
-                publisher = self._publishers[writer] = self._open_publisher(writer)
+                publisher = publishers[writer] = open_publisher(writer)
             return publisher

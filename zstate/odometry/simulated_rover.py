@@ -130,7 +130,7 @@ class SimulatedRover:
         """The readings of the IMU until ``stamp`` [ns] since the last call, of 2 s at most."""
         with self._lock:
             self._advance(stamp)
-            return self._imu.take()
+            return self._imu.unread()
 
     def poses(self, stamps: ArrayLike) -> Floats:
         """Where the rover truly was at ``stamps`` [ns], (N,) of the last 2 s: (N, 3), x y [m], yaw [rad].
@@ -221,8 +221,8 @@ class _Imu:
         self._count = 0
         self._turned = self._ahead = self._left = 0.0
 
-    def take(self) -> list[ImuReading]:
-        """The readings that were not taken yet."""
+    def unread(self) -> list[ImuReading]:
+        """The readings since the last call."""
         readings = list(self._readings)
         self._readings.clear()
         return readings
