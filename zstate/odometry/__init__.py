@@ -4,9 +4,8 @@ from zstate.odometry.estimator import BaseCovariance, BaseEstimator, BaseState, 
 from zstate.odometry.health import SourceHealth
 from zstate.odometry.invariant_filter import ImuNoise
 from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
-from zstate.odometry.listener import SensorListener
 from zstate.odometry.map_correction import MapCorrection
-from zstate.odometry.node import OdometryNode
+from zstate.odometry.node import OdometryNode, SensorListener
 from zstate.odometry.publishers import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
 from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
 from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
