@@ -12,13 +12,15 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 import pytest
 from helpers.processes import DEADLINE_S, until
+from helpers.robots import STAMP
 
-from zstate import SecondWriter, StatePublisher, TransformListener, connect, load_model
+from zstate import SecondWriter, StatePublisher, TransformBuffer, TransformListener, connect, load_model
 from zstate.clock import SystemClock
 from zstate.errors import InvalidInput
 from zstate.model.kinematics import Kinematics
 from zstate.net.session import Session
 from zstate.net.status import StatusMonitor
+from zstate.net.subscription import Received, subscribe
 from zstate.odometry import (
     BaseEstimator,
     DiffDrive,
@@ -33,7 +35,8 @@ from zstate.odometry.simulated_rover import SimulatedRover
 from zstate.rate import Rate
 from zstate.sources.square_drive import WheelPair
 from zstate.transform import Transform
-from zstate.wire.messages import Imu, Pose, Velocity
+from zstate.wire.messages import Imu, Odometry, Pose, Velocity
+from zstate.wire.registry import get_wire
 
 MODEL = load_model("diffbot")
 NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)
@@ -114,6 +117,39 @@ def test_odometry_follows_the_truth_and_is_a_moving_edge_with_a_covariance():
 def _distance(rover: Rover, listener: TransformListener) -> float:
     x, y, _ = listener.buffer.lookup(ODOM, BASE).translation.tolist()
     return math.hypot(x - rover.truth.pose.x, y - rover.truth.pose.y)
+
+
+def test_wheels_ahead_of_the_imu_do_not_move_the_state_beyond_its_last_reading(sessions):
+    """What the base does after the last reading of its IMU is not known, and has no place in a covariance."""
+    robot, estimating = sessions
+    mounts = TransformBuffer()
+    mounts.insert_static(Transform(BASE, IMU, (0.1, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
+    wheels = DiffDrive("left_wheel_joint", "right_wheel_joint", 0.08, 0.32)
+    base = BaseEstimator(odom=ODOM, base=BASE, imu=IMU, buffer=mounts, imu_noise=NOISE, wheels=wheels)
+    stamps: list[int] = []
+
+    def on_odometry(received: list[Received]) -> None:
+        stamps.extend(one.message.stamp for one in received if isinstance(one.message, Odometry))
+
+    with (
+        subscribe(robot, get_wire("native"), "r1", "odometry", on_odometry),
+        StatePublisher(robot, MODEL, "r1") as joints,
+        OdometryNode(estimating, "r1", base, has_joints=True) as node,
+        ImuPublisher(robot, "r1", "imu", frame="imu_link") as imu,
+    ):
+        ticks = iter(range(STAMP, STAMP + 1_000_000_000_000, 5_000_000))
+        until(lambda: imu.publish([0, 0, 0], [0, 0, 9.80665], next(ticks)) or stamps)
+        last = next(ticks)
+
+        def has_wheels() -> bool:
+            for ahead in (40_000_000, 60_000_000):
+                joints.publish([0.0, 0.0], [0.0, 0.0], stamp=last + ahead)
+            return any(source.name == "wheels" for source in node.health())
+
+        until(has_wheels)
+        imu.publish([0, 0, 0], [0, 0, 9.80665], last)
+        until(lambda: stamps[-1] >= last)
+        assert stamps[-1] == last
 
 
 def test_without_its_imu_it_goes_on_with_the_wheels_and_without_all_it_ends():

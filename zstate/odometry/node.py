@@ -14,7 +14,7 @@ from typing import Any
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
 from zstate._util.refusals import Refusals
-from zstate.errors import Closed, InvalidInput, NoData, SecondWriter
+from zstate.errors import Closed, InPast, InvalidInput, NoData, SecondWriter
 from zstate.model.robot import POSITION_COUNTS, RobotModel
 from zstate.net.presence import announce_reader
 from zstate.net.session import Session
@@ -149,9 +149,9 @@ class OdometryNode(Closeable):
 
     ``base`` gets the readings of the IMU ``imu``, of the sensors ``velocities`` and ``poses``, and with
     ``has_joints`` the joint states, from the threads of their subscriptions. Each reading of the IMU
-    publishes the newest state, at most ``rate_hz`` of them a second. If the IMU is silent for 0.1 s, readings
-    of the other sources do; if all are silent, nothing is published. The sentences of ``base.health()`` are
-    the warning in the status of the writer.
+    publishes the state at its stamp, at most ``rate_hz`` of them a second. If the IMU is silent for 0.1 s,
+    readings of the other sources do; if all are silent, nothing is published. The sentences of
+    ``base.health()`` are the warning in the status of the writer.
 
     Raises SecondWriter as ``OdometryPublisher``. While it runs, that becomes its ``failure``, and
     ``has_failed`` is set. A context manager.
@@ -233,7 +233,8 @@ class OdometryNode(Closeable):
         with self._lock:
             add_imu(self.base, message)
             self._imu_stamp = max(self._imu_stamp, message.stamp)
-            self._publish(message.stamp)
+            # Not the newest of all data: wheels may be ahead, and what the IMU did since is not known.
+            self._publish(message.stamp, at=self._imu_stamp)
 
     def _on_velocity(self, sensor: str, message: Velocity) -> None:
         if sensor in self._velocities:
@@ -264,13 +265,13 @@ class OdometryNode(Closeable):
         if stamp - self._imu_stamp > _SILENT_NS:
             self._publish(stamp)
 
-    def _publish(self, stamp: int) -> None:
-        """Publish the newest state if that is due at ``stamp``; with the lock."""
+    def _publish(self, stamp: int, at: int | None = None) -> None:
+        """Publish the state ``at`` a stamp, or the newest one, if that is due at ``stamp``; with the lock."""
         if stamp < self._due or self.failure is not None:
             return
         try:
-            state = self.base.state()
-        except NoData:  # not aligned yet
+            state = self.base.state(at)
+        except (NoData, InPast):  # not aligned yet, or at a reading that came too late
             return
         if state.stamp <= self._newest:
             return
