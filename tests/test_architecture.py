@@ -105,7 +105,7 @@ DISTRIBUTIONS = {
     "zenoh": "eclipse-zenoh",
 }
 OF_ROS = {"rospy", "geometry_msgs", "rosgraph_msgs", "sensor_msgs", "std_msgs", "tf2_msgs"}
-NOT_FOR_USERS = {"test", "lint", "mujoco"}
+NOT_FOR_USERS = {"docs", "test", "lint", "mujoco"}
 # Libraries that pin's wheel links, and files with robots.
 WITHOUT_IMPORTS = {"cmeel-urdfdom", "cmeel-tinyxml2", "cmeel-console-bridge", "example-robot-data"}
 
