@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from helpers.cli_runner import Spawn, failure, started, zstate
+from helpers.pages import blocks
 from helpers.processes import Child
 from helpers.tutorial_terminal import FOLDER, TutorialPage, check_page, masked
 
@@ -105,7 +106,7 @@ def test_the_driver_is_a_dozen_lines():
 )
 def test_the_pages_show_the_files_of_their_folder(page: str, files: dict[str, str]):
     for language, name in files.items():
-        assert TutorialPage(page).blocks(language) == [(FOLDER / name).read_text()]
+        assert blocks(language, (FOLDER / page).read_text()) == [(FOLDER / name).read_text()]
 
 
 @pytest.mark.parametrize("uptime_s", [1, 59, 3_600, 9_999, 10_000, 86_400 * 400])
@@ -114,14 +115,14 @@ def test_a_stamp_is_masked_whatever_the_uptime_of_the_machine(uptime_s: int):
 
 
 def test_the_terminal_blocks_match_real_output(folder: Path, without_xacro: None):
-    check_page(TutorialPage("README.md"), folder)
+    check_page(TutorialPage((FOLDER / "README.md").read_text()), folder)
 
 
 def test_the_terminals_of_driving_match_real_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name in ("tutorial", "drivers"):
         shutil.copytree(FOLDER.parent / name, tmp_path / name)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    check_page(TutorialPage("DRIVING.md"), tmp_path / "tutorial")
+    check_page(TutorialPage((FOLDER / "DRIVING.md").read_text()), tmp_path / "tutorial")
 
 
 def test_the_robot_runs_and_can_be_inspected(cell: Child, driver):

@@ -1,19 +1,57 @@
-"""The guides of the documentation: each block of code is a program that runs here, or has a reason not to."""
+"""The guides of the documentation: their programs and terminals run here, and print what the pages show."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
-from helpers.pages import languages
+from helpers.pages import blocks, languages
+from helpers.processes import find_free_port
+from helpers.tutorial_terminal import TutorialPage, check_page
+
+pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).parents[2]
-GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
+GUIDES = {path.stem: path.read_text() for path in sorted((ROOT / "docs" / "guides").glob("*.md"))}
 
-# Those of python, toml and console run. A block of text shows a format, or what needs hardware or root.
-LANGUAGES = {"python", "toml", "console", "text"}
+# Blocks of the first three run. A block of text says why it cannot, in the sentence before it.
+LANGUAGES = {"python", "toml", "console", "text", "{warning}"}
 
 
-@pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
-def test_no_block_is_in_a_language_that_does_not_run(guide: Path) -> None:
-    assert languages(guide.read_text()) <= LANGUAGES
+def files(text: str) -> dict[str, str]:
+    """The files that a guide shows by their names, each of which is the first line of a block, a comment."""
+    found = blocks("python", text) + blocks("toml", text)
+    return {block.split("\n", 1)[0].removeprefix("# "): block for block in found}
+
+
+def on_this_host(text: str) -> str:
+    """The text with other hosts' addresses replaced by this one's, and each port by a free one."""
+    for port in set(re.findall(r"(?<=:)74\d\d\b", text)):
+        text = text.replace(f":{port}", f":{find_free_port()}")
+    return re.sub(r"192\.168\.1\.\d+|0\.0\.0\.0", "127.0.0.1", text)
+
+
+@pytest.mark.parametrize("guide", GUIDES)
+def test_blocks_are_in_languages_that_run(guide: str) -> None:
+    assert languages(GUIDES[guide]) <= LANGUAGES
+
+
+@pytest.mark.parametrize("guide", GUIDES)
+def test_every_file_of_a_guide_is_used_in_its_terminals(guide: str) -> None:
+    used = [line for line in "".join(blocks("console", GUIDES[guide])).splitlines() if line.startswith("$ ")]
+    assert [name for name in files(GUIDES[guide]) if name not in " ".join(used)] == []
+
+
+@pytest.mark.parametrize("guide", GUIDES)
+def test_terminals_print_what_the_guide_shows(
+    guide: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    folder = tmp_path / "guide"
+    folder.mkdir()
+    (folder / "models").symlink_to(ROOT / "models")
+    text = on_this_host(GUIDES[guide])
+    for name, content in files(text).items():
+        (folder / name).write_text(content)
+    check_page(TutorialPage(text), folder)
