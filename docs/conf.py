@@ -109,10 +109,6 @@ def _with_links(text: str, file: Path, page: Path) -> str:
 
 def _read_page(app: Sphinx, name: str, content: list[str]) -> None:
     page = Path(app.env.doc2path(name))
-    if name == "index":  # until these pages exist
-        content[0] = re.sub(
-            r"^(\S+\*)\n", lambda m: m[0] if any(DOCS.glob(m[1])) else "", content[0], flags=re.MULTILINE
-        )
     if name == "commands":
         content[0] = command_reference()
     content[0] = _with_links(content[0], page, page)
