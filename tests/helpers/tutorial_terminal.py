@@ -37,11 +37,7 @@ _MASKS = {
     r"-USR1 \d+": "-USR1 N",
     r"\d+(\.\d+)?(?= (k|M|G)?B\b)": "SIZE",
     r"router [0-9a-f]+": "router ID",
-    r"NIS [\d.]+ for (\d) numbers \([\d.]+ to [\d.]+": r"NIS of \1 numbers (BAND",
-    r"rec-\d{8}-\d{6}": "rec-START",
-    r"\d+ bytes at \d+": "N bytes at N",
-    r"[\d.]+(?= times\b)": "FACTOR",
-    r"(?<=skipped )\d+|\d+(?= (accepted|messages|rows|samples|setpoints|stopped)\b)": "COUNT",
+    r"(?<=skipped )\d+|\d+(?= (messages|rows|samples|setpoints|stopped)\b)": "COUNT",
     # An unplugged cable is noticed while the driver reads, or while it writes.
     r"\w*([Ee]rror|Exception)\(.*?\)(?=;|$)": "EXCEPTION",
     r"that of [\w-]+@": "that of WRITER@",
