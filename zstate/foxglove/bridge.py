@@ -41,8 +41,8 @@ _JOIN_WITHIN_S = 0.9
 Feed = tuple[str, Stream]
 """A stream of a robot."""
 
-_OF_DRIVERS: tuple[tuple[Stream, Stream], ...] = (("driver", "driver"), ("stop", "stop"))
-"""A driver has no token: its streams come with the joint states."""
+_OF_DRIVERS: tuple[Stream, ...] = ("driver", "stop")
+"""Drivers and stops have no tokens: their topics come with the joint states."""
 
 
 class ServedTopics:
@@ -77,6 +77,10 @@ class ServedTopics:
         users.discard(user)
         if not users:
             self._server.unadvertise(number)
+
+    def has_readers(self, robot: str) -> bool:
+        """Whether a channel is read that only a message of ``robot`` has opened."""
+        return any(map(self._server.is_read, self._of_robot.get(robot, ())))
 
     def close_all(self, robot: str) -> None:
         """Close the channels that messages of ``robot`` opened."""
@@ -208,8 +212,8 @@ class FoxgloveBridge(Closeable):
         """Stop serving the robots, within a second."""
         self._stop.set()
         self._wakeup.set()
-        self._opened.close()
         self._thread.join(_JOIN_WITHIN_S)
+        self._opened.close()
 
     def _on_writer(self, announced: Announcement, alive: bool) -> None:
         if not self._selected or announced.robot in self._selected:
@@ -290,7 +294,7 @@ class FoxgloveBridge(Closeable):
         if stream == "odometry" and stream in self._wire.edges:
             carried.append(("tf", "odometry"))
         if stream == "joint_states" and "driver" in self._streams:
-            carried += _OF_DRIVERS
+            carried.extend(zip(_OF_DRIVERS, _OF_DRIVERS, strict=True))
         topics: list[tuple[str, RosType, Feed]] = []
         try:
             for of_topic, of_messages in carried:
@@ -314,6 +318,9 @@ class FoxgloveBridge(Closeable):
             for number, feed in channels
             if self._server.is_read(number)
         }
+        for robot, writers in self._streams_of.items():
+            if self._topics.has_readers(robot):  # covariances of moving edges
+                feeds |= {(robot, one.stream) for one in writers if one.stream in self._wire.edges}
         robots_of: defaultdict[Stream, set[str]] = defaultdict(set)
         for robot, stream in feeds:
             robots_of[stream].add(robot)
@@ -324,7 +331,8 @@ class FoxgloveBridge(Closeable):
             robots = (self._selected or (ANY,)) if wanted and is_shared else wanted
             if stream != "robot_description" and robots != self._subscribed.get(stream, ()):
                 self._subscribe(stream, robots)
-        self._announce({robot: {one for its, one in feeds if its == robot} for robot, _ in feeds})
+        announced = {feed for feed in feeds if feed[1] not in _OF_DRIVERS}
+        self._announce({robot: {one for its, one in announced if its == robot} for robot, _ in announced})
 
     def _subscribe(self, stream: Stream, robots: tuple[str, ...]) -> None:
         if stream in LATCHED_STREAMS:
@@ -344,8 +352,11 @@ class FoxgloveBridge(Closeable):
             before, tokens = self._announced.get(robot, ((), []))
             if streams == before:
                 continue
-            new = announce_reader(self._session, self._wire, robot, streams) if streams else []
-            self._announced[robot] = streams, new
+            if streams:
+                new = announce_reader(self._session, self._wire, robot, streams)
+                self._announced[robot] = streams, new
+            else:
+                del self._announced[robot]
             for token in tokens:
                 token.close()
 

@@ -354,7 +354,7 @@ class RecordingEncoder:
                 is_new = True
             else:
                 is_new = self._writer.latch(number, key, payload, log_time, log_time, once_per_file=once)
-                if before is not channel:
+                if before.number != channel.number:
                     self._writer.unlatch(before.number, key)
             latched[key] = channel
             self._counts[robot, stream] += is_new
