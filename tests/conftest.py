@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from helpers.processes import Child, find_free_port, until
+from hypothesis import settings
 
 from zstate.net.session import Session, connect
 
@@ -22,6 +23,11 @@ if TYPE_CHECKING:
 ROOT = str(Path(__file__).parents[1])
 if ROOT not in sys.path:
     sys.path.append(ROOT)
+
+
+# An example may take any time: on a busy machine one takes seconds.
+settings.register_profile("zstate", deadline=None)
+settings.load_profile("zstate")
 
 
 @pytest.fixture
