@@ -103,40 +103,39 @@ def height(state: FilterState, foot: str, level: float, sigma: float) -> Measure
     return Measurement(np.array([level - point[2]]), jacobian, np.array([[sigma**2]]))
 
 
-def with_loose_contact(state: FilterState, foot: str, offset: Floats, sigma: float) -> FilterState:
-    """As GTSAM adds a foot: to ``sigma`` in the world, however uncertain the pose is."""
-    point = state.position + state.rotation @ offset
-    size = len(state.covariance)
-    by_error = np.vstack((np.eye(size), np.zeros((3, size))))
-    by_error[size:, :3] = skew(point)
-    covariance = by_error @ state.covariance @ by_error.T
-    covariance[size:, size:] += np.eye(3) * sigma**2
-    contacts = np.vstack((state.contacts, point))
-    return state._replace(feet=(*state.feet, foot), contacts=contacts, covariance=covariance)
-
-
 def after_contacts(state: FilterState, contacts: list[Any], lever: Floats, on_floor: bool) -> FilterState:
     """The state after GTSAM's contacts of one instant, whose points are in the axes of the body."""
     active = {str(contact.foot): contact for contact in contacts}
     for foot in state.feet:
         if foot not in active or active[foot].touchdown:
             state = iekf.without_contact(state, foot)
-    for foot in sorted(active):
-        offset = active[foot].bodyPoint - lever
-        if foot not in state.feet:
-            state = with_loose_contact(state, foot, offset, 0.5)
-        if on_floor:
-            state = iekf.updated(state, height(state, foot, 0.0, 0.02))
-        state = iekf.updated(state, measurements.contact(state, foot, offset, CONTACT))
+    for is_new in (False, True):
+        for foot in sorted(active):
+            offset = active[foot].bodyPoint - lever
+            if is_new == (foot in state.feet):
+                continue
+            if is_new:
+                state = iekf.with_contact(state, foot, offset, CONTACT)
+            if on_floor:
+                state = iekf.updated(state, height(state, foot, 0.0, 0.02))
+            if not is_new:
+                state = iekf.updated(state, measurements.contact(state, foot, offset, CONTACT))
     return state
 
 
-def test_a_quadruped_on_stairs_stays_within_5_cm_of_gtsam():
-    """The real data of GTSAM's own example: 24 s, IMU at 100 Hz, contact points, no ground truth."""
+def test_a_quadruped_on_stairs_stays_within_a_millimetre_of_gtsam():
+    """The real data of GTSAM's own example: 24 s, IMU at 100 Hz, contact points, no ground truth.
+
+    GTSAM adds a foot with an error that is independent of the position's, of ``footholdInitSigma`` s, and
+    measures it. The variance P of the position falls by that to P - P^2 / (P + s^2 + r), with r that of the
+    measurement, although a new foot says nothing of where the base is: each one is a false fix. As s grows,
+    this tends to ``with_contact``. With s = 0.5 m, as in the example, the paths are 0.25 m apart at the end,
+    and GTSAM claims 0.10 m in x, not 0.27.
+    """
     recording = LeggedEstimatorExample.load_legged_csv_dataset()
     lever = np.array([0.30, 0.0, 0.15])
     parameters = legged_parameters(imu_parameters(8e-4, 2e-2, 1e-3), lever)
-    parameters.useFullContactInitialization = True
+    parameters.useFullContactInitialization, parameters.footholdInitSigma = True, 50.0
     judge = LeggedEstimatorExample.make_legged_estimator("invariant_ekf", recording["foot_names"], parameters)
     noise = ImuNoise(gyro=8e-4, accel=2e-2, gyro_bias=0.0, accel_bias=0.0)
     samples = [(sample.timestamp_s, 0, sample) for sample in recording["imu_samples"]]
@@ -164,5 +163,5 @@ def test_a_quadruped_on_stairs_stays_within_5_cm_of_gtsam():
             distances.append(float(np.linalg.norm(estimate.x(0) - state.position)))
         elif len(item.active_contacts) == 4:  # where GTSAM aligns itself
             state = state_from_gtsam(estimate.rotation().matrix(), estimate.xMatrix(), judge.covariance())
-    assert max(distances) < 0.05
+    assert max(distances) < 1e-3
     assert judge.estimate().x(0)[2] > 4.0  # it was replayed up to the top of the stairs

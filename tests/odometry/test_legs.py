@@ -9,6 +9,7 @@ from zstate import InvalidInput
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import invariant_filter as iekf
+from zstate.odometry import legs
 from zstate.odometry.legs import (
     ForceThresholds,
     LegNoise,
@@ -16,7 +17,7 @@ from zstate.odometry.legs import (
     SpeedThresholds,
     updated_by_feet,
 )
-from zstate.odometry.rotations import Floats, rotation_exp
+from zstate.odometry.rotations import Floats, rotation_exp, skew
 
 GATE = 16.27  # 99.9 % of the chi-square distribution of three degrees of freedom
 
@@ -207,6 +208,27 @@ def test_errors_of_walks_are_as_large_as_the_covariance_states():
     low, high = mean_band(runs=20, freedom=3)
     mean = np.mean(nees, axis=0)
     assert ((low < mean) & (mean < high)).all(), mean
+
+
+def test_feet_with_a_prior_of_their_own_are_false_fixes(monkeypatch: pytest.MonkeyPatch):
+    """What GTSAM does by default: a new foot is known to 0.5 m, whatever the error of the position is."""
+
+    def with_loose_contact(state: iekf.FilterState, foot: str, offset: Floats, _: Floats) -> iekf.FilterState:
+        point = state.position + state.rotation @ offset
+        size = len(state.covariance)
+        by_error = np.vstack((np.eye(size), np.zeros((3, size))))
+        by_error[size:, :3] = skew(point)
+        covariance = by_error @ state.covariance @ by_error.T
+        covariance[size:, size:] += np.eye(3) * 0.5**2
+        contacts = np.vstack((state.contacts, point))
+        return state._replace(feet=(*state.feet, foot), contacts=contacts, covariance=covariance)
+
+    monkeypatch.setattr(legs, "with_contact", with_loose_contact)
+    nees = list[float]()
+    for seed in range(6):
+        walk = Walk(seed)
+        nees.append(float(walk.body.nees(walk.estimate(100))[2]))
+    assert np.mean(nees) > 3.0 * mean_band(runs=6, freedom=3)[1]
 
 
 def test_a_foot_that_slips_is_placed_again_and_does_not_move_the_body():
