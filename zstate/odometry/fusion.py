@@ -14,7 +14,7 @@ kept.
   compass turns with the robot and its place and does not average out. So the variance of the yaw is never
   lowered below that of the source, which is the stated one or, if larger, the mean square that its
   innovations have shown for 20 s. A compass that is wrong by tens of degrees loses its weight; one that is
-  right still bounds the drift.
+  right still bounds the drift. Until it has shown which, in the first minutes, it may be off by 0.3 rad.
 """
 
 from __future__ import annotations
@@ -63,6 +63,8 @@ _REST_FORCE = 0.5
 """[m/s^2] The specific force of a base at rest differs from gravity by less; a bias is part of it."""
 
 _DEVIATION_S = 20.0
+_UNPROVEN = 0.3
+"""[rad] The standard deviation of a compass at its first reading; its square falls with ``_DEVIATION_S``."""
 _SAMPLED_S, _SAMPLED_GAIN = 0.01, 0.05
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
@@ -136,10 +138,12 @@ class Run(NamedTuple):
 class Compass(NamedTuple):
     """What is known of a source of headings.
 
-    ``offset`` is its yaw minus ours at its first reading, ``offset_variance`` that of our yaw then, and
-    ``deviation`` the variance by which its errors exceed the stated one; ``excess`` is their present mean.
+    ``start`` is the stamp of its first reading, ``offset`` its yaw minus ours then, and ``offset_variance``
+    that of our yaw then. ``deviation`` is the variance by which its errors exceed the stated one, and
+    ``excess`` their present mean.
     """
 
+    start: int
     stamp: int
     offset: float
     offset_variance: float
@@ -259,7 +263,7 @@ class Fusion:
         settled = self.settled(estimate)
         variance = float(row @ settled.state.covariance @ row)
         if compass is None:
-            first = Compass(reading.stamp, residual, variance, 0.0, 0.0)
+            first = Compass(reading.stamp, reading.stamp, residual, variance, 0.0, 0.0)
             return _with_compass(estimate, source, first), Outcome("accepted", 1.0, 1)
         # The first reading has an error as well, and that of our yaw then is part of the present one.
         expected = variance + 2.0 * reading.variance
@@ -268,6 +272,8 @@ class Fusion:
         deviation = max(compass.deviation, excess)
         compass = compass._replace(stamp=reading.stamp, excess=excess, deviation=deviation)
         estimate = _with_compass(estimate, source, compass)
+        age_s = (reading.stamp - compass.start) * 1e-9
+        deviation = max(deviation, _UNPROVEN * _UNPROVEN * math.exp(-age_s / _DEVIATION_S))
         nis = residual * residual / expected
         if residual * residual > gate(1) * (expected + deviation):
             return estimate, Outcome("rejected", nis, 1)
