@@ -338,19 +338,21 @@ def edge(child: str, x: float, parent: str = "odom") -> Transform:
     return Transform(parent, child, (x, 0.0, 0.0), UPRIGHT)
 
 
-def test_odometry_is_carried_to_ros_with_its_velocity_and_covariances_and_to_tf(world):
-    world.bridge("r1")
+def test_odometry_is_carried_with_its_velocity_and_covariances_beside_its_edge(world, here, there):
+    """From ROS as well, where its node publishes both."""
+    bridge = world.bridge("r1")
     received: list[Odometry] = []
 
     def on_messages(messages: list[Received]) -> None:
         received.extend(one.message for one in messages if isinstance(one.message, Odometry))
 
-    ros = world.join("ros2")
+    far = world.join(there)
+    wire = "native" if here == "native" else "ros2:node=ekf"
     with (
-        StatePublisher(world.join("native"), RRBOT, "r1") as publisher,
-        OdometryPublisher(world.join("native"), "r1") as odometry,
-        TransformListener(ros, "r1", wire="ros2") as carried,
-        subscribe(ros, get_wire("ros2"), "r1", "odometry", on_messages),
+        StatePublisher(world.join(here), RRBOT, "r1", (here,)) as publisher,
+        OdometryPublisher(world.join(here), "r1", wires=wire) as odometry,
+        TransformListener(far, "r1", wire=there) as carried,
+        subscribe(far, get_wire(there), "r1", "odometry", on_messages),
     ):
         pose_covariance, twist_covariance = np.diag(np.arange(1.0, 7.0)), np.diag(np.arange(7.0, 13.0))
         pose = edge("world", 2.0).with_covariance(pose_covariance)
@@ -363,6 +365,7 @@ def test_odometry_is_carried_to_ros_with_its_velocity_and_covariances_and_to_tf(
         stamps = iter(range(1, 1_000_000))
         until(lambda: move(next(stamps)))
         assert carried.buffer.lookup("odom", "world").translation[0] == 2.0
+        assert bridge.carriers[0].refused == {}
     message = received[-1]
     assert message.edges == (("odom", "world"),)
     assert from_block(message.twist).tolist() == [1, 2, 3, 4, 5, 6]

@@ -140,13 +140,13 @@ class BridgeSide(NamedTuple):
 class TransformBridge(Closeable):
     """Publishes on ``target`` the moving edges of programs on ``source``, except those of ``model``.
 
-    On the native side they keep the names of their writers; for a ROS node it is its own. Native odometry is
-    a nav_msgs/Odometry in ROS, with its velocity and covariances, on a topic of its writer's name, and an
-    edge on /tf. From ROS /tf alone is carried: there, the poses of odometry are measurements and no edges.
-    Other covariances are dropped, because /tf has none. Samples of bridges are skipped, and
-    samples of writers that are not announced, which may be bridges. If all robots share /tf, the edges
-    whose child is a frame of this robot are published. Subscribes only while there is a writer: on the ROS
-    side the bridge itself would be a reader for which it computes /tf.
+    On the native side they keep the names of their writers; for a ROS node it is its own. Odometry is carried
+    with its velocity and covariances: in ROS it is a nav_msgs/Odometry on a topic of its writer's name, and
+    an edge on /tf. From ROS it is carried if its node also publishes that edge on /tf; poses of others are
+    measurements. Other covariances are dropped, because /tf has none. Samples of bridges are skipped, and
+    samples of writers that are not announced, which may be bridges. If all robots share /tf, the edges whose
+    child is a frame of this robot are published. Subscribes only while there is a writer: on the ROS side the
+    bridge itself would be a reader for which it computes /tf.
     """
 
     def __init__(
@@ -156,7 +156,13 @@ class TransformBridge(Closeable):
         self._source = source
         self._wire = get_wire(source.wire)
         self._counters = counters
+        self._streams: tuple[Stream, ...] = tuple(dict.fromkeys((*self._wire.edges, "odometry")))
         self._writers: dict[int, str] = {}
+        self._placed: defaultdict[str, set[Edges]] = defaultdict(set)
+        """Single edges on /tf, by writer: those that its odometry may have."""
+        self._as_odometry: dict[Edges, str] = {}
+        """The edges of /tf that are carried as odometry, with their writers."""
+        self._lock = threading.Lock()
         self._subscription: ExitStack | None = None
 
         def open_publisher(writer: str) -> TransformPublisher:
@@ -177,16 +183,20 @@ class TransformBridge(Closeable):
         self._opened.close()
 
     def _on_writer(self, announced: Announcement, alive: bool) -> None:
-        if announced.stream not in self._wire.edges or is_bridge(announced):
+        if announced.stream not in self._streams or is_bridge(announced):
             return
         session = announced.writer.session
-        name = announced.name or edge_writer_of_node(announced.writer.program)
+        name = edge_writer_of_node(announced.writer.program) if self._wire.shared else announced.name
         if alive:
             self._writers[session] = name
             self._subscribe()
             return
         self._writers.pop(session, None)
+        with self._lock:
+            if announced.stream == "odometry":  # its edge may go on
+                self._as_odometry = {edge: one for edge, one in self._as_odometry.items() if one != name}
         if name not in self._writers.values():  # a ROS node may have several publishers
+            self._placed.pop(name, None)
             self._relay.remove(name)
         if not self._writers:
             self._unsubscribe()
@@ -194,7 +204,7 @@ class TransformBridge(Closeable):
     def _subscribe(self) -> None:
         if self._subscription is not None:
             return
-        session, robot, streams = self._source.session, self._robot, self._wire.edges
+        session, robot, streams = self._source.session, self._robot, self._streams
         on_error = self._counters.count_refusal
         with ExitStack() as opening:
             for stream in streams:
@@ -216,17 +226,33 @@ class TransformBridge(Closeable):
                 assert isinstance(sample, TransformSample)
                 writer = self._writers.get(sample.session)
                 if writer is not None and isinstance(sample, Odometry):
-                    self._relay.publish_odometry(writer, sample)
+                    self._publish_odometry(writer, sample)
                 elif writer is not None and sample.edges is not None:
                     self._publish(writer, sample.edges, sample)
 
+    def _publish_odometry(self, writer: str, sample: Odometry) -> None:
+        edges = sample.edges
+        assert edges is not None
+        if self._wire.shared:
+            with self._lock:
+                if edges not in self._placed[writer]:
+                    return
+                if edges not in self._as_odometry:
+                    self._relay.remove(writer)  # which owns the edge
+                    self._as_odometry[edges] = writer
+        self._relay.publish_odometry(writer, sample)
+
     def _publish(self, writer: str, edges: Edges, sample: TransformSample) -> None:
         poses = poses_from_block(sample.poses)
-        if self._wire.shared:
-            kept = [is_of_robot(self._robot, child) for _, child in edges]
-            edges, poses = tuple(compress(edges, kept)), poses[kept]
-        if edges:
-            self._relay.publish(writer, edges, poses, sample.stamp)
+        with self._lock:
+            if self._wire.shared:
+                self._placed[writer].update((edge,) for edge in edges if is_of_robot(self._robot, edge[1]))
+                kept = [
+                    (edge,) in self._placed[writer] and (edge,) not in self._as_odometry for edge in edges
+                ]
+                edges, poses = tuple(compress(edges, kept)), poses[kept]
+            if edges:
+                self._relay.publish(writer, edges, poses, sample.stamp)
 
 
 def is_of_robot(robot: str, frame: str) -> bool:

@@ -44,8 +44,9 @@ def bridge_command(
 
     Carries the model, joint states with their stamps, and static edges, whichever side publishes them. The
     model's part of /tf is computed again on the other side. Other moving edges, such as odom -> base_link,
-    are carried from either side, without covariances, which /tf does not have; in zstate their writer has the
-    name of the ROS node. Nothing that the bridge has published is carried back.
+    are carried from either side; in zstate their writer has the name of the ROS node. Odometry keeps its
+    velocity and covariances (nav_msgs/Odometry); other edges have none, as on /tf. Nothing that the bridge
+    has published is carried back.
 
     On the ROS side the robot is in the root namespace, or in the one that --wire names. ROBOT may be left
     out if only one robot is announced natively, or with namespace=*, which gives each robot a namespace of
