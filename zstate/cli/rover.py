@@ -177,17 +177,13 @@ class _RoverLaser:
         self._laser, self._rover = laser, rover
         self._x, self._y, _ = mount.translation.tolist()
         _, _, self._yaw = mount.rpy.tolist()
-        self._begin: int | None = None
 
     def read(self, stamp: int) -> Scan | None:
-        """The sweep that ends at ``stamp`` [ns]; None before the rover is that old."""
+        """The sweep that ends at ``stamp`` [ns]; None if it began before the rover, or before a pause."""
         import numpy as np
 
-        end = self._rover.advance(stamp)
-        if self._begin is None:
-            self._begin = end
-        first = end - self._laser.sweep_ns
-        if first < self._begin:
+        first = self._rover.advance(stamp) - self._laser.sweep_ns
+        if not self._rover.has_poses_since(first):
             return None
         x, y, yaw = self._rover.poses(self._laser.stamps(first)).T
         cosine, sine = np.cos(yaw), np.sin(yaw)

@@ -132,10 +132,15 @@ class SimulatedRover:
             self._advance(stamp)
             return self._imu.unread()
 
+    def has_poses_since(self, stamp: int) -> bool:
+        """Whether ``poses`` are known from ``stamp`` [ns] on: it is neither too old nor before a pause."""
+        with self._lock:
+            return self._stamp is not None and self._stamp - (len(self._poses) - 1) * _STEP_NS <= stamp
+
     def poses(self, stamps: ArrayLike) -> Floats:
         """Where the rover truly was at ``stamps`` [ns], (N,) of the last 2 s: (N, 3), x y [m], yaw [rad].
 
-        Raises InvalidInput for stamps that are older, or later than the last step.
+        Raises InvalidInput for stamps that are older, before a pause, or later than the last step.
         """
         instants = np.asarray(stamps, dtype=np.int64)
         with self._lock:
