@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers.pages import blocks, languages
+from helpers.pages import blocks, languages, programs
 from helpers.processes import find_free_port
 from helpers.tutorial_terminal import TutorialPage, check_page
 
@@ -20,9 +20,7 @@ LANGUAGES = {"python", "toml", "console", "text", "{warning}"}
 
 
 def files(text: str) -> dict[str, str]:
-    """The files that a guide shows by their names, each of which is the first line of a block, a comment."""
-    found = blocks("python", text) + blocks("toml", text)
-    return {block.split("\n", 1)[0].removeprefix("# "): block for block in found}
+    return programs(text) | programs(text, "toml")
 
 
 def on_this_host(text: str) -> str:

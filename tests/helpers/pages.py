@@ -19,9 +19,9 @@ def languages(text: str) -> set[str]:
     return set(re.findall(r"^ *```([^\n`]*)\n.*?^ *```$", text, re.MULTILINE | re.DOTALL))
 
 
-def programs(text: str) -> dict[str, str]:
-    """The Python blocks of ``text`` by their file names, each of which is the first line, a comment."""
-    return {block.split("\n", 1)[0].removeprefix("# "): block for block in blocks("python", text)}
+def programs(text: str, language: str = "python") -> dict[str, str]:
+    """The blocks in ``language`` by their file names, each of which is the first line, a comment."""
+    return {block.split("\n", 1)[0].removeprefix("# "): block for block in blocks(language, text)}
 
 
 def section(text: str, heading: str) -> str:
