@@ -232,7 +232,7 @@ class FoxgloveServer(Closeable):
         def update() -> None:
             if not self._has_time:
                 self._has_time = True
-                self._session += 1  # clients start anew with the other clock
+                self._session += 1  # clients start again with the other clock
                 self._broadcast(self._server_info())
             for client in self._clients.values():
                 client.put_time(stamp)

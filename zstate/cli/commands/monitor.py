@@ -52,7 +52,7 @@ _FIRST_AFTER_S = 1.0
 _DISCOVERY_S = 0.3
 _WITHIN_NS = 2_000_000_000
 _OWN_RATES: dict[Stream, str] = {"transforms": "transforms", "odometry": "odometry", "scan": "scans"}
-"""The streams that have a rate of their own beside that of the joint states, and its column."""
+"""The streams that have a rate apart from that of the joint states, and its column."""
 
 
 @click.command("monitor")
@@ -401,7 +401,7 @@ class RobotMonitor(Closeable):
                 print_wrapped(f"{one.robot}  {status.level}  {_program(status)}: {status.text}")
 
     def _own_rates(self, robot: str, measure: RobotMeasure) -> dict[Stream, float]:
-        """The rates of streams beside the joint states, 0 for those that are silent."""
+        """The rates of streams other than the joint states, 0 for those that are silent."""
         rates: dict[Stream, float] = {}
         for stream in _OWN_RATES:
             counted = self._counted.get((robot, stream))
