@@ -114,6 +114,67 @@ class NoisyImu:
         return t, measured[0], measured[1]
 
 
+@dataclass
+class RoughDrive:
+    """A drive on the floor with all that recordings have and data sheets have not, from its ``seed``.
+
+    It begins in motion. The IMU is on its side, at about 50 Hz, with jitter, gaps, vibration, a bias of the
+    gyro and scales that are wrong by 1 %. Wheels have encoders of 1000 steps at 10 Hz, a radius and a track
+    that are wrong by 2 %, and slip in turns. A compass is wrong by up to 35 degrees, which change.
+    """
+
+    seed: int
+    seconds: float
+    radius: float = 0.1
+    track: float = 0.5
+    step_s: float = 0.01
+
+    def __post_init__(self) -> None:
+        random, count = np.random.default_rng(self.seed), round(self.seconds / self.step_s)
+        legs = math.ceil(self.seconds / 8.0)
+        part = np.arange(count) * legs // count
+        smooth = np.ones(100) / 100.0
+        speeds, rates = random.uniform(0.4, 1.0, legs), random.uniform(-0.8, 0.8, legs)
+        standing = random.random(legs) < 0.25
+        standing[0] = False
+        self.t = np.arange(count) * self.step_s
+        speed, rate = (
+            np.convolve(np.pad(values[part] * ~standing[part], (50, 49), mode="edge"), smooth, "valid")
+            for values in (speeds, rates)
+        )
+        self.yaw = np.cumsum(rate) * self.step_s
+        velocity = speed[:, None] * np.stack((np.cos(self.yaw), np.sin(self.yaw)), axis=1)
+        self.position = np.cumsum(velocity, axis=0) * self.step_s
+        self.mount = Transform.from_rpy(
+            "base_link", "imu_link", (0.0, 0.0, 0.2), (math.pi / 2, 0.0, math.pi / 2)
+        )
+        chosen = np.flatnonzero(random.random(count // 2) > 0.02) * 2
+        force = np.stack((np.gradient(speed, self.step_s), speed * rate, np.full(count, 9.80)), axis=1)
+        force += 0.5 * speed[:, None] * np.sin(np.outer(self.t, (145.0, 199.0, 259.0)))
+        turn = np.stack((0.0 * rate, 0.0 * rate, rate), axis=1)
+        self.gyro, self.accel = (
+            (ideal @ self.mount.matrix[:3, :3])[chosen] * (1.0 + random.normal(0.0, 0.01, 3))
+            + random.normal(0.0, bias, 3)
+            + random.normal(0.0, white * math.sqrt(50.0), (len(chosen), 3))
+            for ideal, bias, white in ((turn, 0.01, NOISE.gyro), (force, 0.05, NOISE.accel))
+        )
+        self.imu_times = np.sort(self.t[chosen] + random.normal(0.0, 0.002, len(chosen)) + 0.01)
+        slip, (radius, track) = 1.0 + 0.03 * np.abs(rate), 1.0 + random.normal(0.0, 0.02, 2)
+        across = 0.5 * self.track * track * rate
+        angles = np.cumsum([speed * slip - across, speed * slip + across], axis=1).T * self.step_s
+        tick = math.tau / 1000
+        self.wheels = np.floor(angles / (self.radius * radius) / tick)[::10] * tick
+        hard_iron = math.radians(35.0) * np.sin(self.yaw + 0.02 * self.t + random.uniform(0.0, math.tau))
+        self.compass = (self.yaw + 1.0 + hard_iron)[::10]
+
+    def dead_reckoned(self) -> Floats:
+        """The end by wheel speed and gyro, as they are: (2,)."""
+        yaw = np.cumsum((self.gyro @ self.mount.matrix[:3, :3].T)[:, 2] * np.gradient(self.imu_times))
+        distances = np.diff(self.wheels.mean(axis=1)) * self.radius
+        yaw = np.interp(self.t[10::10] - 0.05, self.imu_times, yaw)
+        return np.array((distances @ np.cos(yaw), distances @ np.sin(yaw)))
+
+
 def mounted(base_from_imu: Transform) -> TransformBuffer:
     """A buffer with the mount of an IMU."""
     buffer = TransformBuffer()

@@ -14,7 +14,7 @@ kept.
   compass turns with the robot and its place and does not average out. So the variance of the yaw is never
   lowered below that of the source, which is the stated one or, if larger, the mean square that its
   innovations have shown for 20 s. A compass that is wrong by tens of degrees loses its weight; one that is
-  right still bounds the drift. Until it has shown which, in the first minutes, it may be off by 0.3 rad.
+  right still bounds the drift. Until it has shown which, in the first minutes, it may be off by 0.5 rad.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ _REST_FORCE = 0.5
 """[m/s^2] The specific force of a base at rest differs from gravity by less; a bias is part of it."""
 
 _DEVIATION_S = 20.0
-_UNPROVEN = 0.3
-"""[rad] The standard deviation of a compass at its first reading; its square falls with ``_DEVIATION_S``."""
+_UNPROVEN, _PROVING_S = 0.5, 100.0
+"""[rad], [s]: the standard deviation of a compass at its first reading, whose square falls to 1/e so fast."""
 _SAMPLED_S, _SAMPLED_GAIN = 0.01, 0.05
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
@@ -273,7 +273,7 @@ class Fusion:
         compass = compass._replace(stamp=reading.stamp, excess=excess, deviation=deviation)
         estimate = _with_compass(estimate, source, compass)
         age_s = (reading.stamp - compass.start) * 1e-9
-        deviation = max(deviation, _UNPROVEN * _UNPROVEN * math.exp(-age_s / _DEVIATION_S))
+        deviation = max(deviation, _UNPROVEN * _UNPROVEN * math.exp(-age_s / _PROVING_S))
         nis = residual * residual / expected
         if residual * residual > gate(1) * (expected + deviation):
             return estimate, Outcome("rejected", nis, 1)
