@@ -378,6 +378,8 @@ class FoxgloveBridge(Closeable):
         if isinstance(message, RobotDescription):
             self._descriptions[robot] = message.urdf
             self._update_parameter(encoder, robot)
+            if robot not in self._streams_of:  # not announced yet, or gone
+                self._topics.close_all(robot)
         elif isinstance(message, ClockMessage):
             self._simulated_time = message.stamp
             self._server.set_time(message.stamp)
