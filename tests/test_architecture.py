@@ -426,11 +426,11 @@ class Ratchet:
 RATCHETS = (
     Ratchet("dialect words", dialect_words, 7, 150),
     Ratchet("banned methods", banned_methods, 2, 0),  # `tell` of a file, which mcap calls; `Limits.of`
-    Ratchet("single importers", single_importers, 38, 25),
+    Ratchet("single importers", single_importers, 39, 25),
     Ratchet("modules in largest folder", modules_in_largest_folder, 18, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
-    Ratchet("modules", lambda: len(modules()), 290, 270),  # 270 before odometry, which has 15
-    Ratchet("lines", lines, 65_000, 36_000),  # 40,026 before moving frames, drivers, scans, driving, odometry
+    Ratchet("modules", lambda: len(modules()), 293, 270),  # 270 before odometry, which has 14, and Foxglove, 3
+    Ratchet("lines", lines, 66_500, 36_000),  # 40,026 before moving frames, drivers, scans, driving, odometry
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
 
