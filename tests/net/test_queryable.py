@@ -12,10 +12,14 @@ import pytest
 from helpers.processes import SOON_S, until
 
 from zstate.net.queryable import Queryable, Reply, RequestQueryable, parse_parameters, query
-from zstate.net.session import Session
+from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher, StreamSubscriber
 
 KEY = "zstate/r1/lookup"
+
+
+def peer_is_linked(session: Session, zid: str) -> bool:
+    return zid in map(str, session.zenoh.info.peers_zid())
 
 
 def replies(session: Session, selector: str, timeout_s: float = 5.0) -> list[tuple[bool, bytes, str]]:
@@ -50,6 +54,20 @@ def test_query_gets_its_reply_and_errors_are_zenoh_error_replies(sessions: tuple
         assert replies(sessions[1], f"{KEY}?wrong") == [(False, b"{'wrong': ''}", "text/plain")]
         until(lambda: service.answered == 2)
     assert replies(sessions[1], KEY) == []
+
+
+def test_a_query_ends_with_its_replies_after_one_of_two_equal_queryables_and_its_session_are_closed(
+    sessions: tuple[Session, Session],
+):
+    with connect() as other, Queryable(other, KEY, lambda _: Reply(b"other", "")):
+        with connect() as first:
+            with Queryable(first, KEY, lambda _: Reply(b"first", "")) as service:
+                until(lambda: bool(replies(sessions[1], KEY)) and service.answered > 0)
+            until(lambda: [payload for _, payload, _ in replies(sessions[1], KEY)] == [b"other"])
+        until(lambda: not peer_is_linked(sessions[1], first.zid))
+        start = time.monotonic()
+        assert [payload for _, payload, _ in replies(sessions[1], KEY, timeout_s=30.0)] == [b"other"]
+        assert time.monotonic() - start < 15.0
 
 
 def test_query_without_a_reply_ends_at_once(sessions: tuple[Session, Session]):

@@ -142,6 +142,7 @@ class _WaitingQueries:
     def __init__(self, session: Session, key: str, capacity: int) -> None:
         self._queries: queue.SimpleQueue[zenoh.Query | None] = queue.SimpleQueue()
         self._capacity = capacity
+        self._session, self._key = session, key
         callback = zenoh.handlers.Callback(self._add, self._end, indirect=False)
         self._queryable = session.zenoh.declare_queryable(key, callback)
 
@@ -179,6 +180,7 @@ class _WaitingQueries:
     def undeclare(self) -> None:
         """End the queryable."""
         self._queryable.undeclare()
+        self._session.on_queryable_end(self._key)
 
 
 class Queryable(Receiver[zenoh.Query]):
@@ -285,7 +287,8 @@ def query_lookup(
         f"no reply at {key!r} within {timeout_s:g} s; run `zstate publish {robot}`, or a LookupService",
         endpoints=(key,),
     )
-    for reply in query(session.zenoh, selector, timeout_s):
+    # Without consolidation the first reply arrives before the end of the query.
+    for reply in query(session.zenoh, selector, timeout_s, consolidation=zenoh.ConsolidationMode.NONE):
         # A reply on another key, such as one with a wildcard, is not from this robot.
         if reply.ok is not None and str(reply.ok.key_expr) == key:
             return from_json(reply.ok.payload.to_bytes())

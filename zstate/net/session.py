@@ -197,6 +197,7 @@ class Session(Closeable):
         """False once this session is closed, and in a forked process."""
         self._lock = fork_safe_lock()
         self._numbers = itertools.count()
+        self._ended_queryables: set[str] = set()
         self.zid = str(raw.zid())
         self.opened_at = time.monotonic()
         self.probe = probe
@@ -218,6 +219,15 @@ class Session(Closeable):
     def next_number(self) -> int:
         """The next of the numbers 0, 1, 2, ..., unique in this session."""
         return next(self._numbers)
+
+    def on_queryable_end(self, key: str) -> None:
+        """Note that this session has undeclared a queryable on ``key``, which other sessions may have, too.
+
+        Zenoh 1.10 keeps such a queryable in its routes while another session has an equal one. Once this
+        session had closed, queries on ``key`` would end only at their timeout (mended by Zenoh #2660).
+        """
+        if "/@" not in key:  # keys of one writer each, without end
+            self._ended_queryables.add(key)
 
     def check(self) -> None:
         """Raise Closed if this session is closed, or belongs to the process that this one was forked from."""
@@ -290,4 +300,8 @@ class Session(Closeable):
         if self._companion is not None:
             self._companion.close()
         with suppress(zenoh.ZError):  # it was delayed for too long
+            # A queryable that its session still has at its end is removed from all routes.
+            channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(1)
+            held = [self._raw.declare_queryable(key, channel) for key in self._ended_queryables]
             self._raw.close()
+            del held
