@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from itertools import permutations
 
+import msgspec
 import pytest
 from helpers.robots import RRBOT, assert_pose, kinematic_pose
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import LookupFailed
+from zstate.ingest import base
 from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
@@ -246,6 +248,36 @@ def test_older_of_two_writers_is_counted_and_stays_refused(case: IngestCase):
     assert case.counters.stats().refused == {"second writer": 9}
     assert case.elbow_is([2.0, 2.0])
     assert case.buffer.explain("r1/upper", "r1/lower", 0) is not None
+
+
+def test_announced_writer_is_accepted_again_after_a_stray_sample_and_silence(
+    case: IngestCase, monkeypatch: pytest.MonkeyPatch
+):
+    case.ingest.describe(description())
+    case.ingest.name_writer(1, "driver")
+    stray = msgspec.structs.replace(case.sample(0, [9.0, 9.0], session=9, stamp=0), order=bytes(8))
+    case.receive(case.sample(0, [1.0, 1.0], session=1, stamp=1), stray)
+    case.receive(*[case.sample(seq, [1.0, 1.0], session=1, stamp=seq + 1) for seq in (1, 2)])
+    assert case.counters.stats().refused["second writer"] == 2
+    monkeypatch.setattr(base, "SILENT_S", 0.0)
+    case.receive(case.sample(3, [2.0, 2.0], session=1, stamp=4))
+    assert case.counters.stats().refused["second writer"] == 2
+    assert case.elbow_is([2.0, 2.0], at=4)
+
+
+def test_announced_writer_stays_refused_while_an_unannounced_one_sends(
+    case: IngestCase, monkeypatch: pytest.MonkeyPatch
+):
+    now_s = 0.0
+    monkeypatch.setattr(base.time, "monotonic", lambda: now_s)
+    case.ingest.describe(description())
+    case.ingest.name_writer(1, "driver")
+    case.receive(case.sample(0, [1.0, 1.0], session=1, stamp=0))
+    for seq in range(5):
+        now_s += 0.9 * base.SILENT_S
+        case.receive(case.sample(seq, [2.0, 2.0], session=2, stamp=2 * seq + 1))
+        case.receive(case.sample(seq + 1, [1.0, 1.0], session=1, stamp=2 * seq + 2))
+    assert case.counters.stats().refused == {"second writer": 5}
 
 
 def test_replaced_writer_is_accepted_again_after_the_newer_one_left(case: IngestCase):

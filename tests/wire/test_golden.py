@@ -315,8 +315,23 @@ def parsed_key(key: str) -> Json | None:
         "edge": lambda: edge(*keys.parse_edge_key(key)),
         "clock": lambda: owned(*keys.parse_clock_key(key)),
         "status": lambda: owned(*keys.parse_status_key(key)),
+        "release": lambda: owned(*release(key)),
+        "motion": lambda: of_robot(keys.motion_key),
+        "lookup": lambda: of_robot(keys.lookup_key),
         "stream": lambda: stream(stream_of(key)),
     }
+
+    def release(key: str) -> tuple[str, str]:
+        robot, identity = keys.robot_from_key(key), key.rpartition("/")[2]
+        if keys.release_key(robot, identity) != key:
+            raise InvalidInput(key)
+        return robot, identity
+
+    def of_robot(key_of: Callable[[str], str]) -> Json:
+        robot = keys.robot_from_key(key)
+        if key_of(robot) != key:
+            raise InvalidInput(key)
+        return {"robot": robot}
 
     def owned(robot: str, identity: str) -> Json:
         return {"robot": robot, "id": parts(WriterId.parse(identity))}

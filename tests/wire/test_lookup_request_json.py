@@ -45,7 +45,7 @@ def test_the_fields_have_the_names_of_the_constructor() -> None:
         (b'{"target": "a", "source": "b", "translation": [0, 0], "rotation": [0, 0, 0, 1]}', "translation"),
         (b'{"target": 1, "source": "b", "translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}', "target"),
         (b'{"source": "b", "translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}', "target"),
-        (b'{"targt": "a"}', "targt"),
+        (b'{"targt": "a"}', "target"),
         (b"{", "truncated"),
         (b"\xff", "JSON"),
     ],
@@ -53,6 +53,11 @@ def test_the_fields_have_the_names_of_the_constructor() -> None:
 def test_malformed_transform_is_refused_with_the_field(text: bytes, named: str) -> None:
     with pytest.raises(MessageError, match=named):
         from_json(text)
+
+
+def test_members_of_later_versions_are_ignored() -> None:
+    transform = Transform("a", "b", (1, 2, 3), (0, 0, 0, 1))
+    assert from_json(json.dumps({**json.loads(to_json(transform)), "session": 7})) == transform
 
 
 def test_invalid_pose_is_refused_as_by_the_constructor() -> None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -26,6 +27,9 @@ _EARLY = 1024
 EARLY_BYTES = 4 * 2**20
 _EARLY_HISTORY = 20_000
 _EARLY_HISTORY_BYTES = 16 * 2**20
+
+SILENT_S = 2.0
+"""A writer without a token that has sent nothing for this long no longer replaces an announced one."""
 
 # Of one stream; a hostile writer can make up any number of sessions.
 _MAX_UNANNOUNCED = 256
@@ -76,6 +80,8 @@ class StreamIngest(ABC):
         self._writers: BoundedDict[int, str] = BoundedDict()
         self._session: int | None = None
         self._ended_sessions: BoundedDict[int, None] = BoundedDict()
+        # The sample that was expected next, and when [s], since a replaced writer was first refused.
+        self._silence: tuple[int | None, float] = None, 0.0
         self._next_seq: int | None = None
         self._newest: int | None = None
         self._newest_recalled_seq = -1
@@ -338,7 +344,9 @@ class StreamIngest(ABC):
         """Whether samples of this session are inserted: those of the newest writer to appear."""
         session = sample.session
         if session in self._ended_sessions:
-            return False
+            if session not in self._writers or not self._is_unannounced_and_silent():
+                return False
+            del self._ended_sessions[session]
         if session != self._session:
             if self._session is not None:
                 self._ended_sessions[self._session] = None
@@ -348,12 +356,22 @@ class StreamIngest(ABC):
             self._clear_early_history()
             self._missing = MissingSamples()
             self._next_seq = None
+            self._silence = None, 0.0
             self._last_late = self._newest = None
             self._newest_recalled_seq = -1
             if self._update_domain():
                 self._drop_history()  # stamps of two clocks cannot be compared
             self._on_writer_changed()
         return True
+
+    def _is_unannounced_and_silent(self) -> bool:
+        """Whether the current writer has no token, and its samples have ended: called for those of others."""
+        now_s = time.monotonic()
+        if self._session in self._writers:
+            return False
+        if self._silence[0] != self._next_seq:
+            self._silence = self._next_seq, now_s
+        return now_s - self._silence[1] >= SILENT_S
 
     def _replace_session(self, sample: Sample) -> None:
         """Handle the first sample of another writer, which begins a new epoch."""

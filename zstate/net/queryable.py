@@ -26,6 +26,7 @@ from zstate.net.streams import Receiver, call_for_each
 from zstate.transform import Transform
 from zstate.wire.keys import lookup_key
 from zstate.wire.lookup_request import LookupRequest, error_from_json, from_json
+from zstate.wire.messages import SAMPLE_BYTES
 
 MAX_REPLIES = 100_000
 """Limit of the replies to one query that are used. More are counted, and logged as a warning."""
@@ -289,6 +290,9 @@ def query_lookup(
     )
     # Without consolidation the first reply arrives before the end of the query.
     for reply in query(session.zenoh, selector, timeout_s, consolidation=zenoh.ConsolidationMode.NONE):
+        value = reply.ok or reply.err
+        if value is None or len(value.payload) > SAMPLE_BYTES:
+            continue
         # A reply on another key, such as one with a wildcard, is not from this robot.
         if reply.ok is not None and str(reply.ok.key_expr) == key:
             return from_json(reply.ok.payload.to_bytes())

@@ -86,8 +86,8 @@ def error_from_json(text: bytes) -> ZStateError:
     return NetworkError(f"refused: {message}")
 
 
-class TransformJson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The fields of ``Transform.to_dict``, with their types."""
+class TransformJson(msgspec.Struct, frozen=True):
+    """The fields of ``Transform.to_dict``, with their types. Further ones, of later versions, are ignored."""
 
     target: str
     source: str

@@ -158,9 +158,10 @@ class WriterTransforms(TransformSample, frozen=True, array_like=True, gc=False):
     covariances: bytes | None = None
 
     def __post_init__(self) -> None:
+        if self.edges is None:
+            raise InvalidInput("the transforms of a writer name their edges")
         _check_poses(self.poses, self.edges)
-        if self.edges is not None:
-            _check_order(self.order, self.edges)
+        _check_order(self.order, self.edges)
         if self.covariances is not None and len(self.covariances) != 3 * len(self.poses):
             raise InvalidInput(
                 f"{len(self.poses) // POSE_BYTES} poses take 21 numbers of covariance each; got "
@@ -180,9 +181,9 @@ class Odometry(WriterTransforms, frozen=True, array_like=True, gc=False):
     twist_covariance: bytes | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.edges is None or len(self.edges) != 1:
             raise InvalidInput(f"odometry has one edge, from its frame to the base; got {self.edges}")
+        super().__post_init__()
         _finite_numbers("a twist", self.twist, 6)
         _check_covariance("a twist", self.twist_covariance, 6)
 

@@ -102,6 +102,7 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
 _MIN_LIMIT_BYTES = 1_000
 
 MAX_MESSAGE_BYTES: dict[type[Message], int] = {
+    ClockMessage: 1_000,
     Status: 64_000,
     DriverState: 256_000,
     Stop: 8_000,
