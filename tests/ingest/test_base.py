@@ -280,6 +280,18 @@ def test_announced_writer_stays_refused_while_an_unannounced_one_sends(
     assert case.counters.stats().refused == {"second writer": 5}
 
 
+def test_replaced_writer_is_accepted_again_with_its_own_description(case: IngestCase):
+    case.ingest.describe(description())
+    case.receive(case.sample(0, [1.0, 1.0], session=1))
+    case.ingest.describe(msgspec.structs.replace(description(SWAPPED), session=2))
+    case.receive(case.sample(1, [0.0, 0.0], session=2))
+    case.ingest.writer_left(2)
+    received = case.counters.stats().received
+    case.receive(case.sample(3, [2.0, 2.0], session=1))
+    assert case.counters.stats().received == received + 1
+    assert case.elbow_is([2.0, 2.0], at=3)
+
+
 def test_replaced_writer_is_accepted_again_after_the_newer_one_left(case: IngestCase):
     case.ingest.describe(description())
     case.receive(case.sample(0, [1.0, 1.0], session=1), case.sample(1, [2.0, 2.0], session=2))

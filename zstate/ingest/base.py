@@ -31,6 +31,9 @@ _EARLY_HISTORY_BYTES = 16 * 2**20
 SILENT_S = 2.0
 """A writer without a token that has sent nothing for this long no longer replaces an announced one."""
 
+# Of the last sessions; each may have 16 MB.
+_MAX_DESCRIPTIONS = 4
+
 # Of one stream; a hostile writer can make up any number of sessions.
 _MAX_UNANNOUNCED = 256
 
@@ -93,6 +96,7 @@ class StreamIngest(ABC):
         # The clock domain of each session, by its description, and the last one described.
         self._domains: BoundedDict[int, str] = BoundedDict()
         self._domain: str | None = None
+        self._descriptions: dict[int, RobotDescription] = {}
         self._has_joined_domain = False
         self._departed_session: int | None = None
         self._fast_order = b""
@@ -288,6 +292,10 @@ class StreamIngest(ABC):
         with self._lock:
             self._domain = description.clock
             self._domains[description.session] = description.clock
+            self._descriptions.pop(description.session, None)
+            self._descriptions[description.session] = description
+            if len(self._descriptions) > _MAX_DESCRIPTIONS:
+                del self._descriptions[next(iter(self._descriptions))]
             self._update_domain()
 
     def _update_domain(self) -> bool:
@@ -362,6 +370,8 @@ class StreamIngest(ABC):
             if self._update_domain():
                 self._drop_history()  # stamps of two clocks cannot be compared
             self._on_writer_changed()
+            if session in self._descriptions:  # that of a writer which it replaced may be in use
+                self.describe(self._descriptions[session])
         return True
 
     def _is_unannounced_and_silent(self) -> bool:
