@@ -224,7 +224,8 @@ class Session(Closeable):
         """Note that this session has undeclared a queryable on ``key``, which other sessions may have, too.
 
         Zenoh 1.10 keeps such a queryable in its routes while another session has an equal one. Once this
-        session had closed, queries on ``key`` would end only at their timeout (mended by Zenoh #2660).
+        session had closed, queries on ``key`` would end only at their timeout. Its pull request 2660 mends
+        that between routers, not for clients and peers.
         """
         if "/@" not in key:  # keys of one writer each, without end
             self._ended_queryables.add(key)
@@ -302,6 +303,6 @@ class Session(Closeable):
         with suppress(zenoh.ZError):  # it was delayed for too long
             # A queryable that its session still has at its end is removed from all routes.
             channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(1)
-            held = [self._raw.declare_queryable(key, channel) for key in self._ended_queryables]
+            held = [self._raw.declare_queryable(key, channel) for key in tuple(self._ended_queryables)]
             self._raw.close()
             del held
