@@ -88,5 +88,6 @@ def _escaped(text: str) -> str:
     """Plain text with code in backticks, as Markdown."""
     code = re.split(r"(`[^`]*`)", text)
     return "".join(
-        part if part.startswith("`") else re.sub(r"([\\*_\[\]<>#{}$|])", r"\\\1", part) for part in code
+        part if part.startswith("`") else re.sub(r"([\\*_\[\]<>#{}$|]|^%)", r"\\\1", part, flags=re.MULTILINE)
+        for part in code
     )

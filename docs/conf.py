@@ -45,10 +45,12 @@ nitpicky = True
 # Inventories of other projects are on other hosts, so that names of theirs are no links.
 nitpick_ignore_regex = [
     ("py:.*", r"(collections|numpy|os|pathlib|threading|zenoh)\..*"),
-    ("py:class", "|".join(("NDArray", "msgspec.Meta", r"(.*\.)?(S|M|_\w+)", *_ALIASES))),
+    ("py:class", "|".join(("NDArray", "msgspec.Meta", r"(.*\.)?(S|M|_\w+|\w+Like)", *_ALIASES))),
 ]
 
-autodoc_default_options = {"members": True, "member-order": "bysource"}
+# With members of base classes, up to those named here.
+_BASES = "BaseException,ImportError,LookupFailed,OSError,Struct,ZStateError,object,str,tuple"
+autodoc_default_options = {"members": True, "member-order": "bysource", "inherited-members": _BASES}
 autodoc_typehints_format = "short"
 autodoc_type_aliases = {name: name for name in _ALIASES}
 TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # as printed in a union, such as Floats | None

@@ -59,9 +59,13 @@ def addresses_on_other_hosts(site: Path) -> list[str]:
     return sorted(address for address in loaded if re.match(r"(?!data:)\w+:|//", address))
 
 
-def names_without_reference(site: Path) -> list[str]:
+def described_names(site: Path) -> set[str]:
     inventory = zlib.decompress((site / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode()
-    described = {line.split(" ")[0] for line in inventory.splitlines()}
+    return {line.split(" ")[0] for line in inventory.splitlines()}
+
+
+def names_without_reference(site: Path) -> list[str]:
+    described = described_names(site)
     names = [(module, name) for module in PUBLIC for name in import_module(module).__all__]
     assert len(names) > 90
     homes = ("zstate", "zstate.errors")  # of names that two modules have
@@ -70,6 +74,19 @@ def names_without_reference(site: Path) -> list[str]:
         for module, name in names
         if not described & {f"{home}.{name}" for home in (module, *homes)}
     ]
+
+
+def methods_without_reference(site: Path) -> list[str]:
+    """Methods that guides call, inherited ones too."""
+    described = {name.rpartition(".")[2] for name in described_names(site)}
+    guides = "".join(path.read_text() for path in (ROOT / "docs" / "guides").glob("*.md"))
+    called = set(re.findall(r"\.(\w+)\(", guides))
+    public = [
+        getattr(import_module(module), name) for module in PUBLIC for name in import_module(module).__all__
+    ]
+    methods = {name for name in called for one in public if isinstance(one, type) and hasattr(one, name)}
+    assert {"insert_joints", "add_robot", "frames"} <= methods
+    return sorted(methods - described)
 
 
 def commands_without_reference(site: Path) -> list[str]:
@@ -82,4 +99,14 @@ def test_every_page_of_the_repository_is_in_the_site(site: Path) -> None:
     files = chain.from_iterable((ROOT / "docs").rglob(pattern) for pattern in ("*.md", "*.ipynb"))
     pages = {path.relative_to(ROOT / "docs").with_suffix(".html") for path in files}
     contents = (site / "index.html").read_text()
-    assert [str(page) for page in pages if f'href="{page}"' not in contents and page.stem != "index"] == []
+    return [str(page) for page in pages if f'href="{page}"' not in contents and page.stem != "index"]
+
+
+def test_site_is_complete_and_loads_nothing_from_other_hosts(tmp_path: Path) -> None:
+    build(tmp_path)
+    assert addresses_on_other_hosts(tmp_path) == []
+    assert names_without_reference(tmp_path) == []
+    assert methods_without_reference(tmp_path) == []
+    assert commands_without_reference(tmp_path) == []
+    assert "%j;" in (tmp_path / "commands.html").read_text()  # begins a line of help; a comment in MyST
+    assert pages_without_link(tmp_path) == []

@@ -373,8 +373,9 @@ class StatePublisher(SamplePublisher):
     def run(self, source: JointSource, rate_hz: float = 100.0, *, seconds: float | None = None) -> RateReport:
         """Publish the readings of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
 
-        Each tick has an absolute deadline; ``Rate`` describes late ticks. If the source has no new
-        reading, the tick publishes nothing. Raises SecondWriter.
+        Each tick has an absolute deadline: a late one does not delay the next. After a delay of more than
+        0.1 s, ticks in the past are skipped and counted. If the source has no new reading, the tick
+        publishes nothing. Raises SecondWriter.
         """
 
         def publish(reading: JointReading, now: int) -> None:

@@ -246,8 +246,8 @@ class TransformPublisher(EdgePublisher):
     ) -> RateReport:
         """Publish the transforms of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
 
-        Each tick has an absolute deadline; ``Rate`` describes late ticks. If the source has nothing new, the
-        tick publishes nothing. Raises as ``publish``.
+        Deadlines and late ticks are those of ``StatePublisher.run``. If the source has nothing new, the tick
+        publishes nothing. Raises as ``publish``.
         """
 
         def publish(transforms: Sequence[Transform], now: int) -> None:

@@ -116,7 +116,7 @@ class Recording(Closeable):
         return Recording, (self.info.path, self.robot)
 
     def joint_states(self, robot: str | None = None) -> JointTrajectory:
-        """All joint states of ``robot``, by default of the only one: those of its last history, see above.
+        """All joint states of ``robot``, by default of the only one: those of its last history.
 
         Of samples with one stamp the later one counts. Samples without a finite position of every joint
         are left out; the first of each reason is logged. If drivers published some of the joints each, the

@@ -110,7 +110,7 @@ class ScanPublisher(SensorPublisher):
         """Publish the sweeps of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
 
         Each sweep ends at its tick, unless ``source`` returns a Scan. Raises as ``publish``, and InvalidInput
-        for a Scan of another geometry or frame; ``Rate`` describes late ticks.
+        for a Scan of another geometry or frame; late ticks are those of ``StatePublisher.run``.
         """
 
         def publish(sweep: Scan | ArrayLike, now: int) -> None:
