@@ -6,6 +6,7 @@ and Furo's pages make no request to other hosts. Pages are Markdown, read by MyS
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import sys
@@ -99,7 +100,9 @@ def _for_page(file: Path, page: Path, link: str) -> str:
     _, hash_, anchor = link.partition("#")
     inside = target.relative_to(ROOT).as_posix()
     target = DOCS / PAGES[inside] if inside in PAGES else target
-    is_shown = target.suffix in (".png", ".svg") or (target.suffix == ".md" and target.is_relative_to(DOCS))
+    is_shown = target.suffix in (".png", ".svg") or (
+        target.suffix in (".md", ".ipynb") and target.is_relative_to(DOCS)
+    )
     if is_shown:
         return os.path.relpath(target, page.parent) + hash_ + anchor
     return f"{REPOSITORY}/{'tree' if target.is_dir() else 'blob'}/main/{inside}{hash_}{anchor}"
@@ -113,6 +116,10 @@ def _read_page(app: Sphinx, name: str, content: list[str]) -> None:
     page = Path(app.env.doc2path(name))
     if name == "commands":
         content[0] = command_reference()
+    if page.suffix == ".ipynb":
+        book = json.loads(content[0])
+        book["cells"][0]["source"] += ["\n\n", f"{{download}}`Download this notebook <{page.name}>`"]
+        content[0] = json.dumps(book)
     content[0] = _with_links(content[0], page, page)
 
 

@@ -27,14 +27,17 @@ def robots_command(name: str, *, as_json: bool) -> None:
     from zstate.model.load import catalog
 
     everything = catalog()
+    has_extra = any(entry.origin == "example-robot-data" for entry in everything)
+    more = "" if has_extra else "for many more: pip install 'zstate[robots]'"
     entries = [entry for entry in everything if name.lower() in entry.name]
     if not entries and not as_json:
-        fail(f"no name of a robot model contains {name!r}; `zstate robots` lists all {len(everything)}")
+        found = f"no name of a robot model contains {name!r}; `zstate robots` lists all {len(everything)}"
+        fail("; ".join(filter(None, (found, more))))
     if as_json:
         print_json([{"name": one.name, "path": str(one.path), "origin": one.origin} for one in entries])
         return
     for line in in_columns([(entry.name, entry.origin) for entry in entries]):
         print_result(line)
     print_status(f"{count_text(len(entries), 'robot')}; a path to a URDF or xacro file works as well")
-    if not any(entry.origin == "example-robot-data" for entry in everything):
-        print_status("for many more: pip install 'zstate[robots]'")
+    if more:
+        print_status(more)
