@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
+from functools import cache
 from itertools import groupby
 
 import click
@@ -35,8 +36,7 @@ def command_reference() -> str:
         parts.append(f"## {section}")
         for name in named:
             parts += _command_parts(contexts[name], "###")
-    network = [option for option in _options(contexts["ls"]) if _is_network(option)]
-    return "\n\n".join([*parts, _NETWORK_OPTIONS, *_option_parts("zstate", network)])
+    return "\n\n".join([*parts, _NETWORK_OPTIONS, *_option_parts("zstate", _network_options())])
 
 
 def _context(group: click.Group, name: str, parent: click.Context) -> click.Context:
@@ -74,8 +74,15 @@ def _options(context: click.Context) -> list[Option]:
     return [record for record in records if record is not None]
 
 
+@cache
+def _network_options() -> list[Option]:
+    """The options that commands share; some have one of the same name with a meaning of its own."""
+    context = _context(main.group, "ls", click.Context(main.group, info_name="zstate"))
+    return [option for option in _options(context) if option[0].split(" ")[0] in main._NETWORK]
+
+
 def _is_network(option: Option) -> bool:
-    return option[0].split(" ")[0] in main._NETWORK
+    return option in _network_options()
 
 
 def _option_parts(program: str, options: list[Option]) -> Iterator[str]:
