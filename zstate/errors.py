@@ -138,7 +138,7 @@ class ModelError(ZStateError, ValueError):
         self.source = source
         self.findings = tuple(findings)
         errors = [finding for finding in findings if finding.severity == "error"]
-        count = f"{len(errors)} error{'s' if len(errors) != 1 else ''}"
+        count = f"{len(errors)} finding{'s' if len(errors) != 1 else ''}"
         lines = [f"{source} cannot be used ({count})"]
         for finding in errors:
             where = "file" if finding.line is None else f"line {finding.line}"

@@ -48,7 +48,7 @@ def test_a_missing_file_is_an_error_with_its_path(
 def test_the_findings_have_the_path_as_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     Path("bad.urdf").write_text("<robot/>")
-    with pytest.raises(ModelError, match=r"^bad.urdf cannot be used \(1 error\)\n  line 1  "):
+    with pytest.raises(ModelError, match=r"^bad.urdf cannot be used \(1 finding\)\n  line 1  "):
         load_model("bad.urdf")
 
 

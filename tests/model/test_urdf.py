@@ -160,7 +160,7 @@ def test_all_findings_are_reported_in_the_order_of_lines():
         (11, "error"),
     ]
     assert str(error).startswith(
-        "arm.urdf cannot be used (3 errors)\n  line 8  joint 'a' has the unknown type"
+        "arm.urdf cannot be used (3 findings)\n  line 8  joint 'a' has the unknown type"
     )
 
 
