@@ -140,6 +140,7 @@ def test_wheels_ahead_of_the_imu_do_not_move_the_state_beyond_its_last_reading(s
         ticks = iter(range(STAMP, STAMP + 1_000_000_000_000, 5_000_000))
         until(lambda: imu.publish([0, 0, 0], [0, 0, 9.80665], next(ticks)) or stamps)
         last = next(ticks)
+        until(lambda: stamps[-1] == last - 5_000_000)  # the node has taken all readings before
 
         def has_wheels() -> bool:
             for ahead in (40_000_000, 60_000_000):
