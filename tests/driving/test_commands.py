@@ -13,6 +13,7 @@ from zstate.errors import InvalidInput, MessageError
 
 DT = 0.004
 TICK = 4_000_000
+MS = 1_000_000
 TTL = 6 * TICK
 EXACT = 1e-9
 COUNT = 6
@@ -161,18 +162,37 @@ def test_no_sequence_of_modes_commands_silences_and_stops_exceeds_a_limit(modes:
     assert bool(braked) == ("effort" in modes)
 
 
+def _send(targets: Targets, session: int, arrived: int, ttl_ns: int = TTL) -> None:
+    targets.check_session(session, arrived, str)
+    at = np.array([0], dtype=np.intp)
+    targets.accept(Command(session, arrived, at, np.zeros(1), arrived, arrived + ttl_ns))
+
+
 def test_a_commander_whose_token_vanishes_for_a_moment_stays_the_only_one_while_it_sends():
     targets = Targets(1)
-
-    def send(session: int, arrived: int) -> None:
-        targets.check_session(session, arrived, str)
-        at = np.array([0], dtype=np.intp)
-        targets.accept(Command(session, arrived, at, np.zeros(1), arrived, arrived + TTL))
-
-    send(1, TICK)
+    _send(targets, 1, TICK)
     targets.set_announced(1, alive=False, now=2 * TICK)
-    send(1, 3 * TICK)
+    _send(targets, 1, 3 * TICK)
     with pytest.raises(MessageError, match="while commands of 1 are valid"):
-        send(2, 4 * TICK)
+        _send(targets, 2, 4 * TICK)
     targets.set_announced(1, alive=False, now=4 * TICK)  # it has closed: the next one need not wait
-    send(2, 4 * TICK)
+    _send(targets, 2, 4 * TICK)
+
+
+def test_the_end_of_a_commander_may_overtake_its_last_command():
+    """The token and the commands of a commander take different ways; 0.2 s of silence decide."""
+    targets, ttl_ns = Targets(1), 10_000 * MS
+    _send(targets, 1, 100 * MS, ttl_ns)
+    targets.set_announced(1, alive=False, now=101 * MS)
+    _send(targets, 1, 150 * MS, ttl_ns)
+    with pytest.raises(MessageError, match="while commands of 1 are valid"):
+        _send(targets, 2, 350 * MS)
+    _send(targets, 2, 351 * MS)
+
+
+def test_a_commander_without_a_token_that_still_sends_after_a_while_stays_the_only_one():
+    targets, ttl_ns = Targets(1), 10_000 * MS
+    targets.set_announced(1, alive=False, now=101 * MS)
+    _send(targets, 1, 302 * MS, ttl_ns)
+    with pytest.raises(MessageError, match="while commands of 1 are valid"):
+        _send(targets, 2, 600 * MS)

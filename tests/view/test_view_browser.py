@@ -147,7 +147,7 @@ def test_beyond_loopback_a_browser_needs_the_token(browser, open_tab, sessions):
         view.draw()
         without_token = browser.new_page()
         without_token.goto(f"http://127.0.0.1:{page.port}/")
-        assert "asks for its token" in without_token.locator("body").inner_text()
+        assert "requires its token" in without_token.locator("body").inner_text()
         without_token.close()
         view_tab = open_tab(f"http://127.0.0.1:{page.port}/?token={page.access.token}", 640, 400)
         until(page.connected.is_set)

@@ -38,6 +38,9 @@ _WAITING = 32
 _SLACK_BYTES = 1024
 """Above what the numbers and names of the joints take: for what later versions append to a command."""
 
+_OVERTAKEN_NS = 200_000_000
+"""A command may arrive so much later than the end of the token of its commander."""
+
 NO_DEADLINE = -1
 NO_RATES: Mapping[int, Rate] = {}
 NO_COLUMNS = np.array([], dtype=np.intp)
@@ -283,7 +286,7 @@ class Targets:
 
     def check_session(self, session: int, now: int, name_of: Callable[[int], str]) -> None:
         """Raise MessageError for another session than the active one, unless that is gone."""
-        if session != self.session and not self.is_gone(self.session) and self.is_live(now):
+        if session != self.session and not self.is_gone(self.session, now) and self.is_live(now):
             left = format_duration(self._last_deadline - now)
             text = f"it came from {name_of(session)}, while commands of {name_of(self.session)} are valid"
             raise MessageError(f"{text} for {left} more", reason="second commander")
@@ -295,12 +298,17 @@ class Targets:
         else:
             self._gone[session] = now
 
-    def is_gone(self, session: int) -> bool:
-        """Whether the active commander, of ``session``, has closed: it has sent nothing since its token went.
+    def is_gone(self, session: int, now: int) -> bool:
+        """Whether the active commander, of ``session``, has closed: it sends nothing since its token went.
 
-        A token may vanish for a moment, as with a router, while its commander goes on.
+        A token may vanish for a moment, as with a router, while its commander goes on. Its end may also
+        overtake the last commands: those of the next 0.2 s are the last ones if 0.2 s pass without another.
         """
-        return self._gone.get(session, NO_DEADLINE) >= self.arrived
+        gone = self._gone.get(session)
+        if gone is None:
+            return False
+        was_overtaken = self.arrived - gone <= _OVERTAKEN_NS < now - self.arrived
+        return self.arrived <= gone or was_overtaken
 
     def merged(self, command: Command, present: Floats) -> Floats:
         """The positions of ``command``; ``present`` ones for all other joints."""

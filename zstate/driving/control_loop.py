@@ -414,6 +414,6 @@ class ControlLoop:
     def _silence_text(self, now: int) -> str:
         commander = self.targets.session
         name = self._name_of(commander)
-        if self.targets.is_gone(commander):
+        if self.targets.is_gone(commander, now):
             return f"{name} has ended"
         return f"nothing from {name} for {format_duration(now - self.targets.arrived)}"

@@ -5,6 +5,7 @@ The odometry has a constant velocity, so each pose has one true value, whatever 
 
 from __future__ import annotations
 
+import re
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -123,7 +124,8 @@ def test_writer_frozen_for_a_second_is_stale_resumes_and_keeps_its_edge(start: S
     assert_all_true(reader, "odometry ")
     (error,) = rival.query("errors")
     assert f"pid {frozen.child.process.pid}" in error
-    assert "places 'r1/world' on 'r1/odom' already, as 'wheels' of 'r1'" in error
+    # "is placing" if the rival sees the claim of the edge before it sees its writer
+    assert re.search("(places|is placing) 'r1/world' on 'r1/odom' already, as 'wheels' of 'r1'", error)
     assert frozen.query("errors") == []
     assert reader.query("stats")["refused"] == {}
 
