@@ -430,7 +430,7 @@ RATCHETS = (
     Ratchet("modules in largest folder", modules_in_largest_folder, 18, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
     Ratchet("modules", lambda: len(modules()), 293, 270),  # 270 before odometry and Foxglove
-    Ratchet("lines", lines, 66_500, 36_000),  # 40,026 before moving frames, drivers, scans, driving, odometry
+    Ratchet("lines", lines, 66_600, 36_000),  # 40,026 before moving frames, drivers, scans, driving, odometry
     Ratchet("median body", median_body, 5, 6, at_least=True),
 )
 
