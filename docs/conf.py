@@ -36,7 +36,7 @@ RAW = REPOSITORY.replace("github.com", "raw.githubusercontent.com") + "/main"
 
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
 nb_execution_mode = "off"  # notebooks are shown with the outputs that they hold
-exclude_patterns = ["requirements*.txt", "**.ipynb_checkpoints"]
+exclude_patterns = ["**.ipynb_checkpoints"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
 smartquotes = False  # they turn -- of options into dashes

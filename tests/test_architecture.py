@@ -90,6 +90,7 @@ GUESTS = {
     ("cli/up/cell.py", "msgspec"),
     ("cli/commands/drive.py", "msgspec"),  # so is --param, into the types that a driver annotates
     ("scans/map_files.py", "PIL"),
+    ("transform.py", "pinocchio"),  # `Transform.se3`, when it is read
     ("view/server.py", "websockets"),  # what viser's server is made of
     # each reads one kind of file in YAML
     ("cli/up/static_edges.py", "yaml"),
