@@ -204,7 +204,8 @@ def test_writer_keeps_its_deadlines_if_sending_is_slow(job: Job) -> None:
     assert len(stamps) == 50
     assert time.monotonic() - began >= 0.245
     gaps = np.diff(np.array(stamps))
-    assert np.median(gaps) == pytest.approx(5e6, rel=0.1)
+    # 8 ms without deadlines; below 5 ms while it catches up after a pause of the machine.
+    assert 3e6 <= np.median(gaps) < 5.5e6
 
 
 def test_slow_reader_sleeps_in_the_answering_thread(job: Job) -> None:
