@@ -294,6 +294,15 @@ class Fuzz:
             if answer is not None:
                 repr((answer._pose, answer.stamp, answer.kind, answer.target, answer.predicted_s))
             path.failure_at(self.stamp())
+            found = path.at_with_windows(self.pick(None, None, self.stamp()))
+            if found is not None:
+                self.write()  # the blocks stay as they were read
+                for block, first, end in found[1]:
+                    stamps = np.frombuffer(block, np.int64, block.capacity)[first:end]
+                    assert first < end and (np.diff(stamps) > 0).all()
+            other = self.pick(self.paths[0], self.paths[0], *ODD)
+            both = path.at_both(*self.pick((self.stamp(), other, self.stamp()), (None, other, None), ()))
+            assert both is None or len(both) == 2
 
     def take_newer(self) -> None:
         for path in self.paths[-3:]:

@@ -12,7 +12,7 @@ from typing import Literal
 from zstate.errors import InvalidInput
 
 VARIABLE = "ZSTATE_KERNEL"
-REVISION = 11
+REVISION = 12
 """The REVISION that the extension must have; see there."""
 
 

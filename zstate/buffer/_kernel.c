@@ -50,7 +50,7 @@
 
 /* Raised with every change of the interface to Python, so that a library built from older source
  * (an editable install that was not rebuilt) is recognised and not used. */
-#define REVISION 11
+#define REVISION 12
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,

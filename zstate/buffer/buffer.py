@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.core import BufferCore
-from zstate.buffer.path import Plan, TransformPath
+from zstate.buffer.history import HistoryView
+from zstate.buffer.path import Plan, TransformPath, transforms_at_one_moment
 from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader, TimeSpan
 from zstate.buffer.tracks import JointTrack, Track
@@ -77,6 +78,8 @@ class TransformBuffer(BufferCore):
     def __init__(self, history_s: float = DEFAULT_HISTORY_S, clock: Clock | None = None) -> None:
         super().__init__(history_s, clock)
         self._snapshot_readers: dict[frozenset[str], SnapshotReader] = {}
+        # Those of one version of the tree, by the track of the robot and whether they read that track alone.
+        self._joint_readers: tuple[int, dict[tuple[JointTrack, bool], RobotJoints]] = (-1, {})
 
     def __repr__(self) -> str:
         robots = [repr(track.name) for track in list(self._tree.robots.values()) if track is not None]
@@ -145,10 +148,16 @@ class TransformBuffer(BufferCore):
         for name in (target, source, fixed):
             self._tree.resolve(name, target, source)
         # A missing connection, or two clocks, are reported before a bad time, on either side.
-        self.path(fixed, source)
-        self.path(target, source)
-        target_from_fixed = self.lookup(target, fixed, target_at)
-        fixed_from_source = self.lookup(fixed, source, source_at)
+        of_source, _, of_target = self.paths((fixed, source), (target, source), (target, fixed))
+        target_at = None if target_at is None else check_stamp(target_at)
+        source_at = None if source_at is None else check_stamp(source_at)
+        try:
+            target_from_fixed, fixed_from_source = transforms_at_one_moment(
+                of_target, target_at, of_source, source_at
+            )
+        except LookupFailed as reason:
+            self._complete(reason, None)
+            raise
         try:
             both = target_from_fixed @ fixed_from_source
         except InvalidInput:  # a product of large numbers
@@ -298,10 +307,7 @@ class TransformBuffer(BufferCore):
             path = self._cached_path(query.target, query.source).path
             transform = path.transform(query.at, query.predict_ns)
         except LookupFailed as reason:
-            if reason.requested is None:
-                reason.requested = query.at
-            if self._stop_reason:
-                reason.ended = self._stop_reason
+            self._complete(reason, query.at)
             raise
         if query.max_age_s is None:
             return transform
@@ -313,10 +319,21 @@ class TransformBuffer(BufferCore):
             )
             robot = self.domain.robot_placing(edge[1])
             raise ClockMismatch(*names, edges=(edge,), robots=(robot,), domains=domains)
-        age_s = transform.age(self.clock)
-        if path.uses and age_s > query.max_age_s:
-            raise path.stale(transform.stamp, age_s, query.max_age_s)
+        if path.uses and transform.age(self.clock) > query.max_age_s:
+            # Once more, of samples that the error describes.
+            views = path.views()
+            transform = path.transform_in(views, query.at, query.predict_ns)
+            age_s = transform.age(self.clock)
+            if age_s > query.max_age_s:
+                raise path.stale(views, transform.stamp, age_s, query.max_age_s)
         return transform
+
+    def _complete(self, reason: LookupFailed, at: int | None) -> None:
+        """Add to a lookup's error what the path does not know: the instant, and why no samples will come."""
+        if reason.requested is None:
+            reason.requested = at
+        if self._stop_reason:
+            reason.ended = self._stop_reason
 
     def _lookup_or_expect(self, query: Query, waiter: Waiter) -> Transform | LookupFailed:
         """The transform, or the reason that ``waiter`` expects to end. Raises one that no insert can end."""
@@ -405,7 +422,8 @@ class TransformBuffer(BufferCore):
         NoData, InPast, InFuture, Stale or NotFinite, which name the limiting driver, and InvalidInput for an
         unknown robot, with near misses.
         """
-        return self._robot_joints(robot).positions(None if at is None else check_stamp(at))
+        stamp = None if at is None else check_stamp(at)
+        return self._robot_joints(self._robot_track(robot)).positions(stamp)
 
     def joint_positions_many(
         self, robot: str, stamps: ArrayLike
@@ -415,7 +433,7 @@ class TransformBuffer(BufferCore):
         Rows without positions are NaN. Raises InvalidInput as ``joint_positions``.
         """
         instants = check_stamps(stamps)
-        return self._robot_joints(robot).positions_many(instants)
+        return self._robot_joints(self._robot_track(robot)).positions_many(instants)
 
     def joint_states(self, robot: str, start: int | None = None, end: int | None = None) -> JointTrajectory:
         """The samples of a robot that are kept, with stamps in [start, end): copies; efforts are not kept.
@@ -425,7 +443,7 @@ class TransformBuffer(BufferCore):
         ``joint_positions``.
         """
         start, end = (None if stamp is None else check_stamp(stamp) for stamp in (start, end))
-        return self._robot_joints(robot).samples(start, end)
+        return self._robot_joints(self._robot_track(robot)).samples(start, end)
 
     def link_poses(self, robot: str, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """Every link of a robot at a stamp, and that stamp: (L, 7), rows as the ``links`` of its model.
@@ -433,7 +451,7 @@ class TransformBuffer(BufferCore):
         Row i is ``root_from_link``: x y z [m], qx qy qz qw. Raises as ``joint_positions``.
         """
         track = self._robot_track(robot)
-        positions, stamp = self.joint_positions(robot, at)
+        positions, stamp = self._robot_joints(track).positions(None if at is None else check_stamp(at))
         poses = track.kinematics.link_poses(positions)
         unknown = ~np.isfinite(poses).all(axis=1)
         if unknown.any():
@@ -441,11 +459,19 @@ class TransformBuffer(BufferCore):
             raise NotFinite(track.frame(track.model.root), track.frame(link), requested=stamp)
         return poses, stamp
 
-    def _robot_joints(self, robot: str) -> RobotJoints:
-        return RobotJoints(self._robot_track(robot), self._read_views)
+    def _robot_joints(self, robot: JointTrack, *, own: bool = False) -> RobotJoints:
+        # The version is read first: a reader newer than its version is made again, never kept.
+        version = self._tree.version
+        if self._joint_readers[0] != version:
+            self._joint_readers = version, {}
+        readers = self._joint_readers[1]
+        reader = readers.get((robot, own))
+        if reader is None or not reader.is_current():
+            reader = readers[robot, own] = RobotJoints(robot, self._read_views, own=own)
+        return reader
 
-    def _positions_of_track(self, track: JointTrack, at: int) -> tuple[NDArray[np.float64], int]:
-        return RobotJoints(track, self._read_views, own=True).positions(at)
+    def _positions_in(self, view: HistoryView, track: JointTrack, at: int) -> NDArray[np.float64]:
+        return self._robot_joints(track, own=True).positions(at, (view,))[0]
 
     def snapshot(
         self, at: int | None = None, *, robots: Collection[str] = (), hold_s: float = 0.0
@@ -455,7 +481,8 @@ class TransformBuffer(BufferCore):
         ``robots`` restricts it to the frames of these, and those above them. A track is still read at its
         newest sample for ``hold_s`` after that. Beyond its samples poses are not known, with a reason.
         """
-        return self._snapshot_reader(robots).read(self._positions_of_track, at, round(hold_s * 1e9))
+        reader = self._snapshot_reader(robots)
+        return reader.read(self._read_views, self._positions_in, at, round(hold_s * 1e9))
 
     def frame_table(self, robots: Collection[str] = ()) -> FrameTable:
         """The frames that ``snapshot`` reads; the same object while neither the tree nor a writer changes."""

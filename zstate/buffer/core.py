@@ -17,7 +17,7 @@ from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.covariance_path import compile_path_with_covariances
 from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreeSnapshot
 from zstate.buffer.history import FastPath, HistoryView, insert_together, keep_only_around
-from zstate.buffer.path import TrackUse, TransformPath
+from zstate.buffer.path import TransformPath
 from zstate.buffer.pose_tracks import (
     EdgeNames,
     Poses,
@@ -502,6 +502,15 @@ class BufferCore:
             edges = self._tree.path(target, source)
             return compile_path_with_covariances(target, source, edges, self._read_views, compiled=False)
 
+    def paths(self, *pairs: tuple[str, str]) -> list[TransformPath]:
+        """The paths between pairs of frames, all of them of one state of the tree."""
+        version = self._tree.version
+        paths = [self.path(*pair) for pair in pairs]
+        if self._tree.version == version:
+            return paths
+        with self._lock:
+            return [self.path(*pair) for pair in pairs]
+
     def _cached_path(self, target: str, source: str) -> CachedPath:
         version, cached = self._tree.version, self._paths.get((target, source))
         if cached is not None and cached.version == version:
@@ -518,11 +527,11 @@ class BufferCore:
         self._paths[target, source] = cached
         return cached
 
-    def _read_views(self, uses: Sequence[TrackUse]) -> list[HistoryView]:
+    def _read_views(self, tracks: Sequence[Track]) -> list[HistoryView]:
         """The views of several tracks at one moment between writes."""
         before = self._writes
-        views = [use.track.history.view for use in uses]
-        if len(uses) < 2 or (before == self._writes and not before & 1):
+        views = [track.history.view for track in tracks]
+        if len(tracks) < 2 or (before == self._writes and not before & 1):
             return views
         with self._lock:
-            return [use.track.history.view for use in uses]
+            return [track.history.view for track in tracks]

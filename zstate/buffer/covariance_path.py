@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from zstate import se3
 from zstate.buffer.frame_tree import TreePath
 from zstate.buffer.interpolation import Bracket, PoseStep, Step, bracket_at, chain_pose
-from zstate.buffer.path import Stamps, TransformPath, ViewReader, compile_path
+from zstate.buffer.path import Stamps, TransformPath, ViewReader, Views, compile_path
 from zstate.buffer.tracks import PoseTrack
 from zstate.checks import Points
 from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
@@ -67,11 +67,15 @@ class CovariancePath(TransformPath):
         return step.use, track.covariance_columns(interpolators[step.column].column // 7)
 
     def at(self, stamp: object = None, /) -> Transform | None:
-        transform = self._path.at(stamp)
-        return None if transform is None else self._with_covariance(transform)
+        found = self._path.at_and_views(stamp)
+        return None if found is None else self._with_covariance(*found)
 
-    def transform(self, stamp: int | None, predict_ns: int = 0) -> Transform:
-        return self._with_covariance(self._path.transform(stamp, predict_ns))
+    @property
+    def without_covariances(self) -> TransformPath:
+        return self._path
+
+    def transform_in(self, views: Views, stamp: int | None, predict_ns: int = 0) -> Transform:
+        return self._with_covariance(self._path.transform_in(views, stamp, predict_ns), views)
 
     def raise_if_outside(self, stamp: object, /) -> None:
         self._path.raise_if_outside(stamp)
@@ -82,13 +86,13 @@ class CovariancePath(TransformPath):
     def place(self, points: Points, stamps: Stamps) -> tuple[Points, NDArray[np.bool_]]:
         return self._path.place(points, stamps)
 
-    def _with_covariance(self, transform: Transform) -> Transform:
+    def _with_covariance(self, transform: Transform, views: Views) -> Transform:
         """The transform with its covariance, which is computed when it is used; without one if unknown."""
         assert transform.stamp is not None
         brackets: list[Bracket] = []
-        for view in self.read_views(self.uses):
+        for view in views:
             now = bracket_at(view, transform.stamp)
-            if now is None:  # predicted, or dropped from the history in the last microseconds
+            if now is None:  # predicted
                 return transform
             brackets.append(now)
         for _, place in chain(*self._chains):

@@ -212,7 +212,11 @@ else:
         @property
         def view(self) -> HistoryView:
             """The samples for readers in Python; these arrays cannot be written to."""
-            block, first, end = self.window
+            return self.view_of(self.window)
+
+        def view_of(self, window: _kernel.Window) -> HistoryView:
+            """The samples that the extension read: they stay, whatever is inserted or removed since."""
+            block, first, end = window
             arrays = getattr(self, "_arrays", (None,))
             if arrays[0] is not block:
                 # Made once for each block, because waiters read after every insert.

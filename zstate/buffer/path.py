@@ -1,6 +1,7 @@
 """Paths between two frames: compiled once from the edges of the tree, evaluated at any stamp.
 
-An evaluation searches once in each track of the path, reads only the joints on it, and multiplies.
+An evaluation searches once in each track of the path, reads only the joints on it, and multiplies. All
+numbers of an answer come from one view of each track: its samples at one moment, whatever writers do since.
 ``TransformPath`` is the reference in Python. ``CompiledPath`` evaluates lookups in the C extension, which has
 no formula for cubic interpolation, prediction and velocities: the reference computes those.
 """
@@ -52,7 +53,9 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=LookupFailed)
 
 Stamps: TypeAlias = NDArray[np.int64]
-ViewReader: TypeAlias = Callable[[Sequence["TrackUse"]], list[HistoryView]]
+Views: TypeAlias = Sequence[HistoryView]
+ViewReader: TypeAlias = Callable[[Sequence[Track]], list[HistoryView]]
+TransformPair: TypeAlias = tuple[Transform, Transform]
 StepTuple: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
 """A step as the extension takes it: kind, track, column, whether the angle is continuous, numbers."""
 
@@ -84,8 +87,26 @@ class TransformPath:
     read_views: ViewReader
     domain: str = ""
 
+    def __post_init__(self) -> None:
+        self._tracks = tuple(use.track for use in self.uses)
+
+    @property
+    def without_covariances(self) -> TransformPath:
+        """The path of the same transforms without their covariances."""
+        return self
+
+    def views(self) -> Views:
+        """The views of all tracks at one moment."""
+        return self.read_views(self._tracks)
+
     def at(self, stamp: object = None, /) -> Transform | None:
         """The transform, if it is found at once; None if ``transform`` has to be used."""
+
+    def at_and_views(self, stamp: object = None, /) -> tuple[Transform, Views] | None:
+        """As ``at``, with the views that the transform is computed from."""
+
+    def at_both(self, stamp: object, other: TransformPath, other_stamp: object, /) -> TransformPair | None:
+        """``at`` of this path and of another one, at one moment; None unless both are found at once."""
 
     def raise_if_outside(self, stamp: object, /) -> None:
         """Raises the reason why there is no transform now, if it is found at once."""
@@ -100,24 +121,28 @@ class TransformPath:
             return transform
         if not predict_ns:
             self.raise_if_outside(stamp)
+        return self.transform_in(self.views(), stamp, predict_ns)
+
+    def transform_in(self, views: Views, stamp: int | None, predict_ns: int = 0) -> Transform:
+        """The same of given views of the tracks."""
         if not self.uses:
-            return Transform.trusted(self.target, self.source, self._finite_pose((), stamp), stamp, "static")
-        values, at, kind, predicted_ns = self.read(stamp, predict_ns)
-        pose = se3.normalize(self._finite_pose(values, at), se3.SCALARS)
+            pose = self._finite_pose((), (), stamp)
+            return Transform.trusted(self.target, self.source, pose, stamp, "static")
+        values, at, kind, predicted_ns = self.read(views, stamp, predict_ns)
+        pose = se3.normalize(self._finite_pose(views, values, at), se3.SCALARS)
         return Transform.trusted(self.target, self.source, pose, at, kind, predicted_ns * 1e-9)
 
     def latest_common_stamp(self) -> int:
         """The newest instant that every moving edge has reached [ns]. Raises NoData or Stale."""
         if not self.uses:
             raise NoData(self.target, self.source)
-        return self._latest(self.read_views(self.uses))
+        return self._latest(self.views())
 
-    def read(self, stamp: int | None, predict_ns: int = 0) -> tuple[Values, int, Kind, int]:
+    def read(self, views: Views, stamp: int | None, predict_ns: int = 0) -> tuple[Values, int, Kind, int]:
         """The values of each track at ``stamp``, or at the latest instant. Raises as ``transform``.
 
         Also the stamp [ns], how the values were made, and how far they are predicted [ns].
         """
-        views = self.read_views(self.uses)
         at = self._latest(views) if stamp is None else stamp
         kind: Kind = "exact"
         predicted_ns = 0
@@ -137,7 +162,7 @@ class TransformPath:
 
     def motion(self, stamp: int | None) -> tuple[Motion, int | None]:
         """Pose and velocity of the source in the target. Raises as ``transform``; NoData without rates."""
-        views = self.read_views(self.uses)
+        views = self.views()
         at = stamp if stamp is not None or not self.uses else self._latest(views)
         values: list[list[se3.Component]] = []
         rates: list[list[se3.Component]] = []
@@ -155,12 +180,11 @@ class TransformPath:
         above_target = chain_motion(self.steps_to_target, values, rates, se3.SCALARS)
         motion = above_target.inverse().then(chain_motion(self.steps_to_source, values, rates, se3.SCALARS))
         if not np.isfinite((*motion.linear, *motion.angular)).all():
-            raise self.not_finite(values, at)
+            raise self.not_finite(views, values, at)
         return motion, at
 
-    def values_at(self, stamps: Stamps) -> tuple[Values, NDArray[np.bool_]]:
+    def values_at(self, views: Views, stamps: Stamps) -> tuple[Values, NDArray[np.bool_]]:
         """The values of each track at the stamps that all of them cover, and (T,) which these are."""
-        views = self.read_views(self.uses)
         covered = np.ones(len(stamps), dtype=np.bool_)
         for view in views:
             covered &= (stamps >= view.oldest) & (stamps <= view.newest) if view.size else False
@@ -177,7 +201,11 @@ class TransformPath:
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """The pose at each stamp: (T, 7), NaN where it is not known, and (T,) where it is."""
-        values, valid = self.values_at(stamps)
+        return self.poses_in(self.views(), stamps)
+
+    def poses_in(self, views: Views, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """The same of given views of the tracks."""
+        values, valid = self.values_at(views, stamps)
         poses = np.full((len(stamps), 7), np.nan)
         if not valid.any():
             return poses, valid
@@ -194,8 +222,12 @@ class TransformPath:
 
         Also (N,) which are known; the others are NaN: rows without a pose, and points that are not finite.
         """
+        return self.place_in(self.views(), points, stamps)
+
+    def place_in(self, views: Views, points: Points, stamps: Stamps) -> tuple[Points, NDArray[np.bool_]]:
+        """The same of given views of the tracks."""
         instants, rows = np.unique(stamps, return_inverse=True)
-        found = self.poses(instants)[0][np.broadcast_to(rows, len(points))]
+        found = self.poses_in(views, instants)[0][np.broadcast_to(rows, len(points))]
         x, y, z, *rotation = se3.unstack(found)
         px, py, pz = points.astype(np.float64).T
         with np.errstate(over="ignore", invalid="ignore"):
@@ -205,13 +237,13 @@ class TransformPath:
         placed[~valid] = np.nan
         return placed, valid
 
-    def stale(self, stamp: int | None, age_s: float, max_age_s: float) -> Stale:
+    def stale(self, views: Views, stamp: int | None, age_s: float, max_age_s: float) -> Stale:
         """The error for a transform that is too old, naming the edge that is most behind."""
-        covered = [coverage(use.track.history.view) for use in self.uses]
+        covered = [coverage(view) for view in views]
         number = min(range(len(covered)), key=lambda n: covered[n].newest or 0)
         return self._failure(Stale, number, stamp, covered[number], age_s=age_s, max_age_s=max_age_s)
 
-    def failure_at(self, at: int, views: Sequence[HistoryView], predict_ns: int = 0) -> LookupFailed:
+    def failure_at(self, at: int, views: Views, predict_ns: int = 0) -> LookupFailed:
         """The error of the limiting track: one that begins later, else an empty one, else one that ends."""
         numbered = list(enumerate(views))
         too_young = [(view.oldest, n) for n, view in numbered if view.size and at < view.oldest]
@@ -249,7 +281,7 @@ class TransformPath:
                 failure.clock_offset_ns, failure.clock_uncertainty_ns = offset
         return failure
 
-    def _latest(self, views: Sequence[HistoryView]) -> int:
+    def _latest(self, views: Views) -> int:
         for number, view in enumerate(views):
             if not view.size:
                 raise self._failure(NoData, number, None, coverage(view))
@@ -264,19 +296,19 @@ class TransformPath:
             raise self._failure(Stale, number, None, coverage(views[number]), **facts)
         return newest
 
-    def _finite_pose(self, values: Values, at: int | None) -> se3.Pose:
+    def _finite_pose(self, views: Views, values: Values, at: int | None) -> se3.Pose:
         pose = self._pose(values, se3.SCALARS)
         if not all(map(math.isfinite, pose)):
-            raise self.not_finite(values, at)
+            raise self.not_finite(views, values, at)
         return pose
 
-    def not_finite(self, values: Values, at: int | None) -> NotFinite:
+    def not_finite(self, views: Views, values: Values, at: int | None) -> NotFinite:
         """The error for numbers that are too large, naming the edge with the largest."""
         if not self.uses:
             return NotFinite(self.target, self.source, requested=at)
         sizes = [np.abs(_flat(numbers)).max(initial=0.0) for numbers in values]
         number = int(np.argmax(sizes))
-        return self._failure(NotFinite, number, at, coverage(self.uses[number].track.history.view))
+        return self._failure(NotFinite, number, at, coverage(views[number]))
 
     def _pose(self, values: Values, f: se3.Backend) -> se3.Pose:
         target_from_top = chain_pose(self.steps_to_target, values, f)
@@ -313,16 +345,30 @@ class CompiledPath(TransformPath):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self._histories: tuple[Any, ...] = tuple(track.history for track in self._tracks)
         self._compiled = _kernel.Path(
             Transform,
             self.target,
             self.source,
             _step_tuples(self.steps_to_target, self.uses),
             _step_tuples(self.steps_to_source, self.uses),
-            tuple(use.track.history for use in self.uses),
+            self._histories,
         )
         # An attribute of the instance: a method in between would cost a third of the whole lookup.
         self.at = self._compiled.at
+
+    def at_and_views(self, stamp: object = None, /) -> tuple[Transform, Views] | None:
+        found = self._compiled.at_with_windows(stamp)
+        return None if found is None else (found[0], self._views_of(found[1]))
+
+    def at_both(self, stamp: object, other: TransformPath, other_stamp: object, /) -> TransformPair | None:
+        if not isinstance(other, CompiledPath):
+            return None
+        return self._compiled.at_both(stamp, other._compiled, other_stamp)
+
+    def _views_of(self, windows: _kernel.Windows) -> Views:
+        pairs = zip(self._histories, windows, strict=True)
+        return [history.view_of(window) for history, window in pairs]
 
     def raise_if_outside(self, stamp: object, /) -> None:
         failure = self._compiled.failure_at(stamp)
@@ -335,21 +381,22 @@ class CompiledPath(TransformPath):
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         poses, valid = np.empty((len(stamps), 7)), np.empty(len(stamps), np.bool_)
-        self._compiled.poses(stamps, poses, valid)
+        windows = self._compiled.poses(stamps, poses, valid)
         if not valid.all():
             # Its order of operations may overflow where that of the reference, which raises, does not.
-            poses[~valid], valid[~valid] = super().poses(stamps[~valid])
+            poses[~valid], valid[~valid] = self.poses_in(self._views_of(windows), stamps[~valid])
         return poses, valid
 
     def place(self, points: Points, stamps: Stamps) -> tuple[Points, NDArray[np.bool_]]:
         placed, valid = np.empty_like(points, order="C"), np.empty(len(points), np.bool_)
-        self._compiled.place(points, stamps, placed, valid)
+        windows = self._compiled.place(points, stamps, placed, valid)
         rest = ~valid
         if rest.any():
             rest &= np.isfinite(points).all(axis=1)
         if rest.any():  # as in poses
             their_stamps = stamps if len(stamps) == 1 else stamps[rest]
-            placed[rest], valid[rest] = super().place(points[rest], their_stamps)
+            views = self._views_of(windows)
+            placed[rest], valid[rest] = self.place_in(views, points[rest], their_stamps)
         return placed, valid
 
 
@@ -439,6 +486,23 @@ def _joint_numbers(form: JointTransform, before: se3.Pose) -> tuple[float, ...]:
     placed, q = se3.compose(before, (*form.t0, *form.q_cos)), before[3:]
     axis = se3.multiply(q, form.q_sin) if form.kind == "revolute" else se3.rotate(q, form.t1)
     return (form.scale, form.shift, *placed[3:], *placed[:3], *axis)
+
+
+def transforms_at_one_moment(
+    first: TransformPath, first_at: int | None, second: TransformPath, second_at: int | None
+) -> TransformPair:
+    """The transforms of two paths, of one view of each track, without covariances.
+
+    Raises as ``TransformPath.transform``, that of the first path before that of the second.
+    """
+    first, second = first.without_covariances, second.without_covariances
+    both = first.at_both(first_at, second, second_at)
+    if both is not None:
+        return both
+    tracks = tuple({use.track: None for path in (first, second) for use in path.uses})
+    views = dict(zip(tracks, first.read_views(tracks), strict=True))
+    transform = first.transform_in([views[use.track] for use in first.uses], first_at)
+    return transform, second.transform_in([views[use.track] for use in second.uses], second_at)
 
 
 class Plan:

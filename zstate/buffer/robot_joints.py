@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.buffer.path import TrackUse, TransformPath, ViewReader, joint_interpolators
+from zstate.buffer.path import TrackUse, TransformPath, ViewReader, Views, joint_interpolators
 from zstate.buffer.tracks import JointTrack
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.robot import POSITION_COUNTS, coordinate_names, velocity_columns_by_position
@@ -30,29 +30,39 @@ class RobotJoints:
         for name in robot.model.joint_names:
             joints.setdefault(parts.get(name, robot), []).append(name)
         self._tracks = tuple(joints)
+        self._widths = [track.history.width for track in self._tracks]
         root = robot.frame(robot.model.root)
         uses = [_use(track, names) for track, names in joints.items()] or [TrackUse(robot, [], (root, root))]
         # A path without steps: it reads the values, and its errors name the limiting joint's edge.
         self._path = TransformPath(root, root, (), (), uses, read_views)
         self._columns = [_columns(robot, names) for names in joints.values()]
 
-    def positions(self, at: int | None) -> tuple[Floats, int]:
+    def is_current(self) -> bool:
+        """Whether the samples of its tracks have the same columns as when this was made."""
+        return self._widths == [track.history.width for track in self._tracks]
+
+    def positions(self, at: int | None, views: Views | None = None) -> tuple[Floats, int]:
         """All positions (nq,) at a stamp [ns], and that stamp; by default the newest that all tracks reach.
 
-        Raises NoData, InPast, InFuture, Stale or NotFinite.
+        Of the samples in ``views`` of its tracks, if they are given. Raises NoData, InPast, InFuture, Stale
+        or NotFinite.
         """
-        values, stamp, *_ = self._path.read(at)
+        views = self._path.views() if views is None else views
+        values, stamp, *_ = self._path.read(views, at)
         positions = np.empty(self._robot.position_count)
         for columns, numbers in zip(self._columns, values, strict=False):
             positions[columns] = np.hstack(numbers)
         if not np.isfinite(positions).all():
-            raise self._path.not_finite(values, stamp)
+            raise self._path.not_finite(views, values, stamp)
         return positions, stamp
 
     def positions_many(self, stamps: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
         """All positions at each stamp, (T, nq), NaN where they are not known, and (T,) where they are."""
+        return self._positions_in(self._path.views(), stamps)
+
+    def _positions_in(self, views: Views, stamps: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
         positions = np.full((len(stamps), self._robot.position_count), np.nan)
-        values, valid = self._path.values_at(stamps)
+        values, valid = self._path.values_at(views, stamps)
         for columns, numbers in zip(self._columns, values, strict=False):
             rows = [row for number in numbers for row in np.atleast_2d(number)]
             positions[np.ix_(valid, columns)] = np.stack(rows, axis=-1)
@@ -67,10 +77,11 @@ class RobotJoints:
         interpolated between a track's own samples, and velocities known at its samples only.
         """
         if self._tracks in ((), (self._robot,)):
-            return self._robot.samples(start, end)
-        parts = [track.samples(start, end) for track in self._tracks]
+            return self._robot.samples(self._robot.history.view, start, end)
+        views = self._path.views()
+        parts = [track.samples(view, start, end) for track, view in zip(self._tracks, views, strict=True)]
         stamps = np.unique(np.concatenate([part.stamps for part in parts]))
-        positions, valid = self.positions_many(stamps)
+        positions, valid = self._positions_in(views, stamps)
         model = self._robot.model
         coordinates, slots = coordinate_names(model), velocity_columns_by_position(model)
         slot_names = tuple(coordinates[slot] for slot in slots)

@@ -20,16 +20,17 @@ from zstate import se3
 from zstate.buffer.frame_tree import Edge, TreeSnapshot
 from zstate.buffer.history import HistoryView
 from zstate.buffer.interpolation import rows_around
+from zstate.buffer.path import ViewReader
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
-from zstate.errors import InPast, UnknownFrame, format_duration
+from zstate.errors import UnknownFrame, format_duration
 
 Poses: TypeAlias = NDArray[np.float64]
 Rows: TypeAlias = NDArray[np.intp]
 Mask: TypeAlias = NDArray[np.bool_]
 Duals: TypeAlias = NDArray[np.float64]
 """(N, 8): the rotation's quaternion x y z w, then the dual part in the same order."""
-JointReader: TypeAlias = Callable[[JointTrack, int], tuple[NDArray[np.float64], int]]
-"""The joint positions of a track at a stamp, and that stamp, as ``TransformBuffer.joint_positions``."""
+JointReader: TypeAlias = Callable[[HistoryView, JointTrack, int], NDArray[np.float64]]
+"""The joint positions of a track at a stamp, of a view of its history that covers it."""
 
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -213,14 +214,16 @@ class SnapshotReader:
         """Whether tree and writers are unchanged. A writer may become known after its first samples."""
         return version == self._version and self._writers == [track.writer for track in self._parts]
 
-    def read(self, joint_positions: JointReader, stamp: int | None, hold_ns: int) -> FramePoses:
+    def read(
+        self, read_views: ViewReader, joint_positions: JointReader, stamp: int | None, hold_ns: int
+    ) -> FramePoses:
         """As ``TransformBuffer.snapshot``."""
         poses = self._static.copy()
         known = np.ones(len(poses), dtype=np.bool_)
         reasons: dict[int, str] = {}
         newest: list[int] = []
-        for track, (rows, edges) in self._parts.items():
-            view = track.history.view
+        views = read_views(tuple(self._parts))
+        for (track, (rows, edges)), view in zip(self._parts.items(), views, strict=True):
             reason = _reason_against(track, view, stamp, hold_ns)
             if reason is None:
                 poses[rows] = _edge_poses(joint_positions, track, view, stamp)[edges]
@@ -282,19 +285,15 @@ def _edge_poses(joint_positions: JointReader, track: Track, view: HistoryView, s
     if stamp is None or stamp >= view.newest:
         last = view.rows[view.end - 1]
         if isinstance(track, PoseTrack):
-            return last.reshape(-1, 7)
+            return track.poses(last)
         return track.kinematics.edge_poses(last[: track.model.position_count])
     if isinstance(track, PoseTrack):
         around = rows_around(view, stamp)
         assert around is not None  # the view covers the stamp
         before, after, ratio, _ = around
-        first, second = (se3.unstack(view.rows[row].reshape(-1, 7)) for row in (before, after))
+        first, second = (se3.unstack(track.poses(view.rows[row])) for row in (before, after))
         return np.stack(se3.normalize(se3.interpolate(first, second, ratio, se3.ARRAYS), se3.ARRAYS), axis=-1)
-    try:
-        positions, _ = joint_positions(track, stamp)
-    except InPast:  # since then the history has moved on
-        positions = view.rows[view.first, : track.model.position_count]
-    return track.kinematics.edge_poses(positions)
+    return track.kinematics.edge_poses(joint_positions(view, track, stamp))
 
 
 def to_dual(poses: Poses) -> Duals:

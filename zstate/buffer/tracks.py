@@ -124,9 +124,9 @@ class JointTrack:
             velocities = np.full(self.model.velocity_count, np.nan)
         return self.history.insert(stamp, np.concatenate((positions, velocities)))
 
-    def samples(self, start: int | None, end: int | None) -> JointTrajectory:
-        """Copies of the samples kept with stamps in [start, end) [ns]; None is no limit."""
-        view, coordinates = self.history.view, coordinate_names(self.model)
+    def samples(self, view: HistoryView, start: int | None, end: int | None) -> JointTrajectory:
+        """Copies of the samples in ``view`` with stamps in [start, end) [ns]; None is no limit."""
+        coordinates = coordinate_names(self.model)
         stamps = view.kept_stamps()
         first = 0 if start is None else int(stamps.searchsorted(start))
         last = len(stamps) if end is None else int(stamps.searchsorted(end))
@@ -182,6 +182,10 @@ class PoseTrack:
     def has_covariances(self) -> bool:
         """Whether rows have columns for covariances."""
         return self.history.width > 7 * len(self.edges)
+
+    def poses(self, row: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The poses of a row of the history, without the covariances: (N, 7)."""
+        return row[: 7 * len(self.edges)].reshape(-1, 7)
 
     def covariance_columns(self, index: int) -> slice:
         """The columns of the covariance of ``edges[index]``."""

@@ -459,7 +459,10 @@ history_replace(History *self, PyObject *const *args, Py_ssize_t count)
 static PyObject *
 history_window(History *self, void *Py_UNUSED(closure))
 {
-    return Py_BuildValue("(Onn)", self->block, self->first, self->end);
+    /* A new tuple may run the garbage collector, and so any code: it might free the block. */
+    PyObject *block = (PyObject *)self->block;
+    Py_INCREF(block);
+    return Py_BuildValue("(Nnn)", block, self->first, self->end);
 }
 
 static PyObject *

@@ -157,6 +157,29 @@ path_at(Path *self, PyObject *const *args, Py_ssize_t count)
     return transform_when(self, at, stamp);
 }
 
+/* at_both(stamp, other, other_stamp): at one moment, because neither evaluation runs other code:
+ * transforms are no objects that make the garbage collector run. */
+static PyObject *
+path_at_both(Path *self, PyObject *const *args, Py_ssize_t count)
+{
+    if (count != 3 || !PyObject_TypeCheck(args[1], &Path_type)) {
+        PyErr_SetString(PyExc_TypeError, "at_both(stamp, other, other_stamp)");
+        return NULL;
+    }
+    PyObject *first = path_at(self, &args[0], 1);
+    PyObject *second = first == NULL ? NULL : path_at((Path *)args[1], &args[2], 1);
+    PyObject *both = NULL;
+    if (first == Py_None || second == Py_None) {
+        both = Py_None;
+        Py_INCREF(both);
+    }
+    else if (second != NULL)
+        both = PyTuple_Pack(2, first, second);
+    Py_XDECREF(first);
+    Py_XDECREF(second);
+    return both;
+}
+
 /* failure_at(stamp): the limiting track, in the order of zstate/buffer/path.py. */
 
 typedef enum { IN_PAST, NO_DATA, IN_FUTURE } Failure;
@@ -208,7 +231,8 @@ path_failure_at(Path *self, PyObject *stamp)
     Py_RETURN_NONE;
 }
 
-/* poses(stamps, out, valid): a batch, without the GIL. */
+/* Windows of all tracks at one moment, with references to their blocks: the rows in them stay,
+ * whatever writers do meanwhile. */
 
 typedef struct {
     Window *windows;
@@ -227,7 +251,6 @@ batch_release(Batch *batch)
     PyMem_Free(batch->nows);
 }
 
-/* Copies the windows of all tracks at one moment, with references to their blocks. */
 static int
 batch_begin(const Path *self, Batch *batch)
 {
@@ -258,6 +281,22 @@ batch_begin(const Path *self, Batch *batch)
         batch->newest = newest < batch->newest ? newest : batch->newest;
     }
     return 0;
+}
+
+/* A tuple of (block, first, end). */
+static PyObject *
+windows_of(const Batch *batch)
+{
+    PyObject *windows = PyTuple_New(batch->tracks);
+    for (Py_ssize_t i = 0; windows != NULL && i < batch->tracks; i++) {
+        const Window *window = &batch->windows[i];
+        PyObject *item = Py_BuildValue("(Onn)", window->block, window->first, window->end);
+        if (item == NULL)
+            Py_CLEAR(windows);
+        else
+            PyTuple_SET_ITEM(windows, i, item);
+    }
+    return windows;
 }
 
 /* As index_not_before, for an instant that the window covers. Stamps in order advance from sample
@@ -296,6 +335,45 @@ batch_pose(const Path *self, const Batch *batch, int64_t at, Pose *pose)
     return true;
 }
 
+/* at_with_windows(stamp): a transform, and the windows that it is computed from. */
+
+static PyObject *
+path_at_with_windows(Path *self, PyObject *stamp)
+{
+    int64_t at = 0;
+    Batch batch;
+    Pose pose;
+    if (track_count(self) == 0 || (stamp != Py_None && !plain_stamp(stamp, &at)))
+        Py_RETURN_NONE;
+    if (batch_begin(self, &batch) < 0)
+        return NULL;
+    at = stamp == Py_None ? batch.newest : at;
+    PyObject *found = NULL;
+    if (batch_pose(self, &batch, at, &pose)) {
+        PyObject *kind = kind_exact;
+        for (Py_ssize_t i = 0; i < batch.tracks; i++)
+            if (batch.nows[i].a != batch.nows[i].b)
+                kind = kind_interpolated;
+        PyObject *number = PyLong_FromLongLong(at), *windows = windows_of(&batch);
+        if (number != NULL && windows != NULL) {
+            PyObject *transform =
+                fields_new(self->type, self->target, self->source, pose, number, kind);
+            found = transform == NULL ? NULL : PyTuple_Pack(2, transform, windows);
+            Py_XDECREF(transform);
+        }
+        Py_XDECREF(number);
+        Py_XDECREF(windows);
+    }
+    else {
+        found = Py_None;
+        Py_INCREF(found);
+    }
+    batch_release(&batch);
+    return found;
+}
+
+/* poses(stamps, out, valid): a batch, without the GIL. */
+
 static void
 batch_run(const Path *self, const Batch *batch, const int64_t *stamps, Py_ssize_t count,
           double *out, char *valid)
@@ -321,8 +399,9 @@ poses_into(const Path *self, const Py_buffer *stamps, const Py_buffer *out, cons
     if (batch_begin(self, &batch) < 0)
         return NULL;
     Py_BEGIN_ALLOW_THREADS batch_run(self, &batch, stamps->buf, count, out->buf, valid->buf);
-    Py_END_ALLOW_THREADS batch_release(&batch);
-    Py_RETURN_NONE;
+    Py_END_ALLOW_THREADS PyObject *windows = windows_of(&batch);
+    batch_release(&batch);
+    return windows;
 }
 
 static PyObject *
@@ -442,14 +521,20 @@ path_dealloc(Path *self)
 static PyMethodDef path_methods[] = {
     {"at", (PyCFunction)(void (*)(void))path_at, METH_FASTCALL,
      "at(stamp=None): the Transform, or None if the reference has to be used."},
+    {"at_with_windows", (PyCFunction)path_at_with_windows, METH_O,
+     "at_with_windows(stamp): as at, with the (block, first, end) of each track that it is of."},
+    {"at_both", (PyCFunction)(void (*)(void))path_at_both, METH_FASTCALL,
+     "at_both(stamp, other, other_stamp): at of two paths at one moment; None unless both are "
+     "found."},
     {"failure_at", (PyCFunction)path_failure_at, METH_O,
      "failure_at(stamp): (failure, track, stamp, oldest, newest, rate_hz), or None when there is "
      "none."},
     {"poses", (PyCFunction)(void (*)(void))path_poses, METH_FASTCALL,
-     "poses(stamps, out, valid): many at once; NaN and False where there is no transform."},
+     "poses(stamps, out, valid): many at once; NaN and False where there is no transform. "
+     "Returns the (block, first, end) of each track that they are of."},
     {"place", (PyCFunction)(void (*)(void))path_place, METH_FASTCALL,
      "place(points, stamps, out, valid): points moved by the poses at their stamps; NaN and False "
-     "where there is none."},
+     "where there is none. Returns as poses."},
     {NULL},
 };
 

@@ -295,10 +295,9 @@ place_into(const Path *self, const Points *points, const Py_buffer *stamps, cons
     }
     PyMem_RawFree(placing.kept);
     PyMem_Free(placing.intervals);
+    PyObject *windows = has_memory ? windows_of(&placing.batch) : PyErr_NoMemory();
     batch_release(&placing.batch);
-    if (!has_memory)
-        return PyErr_NoMemory();
-    Py_RETURN_NONE;
+    return windows;
 }
 
 static PyObject *
