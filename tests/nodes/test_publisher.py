@@ -3,6 +3,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from zstate.model.pinocchio_solver import select_engine
 from zstate.net.presence import discover
 from zstate.net.session import connect
 from zstate.nodes import publisher as publisher_module
+from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.nodes.publisher_status import StreamStats
 from zstate.wire.messages import TransformSample, from_block, poses_from_block
@@ -269,6 +271,43 @@ def test_first_sample_outside_limits_is_logged_at_once(sessions, caplog):
         assert publisher.stats.outside_limits == 1
     (record,) = caplog.records
     assert "'lift' at -3.5 rad is outside -2 to 2; further" in record.getMessage()
+
+
+class ActingHandler(logging.Handler):
+    """Does something with a publisher at its first record, as handlers that report to the network do."""
+
+    def __init__(self, action) -> None:
+        super().__init__(logging.WARNING)
+        self._action = action
+
+    def emit(self, record: logging.LogRecord) -> None:
+        action, self._action = self._action, lambda: None
+        action()
+
+
+@pytest.mark.parametrize("is_partial", [False, True])
+@pytest.mark.parametrize("closes", [False, True])
+def test_handler_of_the_warning_about_limits_may_publish_or_close(sessions, is_partial, closes):
+    """Also from another thread that it waits for."""
+    opened = PartialStatePublisher(sessions[0], ARM, ["lift"], "r1") if is_partial else None
+    with opened or StatePublisher(sessions[0], ARM, "r1") as publisher:
+
+        def act() -> None:
+            action = publisher.close if closes else partial(publisher.publish, [2.5], stamp=STAMP + 1)
+            other = threading.Thread(target=action, daemon=True)
+            other.start()
+            other.join(SOON_S)
+            assert not other.is_alive()
+            done.set()
+
+        handler, done = ActingHandler(act), threading.Event()
+        logging.getLogger("zstate").addHandler(handler)
+        try:
+            threading.Thread(target=lambda: publisher.publish([2.5], stamp=STAMP), daemon=True).start()
+            assert done.wait(2.0 * SOON_S)
+        finally:
+            logging.getLogger("zstate").removeHandler(handler)
+        until(lambda: publisher.stats.outside_limits == (1 if closes else 2))
 
 
 def test_stats_name_the_engine_of_transforms_and_nothing_without_the_stream(sessions):

@@ -154,8 +154,8 @@ class PartialStatePublisher(SamplePublisher):
                     self._cache.append(stamp, state.seq, native)
                 for place, writer in self._writers.items():
                     writer.write(payloads[place])
-                if self._limits is not None:
-                    self._limits.add(stamp, native)
+            if self._limits is not None:
+                self._limits.add(stamp, native)
         except InvalidInput as error:
             self._count_refusal(error)
             raise

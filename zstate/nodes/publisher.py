@@ -312,9 +312,9 @@ class StatePublisher(SamplePublisher):
                     self._native.write(payload)
                 for writer, other in derived:
                     writer.write(other)
-                if self._limits is not None:
-                    self._limits.add(stamp, payload)
                 self._resume_path()
+            if self._limits is not None:
+                self._limits.add(stamp, payload)
         except InvalidInput as error:
             self._count_refusal(error)
             raise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zstate._util.fork_safe import fork_safe
+from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import html_of_fields
 from zstate.errors import format_duration
 from zstate.model.joint_limits import JointLimits
@@ -70,14 +69,14 @@ class PublisherStats:
 class LimitWatch:
     """Counts the samples whose positions exceed joint limits, and logs the first.
 
-    The first sample is checked at once, later ones in groups, which takes about 0.3 us per sample.
+    The first sample is checked at once, later ones in groups, which takes about 0.3 us per sample. Publishers
+    call it without a lock: a handler of the warning may publish, or close the publisher.
     """
 
     def __init__(self, limits: JointLimits, robot: str) -> None:
         self._count = 0
         self._last = ""
-        # Entered again if a handler of the warning reads the counts.
-        self._lock = fork_safe(threading.RLock())
+        self._lock = fork_safe_lock()
         self._limits, self._robot = limits, robot
         self._payloads: list[bytes] = []
         self._began = self._due = 0
@@ -89,35 +88,43 @@ class LimitWatch:
             if self._began <= stamp < self._due and len(self._payloads) < _CHECKED_AT_ONCE:
                 return
             self._began, self._due = stamp, stamp + _CHECKED_EVERY_NS
-            self._check()
+            first = self._check()
+        self._log(first)
 
     def add_outside(self, payload: bytes) -> None:
         """Count the JointState in ``payload``, which is known to be outside: the first now."""
         with self._lock:
             self._payloads.append(payload)
-            if not self._count or len(self._payloads) >= _CHECKED_AT_ONCE:
-                self._check()
+            is_due = not self._count or len(self._payloads) >= _CHECKED_AT_ONCE
+            first = self._check() if is_due else ""
+        self._log(first)
 
     def counted(self) -> tuple[int, str]:
         """How many samples were outside until now, and the joints of the newest."""
         with self._lock:
-            if self._payloads:
-                self._check()
-            return self._count, self._last
+            first = self._check() if self._payloads else ""
+            counted = self._count, self._last
+        self._log(first)
+        return counted
 
-    def _check(self) -> None:
+    def _log(self, first: str) -> None:
+        if first:
+            _LOG.warning("%s: %s; further samples outside limits are only counted", self._robot, first)
+
+    def _check(self) -> str:
+        """Count the samples that are outside; the text of the first ever, else empty."""
         block = b"".join(map(joint_positions, self._payloads))
         positions = from_block(block).reshape(len(self._payloads), -1)
         self._payloads.clear()
         # Usually nothing is outside, and these two rows are sufficient to show it.
         extremes = np.stack((positions.min(axis=0), positions.max(axis=0)))
         if not self._limits.are_exceeded(extremes).any():
-            return
+            return ""
         are_exceeded = self._limits.are_exceeded(positions)
         self._last = self._limits.explanation(positions[are_exceeded][-1:])
-        if not self._count:
-            _LOG.warning("%s: %s; further samples outside limits are only counted", self._robot, self._last)
+        first = "" if self._count else self._last
         self._count += int(are_exceeded.sum())
+        return first
 
 
 class Health(NamedTuple):
