@@ -40,6 +40,19 @@ def test_frame_table_lists_the_edge_and_its_writer():
     assert "r2" not in buffer.frame_table().robots
 
 
+@pytest.mark.parametrize("at", [None, SECOND, SECOND // 2])
+def test_covariances_are_no_poses(at, recwarn):
+    """A variance of zero is usual: odometry on a floor. Warnings would be printed by any program."""
+    buffer = TransformBuffer(10.0, ManualClock())
+    for second in (0, 1):
+        base = Transform("odom", "base", [2.0 * second, 0, 0], [0, 0, 0, 1], second * SECOND)
+        buffer.insert(base.with_covariance(np.diag([0.01, 0.01, 0, 0, 0, 0.01])))
+    poses = buffer.snapshot(at)
+    expected = 2.0 if at is None else 2.0 * at / SECOND
+    assert poses.poses_in("odom")[poses.tree.row("base")].tolist() == [expected, 0, 0, 0, 0, 0, 1]
+    assert [str(warning.message) for warning in recwarn] == []
+
+
 def test_frame_added_later_appears_in_the_next_snapshot():
     buffer = filled()
     assert "camera" not in buffer.frame_table().names

@@ -90,8 +90,11 @@ class JointTrack:
 
     def is_continuous(self, index: int) -> bool:
         """Whether the joint of an edge is continuous: any number of turns, encoders that wrap."""
-        master = self.model.mimic_of(self.model.joints[index]).joint
-        return any(joint.name == master and joint.type == "continuous" for joint in self.model.driven_joints)
+        return self.model.mimic_of(self.model.joints[index]).joint in self._continuous
+
+    @cached_property
+    def _continuous(self) -> frozenset[str]:
+        return frozenset(joint.name for joint in self.model.driven_joints if joint.type == "continuous")
 
     def frame(self, link: str) -> str:
         """The name of a link's frame in the buffer."""
