@@ -154,8 +154,10 @@ class Transform(TransformFields):
     @classmethod
     def from_pose7(cls, target: str, source: str, pose7: ArrayLike, stamp: int | None = None) -> Transform:
         """From x y z [m], qx qy qz qw."""
+        check_names(target, source)
         pose = check_pose(pose7, f"{target!r} from {source!r}")
-        return cls(target, source, pose[:3], pose[3:], stamp)
+        stamp = None if stamp is None else check_stamp(stamp)
+        return cls.trusted(target, source, pose, stamp, "static" if stamp is None else "exact")
 
     @classmethod
     def from_matrix(cls, target: str, source: str, matrix: ArrayLike, stamp: int | None = None) -> Transform:
