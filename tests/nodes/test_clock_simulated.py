@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections.abc import Callable
 
@@ -10,6 +11,7 @@ import pytest
 from helpers.processes import until
 from helpers.robots import wait_for_reader
 
+from zstate._util.bounded import MAX_ENTRIES
 from zstate.errors import Closed, NoClock
 from zstate.model.load import load_model
 from zstate.net.streams import StreamPublisher
@@ -121,6 +123,35 @@ def test_wait_ends_at_once_when_stopped_or_the_clock_is_closed(sessions):
     assert not clock.wait_until(0, threading.Event())
     with pytest.raises(Closed, match="closed before it received a time"):
         clock.now()
+
+
+def test_closed_clock_does_not_return_the_time_at_which_it_was_closed(sessions):
+    writer, reader = sessions
+    with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
+        wait_for_reader(writer, "zstate/clock")
+        publishing(publisher, clock)(5 * SECOND)
+        child = os.fork()
+        if child == 0:
+            try:
+                clock.now()
+            except Closed as error:
+                os._exit(0 if "open one in this process" in str(error) else 1)
+            os._exit(2)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert clock.now() == 5 * SECOND
+        clock.close()
+        for read in (clock.now, clock.wait):
+            with pytest.raises(Closed, match="closed after it received 5000000000 ns"):
+                read()
+
+
+def test_sessions_of_earlier_publishers_are_bounded(sessions):
+    """A program that may write the clock may send any number of sessions."""
+    with SimulatedClock(sessions[1]) as clock:
+        for number in range(2 * MAX_ENTRIES):
+            assert clock._follows(number)
+        assert len(clock._ended_sessions) == MAX_ENTRIES
+        assert not clock._follows(2 * MAX_ENTRIES - 2)
 
 
 def test_jump_back_ends_waits_and_is_logged_once(sessions, caplog):

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate._util.refusals import Refusals
@@ -91,7 +92,7 @@ class SimulatedClock(Closeable):
         self._wire = get_wire(wire)
         self._now: int | None = None
         self._session: int | None = None
-        self._ended_sessions: set[int] = set()
+        self._ended_sessions: BoundedDict[int, None] = BoundedDict()
         self._received_s = 0.0
         self._has_time = fork_safe(threading.Event())
         self._lock = fork_safe_lock()
@@ -110,16 +111,18 @@ class SimulatedClock(Closeable):
     def now(self) -> int:
         """The newest stamp [ns]. Raises NoClock if none is received within ``timeout_s``, and Closed."""
         now = self._now
-        return self.wait(self.timeout_s) if now is None else now
+        return self.wait(self.timeout_s) if now is None or not self._is_open else now
 
     def wait(self, timeout_s: float | None = None) -> int:
         """The newest stamp [ns], waiting for the first; None waits for ever. Raises NoClock and Closed."""
         if self._is_open and not wait_interruptible(self._has_time, timeout_s):
             text = f"no time was received on {self.key!r} for {timeout_s:g} s"
             raise NoClock(f"{text}; start the simulation or `zstate replay`", waited_s=timeout_s or 0.0)
-        if self._now is None:
-            raise Closed("the simulated clock was closed before it received a time")
-        return self._now
+        now = self._now
+        if not self._is_open or now is None:
+            last = "before it received a time" if now is None else f"after it received {now} ns"
+            raise Closed(f"the simulated clock was closed {last}; open one in this process")
+        return now
 
     def wait_until(self, stamp: int, stop: threading.Event) -> bool:
         """Block until ``stamp``, or until ``stop`` is set or the clock closed. True when it was reached.
@@ -170,8 +173,8 @@ class SimulatedClock(Closeable):
             return False
         if session != self._session:
             if self._session is not None:
-                self._ended_sessions.add(self._session)
-            self._ended_sessions.discard(session)
+                self._ended_sessions[self._session] = None
+            self._ended_sessions.pop(session, None)
             self._session = session
         self._received_s = now_s
         return True
