@@ -5,8 +5,11 @@ from __future__ import annotations
 import pickle
 import threading
 import time
+from collections import deque
+from types import SimpleNamespace
 
 import pytest
+import zenoh
 from helpers.processes import until
 
 from zstate.errors import Closed, SecondWriter
@@ -20,6 +23,7 @@ from zstate.wire.keys import Stream, writer_key
 
 FIRST = WriterId("driver", "jetson", 412, 1_000_000_000, 7)
 SECOND = WriterId("simulator", "laptop", 9, 2_000_000_000, 8)
+THIRD = WriterId("twin", "laptop", 10, 3_000_000_000, 9)
 
 
 def announcement(
@@ -137,6 +141,35 @@ def test_claim_needs_no_thread_and_a_check_is_cheaper_than_a_claim(sessions):
     assert checked - opened < opened - began
     for claim in claims:
         claim.close()
+
+
+def test_token_that_comes_during_a_check_is_read_by_the_next_one(sessions):
+    """Zenoh's thread may report it between the last change that a check reads and the time of the next."""
+    ours, theirs = sessions
+    key = writer_key("r1", "joint_states", FIRST.identity)
+
+    class Changes(deque[tuple[str, zenoh.SampleKind]]):
+        """The first writer comes when a check has read all changes."""
+
+        def __bool__(self) -> bool:
+            if len(self) or not latecomers:
+                return len(self) > 0
+            claim._on_token(latecomers.pop())
+            return False
+
+    latecomers: list[zenoh.Sample] = []
+    with WriterClaim(ours, [announcement(SECOND)]) as claim, announced(theirs, announcement(THIRD)):
+        claim.check()
+        until(lambda: claim.check() or claim._rivals)
+        # A second later the writer is established: then checks are rare.
+        claim._established_at = 0.0
+        claim._changes, claim._next_check_s = Changes(), 0.0
+        latecomers.append(SimpleNamespace(key_expr=key, kind=zenoh.SampleKind.PUT))  # type: ignore[arg-type]
+        claim.check()
+        assert not latecomers
+        assert claim._next_check_s == 0.0
+        claim.check()
+        assert {rival.writer for rival in claim._rivals} == {FIRST, THIRD}
 
 
 def test_check_on_a_closed_session_raises_closed(sessions):

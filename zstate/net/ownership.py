@@ -152,6 +152,8 @@ class WriterClaim(Closeable):
                 return
             if now > self._established_at:
                 self._next_check_s = now + CHECK_PERIOD_S
+                if self._changes:  # a token that came just now: its own 0 may be overwritten
+                    self._next_check_s = 0.0
             older = {rival for rival in self._rivals if self._is_older(rival)}
             if now > self._established_at:
                 older = {rival for rival in older if self._publishes(rival)}
