@@ -35,7 +35,6 @@ Level = Literal["ok", "warn", "error", "stale"]
 POSE_BYTES = 7 * 8
 COVARIANCE_NUMBERS = 21
 """The upper triangle of a covariance of a pose."""
-VECTOR_BYTES = 3 * 8
 _UNIT_TOLERANCE = 1e-3
 _UPPER_TRIANGLES = {size: np.triu_indices(size) for size in (3, 6)}
 _FLOAT64 = np.dtype("<f8")
