@@ -25,12 +25,14 @@ import numpy as np
 import viser
 import websockets.asyncio.server
 from numpy.typing import NDArray
+from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from zstate._util.closeable import Closeable
 from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, LibraryMissing, ZStateError
+from zstate.view.browser_messages import Widget, accept_message
 from zstate.web_access import AccessCheck, is_websocket, listen
 
 PORT = 8080
@@ -40,6 +42,7 @@ _PING_PERIOD_S = 0.5
 _ANSWER_WITHIN_S = 3.0
 """A browser without an answer to a ping for so long is cut off, suspended, or has too much to draw."""
 
+_LOG = logging.getLogger("zstate")
 # websockets logs a traceback for each connection that a browser opens and drops.
 _SILENT = logging.getLogger("zstate.view.http")
 _SILENT.addHandler(logging.NullHandler())
@@ -98,7 +101,8 @@ class ViewServer(Closeable):
         self.access = AccessCheck.at(host, self.port)
         self.connected = threading.Event()
         """Set while at least one browser shows the page."""
-        self._answered_at: dict[websockets.asyncio.server.ServerConnection, float] = {}
+        self._has_refused = False
+        self._answered_at: dict[ServerConnection, float] = {}
         try:
             with _opening, _no_output(), self._guarded_serve() as opened:
                 self.server = _Server(host, self.port, "zstate", verbose=False)
@@ -152,10 +156,12 @@ class ViewServer(Closeable):
             handler: Any, host: str, port: int, *, process_request: Any, **options: Any
         ) -> websockets.asyncio.server.serve:
             opened.append(port)
+            new_connection: Any = functools.partial(_Connection, self._accept)
             return original(
                 functools.partial(self._handle, handler),
                 sock=self._socket,
                 process_request=functools.partial(self._process_request, process_request),
+                create_connection=new_connection,
                 logger=_SILENT,
                 close_timeout=_CLOSE_TIMEOUT_S,
                 **options,
@@ -167,9 +173,19 @@ class ViewServer(Closeable):
         finally:
             websockets.asyncio.server.serve = original
 
-    async def _handle(
-        self, viser_handler: Any, connection: websockets.asyncio.server.ServerConnection
-    ) -> None:
+    def _accept(self, address: tuple[Any, ...], raw: bytes | str) -> bytes | None:
+        """A message of the browser at ``address`` as viser may receive it; None if it is ignored."""
+        accepted = accept_message(raw, self._widget)
+        if accepted is None and not self._has_refused:
+            self._has_refused = True
+            text = "a browser at %s sent a message that this page does not send; such messages are ignored"
+            _LOG.warning(text, address[0])
+        return accepted
+
+    def _widget(self, uuid: str) -> Widget | None:
+        return self.server.gui._gui_input_handle_from_uuid.get(uuid)  # pyright: ignore[reportPrivateUsage]
+
+    async def _handle(self, viser_handler: Any, connection: ServerConnection) -> None:
         self._answered_at[connection] = time.monotonic()
         pings = asyncio.create_task(self._ping(connection))
         try:
@@ -179,7 +195,7 @@ class ViewServer(Closeable):
             await asyncio.gather(pings, return_exceptions=True)
             del self._answered_at[connection]
 
-    async def _ping(self, connection: websockets.asyncio.server.ServerConnection) -> None:
+    async def _ping(self, connection: ServerConnection) -> None:
         with contextlib.suppress(ConnectionClosed):
             while True:
                 pong = await connection.ping()
@@ -190,7 +206,7 @@ class ViewServer(Closeable):
     def _process_request(
         self,
         viser_process_request: Any,
-        connection: websockets.asyncio.server.ServerConnection,
+        connection: ServerConnection,
         request: Request,
     ) -> Response | None:
         denied = self.access.check(request.path, request.headers)
@@ -201,6 +217,22 @@ class ViewServer(Closeable):
         response = viser_process_request(connection, request)
         response.headers.update(self.access.headers())
         return response
+
+
+class _Connection(ServerConnection):
+    """The connection of a browser, without the messages for which ``accept(address, raw)`` is None."""
+
+    def __init__(
+        self, accept: Callable[[tuple[Any, ...], bytes | str], bytes | None], *arguments: Any, **options: Any
+    ) -> None:
+        super().__init__(*arguments, **options)
+        self._accept = accept
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        while True:
+            accepted = self._accept(self.remote_address, await super().recv(decode))
+            if accepted is not None:
+                return accepted
 
 
 class _Server(viser.ViserServer):

@@ -8,7 +8,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import pytest
+import viser
 from helpers.processes import repeated
 from helpers.processes import until as until_then
 
@@ -161,6 +163,35 @@ def test_sliders_command_a_driver_only_in_control_and_the_stop_button_ends_that(
     until(lambda: host.state == "active")
     page.tab.close()
     until(lambda: host.state == "holding")
+
+
+def test_stop_button_works_after_another_browser_has_tried_to_switch_it_off(
+    open_tab, show_view, sessions, host_driver
+):
+    host = host_driver()
+    shown = show_view(sessions[1], "arm")
+    mine, theirs = (Panels(open_tab(shown.page.url, 640, 480)) for _ in range(2))
+    theirs.view_tab.text("Driver of arm: ready")
+    gui = shown.page.server.gui
+    (stop,) = [one for one in gui._gui_input_handle_from_uuid.values() if one.label == "STOP arm"]
+    hostile = """([url, protocol, messages]) => new Promise((done) => {
+        const socket = new WebSocket(url, protocol);
+        socket.onopen = () => {
+            messages.forEach((bytes) => socket.send(new Uint8Array(bytes)));
+            socket.onmessage = () => done();
+        };
+    })"""
+    messages = [
+        list(
+            msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": stop._impl.uuid, "updates": updates})
+        )
+        for updates in ({"update_cb": []}, {"removed": True})
+    ]
+    address = shown.page.url.replace("http:", "ws:")
+    mine.tab.evaluate(hostile, [address, f"viser-v{viser.__version__}", messages])
+    theirs.press("STOP arm")
+    assert "the stop button" in theirs.view_tab.text("Driver of arm: stopped by").inner_text()
+    assert host.state == "stopped"
 
 
 def test_frame_search_selects_a_frame_and_its_pose_follows_the_fixed_frame(panels, sessions):
