@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -13,48 +11,10 @@ import pytest
 pytest.importorskip("viser")
 
 import msgspec
-import viser
+from helpers.browser_client import CAMERA, browser
 from helpers.processes import until
-from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Subprotocol
 
 from zstate.view.browser_messages import accept_message
-from zstate.view.server import ViewServer
-
-CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": (1.0, 0.0, 0.0, 0.0),
-    "position": (0.0, 0.0, 0.0),
-    "fov": 1.0,
-    "near": 0.1,
-    "far": 10.0,
-    "image_height": 100,
-    "image_width": 100,
-    "look_at": (0.0, 0.0, 1.0),
-    "up_direction": (0.0, 0.0, 1.0),
-}
-
-
-class Browser:
-    """A connection that sends what it is told to."""
-
-    def __init__(self, connection: ClientConnection) -> None:
-        self._connection = connection
-        self.send(CAMERA)
-
-    def send(self, message: object) -> None:
-        self._connection.send(msgspec.msgpack.encode(message))
-
-    def update(self, widget: Any, **updates: object) -> None:
-        self.send({"type": "GuiUpdateMessage", "uuid": widget._impl.uuid, "updates": updates})
-
-
-@contextmanager
-def browser(page: ViewServer) -> Iterator[Browser]:
-    address = f"ws://127.0.0.1:{page.port}"
-    protocol = [Subprotocol(f"viser-v{viser.__version__}")]
-    with connect(address, subprotocols=protocol, compression=None, max_queue=None) as connection:
-        yield Browser(connection)
 
 
 def test_no_browser_switches_off_a_button_of_the_others(page, caplog):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -363,6 +364,8 @@ class SliderCommander(Closeable):
         self._control: _Control | None = None
         self._thread: threading.Thread | None = None
         self._closed = False
+        self._stopper = ThreadPoolExecutor(1, "zstate stop button")
+        self._stop_is_queued = False
 
     @property
     def has_control(self) -> bool:
@@ -436,6 +439,20 @@ class SliderCommander(Closeable):
         except ZStateError as error:
             self.problem = str(error)
 
+    def request_stop(self) -> None:
+        """``stop`` in a thread of its own, which nothing else delays; one thread calls this.
+
+        Requests while a stop is under way are one more stop, after it.
+        """
+        self.release_control()
+        if not self._stop_is_queued and not self._closed:
+            self._stop_is_queued = True
+            self._stopper.submit(self._stop_once)
+
+    def _stop_once(self) -> None:
+        self._stop_is_queued = False
+        self.stop()
+
     def release_stops(self, client: int) -> None:
         """Release the stops of the driver. Nothing moves by that. Waits up to some seconds.
 
@@ -454,6 +471,7 @@ class SliderCommander(Closeable):
         with self._lock:
             self._closed = True
             self._join()
+        self._stopper.shutdown(wait=False)
 
     def _join(self) -> None:
         if self._thread is not None:

@@ -1,6 +1,10 @@
-"""Rows of a plot: few, and the same ones while it scrolls; a stop that fails."""
+"""Rows of a plot: few, and the same ones while it scrolls; a stop that fails, or that others delay."""
+
+import threading
 
 import numpy as np
+from helpers.browser_client import browser
+from helpers.processes import until
 
 from zstate.driving.driver_state import DriverStateListener, ReceivedState
 from zstate.view.panels import html
@@ -41,3 +45,35 @@ def test_failed_stop_is_shown_in_the_color_of_alarms_without_sliders(page, sessi
         panel.update(ReceivedState(ready, 0.0))
         shown = html.paragraph(commander.problem, color=html.ALARM)
         assert shown in {getattr(handle, "content", "") for handle in vars(panel).values()}
+
+
+def test_stop_button_works_while_clicks_of_a_browser_occupy_all_threads(page, sessions, host_driver):
+    host = host_driver()
+    gui = page.server.gui
+    release, occupied = threading.Event(), threading.Semaphore(0)
+    workers = gui._thread_executor._max_workers
+
+    def occupy() -> None:
+        occupied.release()
+        release.wait(60.0)
+
+    with (
+        DriverStateListener(sessions[1], "arm") as states,
+        SliderCommander(sessions[1], "arm", states, lambda _: True) as commander,
+        browser(page) as mine,
+    ):
+        until(lambda: states.get("arm") is not None)
+        _DriverPanel(gui, commander, gui.add_folder("Drivers"))
+        *_, stop = [one for one in gui._gui_input_handle_from_uuid.values() if one.label == "STOP arm"]
+        try:
+            for _ in range(2 * workers):
+                gui._thread_executor.submit(occupy)
+            for _ in range(workers):
+                assert occupied.acquire(timeout=60.0)
+            until(page.server.get_clients)
+            for _ in range(100):
+                mine.update(stop, value=True)
+            until(lambda: host.state == "stopped")
+            assert not release.is_set()
+        finally:
+            release.set()

@@ -225,8 +225,9 @@ class _DriverPanel:
             stop = gui.add_button(f"STOP {self._robot}", color="red", hint=hint)
         self._figures = gui.add_html("")
 
-        def on_click(_: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            commander.stop()
+        async def on_click(_: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            # A coroutine: other callbacks of all browsers wait for the same few threads.
+            commander.request_stop()
 
         stop.on_click(on_click)
 
