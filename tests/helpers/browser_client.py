@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 if TYPE_CHECKING:
-    from websockets.sync.client import ClientConnection
+    from websockets.sync.connection import Connection
 
     from zstate.view.server import ViewServer
 
@@ -30,7 +30,7 @@ CAMERA = {
 class Browser:
     """A connection; its first message is its camera, as the page's is."""
 
-    def __init__(self, connection: ClientConnection) -> None:
+    def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self.send(CAMERA)
 

@@ -17,6 +17,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     mesh = tmp_path / "src" / "repository" / "arm" / "meshes" / "a b.stl"
     mesh.parent.mkdir(parents=True)
     mesh.touch()
+    (mesh.parents[1] / "package.xml").write_text("<package><name>arm</name></package>")
     return tmp_path / "src" / "repository" / "arm"
 
 
@@ -117,6 +118,43 @@ def test_received_description_gets_no_file_outside_packages_and_no_hint_that_it_
     assert linked.reason == "it leads out of the package 'arm'"
 
 
+def test_folders_without_a_package_xml_are_no_packages_of_a_received_description(package, monkeypatch):
+    """A link below the search path may lead anywhere: to /etc, or to the user's pictures."""
+    workspace, private = package.parents[1], package.parents[2] / "private"
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(workspace))
+    share = package.parents[2] / "install" / "share"
+    share.mkdir(parents=True)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(share.parent))
+    private.mkdir()
+    for folder in (private, workspace, workspace / "repository"):
+        (folder / "secret.stl").touch()
+    for link in (package / "pictures", workspace / "pictures", share / "pictures"):
+        link.symlink_to(private)
+    for uri in (
+        "package://pictures/secret.stl",
+        f"package://{workspace.name}/secret.stl",
+        "package://repository/secret.stl",
+        f"{workspace}/secret.stl",
+        f"{workspace}/pictures/secret.stl",
+        f"{workspace}/repository/secret.stl",
+        f"{package}/pictures/secret.stl",
+        f"file://{share}/pictures/secret.stl",
+    ):
+        assert isinstance(MeshPaths().find(uri), MissingFile), uri
+    # The URDF that the user names may use all of them.
+    assert MeshPaths(package).find("package://pictures/secret.stl") == package / "pictures" / "secret.stl"
+
+
+def test_package_behind_a_link_of_a_workspace_is_found(package, monkeypatch):
+    workspace = package.parents[2] / "workspace"
+    workspace.mkdir()
+    (workspace / "arm").symlink_to(package)
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(workspace))
+    expected = workspace / "arm" / "meshes" / "a b.stl"
+    assert MeshPaths().find("package://arm/meshes/a b.stl") == expected
+    assert MeshPaths().find(str(expected)) == expected
+
+
 def test_received_description_may_name_a_file_of_a_package_by_its_path(package, outside):
     file = package / "meshes" / "a b.stl"
     assert MeshPaths().find(str(file)) == file
@@ -130,6 +168,7 @@ def test_links_to_the_sources_of_the_same_package_are_followed(package, monkeypa
     installed.parent.mkdir(parents=True)
     installed.symlink_to(file)
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(installed.parents[3]))
+    (package / "package.xml").unlink()
     assert isinstance(MeshPaths().find("package://arm/meshes/a b.stl"), MissingFile)
     (package / "package.xml").write_text("<package><name>leg</name></package>")
     assert isinstance(MeshPaths().find("package://arm/meshes/a b.stl"), MissingFile)
@@ -151,5 +190,5 @@ def test_missing_file_lists_the_searched_folders(package, monkeypatch):
     assert (missing.reason, missing.searched) == ("the package 'arm' has no such file", (str(package),))
     unknown = MeshPaths().find("package://leg/meshes/c.stl")
     assert isinstance(unknown, MissingFile)
-    assert "there is no package 'leg'; put the folder" in unknown.reason
+    assert "there is no package 'leg'; put its folder" in unknown.reason
     assert str(package.parent) in unknown.searched

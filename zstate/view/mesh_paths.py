@@ -50,7 +50,8 @@ class MeshPaths:
     ``base``; ROS_PACKAGE_PATH; AMENT_PREFIX_PATH; and the installed files of example-robot-data and
     robot_descriptions. ``base`` is the folder of a URDF file that the user named: relative paths start
     there, and every file can be found. With None, the description was received: only files in packages are
-    found, and no ``..`` or symbolic link leads out of one.
+    found, and no ``..`` or symbolic link leads out of one. A package is then a folder with a package.xml, as
+    in ROS, or a folder in share/ or in one of the collections.
     """
 
     def __init__(self, base: Path | None = None) -> None:
@@ -59,7 +60,9 @@ class MeshPaths:
         # Folders with packages directly in them.
         self._shares = [prefix / "share" for prefix in _path_list("AMENT_PREFIX_PATH")]
         # Folders that are a package, or have packages somewhere below them.
-        self._search_roots = [*_path_list("ROS_PACKAGE_PATH"), *package_folders()]
+        # In a collection every folder counts as one.
+        self._collections = package_folders()
+        self._search_roots = [*_path_list("ROS_PACKAGE_PATH"), *self._collections]
 
     def find(self, uri: str) -> Path | MissingFile:
         """The file of that name, or why there is none."""
@@ -80,8 +83,11 @@ class MeshPaths:
         if not path.is_absolute():
             reason = "a relative path means nothing without the folder of its URDF; write package://NAME/PATH"
             return MissingFile(uri, reason)
-        for folder in (*self._shares, *self._search_roots):
-            if folder in path.parents and _is_within(path, folder, path.parts[len(folder.parts)]):
+        for root in (*self._shares, *self._search_roots):
+            if root not in path.parents or ".." in path.parts:
+                continue
+            above = path.parents[: len(path.parts) - len(root.parts)]
+            if any(self._is_package(one, root) and _is_within(path, one, one.name) for one in above):
                 return path if _succeeds(path.is_file) else MissingFile(uri, _NO_FILE, (str(path.parent),))
         return MissingFile(uri, _ONLY_PACKAGES)
 
@@ -90,8 +96,8 @@ class MeshPaths:
         if package in ("", ".", ".."):
             return MissingFile(uri, f"{package!r} is not a package name")
         found = [folder for folder in self._ancestors if folder.name == package]
-        inside = [folder / package for folder in (*self._ancestors, *self._shares)]
-        found += [folder for folder in inside if _succeeds(folder.is_dir)]
+        inside = [(folder, folder / package) for folder in (*self._ancestors, *self._shares)]
+        found += [one for root, one in inside if _succeeds(one.is_dir) and self._is_package(one, root)]
         folders = list(dict.fromkeys(found + self._folders_by_name.get(package, [])))
         allowed = [one for one in folders if self._base or _is_within(one / rest, one, package)]
         for folder in allowed:
@@ -103,19 +109,27 @@ class MeshPaths:
             return MissingFile(uri, f"it leads out of the package {package!r}", tuple(map(str, folders)))
         return MissingFile(
             uri,
-            f"there is no package {package!r}; put the folder of the package into ROS_PACKAGE_PATH",
+            f"there is no package {package!r}; put its folder, with a package.xml, into ROS_PACKAGE_PATH",
             tuple(str(folder) for folder in (*self._ancestors, *self._shares, *self._search_roots)),
         )
 
+    def _is_package(self, folder: Path, root: Path) -> bool:
+        """Whether a folder at or below ``root`` is a package; for a URDF that the user named each one is."""
+        if self._base is not None or _succeeds((folder / "package.xml").is_file):
+            return True
+        is_shared = root in self._shares and folder.parent == root
+        return (is_shared or (root in self._collections and folder != root)) and _is_within(folder, root, "")
+
     @cached_property
     def _folders_by_name(self) -> dict[str, list[Path]]:
-        """Every folder of the search roots by its name, breadth first."""
+        """Every package of the search roots by the name of its folder, breadth first."""
         found: dict[str, list[Path]] = {}
         for root in self._search_roots:
             level = [root]
             for _ in range(_MAX_DEPTH + 1):
                 for folder in level:
-                    found.setdefault(folder.name, []).append(folder)
+                    if self._is_package(folder, root):
+                        found.setdefault(folder.name, []).append(folder)
                 level = [below for folder in level for below in _package_candidates(folder)]
         return found
 
