@@ -1,4 +1,4 @@
-"""Access checks for requests to web servers (the view and Foxglove), and their sockets.
+"""Access checks for requests to web servers (the view, Foxglove and metrics), and their sockets.
 
 A browser lets any page on the internet open a websocket to a port of the machine it runs on. So:
 
@@ -60,7 +60,7 @@ class AccessCheck:
     """Decides which requests a server at ``host`` and ``port`` answers; ``token`` is needed unless None.
 
     ``origins`` are sites whose pages may open a websocket as well, as "https://app.example". ``command`` runs
-    the server; refusals name it.
+    the server, and with ``host_option`` beyond loopback; refusals name both.
     """
 
     host: str
@@ -68,6 +68,7 @@ class AccessCheck:
     token: str | None = None
     origins: tuple[str, ...] = ()
     command: str = "zstate view"
+    host_option: str = "--host"
 
     @classmethod
     def at(
@@ -96,7 +97,7 @@ class AccessCheck:
             text = (
                 f"`{self.command}` is for this machine only, at port {self.port}, and was requested as "
                 f"{host!r}; forward the same port (ssh -L {self.port}:127.0.0.1:{self.port} HOST), or open "
-                f"it to others with `{self.command} --host`"
+                f"it to others with `{self.command} {self.host_option}`"
             )
             return AccessDeniedResponse(HTTPStatus.FORBIDDEN, text)
         origin = next(iter(headers.get_all("Origin")), None)

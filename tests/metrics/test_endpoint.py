@@ -4,16 +4,17 @@ import socket
 import subprocess
 import sys
 import threading
+from contextlib import ExitStack, suppress
 
 import pytest
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.prometheus_text import row, scraped
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 import zstate
 from zstate.errors import InvalidInput, PortBusy
-from zstate.metrics.endpoint import BindAddress, MetricsEndpoint
+from zstate.metrics.endpoint import _MAX_CONNECTIONS, BindAddress, MetricsEndpoint
 
 
 class Counting(Collector):
@@ -55,6 +56,82 @@ def test_only_this_host_reaches_the_endpoint_by_default():
     with MetricsEndpoint([], "::1") as endpoint:
         assert endpoint.url.startswith("http://[::1]:")
         assert scraped(endpoint.url)
+
+
+def port_of(endpoint: MetricsEndpoint) -> int:
+    return int(endpoint.url.rsplit(":", 1)[1].split("/")[0])
+
+
+def response(port: int, *lines: str) -> bytes:
+    """The response to a request of these lines."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10.0) as connection:
+        connection.sendall("\r\n".join([*lines, "", ""]).encode())
+        return connection.makefile("rb").read()
+
+
+def test_other_hosts_are_refused_on_loopback():
+    """The page of a site whose name resolves to 127.0.0.1 asks for the host of that site."""
+    counting = Counting()
+    with MetricsEndpoint([counting]) as endpoint:
+        port, before = port_of(endpoint), counting.scrapes
+        for host in (
+            "evil.example",
+            f"evil.example:{port}",
+            f"127.0.0.1:{port + 1}",
+            f"127.0.0.1.evil:{port}",
+        ):
+            answer = response(port, "GET /metrics HTTP/1.1", f"Host: {host}")
+            assert b" 403 " in answer.splitlines()[0]
+            assert b"open it to others with `--metrics HOST:PORT`" in answer
+        twice = response(port, "GET /metrics HTTP/1.1", f"Host: 127.0.0.1:{port}", "Host: evil.example")
+        assert b" 400 " in twice.splitlines()[0]
+        assert counting.scrapes == before
+        good = response(port, "GET /metrics HTTP/1.1", f"Host: localhost:{port}")
+        assert b" 200 " in good.splitlines()[0]
+    with MetricsEndpoint([Counting()], "0.0.0.0") as endpoint:
+        opened = response(port_of(endpoint), "GET /metrics HTTP/1.1", "Host: robot.example")
+        assert b" 200 " in opened.splitlines()[0]
+
+
+def test_a_connection_without_a_whole_request_is_closed_in_silence(monkeypatch, capfd):
+    monkeypatch.setattr("zstate.metrics.endpoint._REQUEST_WITHIN_S", 0.5)
+    with MetricsEndpoint([]) as endpoint:
+        port = port_of(endpoint)
+        with (
+            socket.create_connection(("127.0.0.1", port), timeout=DEADLINE_S) as idle,
+            socket.create_connection(("127.0.0.1", port), timeout=DEADLINE_S) as trickling,
+        ):
+            # One byte at a time, each well within the time of a whole request.
+            def trickle() -> bool:
+                try:
+                    trickling.sendall(b"G")
+                except OSError:
+                    return True
+                return False
+
+            until(trickle)
+            assert idle.recv(100) == b""
+        assert scraped(endpoint.url)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_idle_connections_keep_neither_threads_nor_scrapes(monkeypatch, capfd):
+    monkeypatch.setattr("zstate.metrics.endpoint._REQUEST_WITHIN_S", 60.0)
+    before = threading.active_count()
+    with MetricsEndpoint([]) as endpoint, ExitStack() as opened:
+        address = ("127.0.0.1", port_of(endpoint))
+        for _ in range(300):
+            opened.enter_context(socket.create_connection(address, timeout=DEADLINE_S))
+        until(lambda: threading.active_count() > before + 1)
+
+        def is_scraped() -> bool:
+            with suppress(OSError):
+                return bool(scraped(endpoint.url))
+            return False
+
+        until(is_scraped)
+        assert threading.active_count() <= before + 1 + _MAX_CONNECTIONS
+    assert capfd.readouterr() == ("", "")
 
 
 def test_close_ends_threads_connections_and_the_port():
