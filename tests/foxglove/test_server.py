@@ -132,6 +132,7 @@ def test_a_slow_client_loses_its_oldest_messages_and_delays_no_other(server: Fox
         ('{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 99}]}', "there is no channel 99"),
         ('{"op": "subscribe", "subscriptions": [{"id": -1, "channelId": 1}]}', "an invalid request"),
         ('{"op": "setParameters", "parameters": [{"name": "a", "value": 1}]}', "not set here"),
+        ('{"op": "subscribe", "subscriptions": [{"id": 1e999, "channelId": 1}]}', "an invalid request"),
         ("[" * 100_000, "an invalid request"),
     ],
 )
@@ -168,6 +169,36 @@ def test_pages_of_other_sites_are_refused_with_a_reason_for_the_user():
         until(lambda: any("refused" in event for event in events))
     (refusal,) = [event for event in events if "refused" in event]
     assert "a page of 'https://evil.example' may not use `zstate foxglove`; --allow-origin" in refusal
+
+
+@pytest.mark.parametrize(
+    "names", [["x" * 100_000], [str(number) for number in range(5000)]], ids=["long name", "many names"]
+)
+def test_what_a_client_watches_is_bounded(server: FoxgloveServer, names: list[str]):
+    with FoxgloveClient(server.url) as client:
+        client.request("subscribeParameterUpdates", parameterNames=["a"])
+        client.request("subscribeParameterUpdates", parameterNames=names)
+        client.until(lambda: client.statuses)
+        assert "a client may watch 4096 parameters" in client.statuses[0]["message"]
+        (served,) = server._clients.values()
+        assert served.watched == {"a"}
+        server.set_parameter("a", "text")
+        client.until(lambda: client.parameters == {"a": "text"})
+
+
+def test_clients_beyond_the_limit_are_refused_until_one_leaves(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("zstate.foxglove.server._MAX_CLIENTS", 2)
+    events: list[str] = []
+    with FoxgloveServer(port=0, on_event=events.append) as server:
+        with FoxgloveClient(server.url), FoxgloveClient(server.url):
+            for _ in range(2):
+                with pytest.raises(InvalidStatus) as refused:
+                    FoxgloveClient(server.url)
+                assert refused.value.response.status_code == 503
+        until(lambda: server.stats.clients == 0)
+        with FoxgloveClient(server.url):
+            pass
+    assert sum("2 clients are connected, which is the limit" in event for event in events) == 1
 
 
 def test_beyond_loopback_clients_need_the_token():

@@ -60,6 +60,10 @@ _JOIN_WITHIN_S = 0.9
 _MAX_REQUEST_BYTES = 1 << 20
 _MAX_REFUSALS = 1000
 """Different refusals that are reported, each once."""
+_MAX_CLIENTS = 64
+_MAX_WATCHED = 4096
+"""Parameters that a client may watch; those of a robot are few."""
+_MAX_NAME = 256
 
 # websockets logs a traceback for each connection that a client opens and drops.
 _SILENT = logging.getLogger("zstate.foxglove.http")
@@ -116,7 +120,7 @@ class FoxgloveServer(Closeable):
     ``on_readers()`` is called after a client has subscribed or unsubscribed, ``on_event(text)`` for clients
     that come, leave or are refused; both from the thread of the server.
 
-    Each client has a queue of its own: a client that reads slowly loses its oldest messages, which are
+    There are 64 clients at most. Each has a queue of its own: a client that reads slowly loses its oldest messages, which are
     counted, and delays no other. It always receives the newest latched message of each key. A client that
     does not answer a ping within 20 s is disconnected.
 
@@ -269,17 +273,25 @@ class FoxgloveServer(Closeable):
     def _process_request(self, connection: ServerConnection, request: Request) -> Response | None:
         denied = self.access.check(request.path, request.headers)
         if denied is not None:
-            if denied.text not in self._refused and len(self._refused) < _MAX_REFUSALS:
-                self._refused.add(denied.text)
-                # Any page can take the origin "null", in a sandboxed frame.
-                is_site = denied.origin not in ("", "null")
-                allowing = f"; --allow-origin {denied.origin} allows it" if is_site else ""
-                self._on_event(printable(f"refused {_name_of(connection)}: {denied.text}{allowing}"))
+            # Any page can take the origin "null", in a sandboxed frame.
+            is_site = denied.origin not in ("", "null")
+            hint = f"; --allow-origin {denied.origin} allows it" if is_site else ""
+            self._on_refusal(connection, denied.text, hint)
             return connection.respond(denied.status, denied.text + "\n")
         if not is_websocket(request.headers):
             text = f"This is no page. Open {self.access.url('ws')} in Foxglove, as a Foxglove WebSocket.\n"
             return connection.respond(HTTPStatus.UPGRADE_REQUIRED, text)
+        if len(self._clients) >= _MAX_CLIENTS:
+            text = f"{_MAX_CLIENTS} clients are connected, which is the limit"
+            self._on_refusal(connection, text)
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, text + "\n")
         return None
+
+    def _on_refusal(self, connection: ServerConnection, text: str, hint: str = "") -> None:
+        """Report each text once."""
+        if text not in self._refused and len(self._refused) < _MAX_REFUSALS:
+            self._refused.add(text)
+            self._on_event(printable(f"refused {_name_of(connection)}: {text}{hint}"))
 
     async def _handle(self, connection: ServerConnection) -> None:
         client = self._clients[connection] = _Client(connection)
@@ -313,7 +325,7 @@ class FoxgloveServer(Closeable):
                 yield _status(_ERROR, "a request is a JSON object in a text frame")
                 return
             yield from self._answer(client, cast("dict[str, Any]", fields))
-        except (KeyError, TypeError, ValueError, RecursionError, struct.error) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, RecursionError, struct.error) as error:
             yield _status(_ERROR, f"an invalid request: {error!r}")
 
     def _answer(self, client: _Client, fields: dict[str, Any]) -> Iterable[dict[str, object]]:
@@ -335,7 +347,12 @@ class FoxgloveServer(Closeable):
                 answer = _parameter_values({name: value for name, value in values.items() if value})
                 yield answer if fields.get("id") is None else {**answer, "id": fields["id"]}
             case "subscribeParameterUpdates":
-                client.watched.update(map(str, fields["parameterNames"]))
+                watched = client.watched | {str(name) for name in fields["parameterNames"]}
+                if len(watched) > _MAX_WATCHED or max(map(len, watched), default=0) > _MAX_NAME:
+                    limits = f"{_MAX_WATCHED} parameters, each with a name of {_MAX_NAME} characters"
+                    yield _status(_ERROR, f"a client may watch {limits}; the request is ignored")
+                else:
+                    client.watched = watched
             case "unsubscribeParameterUpdates":
                 client.watched.difference_update(map(str, fields["parameterNames"]))
             case op:
