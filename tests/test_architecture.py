@@ -85,6 +85,7 @@ GUESTS = {
     ("cli/commands/drive.py", "msgspec"),  # so is --param, into the types that a driver annotates
     ("scans/map_files.py", "PIL"),
     ("transform.py", "pinocchio"),  # `Transform.se3`, when it is read
+    ("view/browser_messages.py", "msgspec"),  # what viser's page sends
     ("view/server.py", "websockets"),  # what viser's server is made of
     # each reads one kind of file in YAML
     ("cli/up/static_edges.py", "yaml"),
@@ -105,8 +106,8 @@ NOT_FOR_USERS = {"docs", "test", "lint", "mujoco"}
 WITHOUT_IMPORTS = {"cmeel-urdfdom", "cmeel-tinyxml2", "cmeel-console-bridge", "example-robot-data"}
 
 PURE = {"model", "buffer", "wire"}
-# The loader and the catalog find and read model files.
-READS_FILES = {"model/load.py", "model/catalog.py"}
+# The loader and the catalog find and read model files; xacro is expanded in a process of its own.
+READS_FILES = {"model/load.py", "model/xacro_expansion.py", "model/catalog.py"}
 READS_ENVIRONMENT = {"wire/registry.py"}  # ROS_DOMAIN_ID
 IMPURE_MODULES = {
     "io",

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from zstate.errors import ModelError
+from zstate.model import xacro_expansion
 from zstate.model.load import load_model
 
 NAMESPACE = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
@@ -94,6 +95,34 @@ def test_a_failed_expansion_has_its_cause_in_one_line(inner: str, words: str):
     assert finding.message.startswith("xacro could not expand it: ")
     assert words in finding.message
     assert "\n" not in finding.message
+
+
+@pytest.mark.parametrize(
+    ("inner", "limit", "words"),
+    [
+        ('<link name="${9**9**9}"/>', "_CPU_S", "takes more than 30 s of CPU"),
+        ("<link name=\"${'%1000000000d' % 1 * 3}\"/>", "_MEMORY_BYTES", "needs more than 2 GiB of memory"),
+    ],
+)
+def test_an_expansion_has_limits_of_time_and_memory(inner: str, limit: str, words: str, monkeypatch):
+    pytest.importorskip("xacro")
+    # A smaller limit in the process of the expansion; the texts keep the shipped one.
+    small = {"_CPU_S": 1, "_MEMORY_BYTES": 1 << 29}[limit]
+    lower = f"import zstate.model.xacro_expansion as expansion\nexpansion.{limit} = {small}\nanswer_request("
+    program = xacro_expansion._PROGRAM.replace("answer_request(", lower)
+    monkeypatch.setattr(xacro_expansion, "_PROGRAM", program)
+    with pytest.raises(ModelError, match=words):
+        load_model(f'<robot name="r" {NAMESPACE}><xacro:if value="0"/>{inner}</robot>')
+
+
+def test_the_environment_and_the_folder_add_no_modules_to_an_expansion(
+    tmp_path: Path, arm: Path, monkeypatch
+):
+    pytest.importorskip("xacro")
+    (tmp_path / "json.py").write_text("raise SystemExit('imported')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert load_model(arm).joints[0].origin[0] == 2.0
 
 
 def test_without_a_xacro_package_the_error_names_the_extra_to_install(arm: Path):

@@ -120,9 +120,9 @@ class FoxgloveServer(Closeable):
     ``on_readers()`` is called after a client has subscribed or unsubscribed, ``on_event(text)`` for clients
     that come, leave or are refused; both from the thread of the server.
 
-    There are 64 clients at most. Each has a queue of its own: a client that reads slowly loses its oldest messages, which are
-    counted, and delays no other. It always receives the newest latched message of each key. A client that
-    does not answer a ping within 20 s is disconnected.
+    There are 64 clients at most. Each has a queue of its own: a client that reads slowly loses its oldest
+    messages, which are counted, and delays no other. It always receives the newest latched message of each
+    key. A client that does not answer a ping within 20 s is disconnected.
 
     Raises InvalidInput if ``host`` or ``port`` cannot be used.
     """
