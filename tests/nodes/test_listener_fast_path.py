@@ -86,8 +86,7 @@ class Receiver:
 
     def ingests(self) -> Iterator[StreamIngest]:
         for samples in self.listener._sample_streams.values():
-            yield from samples.ingests.values()
-            yield from samples.unannounced.values()
+            yield from samples.all()
 
     def state(self) -> dict[str, object]:
         """Everything a user can see, and what decides on later samples."""

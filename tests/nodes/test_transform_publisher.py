@@ -389,12 +389,12 @@ def test_unannounced_writers_are_bounded_and_leave_no_edges(sessions):
             arrival = SerializedSample("zstate/r1/transforms/thief", encode(sample), encoding)
             listener._on_samples(transforms, [arrival])
         moving = [frame.name for frame in listener.buffer.frames() if frame.parent]
-    assert len(transforms.unannounced) == 256
+        assert listener.stats.refused == {"too many writers": 44}
+    assert len(transforms.all()) == 256
     assert moving == [f"r1/frame{session}" for session in range(44, 300)]
 
 
-def test_edges_of_writers_that_have_left_stay(sessions, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("zstate.ingest.base._MAX_UNANNOUNCED", 1)
+def test_edges_of_writers_that_have_left_stay(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener:
         for number in range(3):

@@ -1,7 +1,4 @@
-"""Base of the ingest of one robot's samples: writers, sequence numbers, early samples, epochs.
-
-``StreamIngests`` has the ingests of all writers on one stream.
-"""
+"""Base of the ingest of one robot's samples: writers, sequence numbers, early samples, epochs."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from zstate._util.bounded import BoundedDict, BoundedQueue
@@ -19,7 +15,6 @@ from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput, MessageError, format_duration
 from zstate.ingest.counters import MissingSamples
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.wire.keys import Stream
 from zstate.wire.messages import Edges, RobotDescription, Sample, message_size
 
 # Bounds on the samples that wait for the robot's description, which takes milliseconds.
@@ -33,9 +28,6 @@ SILENT_S = 2.0
 
 # Of the last sessions; each may have 16 MB.
 _MAX_DESCRIPTIONS = 4
-
-# Of one stream; a hostile writer can make up any number of sessions.
-_MAX_UNANNOUNCED = 256
 
 ClockSetBack: TypeAlias = Callable[[str, int, str], None]
 """Called with a robot, the session of its writer, and a description of what happened."""
@@ -101,6 +93,7 @@ class StreamIngest(ABC):
         self._departed_session: int | None = None
         self._fast_order = b""
         self._fast_path = self._buffer.fast_path(self._counters.fast_counts, ownership)
+        self._is_dropped = False
         self._lock = _IngestLock(self._stop_fast_path)
         self._buffer.name_robot(robot)
 
@@ -132,9 +125,14 @@ class StreamIngest(ABC):
                 self._buffer.domain.leave(self.robot)
 
     def drop(self) -> None:
-        """Remove all samples and edges of this robot's writers from the buffer."""
+        """Remove all samples and edges of this writer from the buffer. Later samples are refused.
+
+        One thread may look up an ingest, and insert its sample after another thread has dropped the ingest.
+        """
         with self._lock:
-            self._drop_history()
+            self._is_dropped = True
+            self._count_dropped()
+            self._remove()
 
     def insert_next(self, message: bytes | None, earliest: int, latest: int) -> bool:
         """Insert the live sample encoded in ``message`` if it is the usual next one; else nothing is done.
@@ -158,6 +156,9 @@ class StreamIngest(ABC):
         """
         self.has_data = True
         with self._lock:
+            if self._is_dropped:
+                self._count_dropped()
+                return
             if sample.session != self._session and not self._accept_session(sample):
                 self._counters.count_refusal(
                     "second writer", f"{self.robot!r} has another, newer writer than {sample.session}"
@@ -207,7 +208,7 @@ class StreamIngest(ABC):
         self.has_data = True
         for sample in reversed(samples):
             with self._lock:  # for each, so that live samples need not wait for all
-                if not self._accept_session(sample):
+                if self._is_dropped or not self._accept_session(sample):
                     return False
                 if self._is_missing(sample.seq) and not self._insert_old(sample):
                     return False
@@ -258,6 +259,12 @@ class StreamIngest(ABC):
     def _refuse_undescribed(self) -> None:
         self._counters.count_refusal(
             "no description", f"{self.robot!r}: no robot_description fits its samples"
+        )
+
+    def _count_dropped(self) -> None:
+        self._counters.count_refusal(
+            "too many writers",
+            f"{self.robot!r} has too many writers that are not announced; the oldest lost its edges",
         )
 
     def _insert_counted(self, sample: Sample, *, is_in_order: bool) -> bool | None:
@@ -406,6 +413,10 @@ class StreamIngest(ABC):
     def _drop_history(self) -> None:
         """Drop all samples inserted so far; a new epoch begins."""
 
+    def _remove(self) -> None:
+        """Remove all samples and edges: no further ones come."""
+        self._drop_history()
+
     @abstractmethod
     def _may_restart_epoch(self) -> bool:
         """Whether dropping the history would drop no samples of other writers."""
@@ -413,73 +424,3 @@ class StreamIngest(ABC):
     @abstractmethod
     def _on_writer_changed(self) -> None:
         """Called when the current writer, or its name, has changed."""
-
-
-@dataclass(eq=False)
-class StreamIngests:
-    """The ingests of the writers of one stream, by robot and session; the session is 0 unless ``is_shared``.
-
-    ``is_shared`` means that each writer publishes its own part of a robot, and has its own ingest. The first
-    samples of a writer may arrive before its announcement, and the last after it has left: then its ingest is
-    among the ``unannounced``. Of more than 256 the oldest is dropped, with its edges if it was never
-    announced.
-    """
-
-    stream: Stream
-    is_shared: bool
-    has_parts: bool = False
-    """Whether its samples are joint states of some of the joints, or may be."""
-    capacity: int = 0
-    """Of the ring that the samples arrive in."""
-    ingests: dict[tuple[str, int], StreamIngest] = field(default_factory=dict[tuple[str, int], StreamIngest])
-    unannounced: dict[tuple[str, int], StreamIngest] = field(
-        default_factory=dict[tuple[str, int], StreamIngest]
-    )
-    overflowed: set[StreamIngest] = field(default_factory=set[StreamIngest])
-    newest_by_key: BoundedDict[str, StreamIngest] = field(default_factory=BoundedDict[str, StreamIngest])
-    """The ingest of the last sample on each key, which may expect the next one."""
-
-    def all(self, robot: str | None = None) -> list[StreamIngest]:
-        """All ingests, or those of one robot; any thread may add others at the same time."""
-        # In this order: ``announce`` moves an ingest from one to the other, and none may be overlooked.
-        ingests = dict.fromkeys((*list(self.unannounced.values()), *list(self.ingests.values())))
-        return [one for one in ingests if robot in (None, one.robot)]
-
-    def add(self, ingest: StreamIngest, session: int, writer: str | None) -> StreamIngest:
-        """Add the ingest of a session; ``writer`` is the name of its writer if that is announced.
-
-        Returns the ingest that another thread has added at the same time, if any.
-        """
-        if not self.is_shared:
-            return self.ingests.setdefault((ingest.robot, 0), ingest)
-        if writer is None:
-            return self._add_unannounced((ingest.robot, session), ingest)
-        ingest = self.ingests.setdefault((ingest.robot, session), ingest)
-        ingest.name_writer(session, writer)
-        return ingest
-
-    def announce(self, robot: str, session: int) -> bool:
-        """Keep the ingest of a writer that is announced now; False if it has not published yet."""
-        key = (robot, session)
-        ingest = self.unannounced.get(key)
-        if ingest is not None:
-            self.ingests[key] = ingest
-            self.unannounced.pop(key, None)
-        return key in self.ingests
-
-    def writer_left(self, robot: str, session: int) -> None:
-        """Handle the end of a writer, whose last samples may arrive later."""
-        key = (robot, session if self.is_shared else 0)
-        ingest = self.ingests.get(key)
-        if ingest is not None:
-            ingest.writer_left(session)
-            if self.is_shared:
-                self._add_unannounced(key, self.ingests.pop(key))
-
-    def _add_unannounced(self, key: tuple[str, int], ingest: StreamIngest) -> StreamIngest:
-        ingest = self.unannounced.setdefault(key, ingest)
-        if len(self.unannounced) > _MAX_UNANNOUNCED:
-            oldest = self.unannounced.pop(next(iter(self.unannounced)))
-            if oldest.writer is None:
-                oldest.drop()
-        return ingest

@@ -83,6 +83,10 @@ class EdgeSource:
     is_model: bool = False
     claims: dict[EdgeNames, EdgeClaim] = field(default_factory=dict[EdgeNames, EdgeClaim])
 
+    def is_of_writer_of(self, other: EdgeSource) -> bool:
+        """Whether both are edges of the same writer, for instance on two streams."""
+        return (self.robot, self.session) == (other.robot, other.session)
+
 
 class Admitted(NamedTuple):
     """The ``rows`` of a sample that are inserted, None for all, and the refusal of another row."""
@@ -502,7 +506,8 @@ class FrameOwnership:
         is_same_edge = there.parent == parent
         # Of static edges the last value counts; samples of two writers would alternate. ROS allows that.
         both_move = there.claim is not None and there.pose is None and claim.pose is None
-        may_share = there.rank == rank and (self._is_shared or not both_move)
+        is_own = there.claim is not None and there.claim.source.is_of_writer_of(claim.source)
+        may_share = is_own or (there.rank == rank and (self._is_shared or not both_move))
         if is_same_edge and (there.is_as_good_as(claim) or may_share):
             return None
         if rank == _OTHERS and there.rank < _OTHERS:

@@ -274,10 +274,6 @@ class PartialJointStateIngest(StreamIngest):
         with self._lock:
             self._insert_early()
 
-    def drop(self) -> None:
-        with self._lock:
-            self._parts.drop(self._session or 0)
-
     def _insert(self, sample: Sample) -> bool | None:
         assert isinstance(sample, JointState)
         part = self._parts.part_of(sample, others=self._others)
@@ -298,6 +294,9 @@ class PartialJointStateIngest(StreamIngest):
 
     def _drop_history(self) -> None:
         self._parts.restart(self._session or 0)
+
+    def _remove(self) -> None:
+        self._parts.drop(self._session or 0)
 
     def _on_writer_changed(self) -> None:
         pass  # ``RobotParts`` has the writers

@@ -15,13 +15,14 @@ from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.clock import SYSTEM, Clock, SystemClock
 from zstate.errors import InvalidInput, MessageError
 from zstate.extension import kernel
-from zstate.ingest.base import StreamIngest, StreamIngests
+from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters, ListenerStats
 from zstate.ingest.events import EventLog, WriterEvent
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_parts import PartialJointStateIngest, RobotParts
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.stamp_checks import FAR_NS, LATE_NS, StampCheck
+from zstate.ingest.stream_ingests import StreamIngests
 from zstate.ingest.transforms import StaticTransformIngests, TransformIngest
 from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.latched import LatchedSubscriber
@@ -263,12 +264,10 @@ class TransformListener(Closeable):
         return StreamSubscriber(session, keys, on_samples, insert_next=insert_next, envelope=envelope)
 
     def _ingest_for(self, samples: StreamIngests, robot: str, session: int) -> StreamIngest:
-        key = (robot, session if samples.is_shared else 0)
-        ingest = samples.ingests.get(key) or samples.unannounced.get(key)
+        ingest = samples.find(robot, session)
         if ingest is None:
-            ingest = self._new_ingest(samples, robot)
             self._ownership.add_robot(robot)
-            ingest = samples.add(ingest, session, self._names.get((robot, session)))
+            ingest = samples.add(self._new_ingest(samples, robot), session)
         return ingest
 
     def _new_ingest(self, samples: StreamIngests, robot: str) -> StreamIngest:
@@ -304,7 +303,7 @@ class TransformListener(Closeable):
         is_full = len(arrivals) >= samples.capacity
         if is_full:
             # A full ring has lost samples of any of the writers, and loses more while it is drained.
-            samples.overflowed = set(samples.ingests.values())
+            samples.overflowed = set(samples.all())
         # The samples of full batches take the long way.
         is_fast = (
             self._has_fast_path and not is_full and self._wire.usual_envelope(samples.stream) is not None
@@ -439,7 +438,9 @@ class TransformListener(Closeable):
             self._history.request(stream_key(robot, samples.stream, announced.name), session)
         if not alive:
             samples.writer_left(robot, session)
-        elif not samples.is_shared or samples.announce(robot, session):
+        elif samples.is_shared:
+            samples.announce(robot, session, str(announced.writer))
+        else:
             self._ingest_for(samples, robot, session).name_writer(session, str(announced.writer))
 
 
