@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import count
 
 import numpy as np
 import pytest
@@ -14,14 +15,14 @@ from zstate.clock import ManualClock
 from zstate.errors import AmbiguousFrame, InvalidInput
 from zstate.model.load import load_model
 from zstate.net.clock_offset import measure_offsets
-from zstate.net.presence import discover
+from zstate.net.presence import announce, discover
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
 from zstate.transform import Transform
-from zstate.wire.messages import JointState, order_digest
+from zstate.wire.messages import JointState, Odometry, WriterTransforms, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.protocol import SerializedSample
 
@@ -328,6 +329,33 @@ def test_invalid_token_hides_no_other(sessions, robot):
         assert measure_offsets(reader, "*")
     for token in tokens:
         token.undeclare()
+
+
+@pytest.mark.parametrize("stream", ["transforms", "odometry"])
+def test_writer_whose_token_has_no_name_is_announced(sessions, monkeypatch: pytest.MonkeyPatch, stream):
+    raised: list[object] = []
+    monkeypatch.setattr("threading.excepthook", raised.append)
+    writer, reader = sessions
+    edges = (("odom", "base_link"),)
+    body = 5, order_digest(edges), to_block((*[0.0] * 6, 1.0)), edges
+
+    def named() -> bool:
+        seq = next(seqs)
+        if stream == "transforms":
+            publisher.put(encode(WriterTransforms(1 + seq, seq, *body)))
+        else:
+            publisher.put(encode(Odometry(1 + seq, seq, *body, twist=to_block([0.0] * 6))))
+        return [frame.writer for frame in listener.buffer.frames() if frame.parent] == ["p@h pid 1"]
+
+    seqs = count()
+    encoding = ENCODINGS[WriterTransforms if stream == "transforms" else Odometry]
+    with (
+        announce(writer, f"zstate/r1/@writer/{stream}/p,h,1,1,5"),
+        TransformListener(reader, "r1") as listener,
+        StreamPublisher(writer, f"zstate/r1/{stream}/any", encoding) as publisher,
+    ):
+        until(named)
+    assert raised == []
 
 
 def test_observers_are_called_after_each_processed_batch(sessions):

@@ -217,9 +217,12 @@ class WriterClaim(Closeable):
         stream = (rival.stream, rival.name)
         if stream not in self._received:
             ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
+            is_named = bool(rival.name) or rival.stream not in NAMED_STREAMS
             self._received[stream] = zenoh.ext.declare_advanced_subscriber(
                 self._session.zenoh,
-                stream_key(rival.robot, *stream),
+                stream_key(rival.robot, *stream)
+                if is_named
+                else stream_expression(rival.robot, rival.stream),
                 ring,
                 history=zenoh.ext.HistoryConfig(max_samples=1),
             )

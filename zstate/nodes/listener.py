@@ -35,6 +35,7 @@ from zstate.wire.keys import (
     ANY,
     EDGE_STREAMS,
     MODEL_WRITER,
+    NAMED_STREAMS,
     Stream,
     check_robot,
     shortened,
@@ -434,7 +435,9 @@ class TransformListener(Closeable):
             self._clock_offsets.watch(robot, announced.writer)
         elif self._clock_offsets is not None:
             self._clock_offsets.unwatch(announced.writer)
-        if alive and self._history is not None:
+        # A token without a name leaves open on which key of a named stream its writer publishes.
+        has_key = bool(announced.name) or samples.stream not in NAMED_STREAMS
+        if alive and self._history is not None and has_key:
             self._history.request(stream_key(robot, samples.stream, announced.name), session)
         if not alive:
             samples.writer_left(robot, session)
