@@ -10,7 +10,7 @@ from zstate import Transform, TransformBuffer, connect
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.commands.ls import robots_text
 from zstate.cli.commands.tree import tree_drawing
-from zstate.cli.doctor.robot_probe import StreamSamples
+from zstate.cli.doctor.robot_probe import StreamCollector
 from zstate.cli.edge_statistics import EdgeRow, EdgeStatistics, path_text
 from zstate.cli.output.drawing import ALARM, draw
 from zstate.clock import SystemClock
@@ -27,6 +27,7 @@ INTERVALS_50_HZ = [0.020, 0.019, 0.023, 0.018, 0.041, 0.020, 0.016, 0.022, 0.021
 INTERVALS_2_HZ = [0.50, 0.49, 0.53, 0.47, 0.52, 0.50, 0.48]
 SESSION = 7
 WRITER = WriterId("driver", "jetson", 412, 0, SESSION)
+INFO = RobotInfo("r1", (("joint_states", WRITER),))
 
 
 def staleness(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
@@ -39,7 +40,7 @@ def staleness(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
         connect() as session,
         TopicStatistics(session, native) as listed,
         EdgeStatistics(session, "r1", "native", "joint_states", SystemClock()) as edges,
-        StreamSamples(session, "r1", "joint_states", native) as examined,
+        StreamCollector(session, [INFO], "native", lambda: None) as examined,
     ):
         events, answered, metered = DeadlineMonitor(), Deadline(unknown_s=2.0), MeteredBuffer()
         events.register(("r1", SESSION))
@@ -54,11 +55,12 @@ def staleness(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
             buffer.insert(Transform("r1/base", "r1/tool", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp))
         (tool,) = [frame for frame in buffer.frames() if frame.name == "r1/tool"]
         found["events"] = bool(events.expired(now_s)[0])
-        found["ls"] = "silent" in robots_text((RobotInfo("r1", (("joint_states", WRITER),)),), listed)
+        found["ls"] = "silent" in robots_text((INFO,), listed)
         found["monitor"] = "silent" in path_text([EdgeRow("r1/tool", edge, edges.measure(edge), None)])
         found["monitor --robots, demo"] = metered.measure("r1").rate_hz == 0.0
-        found["doctor"] = examined.statistics.is_stale()
-        found["doctor, ROS"] = examined.writers[SESSION].statistics.is_stale()
+        samples = examined.samples("r1", "joint_states")
+        found["doctor"] = samples.statistics.is_stale()
+        found["doctor, ROS"] = samples.writers[SESSION].statistics.is_stale()
         found["tf"] = answered.is_missed(now_s)
         found["view"] = is_stale(now_s - arrivals[-1] * 1e-9, tool.rate_hz)
         found["tree"] = ALARM in draw(tree_drawing(buffer.frames(), time.time_ns(), in_full=True), "svg", "")

@@ -11,7 +11,7 @@ from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InFuture, InPast, InvalidInput, Stale
-from zstate.net.clock_offset import ClockOffsetMonitor, measure_offsets
+from zstate.net.clock_offset import ClockOffsetMonitor, measure_offsets, unanswered
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import connect
 from zstate.nodes.listener import TransformListener
@@ -226,3 +226,18 @@ def test_reply_of_another_writer_does_not_count(sessions):
         assert measure_offsets(reader, "r1", timeout_s=0.3) == ()
     with Queryable(writer, key, lambda _: answer(asked.session)):
         until(lambda: [one.writer for one in measure_offsets(reader, "r1")] == [asked])
+
+
+def test_a_query_that_no_writer_receives_is_told_from_one_that_times_out(sessions):
+    writer, reader = sessions
+    queries: list[zenoh.Query] = []  # received, and never answered
+    frozen, absent = (
+        WriterId(name, "host", 7, 0, number) for number, name in enumerate(("frozen", "absent"))
+    )
+    queryable = writer.zenoh.declare_queryable(clock_key("r1", frozen.identity), queries.append)
+    with StatePublisher(writer, RRBOT, "r1"):
+        (measured,) = measure_offsets(reader, "r1", timeout_s=5.0)
+        of_robot = {("r1", one) for one in (frozen, absent, measured.writer)}
+        assert unanswered(reader, of_robot, 1.0) == {("r1", frozen): True, ("r1", absent): False}
+    assert queries
+    queryable.undeclare()

@@ -218,7 +218,7 @@ class FrameOwnership:
             self.buffer.withdraw(frame.name)
             if frame.name not in self._claims:  # claims are reported when they are resolved
                 text = f"{frame.writer or 'hand'!r} placed {frame.name!r}, a link of the model"
-                self.counters.count_refusal("second writer", text)
+                self.counters.for_robot(robot).count_refusal("second writer", text)
         root = f"{robot}/{model.root}"
         top = root
         while (above := self.buffer.frames((top,))) and above[0].parent is not None:
@@ -229,7 +229,7 @@ class FrameOwnership:
             self.buffer.withdraw(root)
             if root not in self._claims:
                 text = f"{frame.writer or 'hand'!r} placed {root!r}, the root of the model, below the model"
-                self.counters.count_refusal("loop", text)
+                self.counters.for_robot(robot).count_refusal("loop", text)
             return True
         return bool(taken)
 
@@ -548,7 +548,8 @@ class FrameOwnership:
                 self._report(claim.source, error)
 
     def _report(self, source: EdgeSource, error: InsertRefused) -> None:
-        self.counters.count_refusal(error.reason, f"static edge of {source.name!r}: {error}")
+        text = f"static edge of {source.name!r}: {error}"
+        self.counters.for_robot(source.robot).count_refusal(error.reason, text)
         self.report_conflict("tf_static", source, error)
 
     def report_conflict(self, stream: Stream, source: EdgeSource, error: InsertRefused) -> None:

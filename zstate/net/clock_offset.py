@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import partial
 
 import zenoh
 
@@ -44,6 +45,9 @@ _FIRST_ROUNDS = 2
 """Fewer when a writer is first watched: a listener of a thousand robots measures all of them at once."""
 
 _DISCOVERY_S = 0.05
+
+_MOST_OF_A_TIMEOUT = 0.9
+"""A query that took this part of its timeout has timed out."""
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -90,6 +94,44 @@ def measure_offsets(
     return tuple(
         sorted(_measure(session, clock_expression(robot), rounds, clock or SystemClock(), timeout_s))
     )
+
+
+def unanswered(
+    session: Session, writers: Collection[tuple[str, WriterId]], timeout_s: float
+) -> dict[tuple[str, WriterId], bool]:
+    """The ``writers``, each with its robot, that do not reply with their clocks within ``timeout_s`` [s].
+
+    The value is False for a query that ended earlier without a reply: nothing at its key received it. All are
+    queried together. Raises InvalidInput and Closed.
+    """
+    check_timeout(timeout_s)
+    began = time.monotonic()
+    ended = threading.Condition()
+    replied: set[tuple[str, WriterId]] = set()
+    durations_s: dict[tuple[str, WriterId], float] = {}
+
+    def on_reply(of: tuple[str, WriterId], reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            replied.add(of)
+
+    def on_end(of: tuple[str, WriterId]) -> None:
+        with ended:
+            durations_s[of] = time.monotonic() - began
+            ended.notify()
+
+    for robot, writer in writers:
+        # Called on threads of Zenoh, which must not wait.
+        handler = zenoh.handlers.Callback(
+            partial(on_reply, (robot, writer)), partial(on_end, (robot, writer)), indirect=False
+        )
+        session.zenoh.get(clock_key(robot, writer.identity), handler, timeout=timeout_s)
+    with ended:
+        ended.wait_for(lambda: len(durations_s) == len(writers), timeout_s + _DISCOVERY_S)
+    return {
+        one: durations_s.get(one, timeout_s) > _MOST_OF_A_TIMEOUT * timeout_s
+        for one in writers
+        if one not in replied
+    }
 
 
 def _measure(

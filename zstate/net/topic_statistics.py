@@ -182,8 +182,8 @@ class TopicStatistics(Closeable):
     """Statistics of subscribed streams by source; messages that cannot be decoded are skipped.
 
     ``sources(robot, stream, sample)`` are the keys under which a sample is counted, by default the
-    ``WriterKey`` of its writer. ``clock`` is that of the stamps. ``on_sample`` is called with each sample, in
-    the subscriber's thread.
+    ``WriterKey`` of its writer. ``clock`` is that of the stamps. ``on_sample(robot, stream, sample)`` is
+    called for each sample, in the subscriber's thread.
     """
 
     def __init__(
@@ -194,7 +194,7 @@ class TopicStatistics(Closeable):
         sources: Callable[[str, Stream, StampedMessage], Iterable[Hashable]] | None = None,
         clock: Clock | None = None,
         window: int = WINDOW,
-        on_sample: Callable[[Stream, StampedMessage], None] | None = None,
+        on_sample: Callable[[str, Stream, StampedMessage], None] | None = None,
     ) -> None:
         self.gaps = SequenceGaps()
         self._session, self._wire = session, wire
@@ -204,6 +204,7 @@ class TopicStatistics(Closeable):
         self._statistics: BoundedDict[Hashable, IntervalStatistics] = BoundedDict()
         self._arrived = threading.Condition()
         self._subscriptions = ExitStack()
+        self._subscribers: list[StreamSubscriber] = []
 
     def subscribe(self, stream: Stream, robot: str = ANY) -> None:
         """Count ``stream`` of ``robot``, or of all robots, from now on."""
@@ -217,7 +218,13 @@ class TopicStatistics(Closeable):
                 self._arrived.notify_all()
 
         key = self._wire.expression(robot, stream)
-        self._subscriptions.enter_context(StreamSubscriber(self._session, key, on_samples))
+        subscriber = StreamSubscriber(self._session, key, on_samples)
+        self._subscribers.append(self._subscriptions.enter_context(subscriber))
+
+    @property
+    def has_overrun(self) -> bool:
+        """Whether more samples have arrived than were taken in here: then rates are too low."""
+        return any(subscriber.full_batches for subscriber in self._subscribers)
 
     def add(self, robot: str, stream: Stream, sample: StampedMessage, at: int, now: int) -> None:
         """Count a sample that arrived ``at``, when it was ``now`` by the clock of the stamps."""
@@ -232,7 +239,7 @@ class TopicStatistics(Closeable):
                 continue  # a ROS message holds several samples, counted as one
             statistics.add(received, sample.session)
         if self._on_sample is not None:
-            self._on_sample(stream, sample)
+            self._on_sample(robot, stream, sample)
 
     def get(self, source: Hashable) -> IntervalStatistics | None:
         """The statistics of one source; None if no sample has arrived."""

@@ -212,6 +212,10 @@ class TransformListener(Closeable):
         """The text of the first refusal of each reason in ``stats.refused``."""
         return self._counters.refusals()
 
+    def refusals_of(self, robot: str) -> dict[str, str]:
+        """The part of ``refusals`` that concerns one robot."""
+        return self._counters.for_robot(robot).refusals()
+
     def robots(self) -> tuple[str, ...]:
         """The robots that sent any message so far, sorted by name."""
         ingests = (

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,18 @@ from helpers.cli_runner import ALL_STREAMS, RRBOT, Spawn, failure, published_rob
 from helpers.processes import DEADLINE_S, find_free_port, repeated, until
 
 from zstate import PartialStatePublisher, StatePublisher, StaticPublisher, Transform, connect, load_model
+from zstate.cli.doctor.robot_probe import RobotProbe, StreamCollector
 from zstate.clock import ManualClock, SystemClock
 from zstate.driving import Commander, stop
+from zstate.net.presence import announce, discover, discover_readers, local_writer
 from zstate.nodes.clock import ClockPublisher
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.odometry import ImuPublisher, OdometryPublisher
-from zstate.wire.keys import Stream
+from zstate.odometry import ImuPublisher, OdometryPublisher, SensorListener
+from zstate.sources import JointStateListener
+from zstate.wire.keys import Stream, writer_key
+from zstate.wire.messages import JointState, order_digest
+from zstate.wire.native import ENCODINGS, encode
 
 pytestmark = pytest.mark.processes
 
@@ -244,6 +251,80 @@ def test_robot_with_transforms_only_is_sound():
     assert "as 'odometry'" in found["transforms"]
     assert found["stamps"].endswith("old on arrival")
     assert found["poses"].endswith("cart/base in cart/odom is known")
+
+
+def test_odometry_whose_driver_has_ended_names_the_streams_that_it_waits_for():
+    edge = Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    with (
+        connect() as session,
+        OdometryPublisher(session, "cart", "odometry", program="odometry") as odometry,
+        TransformListener(session, "cart"),
+        SensorListener(session, "cart", on_imu=lambda *_: None),
+        JointStateListener(session, "cart"),
+        repeated(lambda: odometry.publish(edge, [0, 0, 0], [0, 0, 0])),
+    ):
+        report = diagnosed("cart", code=1)
+    first, states = report["first_broken"], {check["name"]: check["state"] for check in report["checks"]}
+    assert first["name"] == "programs"
+    assert (
+        f"pid {os.getpid()} waits for imu and joint_states of 'cart', which have no writer" in first["text"]
+    )
+    assert (states["model"], states["joint_states"]) == ("broken", "broken")
+    assert first["next"].startswith("zstate ls  # start ")
+
+
+def test_readers_of_other_programs_wait_for_nothing_that_a_robot_lacks(spawn: Spawn):
+    """Such as `zstate echo` of a stream that the robot does not have."""
+    edge = Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    with (
+        connect() as session,
+        OdometryPublisher(session, "cart", "odometry") as odometry,
+        TransformListener(session, "cart"),
+        repeated(lambda: odometry.publish(edge, [0, 0, 0], [0, 0, 0])),
+    ):
+        started(spawn, "echo", "cart", "--stream", "imu")
+        until(lambda: any(one.stream == "imu" for one in discover_readers(session)))
+        assert diagnosed("cart", code=0)["sound"]
+
+
+def test_a_fifth_of_lost_samples_is_a_warning():
+    """Three of four sequence numbers arrive: 75 % of what was sent."""
+    seq = count()
+    order = order_digest(load_model(RRBOT).joint_names)
+    writer = local_writer(7, "lossy")
+    with (
+        connect() as session,
+        StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]),
+        announce(session, writer_key("rrbot", "joint_states", writer.identity)),
+    ):
+
+        def publish() -> None:
+            number = next(seq)
+            if number % 4:
+                state = JointState(time.time_ns(), number, 7, order, bytes(16))
+                session.zenoh.put("zstate/rrbot/joint_states", encode(state), encoding=ENCODINGS[JointState])
+
+        with repeated(publish):
+            found = warnings("rrbot")
+    assert re.search(r"Hz from lossy@.*; \d+ were lost on the way and 0 here", found["joint_states"])
+
+
+def test_a_writer_whose_samples_arrive_is_not_frozen_though_it_does_not_reply():
+    """On a busy machine a writer may publish and still be too slow for a reply."""
+    writer = local_writer(7, "busy")
+    with (
+        connect() as session,
+        TransformPublisher(session, "cart", "odometry") as odometry,
+        announce(session, writer_key("cart", "joint_states", writer.identity)),
+        repeated(lambda: odometry.publish([Transform("odom", "base", (0, 0, 0), (0, 0, 0, 1))])),
+    ):
+        (info,) = discover(session)
+        with StreamCollector(session, [info], "native", lambda: None) as collector:
+            probe = RobotProbe(collector, info, [info])
+            until(lambda: probe.silent_writers() == {writer})
+            state = JointState(time.time_ns(), 0, 7, order_digest(()), b"")
+            session.zenoh.put("zstate/cart/joint_states", encode(state), encoding=ENCODINGS[JointState])
+            until(lambda: not probe.silent_writers())
 
 
 def test_writer_without_new_samples_is_broken():

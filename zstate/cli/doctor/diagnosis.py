@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import shlex
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -39,13 +38,6 @@ from zstate.wire.keys import ANY
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
-
-_GROUP = 50
-"""The number of robots probed at the same time: each takes eight threads."""
-
-_MAX_TIMEOUTS = 5
-"""The number of timeouts after which no more robots are examined. In a large fleet, silent robots take one
-timeout for each group of them."""
 
 _RENDEZVOUS_WITHIN_S = 1.0
 
@@ -285,41 +277,26 @@ def _robots_checks(
     # Loaded after discovery, so that the first checks appear at once.
     from zstate.cli.doctor.clock_checks import domains_check
     from zstate.cli.doctor.robot_checks import robot_checks, shared_roots_checks, static_roots
-    from zstate.cli.doctor.robot_probe import RobotProbe, wait_for_probes
+    from zstate.cli.doctor.robot_probe import collected_probes
     from zstate.cli.doctor.ros_checks import ros_checks
-    from zstate.net.clock_offset import measure_offsets
 
-    messages, is_native = messages_for(wire), wire == "native"
-    offsets = measure_offsets(session, ANY) if is_native else ()
+    messages = messages_for(wire)
     tops: list[FrameInfo] = []
     clocks: dict[str, str] = {}
-    deadline = time.monotonic() + _MAX_TIMEOUTS * timeout_s
-    for first in range(0, len(selected), _GROUP):
-        if time.monotonic() > deadline:
-            text = (
-                f"{len(selected) - first} of {len(selected)} robots were not examined within "
-                f"{_MAX_TIMEOUTS * timeout_s:g} s; name one robot, or raise --timeout"
-            )
-            yield warning("robots", text, f"zstate doctor {selected[first].name}")
-            break
-        with ExitStack() as opened:
-            waiter, probes = ConditionWaiter(), list[RobotProbe]()
-            for info in selected[first : first + _GROUP]:
-                probes.append(opened.enter_context(RobotProbe(session, info, wire, robots, waiter.notify)))
-            for probe in probes if is_native else ():
-                probe.offsets = tuple(one for one in offsets if one.robot == probe.info.name)
-                probe.find_unresponsive()
-            wait_for_probes(probes, waiter, timeout_s)
-            for probe in probes:
-                if probe.description is not None:
-                    clocks[probe.info.name] = probe.description.clock
-                if isinstance(messages, RosMessages):
-                    checks = ros_checks(probe, session, messages, model_name)
-                else:
-                    checks = robot_checks(probe, session)
-                for check in checks:
-                    yield replace(check, robot=probe.info.name)
-                tops += static_roots(probe)
-    if is_native:
+    with collected_probes(session, selected, robots, wire, timeout_s) as probes:
+        for probe in probes:
+            if probe.description is not None:
+                clocks[probe.info.name] = probe.description.clock
+            if isinstance(messages, RosMessages):
+                checks = ros_checks(probe, messages, model_name)
+            else:
+                checks = robot_checks(probe, session)
+            for check in checks:
+                yield replace(check, robot=probe.info.name)
+            tops += static_roots(probe)
+        if any(probe.collector.has_overrun for probe in probes):
+            text = "more samples arrive than this process takes in: the rates above are too low"
+            yield warning("robots", text, f"zstate doctor {selected[0].name}  # one robot")
+    if wire == "native":
         yield from shared_roots_checks(tops)
     yield from domains_check(clocks)

@@ -45,11 +45,12 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
         yield _silent_check(probe, session)
         return
     for reason in _VERSION_REASONS:
-        if text := probe.listener.refusals.get(reason):
+        if text := probe.refusals.get(reason):
             is_newer = reason == "newer version"
             advice = f"zstate ls  # shows the writers of {probe.info.name}"
             yield broken("version", text, "pip install -U zstate" if is_newer else advice)
             break
+    yield from _waits_checks(probe)
     yield from maps_checks(probe, f"zstate doctor {probe.info.name} --timeout 10")
     if probe.is_place:
         yield statics_check(probe)
@@ -66,10 +67,9 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
     yield from sensor_frames_checks(probe)
     yield from measured_checks(probe)
     yield clocks_check(probe)
-    yield stamps_check(probe, session)
+    yield stamps_check(probe)
     if model is not None:
-        parts = {} if probe.parts is None else probe.parts.writers
-        writers = (*probe.samples.writers.values(), *parts.values())
+        writers = (*probe.samples.writers.values(), *probe.parts.writers.values())
         yield from limits_check(probe, model, writers, f"zstate echo {probe.info.name}")
     yield statics_check(probe)
     yield poses_check(probe, model)
@@ -120,6 +120,20 @@ def _silent_check(probe: RobotProbe, session: Session) -> Check:
     return broken("writers", text, f"zstate echo {robot}")
 
 
+def _waits_checks(probe: RobotProbe) -> Iterator[Check]:
+    """A finding for each program of the robot that waits for streams without a writer."""
+    streams: dict[str, list[str]] = {}
+    for stream, reader in sorted(probe.waits.items()):
+        streams.setdefault(str(reader), []).append(stream)
+    for program, waited in streams.items():
+        names, have = " and ".join(waited), "has" if len(waited) == 1 else "have"
+        text = (
+            f"{program} waits for {names} of {probe.info.name!r}, which {have} no writer: the program that "
+            "writes has ended, or was not started"
+        )
+        yield broken("programs", text, f"zstate ls  # start what writes {names}")
+
+
 def model_check(probe: RobotProbe) -> tuple[RobotModel | None, Check]:
     """The model of the robot if it can be used, and the check."""
     robot, writers = probe.info.name, probe.writers("robot_description")
@@ -139,7 +153,7 @@ def model_check(probe: RobotProbe) -> tuple[RobotModel | None, Check]:
         model = parse_urdf(probe.description.urdf, f"the URDF of {robot!r}")
     except ModelError as error:
         return None, broken("model", str(error), "zstate check FILE  # the file that its publisher loads")
-    refused = probe.listener.refusals.get("robot description")
+    refused = probe.refusals.get("robot description")
     if refused:
         return None, broken("model", refused, f"zstate tree {robot}")
     size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joint_names), 'joint')}"
@@ -242,12 +256,15 @@ def _rate_check(probe: RobotProbe, writer: str, rate_hz: float) -> Check:
     silence, hz = format_duration(round(statistics.silent_s() * 1e9)), f"zstate hz {robot} --stream {stream}"
     if statistics.is_stale():
         return broken(stream, f"the samples of {writer} stopped {silence} ago", hz)
-    text, stats = f"{rate_hz:.1f} Hz from {writer}", probe.listener.stats
+    text, stats = f"{rate_hz:.1f} Hz from {writer}", probe.stats
     status = probe.statuses.get(statistics.session)
+    if probe.collector.has_overrun:
+        return ok(stream, f"{text}, newest {silence} ago")
     if status is not None and rate_hz < _MIN_RECEIVED * status.rate_hz:
         text += f", which sends {status.rate_hz:.1f} Hz: the rest is lost or downsampled on the way"
         return warning(stream, text, hz)
-    if stats.missed + stats.dropped > _MIN_RECEIVED * statistics.count:
+    lost = stats.missed + stats.dropped
+    if statistics.count < _MIN_RECEIVED * (statistics.count + lost):
         text += f"; {stats.missed} were lost on the way and {stats.dropped} here"
         return warning(stream, text, f"zstate monitor --robots --robot {robot}")
     return ok(stream, f"{text}, newest {silence} ago")
@@ -260,8 +277,7 @@ def _parts_checks(probe: RobotProbe, model: RobotModel | None) -> Iterator[Check
     if refused is not None:
         yield refused
     yield from named_writers_checks(probe, stream, probe.parts, probe.info.part_names)
-    parts = {} if probe.parts is None else probe.parts.writers
-    written = {name for samples in parts.values() for name in samples.names}
+    written = {name for samples in probe.parts.writers.values() for name in samples.names}
     if model is not None and not written.issuperset(coordinate_names(model)):
         missing = [
             joint for joint in model.joint_names if written.isdisjoint(coordinate_names(model.part([joint])))
@@ -276,12 +292,12 @@ def _parts_checks(probe: RobotProbe, model: RobotModel | None) -> Iterator[Check
 def named_writers_checks(
     probe: RobotProbe,
     stream: Stream,
-    stream_samples: StreamSamples | None,
+    stream_samples: StreamSamples,
     names: Sequence[tuple[str, WriterId]],
     hz: str | None = None,
 ) -> Iterator[Check]:
     """Whether each announced writer of a stream with names publishes; ``hz`` is the command for the rate."""
-    samples = {} if stream_samples is None else stream_samples.writers
+    samples = stream_samples.writers
     hz, what = hz or f"zstate hz {probe.info.name} --stream {stream}", stream.replace("_", " ")
     for name, writer in names:
         received, known_as = samples.get(writer.session), f"{writer}, as {name!r}"
@@ -333,7 +349,7 @@ def maps_checks(probe: RobotProbe, patient: str) -> Iterator[Check]:
 def sensor_frames_checks(probe: RobotProbe) -> Iterator[Check]:
     """Findings for measurements in frames of the robot that it does not have: no reader can place them."""
     robot, info, measured = probe.info.name, probe.info, probe.measured
-    frames = {frame.name for frame in probe.listener.buffer.frames()}
+    frames = {frame.name for frame in probe.frames}
     for stream, what, samples, names in (
         ("scan", "scans", probe.scans.writers, info.scan_names),
         ("imu", "readings", measured["imu"].writers, info.imu_names),
@@ -353,7 +369,11 @@ def sensor_frames_checks(probe: RobotProbe) -> Iterator[Check]:
 
 
 def _no_writer_check(probe: RobotProbe) -> Check:
-    robot, waiting = probe.info.name, probe.writers("tf")
+    robot = probe.info.name
+    waiting = [
+        *probe.writers("tf"),
+        *(reader for stream, reader in probe.waits.items() if stream == "joint_states"),
+    ]
     then = f"{publish_command_for('joints', robot)}  # moves it, until the driver runs"
     if "robot_description" not in probe.streams and not waiting:
         text = f"{robot!r} has no writer of joint_states or tf: it does not move"
@@ -369,7 +389,7 @@ def _no_writer_check(probe: RobotProbe) -> Check:
 
 def refused_check(probe: RobotProbe) -> Check | None:
     """Why samples that arrived cannot be used; None if all can."""
-    refused, texts = probe.listener.stats.refused, probe.listener.refusals
+    refused, texts = probe.stats.refused, probe.refusals
     reasons = [
         reason
         for reason, text in texts.items()
@@ -379,7 +399,7 @@ def refused_check(probe: RobotProbe) -> Check | None:
         return None
     reason = max(reasons, key=lambda one: refused[one])
     text = f"{count_text(refused[reason], 'message')} cannot be used ({reason}): {texts[reason]}"
-    if probe.listener.stats.received:
+    if probe.stats.received:
         return warning(probe.followed, text, f"zstate monitor --robots --robot {probe.info.name}")
     return broken(probe.followed, text, f"zstate echo {probe.info.name} --once")
 
@@ -398,9 +418,9 @@ def limits_check(
 def statics_check(probe: RobotProbe) -> Check:
     """Whether all static edges are used, and every announced writer of static edges has one."""
     robot = probe.info.name
-    static = [frame for frame in probe.listener.buffer.frames() if frame.kind == "static"]
+    static = [frame for frame in probe.frames if frame.kind == "static"]
     refused = _refused_static(probe)
-    if refused is None and not probe.nodes:  # ROS nodes share all frames
+    if refused is None and probe.is_alone and not probe.nodes:  # ROS nodes share all frames
         robots = {info.name for info in probe.neighbours}
         for frame in static:
             # Listeners of all robots refuse the edge, although this listener of one robot does not.
@@ -410,7 +430,7 @@ def statics_check(probe: RobotProbe) -> Check:
     if refused is not None:
         then = f"zstate tree {robot}  # the frames without that edge; stop its writer, or correct it"
         return warning("tf_static", without_program_advice(refused), then)
-    writers = {frame.writer for frame in static}
+    writers = {frame.writer for frame in probe.all_frames if frame.kind == "static"}
     for name, writer in dict(probe.info.static_names).items():
         if name != MODEL_WRITER and name not in writers:
             text = f"{writer} announces static edges as {name!r}, but places no frame"
@@ -420,7 +440,7 @@ def statics_check(probe: RobotProbe) -> Check:
 
 def _refused_static(probe: RobotProbe) -> str | None:
     """Why a static edge is not used, with its writer."""
-    texts = probe.listener.refusals.values()
+    texts = probe.refusals.values()
     refused = next((text for text in texts if text.startswith(_STATIC_PREFIX)), None)
     for name, writer in probe.info.static_names:
         if refused is not None and refused.startswith(f"{_STATIC_PREFIX} {name!r}:"):
@@ -430,7 +450,7 @@ def _refused_static(probe: RobotProbe) -> str | None:
 
 def poses_check(probe: RobotProbe, model: RobotModel | None) -> Check:
     """Whether all frames are in one tree, and the pose of an outermost frame is known."""
-    frames, robot = probe.listener.buffer.frames(), probe.info.name
+    robot, frames = probe.info.name, probe.frames
     roots = sorted(frame.name for frame in frames if frame.parent is None)
     if len(roots) > 1:
         return _trees_check(probe, {frame.name for frame in frames}, roots)
@@ -444,7 +464,7 @@ def poses_check(probe: RobotProbe, model: RobotModel | None) -> Check:
     placed = [frame.name for frame in frames if frame.parent is not None]
     target, source = roots[0], f"{robot}/{ends[0]}" if ends else (placed or roots)[-1]
     try:
-        probe.listener.buffer.lookup(target, source)
+        probe.buffer.lookup(target, source)
     except LookupFailed as error:
         if not has_samples:
             return skipped("poses", f"no joint positions: {error}")
@@ -483,10 +503,9 @@ def shared_roots_checks(tops: Iterable[FrameInfo]) -> Iterator[Check]:
 
 def static_roots(probe: RobotProbe) -> Iterator[FrameInfo]:
     """One child of each root of the robot whose children are all placed by static writers, not by a model."""
-    frames = probe.listener.buffer.frames()
     writers = {name for name, _ in probe.info.static_names if name != MODEL_WRITER}
-    for root in frames:
-        children = [frame for frame in frames if frame.parent == root.name]
-        is_local = root.parent is None and root.name.startswith(f"{probe.info.name}/")
-        if is_local and children and all(frame.writer in writers for frame in children):
-            yield children[0]
+    for root in probe.frames:
+        if root.parent is None and root.name.startswith(f"{probe.info.name}/"):
+            children = [frame for frame in probe.all_frames if frame.parent == root.name]
+            if children and all(frame.writer in writers for frame in children):
+                yield children[0]

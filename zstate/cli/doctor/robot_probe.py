@@ -1,30 +1,35 @@
-"""Collects everything one robot publishes during a short window."""
+"""Collects what robots publish during a short window, and what has arrived of each of them."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
+from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.waiting import ConditionWaiter
 from zstate.driving.driver_state import DriverStateListener, ReceivedState
-from zstate.errors import Unreachable
+from zstate.errors import NoClock, Unreachable
+from zstate.ingest.counters import ListenerStats
 from zstate.ingest.events import WriterEvent
 from zstate.model.robot import RobotModel, coordinate_names
-from zstate.net.clock_offset import MeasuredOffset
-from zstate.net.presence import RobotInfo, discover
-from zstate.net.queryable import query
+from zstate.net.clock_offset import MeasuredOffset, measure_offsets, unanswered
+from zstate.net.presence import RobotInfo, discover, discover_readers
 from zstate.net.session import Session
 from zstate.net.status import StatusSubscriber
 from zstate.net.subscription import Received, subscribe
-from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics
+from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, WriterKey
+from zstate.nodes.clock import SimulatedClock
 from zstate.nodes.listener import Follow, TransformListener
-from zstate.wire.identity import WriterId
-from zstate.wire.keys import EDGE_STREAMS, JOINT_STREAMS, Stream, clock_key
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, SENSOR_STREAMS, Stream
 from zstate.wire.messages import (
     Imu,
     JointState,
@@ -38,14 +43,17 @@ from zstate.wire.messages import (
     from_block,
     order_digest,
 )
-from zstate.wire.protocol import Wire
 from zstate.wire.registry import get_wire
 
 _MIN_WINDOW_S = 1.2  # writers publish their status once a second
+_READERS_WITHIN_S = 0.3
 _REPLY_WITHIN_S = 0.4
-_ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf")
 _MEASURED: tuple[Stream, ...] = ("imu", "velocity", "pose", "odometry")
-_ALL = ""
+_NATIVE_STREAMS: tuple[Stream, ...] = (
+    *("joint_states", "partial_joint_states", "transforms", "scan"),
+    *_MEASURED,
+)
+_ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "scan", *_MEASURED)
 
 
 class WriterSamples:
@@ -89,133 +97,251 @@ class WriterSamples:
         return found
 
 
-class StreamSamples(Closeable):
-    """Subscribes to ``stream`` of ``robot``; counts its samples together and by writer."""
+class StreamSamples(NamedTuple):
+    """The samples of one stream of a robot: those of each of its ``writers``, by session.
 
-    def __init__(
-        self,
-        session: Session,
-        robot: str,
-        stream: Stream,
-        wire: Wire,
-        on_change: Callable[[], object] = lambda: None,
-    ) -> None:
-        self._writers: dict[int, WriterSamples] = {}
+    ``statistics`` are of all writers together, and only of the streams that poses are computed from.
+    """
 
-        def on_sample(_: Stream, sample: StampedMessage) -> None:
-            writer = self._writers.get(sample.session)
-            if writer is None:
-                statistics = self.topic.get(sample.session)
-                assert statistics is not None
-                writer = self._writers[sample.session] = WriterSamples(statistics)
-            writer.add(sample)
-            on_change()
-
-        self.topic = TopicStatistics(
-            session, wire, sources=lambda _, __, sample: iter((_ALL, sample.session)), on_sample=on_sample
-        )
-        self.topic.subscribe(stream, robot)
-
-    def close(self) -> None:
-        self.topic.close()
-
-    @property
-    def statistics(self) -> IntervalStatistics:
-        """Of all writers together."""
-        return self.topic.get(_ALL) or IntervalStatistics()
-
-    @property
-    def writers(self) -> dict[int, WriterSamples]:
-        """By session, each writer whose samples have arrived."""
-        return self._writers.copy()
+    statistics: IntervalStatistics
+    writers: Mapping[int, WriterSamples]
 
 
-class RobotProbe(Closeable):
-    """Subscribes to the streams of ``info`` and to the status of its writers.
+class StreamCollector(Closeable):
+    """Subscribes to all streams of ``robots``, to their models and maps, and to the status of their writers.
 
-    ``neighbours`` are all announced robots. ``on_change()`` is called after each description and sample.
-    ``nodes`` are the samples of each stream by ROS node, on a ROS wire; ``transforms`` and ``parts``, the
-    partial joint states, are the samples of these streams by writer, on the native wire. ``scans`` are those
-    of its laser scanners, ``measured`` those of its other sensors and its odometry; ``maps`` are its maps by
-    name; ``driver`` is the state of its driver.
+    One set of subscriptions serves all robots: on the native wire, for more than one robot, that of all
+    robots there are. ``on_change()`` is called after each sample and each latched value.
     """
 
     def __init__(
-        self,
-        session: Session,
-        info: RobotInfo,
-        wire: str,
-        neighbours: Sequence[RobotInfo],
-        on_change: Callable[[], object],
+        self, session: Session, robots: Sequence[RobotInfo], wire: str, on_change: Callable[[], object]
     ) -> None:
-        self.info, self.neighbours = info, neighbours
-        self.streams = frozenset(stream for stream, _ in info.writers)
-        is_native = wire == "native"
-        moves_by_joints = not JOINT_STREAMS.isdisjoint(self.streams) or "tf" not in self.streams
-        self.followed: Follow = "joint_states" if is_native and moves_by_joints else "tf"
-        self.description: RobotDescription | None = None
-        self.statuses: dict[int, Status] = {}
-        self.maps: dict[str, OccupancyGrid] = {}
-        self.events: list[WriterEvent] = []
-        self.offsets: tuple[MeasuredOffset, ...] = ()
-        self.unresponsive: set[WriterId] = set()
-        self.nodes: dict[Stream, StreamSamples] = {}
+        self.is_native = wire == "native"
+        self.robot = robots[0].name if len(robots) == 1 else ANY
+        self.descriptions: dict[str, RobotDescription] = {}
+        self.statuses: dict[str, dict[int, Status]] = {info.name: {} for info in robots}
+        self.maps: dict[str, dict[str, OccupancyGrid]] = {info.name: {} for info in robots}
+        self.events: dict[str, list[WriterEvent]] = {info.name: [] for info in robots}
+        self.drivers: DriverStateListener | None = None
         self._session, self._on_change = session, on_change
-        self._wire = wire_format = get_wire(wire)
+        self._wire = get_wire(wire)
+        self._samples: dict[tuple[str, Stream], dict[int, WriterSamples]] = {}
+        self._listeners: dict[Follow, TransformListener] = {}
+        followed: dict[Follow, list[str]] = {}
+        for info in robots:
+            followed.setdefault(followed_stream(info, wire), []).append(info.name)
+        latched: list[Stream] = ["robot_description"]
+        if any(info.map_names for info in robots):
+            latched.append("map")
         with ExitStack() as opening:
-            description = subscribe(
-                session, wire_format, info.name, "robot_description", self._on_description
-            )
-            opening.enter_context(description)
-            samples = StreamSamples(session, info.name, self.followed, wire_format, on_change)
-            self.samples = opening.enter_context(samples)
-            self.transforms: StreamSamples | None = None
-            self.parts: StreamSamples | None = None
-            self._drivers: DriverStateListener | None = None
-            scans = StreamSamples(session, info.name, "scan", wire_format, on_change)
-            self.scans = opening.enter_context(scans)
-            self.measured: dict[Stream, StreamSamples] = {
-                stream: opening.enter_context(
-                    StreamSamples(session, info.name, stream, wire_format, on_change)
-                )
-                for stream in _MEASURED
-            }
-            if info.map_names:
-                maps = subscribe(session, wire_format, info.name, "map", self._on_maps)
-                opening.enter_context(maps)
-            if is_native:
-                parts = StreamSamples(session, info.name, "partial_joint_states", wire_format, on_change)
-                self.parts = opening.enter_context(parts)
-                transforms = StreamSamples(session, info.name, "transforms", wire_format)
-                self.transforms = opening.enter_context(transforms)
-                opening.enter_context(StatusSubscriber(session, info.name, self._on_status))
-                self._drivers = opening.enter_context(DriverStateListener(session, info.name))
-            for stream in () if is_native else _ROS_STREAMS:
-                nodes = StreamSamples(session, info.name, stream, wire_format)
-                self.nodes[stream] = opening.enter_context(nodes)
-            listener = TransformListener(
-                session, info.name, wire=wire, follow=self.followed, on_event=self.events.append
-            )
-            self.listener = opening.enter_context(listener)
+            for stream in latched:
+                opening.enter_context(subscribe(session, self._wire, self.robot, stream, self._on_latched))
+            topic = TopicStatistics(session, self._wire, sources=_sources, on_sample=self._on_sample)
+            self.topic = opening.enter_context(topic)
+            for stream in _NATIVE_STREAMS if self.is_native else _ROS_STREAMS:
+                topic.subscribe(stream, self.robot)
+            # A subscription to tf makes publishers compute it: only of the robots that have nothing else.
+            for name in followed.get("tf", ()) if self.is_native else ():
+                topic.subscribe("tf", name)
+            if self.is_native:
+                opening.enter_context(StatusSubscriber(session, self.robot, self._on_status))
+                self.drivers = opening.enter_context(DriverStateListener(session, self.robot))
+            for follow, names in followed.items():
+                of = self.robot if follow == "joint_states" else names
+                listener = TransformListener(session, of, wire=wire, follow=follow, on_event=self._on_event)
+                self._listeners[follow] = opening.enter_context(listener)
             self._opened = opening.pop_all()
 
     def close(self) -> None:
         self._opened.close()
 
-    def _on_description(self, received: list[Received]) -> None:
-        for _, _, message in received:
+    def listener(self, follow: Follow) -> TransformListener:
+        """The listener of all robots that move by the stream ``follow``."""
+        return self._listeners[follow]
+
+    def samples(self, robot: str, stream: Stream) -> StreamSamples:
+        """What has arrived of ``stream`` of ``robot``."""
+        statistics = self.topic.get((robot, stream)) or IntervalStatistics()
+        return StreamSamples(statistics, self._samples.get((robot, stream), {}).copy())
+
+    @property
+    def has_overrun(self) -> bool:
+        """Whether more samples have arrived than were taken in here, so that rates are too low."""
+        return self.topic.has_overrun
+
+    @cached_property
+    def frames(self) -> dict[Follow, FleetFrames]:
+        """The frames of all robots, when first asked for."""
+        return {follow: FleetFrames(one.buffer.frames()) for follow, one in self._listeners.items()}
+
+    @cached_property
+    def simulated_now(self) -> int | NoClock:
+        """The simulated time [ns], or why there is none; waits up to half a second when first asked for."""
+        with SimulatedClock(self._session) as clock:
+            try:
+                return clock.wait(0.5)
+            except NoClock as error:
+                return error
+
+    def _on_sample(self, robot: str, stream: Stream, sample: StampedMessage) -> None:
+        if robot not in self.statuses:
+            return  # of a robot that joined later
+        writers = self._samples.setdefault((robot, stream), {})
+        writer = writers.get(sample.session)
+        if writer is None:
+            statistics = self.topic.get(WriterKey(robot, stream, sample.session))
+            assert statistics is not None
+            writer = writers[sample.session] = WriterSamples(statistics)
+        writer.add(sample)
+        self._on_change()
+
+    def _on_latched(self, received: list[Received]) -> None:
+        for robot, key, message in received:
             if isinstance(message, RobotDescription):
-                self.description = message
-                self._on_change()
+                self.descriptions[robot] = message
+            elif isinstance(message, OccupancyGrid) and robot in self.maps:
+                self.maps[robot][self._wire.edge_writer_name(key) or ""] = message
+        self._on_change()
 
-    def _on_maps(self, received: list[Received]) -> None:
-        for _, key, message in received:
-            if isinstance(message, OccupancyGrid):
-                self.maps[self._wire.edge_writer_name(key) or ""] = message
-                self._on_change()
+    def _on_status(self, robot: str, status: Status) -> None:
+        if robot in self.statuses:
+            self.statuses[robot][status.session] = status
 
-    def _on_status(self, _: str, status: Status) -> None:
-        self.statuses[status.session] = status
+    def _on_event(self, event: WriterEvent) -> None:
+        if event.robot in self.events:
+            self.events[event.robot].append(event)
+
+
+def _sources(robot: str, stream: Stream, sample: StampedMessage) -> Iterator[Hashable]:
+    if stream in ("joint_states", "tf"):
+        yield robot, stream
+    yield WriterKey(robot, stream, sample.session)
+
+
+def followed_stream(info: RobotInfo, wire: str) -> Follow:
+    """The stream that the poses of a robot are computed from."""
+    streams = {stream for stream, _ in info.writers}
+    moves_by_joints = not JOINT_STREAMS.isdisjoint(streams) or "tf" not in streams
+    return "joint_states" if wire == "native" and moves_by_joints else "tf"
+
+
+class FleetFrames:
+    """The frames of several robots, by name, and those of each robot."""
+
+    def __init__(self, frames: Sequence[FrameInfo]) -> None:
+        self.by_name = {frame.name: frame for frame in frames}
+        self._names: dict[str, list[str]] = {}
+        for name in self.by_name:
+            self._names.setdefault(name.partition("/")[0], []).append(name)
+
+    def of(self, robot: str) -> list[FrameInfo]:
+        """The frames of ``robot``, and those above them up to their roots."""
+        found: dict[str, FrameInfo] = {}
+        for name in self._names.get(robot, ()):
+            above: str | None = name
+            while above is not None and above not in found:
+                found[above] = self.by_name[above]
+                above = self.by_name[above].parent
+        return list(found.values())
+
+
+class RobotProbe:
+    """What ``collector`` has of the robot ``info``.
+
+    ``neighbours`` are all announced robots. ``nodes`` are the samples of each stream by ROS node, on a ROS
+    wire; ``transforms`` and ``parts``, the partial joint states, are those of the native wire. ``scans`` are
+    those of its laser scanners, ``measured`` those of its other sensors and its odometry. ``waits`` are the
+    streams without a writer that programs of this robot read, with these programs.
+    """
+
+    def __init__(
+        self,
+        collector: StreamCollector,
+        info: RobotInfo,
+        neighbours: Sequence[RobotInfo],
+        readers: Sequence[Announcement] = (),
+    ) -> None:
+        self.info, self.neighbours = info, neighbours
+        self.streams = frozenset(stream for stream, _ in info.writers)
+        self.followed: Follow = followed_stream(info, "native" if collector.is_native else "")
+        self.offsets: tuple[MeasuredOffset, ...] = ()
+        self.unresponsive: set[WriterId] = set()
+        self.waits = unwritten_streams(info, readers)
+        self.collector = collector
+        self.statuses, self.maps = collector.statuses[info.name], collector.maps[info.name]
+        self.events = collector.events[info.name]
+        self._listener = collector.listener(self.followed)
+
+    @property
+    def description(self) -> RobotDescription | None:
+        """The model; None if it has not arrived."""
+        return self.collector.descriptions.get(self.info.name)
+
+    @property
+    def samples(self) -> StreamSamples:
+        """Those of the followed stream."""
+        return self._of(self.followed)
+
+    @property
+    def transforms(self) -> StreamSamples:
+        """Those of moving edges."""
+        return self._of("transforms")
+
+    @property
+    def parts(self) -> StreamSamples:
+        """Those of drivers of some joints."""
+        return self._of("partial_joint_states")
+
+    @property
+    def scans(self) -> StreamSamples:
+        """Those of laser scanners."""
+        return self._of("scan")
+
+    @property
+    def measured(self) -> dict[Stream, StreamSamples]:
+        """Those of other sensors, and of odometry."""
+        return {stream: self._of(stream) for stream in _MEASURED}
+
+    @property
+    def nodes(self) -> dict[Stream, StreamSamples]:
+        """Those of each ROS node; empty on the native wire."""
+        streams: tuple[Stream, ...] = () if self.collector.is_native else ("joint_states", "tf")
+        return {stream: self._of(stream) for stream in streams}
+
+    def _of(self, stream: Stream) -> StreamSamples:
+        return self.collector.samples(self.info.name, stream)
+
+    @property
+    def buffer(self) -> TransformBuffer:
+        """The buffer with its frames, and with those of the others that are examined."""
+        return self._listener.buffer
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether no other robot is examined."""
+        return self.collector.robot != ANY or not self.collector.is_native
+
+    @property
+    def frames(self) -> list[FrameInfo]:
+        """Its frames and those above them; all that its writers place, if it is examined alone."""
+        everything = self.collector.frames[self.followed]
+        return list(everything.by_name.values()) if self.is_alone else everything.of(self.info.name)
+
+    @property
+    def all_frames(self) -> list[FrameInfo]:
+        """Those of all examined robots."""
+        return list(self.collector.frames[self.followed].by_name.values())
+
+    @property
+    def stats(self) -> ListenerStats:
+        """What a listener of this robot counts."""
+        return self._listener.stats if self.is_alone else self._listener.stats_of(self.info.name)
+
+    @property
+    def refusals(self) -> dict[str, str]:
+        """The text of the first refusal of each reason."""
+        return self._listener.refusals if self.is_alone else self._listener.refusals_of(self.info.name)
 
     def writers(self, stream: Stream) -> list[WriterId]:
         """The announced writers of ``stream``, the newest last."""
@@ -237,23 +363,34 @@ class RobotProbe(Closeable):
     @property
     def driver(self) -> ReceivedState | None:
         """The newest state of the robot's driver; None if none has arrived."""
-        return None if self._drivers is None else self._drivers.get(self.info.name)
+        drivers = self.collector.drivers
+        return None if drivers is None else drivers.get(self.info.name)
 
     @property
     def is_incomplete(self) -> bool:
         """Whether announced data has not arrived yet."""
-        lacks_model = "robot_description" in self.streams and self.description is None
+        if "robot_description" in self.streams and self.description is None:
+            return True
         for samples, names in ((self.parts, self.info.part_names), (self.scans, self.info.scan_names)):
-            if samples is not None and not {one.session for _, one in names} <= samples.writers.keys():
+            if not {one.session for _, one in names} <= samples.writers.keys():
                 return True
         if not {name for name, _ in self.info.map_names} <= self.maps.keys():
             return True
-        return lacks_model or (self.followed in self.streams and self.samples.statistics.count < 2)
+        if self.followed not in self.streams:
+            return False
+        return self.samples.statistics.count < 2 or self._is_unplaced
+
+    @property
+    def _is_unplaced(self) -> bool:
+        """Whether the listener has nothing yet of the samples that have arrived."""
+        stats = self.stats
+        is_usable = self.description is not None or self.followed == "tf"
+        return is_usable and not (stats.received or stats.recalled or stats.late or stats.refused)
 
     @property
     def is_silent(self) -> bool:
         """Whether nothing has arrived except announcements."""
-        frames = any(frame.kind == "static" for frame in self.listener.buffer.frames())
+        frames = any(frame.kind == "static" for frame in self.frames)
         has_replied = self.description or self.statuses or self.offsets or self.maps
         return not (has_replied or self.sample_count or frames)
 
@@ -261,13 +398,12 @@ class RobotProbe(Closeable):
     def sample_count(self) -> int:
         """How many joint states, transforms, odometry and messages of sensors have arrived."""
         all_samples = [self.samples, self.transforms, self.parts, self.scans, *self.measured.values()]
-        return sum(samples.statistics.count for samples in all_samples if samples is not None)
+        return sum(one.statistics.count for samples in all_samples for one in samples.writers.values())
 
     def statistics(self) -> list[IntervalStatistics]:
         """Those of the followed stream, and of each writer of partial joint states or of moving edges."""
         moving = self.parts, self.transforms, self.measured["odometry"]
-        named = [samples for samples in moving if samples is not None]
-        writers = [writer for samples in named for writer in samples.writers.values()]
+        writers = [writer for samples in moving for writer in samples.writers.values()]
         return [self.samples.statistics, *(writer.statistics for writer in writers)]
 
     @property
@@ -277,38 +413,100 @@ class RobotProbe(Closeable):
 
     @property
     def has_only_transforms(self) -> bool:
-        """Whether its writers publish moving edges, and no joints or model."""
+        """Whether its writers publish moving edges, and no program publishes or reads joints or a model."""
         others = {*JOINT_STREAMS, "tf", "robot_description"}
-        return not self.streams.isdisjoint(EDGE_STREAMS) and self.streams.isdisjoint(others)
+        has_edges = not self.streams.isdisjoint(EDGE_STREAMS)
+        return has_edges and others.isdisjoint({*self.streams, *self.waits})
 
-    def find_unresponsive(self) -> None:
-        """Query the writers that have not reported their clocks, and collect those that do not reply.
-
-        A stopped process receives the query and lets it time out, or its lease ended after it was found, and
-        it is not announced any more. Where a router denies the query, it ends at once without a reply, which
-        is not counted.
-        """
-        known = {offset.writer.session for offset in self.offsets}
-        for writer in {writer for _, writer in self.info.writers if writer.session not in known}:
-            began, key = time.monotonic(), clock_key(self.info.name, writer.identity)
-            replies = list(query(self._session.zenoh, key, _REPLY_WITHIN_S))
-            has_timed_out = time.monotonic() - began > 0.9 * _REPLY_WITHIN_S
-            has_replied = any(reply.ok is not None for reply in replies)
-            if not has_replied and (has_timed_out or not self._is_announced(writer)):
-                self.unresponsive.add(writer)
-
-    def _is_announced(self, writer: WriterId) -> bool:
-        try:
-            robots = discover(self._session, _REPLY_WITHIN_S)
-        except Unreachable:
-            return True
-        return any(writer == one for robot in robots for _, one in robot.writers)
+    def silent_writers(self) -> set[WriterId]:
+        """The announced writers of which nothing has arrived, not even a reply with their clock."""
+        streams: tuple[Stream, ...] = ("tf", *_NATIVE_STREAMS)
+        known = {session for stream in streams for session in self._of(stream).writers}
+        known.update(self.statuses, (offset.writer.session for offset in self.offsets))
+        return {writer for _, writer in self.info.writers if writer.session not in known}
 
 
-def wait_for_probes(probes: Sequence[RobotProbe], waiter: ConditionWaiter, timeout_s: float) -> None:
-    """Wait until all announced data has arrived, at least 1.2 s, at most ``timeout_s``.
+def unwritten_streams(info: RobotInfo, readers: Sequence[Announcement]) -> dict[Stream, WriterId]:
+    """The streams that programs of the robot ``info`` wait for, with such a program: none writes them.
 
-    ``waiter`` is notified by the probes.
+    A program of the robot is one that also writes a stream of it. One that reads edges or latched streams,
+    too, reads what there is, for instance a listener of poses.
     """
-    time.sleep(min(_MIN_WINDOW_S, timeout_s))
-    waiter.wait_for(lambda: not any(probe.is_incomplete for probe in probes), timeout_s - _MIN_WINDOW_S)
+    written = {stream for stream, _ in info.writers}
+    programs = {(writer.host, writer.pid) for _, writer in info.writers}
+    streams: dict[WriterId, set[Stream]] = {}
+    for one in readers:
+        if one.robot == info.name and (one.writer.host, one.writer.pid) in programs:
+            streams.setdefault(one.writer, set()).add(one.stream)
+    waits: dict[Stream, WriterId] = {}
+    for reader, read in streams.items():
+        if read <= {*JOINT_STREAMS, *SENSOR_STREAMS}:
+            missing = read - written
+            if not JOINT_STREAMS.isdisjoint(read):  # either of the two may have all joints
+                missing -= {"partial_joint_states"} if written.isdisjoint(JOINT_STREAMS) else JOINT_STREAMS
+            waits.update(dict.fromkeys(sorted(missing), reader))
+    return waits
+
+
+def find_unresponsive(session: Session, probes: Sequence[RobotProbe], within_s: float) -> None:
+    """Query the clocks of the silent writers, and collect those that do not reply within ``within_s`` [s].
+
+    A stopped process receives the query and lets it time out, or its lease ended after it was found, and
+    it is not announced any more. Where a router denies the query, it ends at once without a reply, which
+    is not counted; nor is a writer that publishes meanwhile.
+    """
+    silent = {(one.info.name, writer) for one in probes for writer in one.silent_writers()}
+    if not silent:
+        return
+    queried = unanswered(session, silent, within_s)
+    alive = silent
+    with suppress(Unreachable):
+        robots = discover(session, _REPLY_WITHIN_S)
+        alive = {(robot.name, writer) for robot in robots for _, writer in robot.writers}
+    for one in probes:
+        for writer in one.silent_writers():
+            key = one.info.name, writer
+            if key in queried and (queried[key] or key not in alive):
+                one.unresponsive.add(writer)
+
+
+@contextmanager
+def collected_probes(
+    session: Session, selected: Sequence[RobotInfo], robots: Sequence[RobotInfo], wire: str, timeout_s: float
+) -> Generator[Sequence[RobotProbe]]:
+    """The probes of the ``selected`` of all announced ``robots``, after all that is announced has arrived.
+
+    Waits at least 1.2 s and at most ``timeout_s`` [s] for it, and as long again for the replies of writers of
+    which nothing has arrived.
+    """
+    waiter, is_native = ConditionWaiter(), wire == "native"
+    deadline_s = time.monotonic() + timeout_s
+    with ExitStack() as opened:
+        probes: list[RobotProbe] = []
+        readers = discover_readers(session, _READERS_WITHIN_S) if is_native else ()
+        for group in [selected] if is_native else [[info] for info in selected]:
+            collector = opened.enter_context(StreamCollector(session, group, wire, waiter.notify))
+            probes += [RobotProbe(collector, info, robots, readers) for info in group]
+        window_end_s = time.monotonic() + min(_MIN_WINDOW_S, timeout_s)
+        if is_native:
+            offsets: dict[str, list[MeasuredOffset]] = {}
+            for one in measure_offsets(session, ANY if len(selected) > 1 else selected[0].name):
+                offsets.setdefault(one.robot, []).append(one)
+            for probe in probes:
+                probe.offsets = tuple(offsets.get(probe.info.name, ()))
+        time.sleep(max(0.0, window_end_s - time.monotonic()))
+        _wait_for_data(probes, waiter, deadline_s)
+        if is_native:
+            find_unresponsive(session, probes, timeout_s)
+        yield probes
+
+
+def _wait_for_data(probes: Sequence[RobotProbe], waiter: ConditionWaiter, until_s: float) -> None:
+    """Wait until all announced data has arrived, at most until ``until_s`` (``time.monotonic``) [s]."""
+    incomplete = list(probes)
+
+    def is_complete() -> bool:
+        incomplete[:] = [probe for probe in incomplete if probe.is_incomplete]
+        return not incomplete
+
+    waiter.wait_for(is_complete, max(0.0, until_s - time.monotonic()))

@@ -24,23 +24,20 @@ from zstate.cli.output.console import count_text, rate_text
 from zstate.cli.output.wire_text import RosMessages
 from zstate.errors import format_duration
 from zstate.model.robot import RobotModel
-from zstate.net.session import Session
 from zstate.wire.keys import Stream
 
 _MAX_NAMES = 6
 
 
-def ros_checks(
-    probe: RobotProbe, session: Session, messages: RosMessages, model_name: str
-) -> Iterator[Check]:
+def ros_checks(probe: RobotProbe, messages: RosMessages, model_name: str) -> Iterator[Check]:
     """The checks of what ``probe`` has collected; ``model_name`` is the expected model, "*" for any."""
-    for check in _RosChecks(probe, session, messages).run(model_name):
+    for check in _RosChecks(probe, messages).run(model_name):
         yield replace(check, text=messages.translate(check.text), next=messages.translate(check.next))
 
 
 class _RosChecks:
-    def __init__(self, probe: RobotProbe, session: Session, messages: RosMessages) -> None:
-        self._probe, self._session, self._messages = probe, session, messages
+    def __init__(self, probe: RobotProbe, messages: RosMessages) -> None:
+        self._probe, self._messages = probe, messages
         # Commands need a robot's name only if the namespace is open.
         self._robot = "" if messages.robot else f" {probe.info.name}"
         self._publish = "zstate publish FILE" + (f" --name {probe.info.name}" if self._robot else "")
@@ -72,7 +69,7 @@ class _RosChecks:
         yield from named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names, hz)
         yield from sensor_frames_checks(probe)
         yield from measured_checks(probe, f"zstate hz{self._robot}")
-        yield stamps_check(probe, self._session)
+        yield stamps_check(probe)
         if model is not None:
             yield from limits_check(probe, model, nodes.values(), f"zstate echo{self._robot}")
         yield statics_check(probe)
