@@ -8,6 +8,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -126,6 +127,16 @@ def test_without_catching_up_ticks_are_half_a_period_apart_at_least():
     rate = Rate(100.0, clock, threading.Event(), 0.06, catch_up=False)
     assert [stamp / 1_000_000 for stamp in rate] == [0, 10, 29.9, 40, 50]
     assert (rate.report().ticks, rate.report().skipped) == (5, 1)
+
+
+def test_a_step_lasts_no_longer_than_a_period_and_than_the_time_since_the_last_one():
+    # The tick of 20 ms comes at 24.9 ms: that of 30 ms follows after half a period.
+    clock = SteppingClock(0, lateness={2: 4_900_000})
+    rate = Rate(100.0, clock, threading.Event(), 0.05, catch_up=False)
+    stamps = list(rate)
+    assert [stamp / 1_000_000 for stamp in stamps] == [0, 10, 24.9, 30, 40]
+    steps = [rate.step_s(before, after) for before, after in pairwise(stamps)]
+    assert steps == pytest.approx([0.010, 0.010, 0.0051, 0.010])
 
 
 # The pace of a device

@@ -152,8 +152,12 @@ class Rate:
                 self._skipped += 1
 
     def step_s(self, since: int, now: int) -> float:
-        """For how long a robot moves at a tick [s]: one period, also after a late tick: it never hurries."""
-        return self._period_ns * 1e-9
+        """For how long a robot moves at ``now`` that moved last at ``since`` [ns]: until ``now``, in s.
+
+        One period at most, so that it never hurries after a late tick; less where a tick that is on time
+        follows a late one: two whole steps in that time would be up to twice as fast.
+        """
+        return min(max(now - since, 1), self._period_ns) * 1e-9
 
     def report(self) -> RateReport:
         """Statistics so far."""

@@ -4,10 +4,11 @@ A request of an announced commander is planned in a thread of its own: a traject
 or from the measured joints if none is written, which is checked against the limits in closed form. The
 control loop adopts it at its next tick. A cancellation does not wait for a plan.
 
-The time of a motion advances by one period at each tick that writes a setpoint. A tick that was missed delays
-the motion; no step becomes longer by it. A motion is valid for the host's ttl, unless its commander renews
-it: then the joints brake, as they do after commands. It rests until its commander is known to be alive, by a
-first renewal or by an earlier command that is valid: a request that was delivered late moves nothing.
+The time of a motion advances at each tick that writes a setpoint, by the time since the last one, and by one
+period at most. A tick that was missed or late delays the motion; no step becomes longer by it. A motion is
+valid for the host's ttl, unless its commander renews it: then the joints brake, as they do after commands. It
+rests until its commander is known to be alive, by a first renewal or by an earlier command that is valid: a
+request that was delivered late moves nothing.
 
 A ROS node does not renew what it sends: its motion is valid while the node is announced, by its liveliness
 token. As in ros2_control, points that are due already are left out, and a trajectory without points ends the
