@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -155,6 +156,13 @@ def test_limits_are_read_only_copies():
 
 def test_positions_within_the_limits_are_accepted_as_a_vector():
     assert Limits.of(ARM).check_positions([2.0, -1e6, 0]).tolist() == [2.0, -1e6, 0.0]
+
+
+@pytest.mark.parametrize("position", [1.1e9, -1e307, 9e307, 1.7e308])
+def test_a_position_beyond_1e9_is_refused_also_for_a_joint_without_limits(position: float):
+    text = re.escape(f"'wheel' at {position:.9g} rad is outside -1e+09 to 1e+09")
+    with pytest.raises(InvalidInput, match=text):
+        Limits.of(ARM).check_positions([0.0, position, 0.0])
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,12 @@ Floats = NDArray[np.float64]
 ROUNDING = 1e-9
 """[rad] or [m], and as a ratio for rates: rounding of interpolated values, far below any encoder."""
 
+FARTHEST = 1e9
+"""[rad] or [m]; positions further away are refused, whose squares and sums would lose the joint's motion.
+
+It is 100,000 km of a wheel with a radius of 0.1 m; there float64 has steps of 1e-7.
+"""
+
 _SHOWN = 3
 """Unknown joints in an error: near names take time, and names may come from the network."""
 
@@ -168,16 +174,23 @@ class Limits:
 
     def position_findings(self, positions: Floats) -> tuple[str, ...]:
         """A text for each joint that is outside its limits at ``positions``, (n,)."""
-        outside = (positions < self.lower - ROUNDING) | (positions > self.upper + ROUNDING)
+        lower, upper = self.bounds
+        outside = (positions < lower - ROUNDING) | (positions > upper + ROUNDING)
         return tuple(
             f"{self.joint_names[row]!r} at {positions[row]:.9g} {self.units[row]} is outside "
             f"{self.range_text(row)}{self._degrees_text(row, float(positions[row]))}"
             for row in np.flatnonzero(outside).tolist()
         )
 
+    @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """The least and the greatest positions (n,), which are 1e9 [rad] or [m] where there is no limit."""
+        return np.maximum(self.lower, -FARTHEST), np.minimum(self.upper, FARTHEST)
+
     def range_text(self, row: int) -> str:
-        """The position limits of the joint ``joint_names[row]``: "-2 to 2"."""
-        return f"{self.lower[row]:.9g} to {self.upper[row]:.9g}"
+        """The bounds of the joint ``joint_names[row]``: "-2 to 2"."""
+        lower, upper = self.bounds
+        return f"{lower[row]:.9g} to {upper[row]:.9g}"
 
     def containing(self, positions: ArrayLike) -> Limits:
         """The same limits, as far extended as ``positions``, (n,), are outside.

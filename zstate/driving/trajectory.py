@@ -170,7 +170,8 @@ class Trajectory:
 
     def _position_findings(self, limits: Limits, rows: list[int]) -> Iterator[str]:
         times, values = self._extrema[0]
-        excess = np.maximum(limits.lower[rows] - values, values - limits.upper[rows])
+        lower, upper = limits.bounds
+        excess = np.maximum(lower[rows] - values, values - upper[rows])
         for column, (row, at) in enumerate(zip(rows, excess.argmax(axis=0).tolist(), strict=True)):
             if excess[at, column] > ROUNDING:
                 yield (
