@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from helpers.processes import SteppingClock
 from helpers.robots import RRBOT
 
 from zstate import JointReading
@@ -18,11 +21,13 @@ from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command
 from zstate.driving.control_loop import ControlLoop
 from zstate.driving.driver import Setpoint, StopMode
 from zstate.driving.motion_service import plan
+from zstate.driving.setpoint_limiter import Rate as JointRate
 from zstate.driving.stops import StopRegister
 from zstate.driving.stops_file import ActiveStop
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
 from zstate.errors import DriverFault, InvalidInput, MessageError
 from zstate.net.presence import local_writer
+from zstate.rate import Rate
 from zstate.wire.messages import JointTrajectory, MotionCancel, Release, to_block
 
 LIMITS = Limits(RRBOT.joint_names, [-1.0, -2.0], [1.0, 2.0], [2.0, 0.5], [50.0, np.inf])
@@ -246,3 +251,163 @@ def test_a_driver_that_repeats_its_last_reading_is_stopped():
         )
         bench.tick()
     assert "there is no new reading of the joints" in bench.loop.state.reason
+
+
+class Scripted(Joints):
+    """Joints whose next readings after ``enable`` are those of ``glitches``: offsets from where they are.
+
+    ``setpoints`` are all that were written.
+    """
+
+    def __init__(self, glitches: list[list[float] | None] | None = None) -> None:
+        super().__init__()
+        self.glitches = glitches or []
+        self.setpoints: list[Setpoint] = []
+        self.stops: list[str] = []
+
+    @property
+    def is_enabled(self) -> bool:
+        return self._is_enabled
+
+    def read(self, stamp: int) -> JointReading | None:
+        reading = super().read(stamp)
+        if not (self.is_enabled and self.glitches):
+            return reading
+        glitch = self.glitches.pop(0)
+        return None if glitch is None else replace(reading, positions=reading.positions + glitch)
+
+    def write(self, setpoint: Setpoint) -> None:
+        self.setpoints.append(setpoint)
+        super().write(setpoint)
+
+    def stop(self, how: StopMode) -> None:
+        self.stops.append(how)
+        super().stop(how)
+
+
+def scripted(driver: Scripted, start: tuple[float, float] = (0.0, 0.0)) -> Bench:
+    """A bench with ``driver``, which has been read twice at ``start``."""
+    bench = Bench(np.random.default_rng(0))
+    driver.sag(np.array(start))
+    bench.driver = driver
+    bench.loop = bench.opened()
+    for _ in range(2):
+        bench.tick()
+    return bench
+
+
+def drive(bench: Bench, ticks: int, rates: dict[int, JointRate] | None = None) -> None:
+    """Ticks with a command each: the shoulder to 0.2 rad, or ``rates``."""
+    columns, positions = (AT_ZERO[0], np.array([0.2])) if rates is None else (NO_COLUMNS, NO_POSITIONS)
+    for _ in range(ticks):
+        bench.seq += 1
+        now = bench.clock.now()
+        bench.waiting.append(Command(1, bench.seq, columns, positions, now, now + TTL_NS, rates=rates or {}))
+        bench.tick()
+
+
+@pytest.mark.parametrize("glitch", [0.12, 2.9, 50.0, -1e300])
+def test_one_wrong_reading_after_enabling_is_a_failure_of_the_driver_and_no_setpoint(glitch: float):
+    driver = Scripted([[0.0, glitch]])
+    bench = scripted(driver)
+    drive(bench, 10)
+    assert bench.loop.state.name == "active"
+    assert bench.loop.faults == 1
+    assert driver.setpoints[0].positions.tolist() == [0.0, 0.0]
+    assert driver.longest <= 1.0 + EXACT
+
+
+def test_joints_that_sag_when_their_brakes_open_start_from_two_readings_that_agree():
+    driver = Scripted([[0.0, -0.15], [0.0, -0.151], [0.0, -0.151]])
+    bench = scripted(driver)
+    drive(bench, 4)
+    assert driver.setpoints[0].positions.tolist() == [0.0, -0.151]
+    assert bench.loop.faults == 1
+
+
+def test_readings_that_never_agree_stop_the_driver_before_a_joint_has_moved():
+    driver = Scripted([[0.0, 0.3 * number] for number in range(1, 20)])
+    bench = scripted(driver)
+    loop = bench.loop
+    drive(bench, 10)
+    assert not driver.setpoints
+    assert "hold" in driver.stops
+    assert "'elbow' at 0.9 rad" in loop.state.reason
+    assert "two readings disagree" in loop.state.reason
+
+
+def test_one_wrong_reading_in_mode_velocity_is_no_setpoint_of_mode_position():
+    driver = Scripted()
+    bench = scripted(driver)
+    drive(bench, 30, {0: JointRate("velocity", 0.5)})
+    assert driver.setpoints[-1].modes[0] == "velocity"
+    driver.glitches.append([-0.7, 0.0])
+    drive(bench, 20)
+    assert driver.setpoints[-1].modes[0] == "position"
+    assert bench.loop.faults == 1
+    ways = np.diff([one.positions for one in driver.setpoints], axis=0) / LIMITS.velocity
+    assert np.abs(ways).max() <= 1.5e-9 * PERIOD_NS
+
+
+@pytest.mark.parametrize("glitches", [[None] * 30, [[0.0, 0.3], None, [0.0, -0.3], None] * 8])
+def test_joints_with_power_and_without_two_readings_are_stopped_after_the_ttl(
+    glitches: list[list[float] | None],
+):
+    driver = Scripted(glitches)
+    bench = scripted(driver)
+    drive(bench, 1)
+    assert driver.is_enabled
+    since = bench.clock.now()
+    while bench.loop.state.name == "ready":
+        drive(bench, 1)
+    assert bench.clock.now() - since < TTL_NS + 4 * PERIOD_NS
+    assert bench.loop.state.name == "stopped"
+    assert "the joints have power, and there are no two readings" in bench.loop.state.reason
+    assert not driver.setpoints
+
+
+def test_a_joint_a_little_outside_its_limits_moves_inwards():
+    driver = Scripted()
+    bench = scripted(driver, (1.3, 0.0))
+    drive(bench, 20)
+    assert driver.setpoints[0].positions.tolist() == [1.3, 0.0]
+    assert driver.setpoints[-1].positions[0] < 1.3
+
+
+def test_a_joint_that_is_read_far_outside_its_limits_is_not_enabled():
+    driver = Scripted()
+    bench = scripted(driver, (1.4, 0.0))
+    drive(bench, 20)
+    assert (driver.setpoints, driver.is_enabled) == ([], False)
+    assert bench.refusals.counts == {"outside limits": 20}
+    assert "'shoulder' is measured at 1.4 rad, 0.4 rad outside -1 to 1: too far" in str(bench.refusals.newest)
+    with pytest.raises(MessageError, match="too far to be moved"):
+        bench.loop.present()
+
+
+def test_a_joint_that_is_read_far_outside_its_limits_once_it_has_power_is_stopped():
+    driver = Scripted([[1.5, 0.0]] * 20)
+    bench = scripted(driver)
+    drive(bench, 6)
+    assert (driver.setpoints, bench.loop.state.name) == ([], "stopped")
+    assert "0.5 rad outside -1 to 1" in bench.loop.state.reason
+
+
+def test_no_joint_is_faster_than_its_limit_after_a_late_tick():
+    # Every fifth tick is late by 0.49 periods; the next one is on time.
+    clock = SteppingClock(0, lateness=dict.fromkeys(range(0, 200, 5), round(0.49 * PERIOD_NS)))
+    rate = Rate(1e9 / PERIOD_NS, clock, threading.Event(), 0.2, catch_up=False)
+    driver = Scripted()
+    bench = Bench(np.random.default_rng(0))
+    bench.driver, bench.clock = driver, clock
+    driver.allowed_s = 1.0
+    bench.loop = bench.opened()
+    target = AT_ZERO[0], np.array([0.9])
+    for seq, _ in enumerate(rate):
+        now = clock.now()
+        bench.waiting.append(Command(1, seq, *target, now, now + TTL_NS))
+        bench.loop.tick(now, rate.step_s)
+    assert len(driver.setpoints) > 80
+    stamps = np.array([one.stamp for one in driver.setpoints]) * 1e-9
+    speeds = np.diff([one.positions[0] for one in driver.setpoints]) / np.diff(stamps)
+    assert speeds.max() == pytest.approx(LIMITS.velocity[0])

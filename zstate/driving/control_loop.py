@@ -21,6 +21,7 @@ from zstate.driving.commands import Command, Targets
 from zstate.driving.driver import Setpoint, StopMode
 from zstate.driving.limits import Limits
 from zstate.driving.motion_service import MotionExecutor, Present
+from zstate.driving.readings import Readings
 from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
 from zstate.driving.stops import LatchedStops, StopRegister
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
@@ -33,7 +34,7 @@ _LOG = logging.getLogger("zstate")
 Floats = NDArray[np.float64]
 StateName = Literal["off", "ready", "active", "holding", "stopped", "fault"]
 
-NO_READING = "no reading has arrived yet"
+NO_READING = "no two readings that agree have arrived yet"
 """The reason of "ready" until the joints are known."""
 
 StepDuration: TypeAlias = "Callable[[int, int], float]"
@@ -93,6 +94,7 @@ class ControlLoop:
         self._limits = limits
         self._limiter = SetpointLimiter(limits, driver.modes)
         self._following = following
+        self._readings = Readings(limits, following.most, following.oldest_ns)
         self._ttl_ns = ttl_ns
         self._on_silence: StopMode = on_silence
         self._faults_allowed = faults_allowed
@@ -123,7 +125,10 @@ class ControlLoop:
         self._barred: BoundedDict[int, None] = BoundedDict()
         """Sessions that have commanded a stopped robot: a release by another does not move it for them."""
         self._measured: Floats | None = None
-        self._measured_at = self._wrote_at = 0
+        self._measured_at = 0
+        self._moved_at = 0
+        """When the last setpoint was made: steps are no longer than the time since then."""
+        self._enabled_at = 0
         self._read_stamp: int | None = None
         """Of the last reading, if the driver gives stamps."""
         self._offset = 0
@@ -183,26 +188,44 @@ class ControlLoop:
         if reading.stamp is not None and reading.stamp == self._read_stamp:
             return  # a driver that repeats its last reading has lost its device
         vector = self._limits.vector
-        positions = vector(reading.positions, "measured positions")
+        positions = self._readings.vector(reading.positions)
         velocities = reading.velocities
         if velocities is not None:
             velocities = vector(velocities, "measured velocities")
         efforts = reading.efforts
         if efforts is not None:
             efforts = vector(efforts, "measured efforts")
+        now = self._now()
+        doubt = self._readings.add(positions, now)
+        self._read_stamp = reading.stamp
+        if doubt and self._moves_by_readings(now):
+            raise InvalidInput(doubt)
         self._publish(positions, velocities, efforts, stamp if reading.stamp is None else reading.stamp)
-        self._measured, self._measured_at, self._read_stamp = positions, self._now(), reading.stamp
-        self._limiter.observe(positions, velocities, self._measured_at)
+        self._measured, self._measured_at = positions, now
+        if not self._readings.is_confirmed:
+            return
+        self._limiter.observe(positions, velocities, now)
         if self.state.reason == NO_READING:
             self._change("ready", "")
 
+    def _moves_by_readings(self, now: int) -> bool:
+        """Whether the next setpoint is where a joint is measured, so that a wrong reading would be a jump."""
+        if self.setpoint is None:
+            return self._driver.is_enabled or self.targets.is_live(now)
+        return not self._limiter.has_positions_only
+
     def _check_following(self, now: int) -> None:
         """Stop if a joint does not follow its setpoints, or is not measured any more."""
-        if self._measured is None:
-            return
-        reason = self._following.deviation(self._measured, self._measured_at, now)
-        if reason:
-            self._stop_and_latch(reason)
+        if self._driver.is_enabled and self.setpoint is None:
+            waited_ns = now - self._enabled_at
+            reason = "the joints have power, and there are no two readings of them that agree"
+            reason = f"{reason} for {format_duration(waited_ns)}"
+            if waited_ns > self._following.oldest_ns:
+                self._stop_and_latch(reason)
+        elif self._measured is not None:
+            reason = self._following.deviation(self._measured, self._measured_at, now)
+            if reason:
+                self._stop_and_latch(reason)
 
     def _obey_stops(self, now: int) -> Exception | None:
         """Stop if there is a new stop; become ready when the last one is released. Returns what failed.
@@ -281,7 +304,8 @@ class ControlLoop:
 
     def _check_limits(self, command: Command) -> None:
         """Raise MessageError unless the limiter accepts the positions of ``command``."""
-        if self.setpoint is None and self._measured is not None:
+        if self.setpoint is None and self._measured is not None and self._readings.is_confirmed:
+            self._check_not_far_outside(self._measured)
             self._limiter.start(self._measured)
         try:
             self._limiter.check(self.targets.merged(command, self._inside))
@@ -289,13 +313,17 @@ class ControlLoop:
         except InvalidInput as error:
             raise MessageError(str(error), reason="outside limits") from None
 
+    def _check_not_far_outside(self, measured: Floats) -> None:
+        if text := self._readings.outside_text(measured):
+            raise MessageError(text, reason="outside limits")
+
     def _advance(self, now: int, step_s: StepDuration, *, is_fresh: bool) -> Exception | None:
         """Enable the joints, or write the next setpoint. Returns what failed."""
         is_live = self.targets.is_live(now)
         if self.setpoint is None:
             if self._driver.is_stopping or (self._driver.needs_stop and not is_live):
                 return self._stop_driver(self._on_silence)
-            is_known = self._measured is not None and now - self._measured_at < self._ttl_ns
+            is_known = self._readings.is_confirmed and now - self._measured_at < self._ttl_ns
             if not is_live or not is_fresh or not is_known:
                 return None
             return self._start(now) if self._driver.is_enabled else self._enable()
@@ -309,7 +337,9 @@ class ControlLoop:
         elif is_live and self.state.name == "holding":
             self.targets.start(now, self._resting())
             self._change("active", "")
-        return self._move(now, step_s(self._wrote_at, now))
+        dt_s = step_s(self._moved_at, now)
+        self._moved_at = now
+        return self._move(now, dt_s)
 
     def _enable(self) -> Exception | None:
         """Switch on power and brakes.
@@ -317,7 +347,9 @@ class ControlLoop:
         Joints may sag by that, so the first setpoint waits for the next reading.
         """
         self._measured_at = 0
-        return self._driver.enable()
+        failure = self._driver.enable()
+        self._enabled_at = self._now()
+        return failure
 
     def _start(self, now: int) -> Exception | None:
         """Write the measured joints as the first setpoint after a change of state.
@@ -325,6 +357,10 @@ class ControlLoop:
         The first step follows at the next tick, and takes the time since then.
         """
         assert self._measured is not None
+        if text := self._readings.outside_text(self._measured):
+            self._stop_and_latch(text)
+            return None
+        self._moved_at = now
         self.targets.start(now, self._measured)
         failure = self._write(self._limiter.start(self._measured))
         if failure is None:
@@ -350,9 +386,7 @@ class ControlLoop:
 
     def _write(self, limited: Limited) -> Exception | None:
         """Write ``limited`` as the setpoint, and publish it. Returns what failed."""
-        self._wrote_at = self._now()
-        stamp = self._wrote_at + self._offset
-        setpoint = Setpoint(stamp, *limited[:2], limited.efforts, limited.modes)
+        setpoint = Setpoint(self._now() + self._offset, *limited[:2], limited.efforts, limited.modes)
         failure = self._driver.write(setpoint)
         if failure is None:
             self.setpoint = limited
@@ -371,10 +405,11 @@ class ControlLoop:
             positions, velocities = setpoint.positions, setpoint.velocities
             resting = positions + velocities * np.abs(velocities) / (2.0 * self._limits.acceleration)
             return Present(positions, velocities, resting, stops)
-        if measured is None or self.state.name in ("off", "fault"):
+        if measured is None or not self._readings.is_confirmed or self.state.name in ("off", "fault"):
             reason = self.state.reason or NO_READING
             text = f"the driver is {self.state.name}, and its joints are not known: {reason}"
             raise MessageError(text, reason="not ready")
+        self._check_not_far_outside(measured)
         return Present(measured, np.zeros(len(measured)), measured, stops)
 
     def _count_fault(self, fault: Exception | None) -> None:

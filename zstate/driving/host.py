@@ -67,15 +67,17 @@ class DriverHost(Closeable):
     of the model by default: positions outside them are refused, and faster motion is slowed; a
     ``Commander.move`` that is too fast is refused. The first setpoint after any change of state is at the
     measured joints, or at the last setpoint where one was written, so that no step is longer than a tick's
-    motion at the velocity limits. Joints may be commanded in all ``driver.modes``; ``SetpointLimiter`` has
-    the rules for velocities and efforts, and for their ends.
+    motion at the velocity limits. ``zstate.driving.readings`` has the rules for the readings that count.
+    Joints may be commanded in all ``driver.modes``; ``SetpointLimiter`` has the rules for velocities and
+    efforts, and for their ends.
 
     A call of the driver that raises is counted, and the loop continues. After ``faults_allowed`` ticks in a
     row with such a failure the driver is stopped as after silence, and ``run`` raises DriverFault. It is
     stopped, too, when a joint is further than ``following_error`` [rad] or [m] from its setpoint, such as
-    without power, when one in mode "velocity" does not move as far as that within a second, or when there is
-    no new reading for ``ttl_s``. These stops, like those of ``zstate.driving.stop``, are latched: a restarted
-    host stays stopped until a commander releases them, see ``zstate.driving.stops``.
+    without power, when one in mode "velocity" does not move as far as that within a second, when it has power
+    and there are no two readings that agree for ``ttl_s``, or no new reading for as long. These stops, like
+    those of ``zstate.driving.stop``, are latched: a restarted host stays stopped until a commander releases
+    them, see ``zstate.driving.stops``.
 
     ``wires`` are those on which the joint states are published. With ``ros2_controller``, the name of a
     controller, ROS nodes on the wire "ros2" may command the joints as well, as in ros2_control: by

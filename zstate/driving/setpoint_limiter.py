@@ -209,7 +209,7 @@ class SetpointLimiter:
         self._resting_mode: Mode = next(mode for mode in ranked if mode in modes)
         self._all_resting = (self._resting_mode,) * len(self._joints)
         self._modes = list(self._all_resting)
-        self._has_positions_only = self._resting_mode == "position"
+        self.has_positions_only = self._resting_mode == "position"
         """Whether all joints are in mode "position" now."""
         self._braked: dict[int, str] = {}
         """Why joints are held that are commanded in mode "effort"."""
@@ -253,7 +253,7 @@ class SetpointLimiter:
         joints in mode "effort" are derived from the positions if not given.
         """
         before, self._observed = self._observed, (positions.tolist(), now)
-        if self._has_positions_only or self._positions is None:
+        if self.has_positions_only or self._positions is None:
             return
         found = self._observed[0]
         dt_s = 0.0 if before is None else (now - before[1]) * 1e-9
@@ -320,7 +320,7 @@ class SetpointLimiter:
                 self._joints, gaps, self._limits.vector(velocities, "velocities").tolist(), strict=True
             )
             wanted = [joint.following(gap, velocity, dt_s) for joint, gap, velocity in moving]
-        if rates or not self._has_positions_only:
+        if rates or not self.has_positions_only:
             return self._step_in_modes(goal, wanted, rates, dt_s)
         positions = self._move(start, wanted, dt_s)
         left = [abs(there - here) > ROUNDING for there, here in zip(goal, positions, strict=True)]
@@ -333,7 +333,7 @@ class SetpointLimiter:
         and before ``start``.
         """
         start = self._started(dt_s)
-        if not self._has_positions_only:
+        if not self.has_positions_only:
             return self._step_in_modes(start, start, dict.fromkeys(range(len(start))), dt_s)
         positions = self._move(start, [0.0] * len(start), dt_s)
         return self._limited(positions, [velocity != 0.0 for velocity in self._velocities])
@@ -403,7 +403,7 @@ class SetpointLimiter:
 
     def _set_modes(self, modes: Sequence[Mode]) -> None:
         self._modes = list(modes)
-        self._has_positions_only = all(mode == "position" for mode in modes)
+        self.has_positions_only = all(mode == "position" for mode in modes)
 
     def _move(self, start: list[float], wanted: list[float], dt_s: float) -> list[float]:
         """Makes a step with the velocities nearest to ``wanted`` that the limits allow; the new positions."""
@@ -424,7 +424,7 @@ class SetpointLimiter:
     def _limited(self, positions: list[float], slowed: list[bool]) -> Limited:
         limited = tuple(compress(self._limits.joint_names, slowed))
         vectors = np.array(positions), np.array(self._velocities)
-        if self._has_positions_only:
+        if self.has_positions_only:
             return Limited(*vectors, limited, None, self._all_resting)
         efforts = np.array(self._efforts) if "effort" in self._modes else None
         return Limited(*vectors, limited, efforts, tuple(self._modes))

@@ -132,8 +132,8 @@ class FollowingCheck:
         if not most > 0.0:
             raise InvalidInput(f"following_error is a distance above zero, not {most!r}")
         self._limits = limits
-        self._most = most
-        self._oldest_ns = oldest_ns
+        self.most = most
+        self.oldest_ns = oldest_ns
         self._setpoint: Limited | None = None
         self._written_at = 0
         self._travel: _Travel | None = None
@@ -157,7 +157,7 @@ class FollowingCheck:
         setpoint = self._setpoint
         if setpoint is None:
             return ""
-        if now - measured_at > self._oldest_ns:
+        if now - measured_at > self.oldest_ns:
             return f"there is no new reading of the joints for {format_duration(now - measured_at)}"
         if measured_at < self._written_at:
             return ""
@@ -167,17 +167,17 @@ class FollowingCheck:
             if text := self._travel_text(setpoint, measured, now):
                 return text
         # Where the norm is within the limit, so is each joint; in a third of the time.
-        return "" if errors @ errors <= self._most**2 else self._distance_text(np.abs(errors))
+        return "" if errors @ errors <= self.most**2 else self._distance_text(np.abs(errors))
 
     def _distance_text(self, errors: NDArray[np.float64]) -> str:
         """Which joint is too far from its setpoint, if any."""
         row = int(errors.argmax())
-        if errors[row] <= self._most:
+        if errors[row] <= self.most:
             return ""
         name, unit = self._limits.joint_names[row], self._limits.units[row]
         return (
             f"{name!r} is {errors[row]:.3g} {unit} from its setpoint, more than "
-            f"following_error={self._most:g}; has it power, and is it free to move?"
+            f"following_error={self.most:g}; has it power, and is it free to move?"
         )
 
     def _travel_text(self, setpoint: Limited, measured: NDArray[np.float64], now: int) -> str:
@@ -190,7 +190,7 @@ class FollowingCheck:
         if travel is None or now - travel.since <= _TRAVEL_NS:
             return ""
         moved = measured - travel.start
-        allowed = self._most + _TRAVEL_SHARE * travel.path + _LAG_S * travel.fastest
+        allowed = self.most + _TRAVEL_SHARE * travel.path + _LAG_S * travel.fastest
         errors = np.abs(moved - travel.commanded) - allowed
         errors[travel.excluded] = 0.0
         row = int(errors.argmax())
