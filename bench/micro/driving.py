@@ -24,6 +24,7 @@ CAP_SYS_NICE and CAP_IPC_LOCK; ``--realtime`` is that of all but the first.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import platform
 import random
@@ -280,7 +281,7 @@ def opened_host(
 ) -> Iterator[Opened]:
     """A host whose loop does not run yet."""
     model = load_model(ROBOT)
-    limits = Limits.of(model, acceleration=acceleration)
+    limits = Limits.of(model, acceleration=acceleration or math.inf)
     driver = TimedDriver(model, limits, plant)
     (port,) = free_ports(1)
     with (

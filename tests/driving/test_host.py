@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import signal
 import socket
@@ -32,7 +33,7 @@ from zstate.wire.keys import release_key, writer_expression
 from zstate.wire.messages import DriverState, JointCommand, Release, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
-LIMITS = Limits.of(RRBOT, velocity=2.0)
+LIMITS = Limits.of(RRBOT, velocity=2.0, acceleration=math.inf)
 ELBOW = order_digest(("elbow",))
 RATE_HZ = 200.0
 STEP = 2.0 / RATE_HZ

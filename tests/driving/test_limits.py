@@ -8,9 +8,10 @@ import re
 import numpy as np
 import pytest
 
-from zstate.driving.limits import Limits
+from zstate.driving.limits import Limits, unused_ranges
 from zstate.errors import InvalidInput
 from zstate.model.load import load_model
+from zstate.model.robot import RobotModel
 
 JOINTS = {
     "shoulder": ("revolute", '<limit lower="-1" upper="2" velocity="3" effort="4"/>'),
@@ -18,7 +19,7 @@ JOINTS = {
     "lift": ("prismatic", '<limit lower="0" upper="0.5" velocity="0.2" effort="4"/>'),
     "slow": ("revolute", '<limit lower="-1" upper="1" velocity="0" effort="4"/>'),
     "base": ("floating", ""),
-    "thumb": ("revolute", '<limit lower="-1" upper="1" velocity="1" effort="4"/><mimic joint="shoulder"/>'),
+    "thumb": ("revolute", '<limit lower="-1" upper="2" velocity="3" effort="4"/><mimic joint="shoulder"/>'),
 }
 
 
@@ -56,7 +57,6 @@ def test_limits_of_some_joints_have_their_order():
     limits = Limits.of(ARM, ["lift", "shoulder"])
     assert limits.joint_names == ("lift", "shoulder")
     assert limits.upper.tolist() == [0.5, 2.0]
-    assert limits.acceleration.tolist() == [math.inf, math.inf]
 
 
 def test_a_part_of_limits_has_the_order_of_its_joints():
@@ -74,7 +74,102 @@ def test_a_part_of_limits_has_the_order_of_its_joints():
 def test_velocities_are_lowered_and_accelerations_given_by_joint():
     limits = Limits.of(ARM, velocity={"shoulder": 1.0, "wheel": 20.0}, acceleration={"lift": 0.5})
     assert limits.velocity.tolist() == [1.0, 20.0, 0.2]
-    assert limits.acceleration.tolist() == [math.inf, math.inf, 0.5]
+    assert limits.acceleration.tolist() == [5.0, 100.0, 0.5]
+
+
+def test_a_joint_without_a_limit_of_its_acceleration_brakes_from_its_velocity_limit_in_a_fifth_of_a_second():
+    assert Limits.of(ARM).acceleration.tolist() == pytest.approx([3.0 / 0.2, math.inf, 0.2 / 0.2])
+    assert Limits.of(ARM, velocity={"wheel": 4.0}).acceleration[1] == pytest.approx(20.0)
+    assert Limits.of(ARM, acceleration=math.inf).acceleration.tolist() == [math.inf] * 3
+
+
+def driven(limit: str, follower: str = "", *, inside: str = "", after: str = "") -> RobotModel:
+    """A robot whose joint "a" has ``limit``; "b" follows it, if there is a ``follower``."""
+    links = '<link name="l0"/><link name="l1"/><link name="l2"/>'
+    joint = (
+        '<joint name="{}" type="revolute"><parent link="l0"/><child link="l{}"/><axis xyz="0 0 1"/>{}</joint>'
+    )
+    kind = follower or '<limit lower="0" upper="0" velocity="1" effort="1"/>'
+    chain = joint.format("a", 1, f"<limit {limit}/>{inside}") + joint.format("b", 2, kind)
+    return load_model(f'<robot name="arm">{links}{chain}{after}</robot>')
+
+
+@pytest.mark.parametrize(
+    ("mimic", "lower", "upper", "velocity", "effort"),
+    [
+        ('multiplier="3"', -1 / 3, 0.5 / 3, 4 / 3, 6.0),
+        ('multiplier="-3"', -0.5 / 3, 1 / 3, 4 / 3, 6.0),
+        ('multiplier="2" offset="0.4"', -0.7, 0.05, 2.0, 4.0),
+        ('multiplier="0.1"', -2.0, 2.0, 5.0, 0.2),
+        ('multiplier="0" offset="9"', -2.0, 2.0, 5.0, 7.0),
+    ],
+)
+def test_a_leading_joint_keeps_the_limits_of_its_followers(
+    mimic: str, lower: float, upper: float, velocity: float, effort: float
+):
+    limit = '<limit lower="-1" upper="0.5" velocity="4" effort="2"/>'
+    model = driven('lower="-2" upper="2" velocity="5" effort="7"', f'{limit}<mimic joint="a" {mimic}/>')
+    limits = Limits.of(model)
+    found = [limits.lower[0], limits.upper[0], limits.velocity[0], limits.effort[0]]
+    assert found == pytest.approx([lower, upper, velocity, effort])
+    if velocity < 5.0:
+        with pytest.raises(InvalidInput, match="velocity 5 of 'a' is above"):
+            Limits.of(model, velocity=5.0)
+
+
+def test_a_range_of_a_follower_that_leaves_no_position_is_not_used_and_said_so():
+    # As in the URDF of the PR2: the follower has the range of its leader, and turns the other way.
+    limit = 'lower="0" upper="0.5" velocity="5" effort="7"'
+    model = driven(limit, f'<limit {limit}/><mimic joint="a" multiplier="-1"/>')
+    assert (Limits.of(model).lower[0], Limits.of(model).upper[0]) == (0.0, 0.5)
+    assert unused_ranges(model, ["a"]) == (
+        "'a' is limited to 0 to 0.5, and not by 'b', which follows it: that would be -0.5 to -0",
+    )
+    assert not unused_ranges(driven(limit), ["a"])
+
+
+def interface(kind: str, **parameters: object) -> str:
+    numbers = "".join(f'<param name="{name}"> {value} </param>' for name, value in parameters.items())
+    return f'<command_interface name="{kind}">{numbers}</command_interface>'
+
+
+def test_soft_limits_and_those_of_ros2_control_are_kept():
+    limit = 'lower="-2" upper="2" velocity="5" effort="7"'
+    soft = '<safety_controller soft_lower_limit="-1.5" soft_upper_limit="3" k_velocity="10"/>'
+    model = driven(limit, inside=soft)
+    assert (Limits.of(model).lower[0], Limits.of(model).upper[0]) == (-1.5, 2.0)
+    interfaces = (
+        interface("position", min=-3, max=1.25)
+        + interface("velocity", min=-1.5, max=1.5)
+        + interface("effort", max=4)
+        + interface("acceleration", min=-2.5, max=2)
+    )
+    system = '<ros2_control name="s" type="system"><joint name="a">{}{}</joint></ros2_control>'
+    limits = Limits.of(driven(limit, inside=soft, after=system.format(interfaces, "")), ["a"])
+    assert (limits.lower[0], limits.upper[0]) == (-1.5, 1.25)
+    assert (limits.velocity[0], limits.effort[0], limits.acceleration[0]) == (1.5, 4.0, 2.0)
+    disabled = Limits.of(driven(limit, after=system.format(interfaces, '<limits enable="false"/>')), ["a"])
+    assert (disabled.upper[0], disabled.velocity[0]) == (2.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("element", "text"),
+    [
+        (interface("position", min="${low}"), "min: '${low}' is a xacro expression, not a number"),
+        (interface("position", min=1, max=-1), "positions from 1 to -1"),
+        (interface("velocity", min=0, max=1), "a velocity from 0 to 1"),
+        (interface("velocity", min=0.5, max=1), "a velocity from 0.5 to 1"),
+    ],
+)
+def test_a_limit_of_commands_that_cannot_be_read_is_a_finding(element: str, text: str):
+    limit = 'lower="-2" upper="2" velocity="5" effort="7"'
+    after = f'<ros2_control name="s" type="system"><joint name="a">{element}</joint></ros2_control>'
+    model = driven(limit, after=after)
+    assert (Limits.of(model).lower[0], Limits.of(model).velocity[0]) == (-2.0, 5.0)
+    (finding,) = model.findings
+    assert finding.message == (
+        f"joint 'a': its <command_interface> has {text}, which does not limit its commands"
+    )
 
 
 def test_efforts_are_those_of_the_urdf_or_lower_by_joint():

@@ -8,9 +8,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import IO, Generic, TypeVar
 
 from zstate._util.closeable import Closeable
@@ -77,7 +77,7 @@ class BackgroundCall(Generic[Result]):
         def run() -> None:
             try:
                 self._outcome.set_result(work())
-            except Exception as error:  # raised again by result()
+            except BaseException as error:  # raised again by result(), also SystemExit of a library
                 self._outcome.set_exception(error)
             finally:
                 self._is_done.set()
@@ -89,6 +89,34 @@ class BackgroundCall(Generic[Result]):
         if not wait_interruptible(self._is_done, timeout_s):
             raise TimeoutError(f"the work took longer than {timeout_s} s")
         return self._outcome.result()
+
+
+@contextmanager
+def orderly_exit(within_s: float = _PROGRAM_ENDS_WITHIN_S) -> Generator[Callable[[], None]]:
+    """A signal raises SystemExit in the block, once; later ones are ignored for ``within_s``.
+
+    After that time a signal ends the process at once. The block calls what is yielded before it stops what
+    must not go on: from there no signal interrupts it. For the main thread.
+    """
+    ends_at: float | None = None
+
+    def begin_end() -> None:
+        nonlocal ends_at
+        ends_at = ends_at or time.monotonic()
+
+    def on_signal(number: int, _: object) -> None:
+        if ends_at is None:
+            begin_end()
+            raise SystemExit(128 + number)
+        if time.monotonic() - ends_at > within_s:
+            os._exit(128 + number)
+
+    before = {one: signal.signal(one, on_signal) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield begin_end
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class ChildProcess(Closeable):

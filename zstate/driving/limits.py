@@ -1,6 +1,7 @@
 """Limits of driven joints: positions, velocities, accelerations and efforts.
 
-A URDF states positions, velocities and efforts; accelerations come from the manual of the actuators.
+A URDF states positions, velocities and efforts, also those of the joints that mimic a driven one, and limits
+of commands: see ``zstate.model.command_limits``. Accelerations come from the manual of the actuators.
 """
 
 from __future__ import annotations
@@ -16,13 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 from zstate._util.format import suggestion_text
 from zstate.checks import real_numbers, reduced_to_fields
 from zstate.errors import InvalidInput
-from zstate.model.robot import POSITION_COUNTS, Joint, RobotModel, near_joint
+from zstate.model.robot import POSITION_COUNTS, Joint, Mimic, RobotModel, near_joint
+from zstate.model.robot import Limits as JointLimits
 from zstate.wire.keys import shortened
 
 Floats = NDArray[np.float64]
 
 ROUNDING = 1e-9
 """[rad] or [m], and as a ratio for rates: rounding of interpolated values, far below any encoder."""
+
+BRAKING_S = 0.2
+"""For how long a joint brakes from its velocity limit if no limit of its acceleration is known [s]."""
 
 FARTHEST = 1e9
 """[rad] or [m]; positions further away are refused, whose squares and sums would lose the joint's motion.
@@ -107,37 +112,43 @@ class Limits:
         """The limits that the URDF of ``model`` states for ``joints``, which are all if left out.
 
         All are the driven joints with one position each: floating and planar joints have no limits in a URDF.
-        Continuous joints have no position limits. ``velocity``, ``acceleration`` and ``effort`` are one
-        number for all joints, or numbers by joint. A velocity or an effort may be lower than that of the
-        URDF, never higher, unless that is zero, as exporters write for an unknown one. Raises InvalidInput
-        for other joints, NaN, and numbers that are not above zero, with the joint and the value.
+        Continuous joints have no position limits. The limits of joints that mimic one of them, soft limits,
+        and those of the command interfaces of <ros2_control> count as well, except for ranges that leave no
+        positions. ``velocity``, ``acceleration``
+        and ``effort`` are one number for all joints, or numbers by joint. They may be lower than those of the
+        URDF, never higher, unless that is zero, as exporters write for an unknown one. A joint without any
+        limit of its acceleration gets the one with which it brakes from its velocity limit in 0.2 s; pass
+        infinity to let it stop in one step. Raises InvalidInput for other joints, NaN, and numbers that are
+        not above zero, with the joint and the value.
         """
         chosen = _driven_joints(model, joints)
         names = tuple(joint.name for joint in chosen)
-        stated = np.array([joint.limits.velocity for joint in chosen])
-        velocities = _rates(velocity, names, stated, "velocity")
-        problems = [
-            f"velocity {asked:g} of {name!r} is above {limit:g}, the limit in the URDF"
-            if asked > 0.0
-            else f"the URDF limits the velocity of {name!r} to {limit:g}, where it could not move"
-            for name, asked, limit in zip(names, velocities.tolist(), stated.tolist(), strict=True)
-            if asked > limit > 0.0 or asked <= 0.0
-        ]
-        stated_efforts = np.array([max(joint.limits.effort, 0.0) for joint in chosen])
-        efforts = _rates(effort, names, stated_efforts, "effort")
-        problems += [
-            f"effort {asked:g} of {name!r} is above {limit:g}, the limit in the URDF"
-            for name, asked, limit in zip(names, efforts.tolist(), stated_efforts.tolist(), strict=True)
-            if asked > limit > 0.0
-        ]
+        stated = [_stated_limits(model, joint)[0] for joint in chosen]
+        problems: list[str] = []
+        velocities = _rates(velocity, names, np.array([one.velocity for one in stated]), "velocity")
+        efforts = _rates(effort, names, np.array([max(one.effort, 0.0) for one in stated]), "effort")
+        braking = np.array([one.acceleration for one in stated])
+        braking = np.where(np.isfinite(braking), braking, velocities / BRAKING_S)
+        accelerations = _rates(acceleration, names, braking, "acceleration")
+        for name, limits, asked in zip(names, stated, velocities.tolist(), strict=True):
+            if asked <= 0.0:
+                at_most = f"{limits.velocity:g}, where it could not move"
+                problems.append(f"the URDF limits the velocity of {name!r} to {at_most}")
+        for kind, asked in (("velocity", velocities), ("effort", efforts), ("acceleration", accelerations)):
+            limits = [getattr(one, kind) for one in stated]
+            problems += [
+                f"{kind} {number:g} of {name!r} is above {limit:g}, the limit in the URDF"
+                for name, number, limit in zip(names, asked.tolist(), limits, strict=True)
+                if number > limit > 0.0
+            ]
         if problems:
             raise InvalidInput(f"{'; '.join(problems)}; pass other limits, or correct the URDF")
         return cls(
             names,
-            np.array([joint.limits.lower for joint in chosen]),
-            np.array([joint.limits.upper for joint in chosen]),
+            np.array([one.lower for one in stated]),
+            np.array([one.upper for one in stated]),
             velocities,
-            _rates(acceleration, names, np.full(len(names), np.inf), "acceleration"),
+            accelerations,
             tuple("m" if joint.type == "prismatic" else "rad" for joint in chosen),
             efforts,
         )
@@ -242,6 +253,52 @@ def _driven_joints(model: RobotModel, names: Sequence[str] | None) -> tuple[Join
     if problems:
         raise InvalidInput(f"limits of {model.name!r}: {'; '.join(problems)}")
     return tuple(single[name] for name in chosen)
+
+
+def unused_ranges(model: RobotModel, joint_names: Sequence[str]) -> tuple[str, ...]:
+    """A text for each range of positions in the URDF that ``Limits.of`` cannot use for ``joint_names``."""
+    chosen = _driven_joints(model, joint_names)
+    return tuple(text for joint in chosen for text in _stated_limits(model, joint)[1])
+
+
+def _stated_limits(model: RobotModel, joint: Joint) -> tuple[JointLimits, list[str]]:
+    """The limits of ``joint``, of its commands, and of the joints that mimic it, as limits of its own.
+
+    A range of which less than two positions are left is not used, and has a text: followers often have that
+    of their leader in the URDF, with the wrong sign.
+    """
+    found, texts = joint.limits, list[str]()
+    narrower = [("its commands", joint.command_limits)]
+    for follower in model.joints:
+        if follower.mimic is not None and (mimic := model.mimic_of(follower)).joint == joint.name:
+            limits = follower.limits.narrowed(follower.command_limits)
+            narrower.append((f"{follower.name!r}, which follows it", _through(mimic, limits)))
+    for source, limits in narrower:
+        both = found.narrowed(limits)
+        if found.lower < found.upper and not both.lower < both.upper:
+            texts.append(
+                f"{joint.name!r} is limited to {found.lower:g} to {found.upper:g}, and not by {source}: that "
+                f"would be {limits.lower:g} to {limits.upper:g}"
+            )
+            both = replace(both, lower=found.lower, upper=found.upper)
+        found = both
+    return found, texts
+
+
+def _through(mimic: Mimic, limits: JointLimits) -> JointLimits:
+    """The ``limits`` of a joint as those of the joint that it follows by ``mimic``.
+
+    A range or a rate of zero is none, as exporters write for an unknown one. The effort of the leading joint
+    may all be at this one.
+    """
+    ratio = mimic.multiplier
+    if ratio == 0.0:
+        return JointLimits()
+    ends = sorted((end - mimic.offset) / ratio for end in (limits.lower, limits.upper))
+    lower, upper = ends if limits.lower < limits.upper else (-math.inf, math.inf)
+    velocity = limits.velocity / abs(ratio) if limits.velocity > 0.0 else math.inf
+    effort = limits.effort * abs(ratio) if limits.effort > 0.0 else math.inf
+    return JointLimits(lower, upper, velocity, effort, limits.acceleration / abs(ratio))
 
 
 def _not_single_text(model: RobotModel, name: str, single: Sequence[str]) -> str:

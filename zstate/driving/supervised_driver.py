@@ -111,12 +111,16 @@ class SupervisedDriver:
         return None
 
     def disable(self) -> None:
-        """Switch off power and brakes, before the driver is closed."""
-        self.repeat_stop()
+        """Switch off power and brakes, before the driver is closed, whatever it raises."""
         try:
-            self._driver.enable(False)
-        except Exception as error:
-            _LOG.error("enable(False) of the driver of %r failed: %r", self._robot, error)
+            self.repeat_stop()
+        finally:
+            try:
+                self._driver.enable(False)
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:  # also SystemExit, which would hide the cause of the end
+                _LOG.error("enable(False) of the driver of %r failed: %r", self._robot, error)
 
 
 class FollowingCheck:

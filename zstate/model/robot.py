@@ -67,12 +67,24 @@ _COORDINATES = {
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of a joint: [rad] or [m], per second, and [Nm] or [N]. Infinite unless stated."""
+    """Limits of a joint: [rad] or [m], per s, [Nm] or [N], and per s^2. Infinite unless stated."""
 
     lower: float = -np.inf
     upper: float = np.inf
     velocity: float = np.inf
     effort: float = np.inf
+    acceleration: float = np.inf
+    """Of commands alone: a joint of a URDF has none."""
+
+    def narrowed(self, other: Limits) -> Limits:
+        """The narrower of these limits and ``other``, each."""
+        return Limits(
+            max(self.lower, other.lower),
+            min(self.upper, other.upper),
+            min(self.velocity, other.velocity),
+            min(self.effort, other.effort),
+            min(self.acceleration, other.acceleration),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +101,8 @@ class Joint:
     """One edge of the robot, from link ``parent`` to link ``child``.
 
     ``origin`` is ``parent_from_joint`` as pose7; ``axis`` is the unit axis in the joint's frame.
-    ``line`` is its line in the URDF.
+    ``line`` is its line in the URDF. ``command_limits`` are for commands alone: soft limits, and those of
+    <ros2_control>.
     """
 
     name: str
@@ -101,6 +114,7 @@ class Joint:
     limits: Limits
     mimic: Mimic | None = None
     line: int | None = None
+    command_limits: Limits = Limits()
 
     @property
     def driven(self) -> bool:
@@ -295,7 +309,7 @@ class RobotModel:
 
 
 def _shown_cells(joint: Joint) -> tuple[str, ...]:
-    limits = (f"{limit:.4g}" if math.isfinite(limit) else "" for limit in astuple(joint.limits))
+    limits = (f"{limit:.4g}" if math.isfinite(limit) else "" for limit in astuple(joint.limits)[:4])
     return (joint.name, joint.type, joint.parent, joint.child, *limits)
 
 

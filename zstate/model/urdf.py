@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from zstate._util.format import suggestion_text
+from zstate.model.command_limits import read_command_limits
 from zstate.model.findings import Findings, quoted, shortened
-from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, Joint, RobotModel
+from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, Joint, Limits, RobotModel
 from zstate.model.urdf_joint import read_joint
 from zstate.model.xml import Document, Element, NumberError, read_document, read_number
 
@@ -48,7 +50,9 @@ def parse_document(document: Document, source: str) -> RobotModel:
     _check_names(findings, robot)
     _check_nesting(findings, robot)
     links = _read_links(findings, robot)
+    commands = read_command_limits(robot, findings)
     joints = [read_joint(element, links, findings) for element in robot.all("joint")]
+    joints = [replace(joint, command_limits=commands.get(joint.name, Limits())) for joint in joints]
     root = _check_tree(findings, links, joints)
     _check_mimics(findings, joints)
     findings.raise_errors()

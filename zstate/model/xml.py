@@ -41,12 +41,13 @@ _MISMATCH = _CODES[expat.errors.XML_ERROR_TAG_MISMATCH]
 
 @dataclass(slots=True)
 class Element:
-    """One XML element: its tag as written, attributes, first line and children."""
+    """One XML element: its tag as written, attributes, first line, children, and the text of a <param>."""
 
     tag: str
     attributes: dict[str, str]
     line: int
     children: list[Element] = field(default_factory=list["Element"])
+    text: str = ""
 
     def all(self, tag: str) -> list[Element]:
         """The direct children with that tag."""
@@ -129,6 +130,7 @@ class _Reader:
         self._count = 0
         self._parser = expat.ParserCreate()
         self._parser.StartElementHandler = self._start
+        self._parser.CharacterDataHandler = self._add_text
         self._parser.EndElementHandler = lambda _tag: self._open.pop()
         self._parser.StartDoctypeDeclHandler = self._doctype
 
@@ -159,6 +161,10 @@ class _Reader:
         else:
             self._root = element
         self._open.append(element)
+
+    def _add_text(self, text: str) -> None:
+        if self._open[-1].tag == "param":  # the only element of a URDF whose text is read
+            self._open[-1].text += text
 
     def _doctype(self, _name: str, system: str | None, public: str | None, has_declarations: int) -> None:
         if system or public or has_declarations:

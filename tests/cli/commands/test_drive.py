@@ -53,6 +53,24 @@ class Paced(Arm):
         time.sleep(0.01)
         return super().read(stamp)
 
+class Leaving(Arm):
+    def read(self, stamp):
+        raise SystemExit(0)
+
+    def stop(self, how):
+        raise SystemExit(0)
+
+    def enable(self, on):
+        self.log.write_text(f"{self.log.read_text()}enable {on} ")
+        raise SystemExit(0)
+
+class SlowToStop(Arm):
+    def stop(self, how):
+        self.log.write_text(self.log.read_text() + "stopping ")
+        time.sleep(0.7)
+        super().stop(how)
+        self.log.write_text(self.log.read_text() + "stopped ")
+
 class Nothing:
     pass
 """
@@ -60,6 +78,8 @@ class Nothing:
 
 CONNECTS = 1 + ARM.splitlines().index('        socket.create_connection(("127.0.0.1", 1))')
 """The line of its own code where a driver fails."""
+
+LEAVES = 1 + ARM.splitlines().index("        raise SystemExit(0)")
 
 
 @pytest.fixture
@@ -81,6 +101,9 @@ def test_changes_of_state_are_lines_and_the_end_is_a_report(spawn: Spawn):
     assert child.line() == (
         "driving 'rrbot' (2 joints, sim) at 100 Hz; the joints hold after 500.0 ms without a command"
     )
+    assert child.line() == (
+        "the joints brake from their velocity limits in 0.2 s; --acceleration sets others"
+    )
     assert child.line() == "ready"
     with connect() as session, Commander(session, "rrbot", program="teleop") as commander:
         commander.wait_for_driver(DEADLINE_S)
@@ -93,6 +116,30 @@ def test_changes_of_state_are_lines_and_the_end_is_a_report(spawn: Spawn):
     assert " samples; commanded 100 Hz, achieved " in child.line()
     assert child.line().startswith("late by ")
     assert child.line().endswith(" written, 0 failures of the driver, commands refused: none")
+
+
+def test_a_second_signal_does_not_skip_the_stop_of_the_driver(spawn: Spawn, arm: str, tmp_path: Path):
+    log = tmp_path / "log"
+    child = started(spawn, "drive", f"{arm}:SlowToStop", "rrbot", "--param", f"log={log}", "--ttl", "20")
+    line_with(child, "ready")
+    with connect() as session, Commander(session, "rrbot") as commander:
+        commander.wait_for_driver(DEADLINE_S)
+        until(lambda: _is_moved(commander))
+        log.write_text("")
+        child.process.send_signal(signal.SIGINT)
+        until(lambda: "stopping" in log.read_text())
+        child.process.send_signal(signal.SIGINT)
+        child.process.send_signal(signal.SIGTERM)
+        assert child.process.wait(DEADLINE_S) == 130
+    assert log.read_text().startswith("stopping stopped ")
+    assert log.read_text().endswith("closed")
+
+
+def test_a_driver_that_raises_system_exit_ends_the_command_with_the_cause(arm: str, tmp_path: Path):
+    log = tmp_path / "log"
+    text = failure("drive", f"{arm}:Leaving", "rrbot", "--param", f"log={log}")
+    assert f"the driver of 'rrbot' raised SystemExit(0) ({arm}, line {LEAVES})" in text
+    assert log.read_text().endswith("enable False closed")
 
 
 def _is_moved(commander: Commander) -> bool:
@@ -124,7 +171,7 @@ def test_ros_nodes_command_the_joints_as_a_controller_and_receive_them(spawn: Sp
     given = ("drive", "sim", "rrbot", "--wire", "native", "--wire", "ros2", "--ttl", "10")
     child = started(spawn, *given, "--ros2-controller", "forward_position_controller")
     assert child.line().startswith("driving 'rrbot' (2 joints, sim)")
-    assert child.line() == (
+    assert line_with(child, "ROS 2 nodes") == (
         "ROS 2 nodes command shoulder, elbow, in this order, on /forward_position_controller/commands and "
         "/forward_position_controller/joint_trajectory"
     )

@@ -10,7 +10,9 @@ import time
 import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from importlib.util import module_from_spec, spec_from_file_location
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -22,7 +24,7 @@ from zstate.cli import options
 from zstate.cli.options import load_robot
 from zstate.cli.output.console import count_text, fail, print_wrapped, report_text
 from zstate.cli.session import SessionOptions, open_session
-from zstate.errors import InvalidInput, MessageError, ZStateError, format_duration
+from zstate.errors import DriverFault, InvalidInput, MessageError, ZStateError, format_duration
 
 if TYPE_CHECKING:
     from zstate.driving import Driver, DriverHost, DriverReport, Limits
@@ -144,7 +146,9 @@ _LIMIT = options.Checked("[JOINT=]V", _parse_limit)
     "accelerations",
     type=_LIMIT,
     multiple=True,
-    help="The same for the acceleration, of which a URDF has none [rad/s^2 or m/s^2]. Repeatable.",
+    help="The same for the acceleration [rad/s^2 or m/s^2], which a URDF has only in <ros2_control>; "
+    "default: the one that brakes a joint from its velocity limit in 0.2 s; inf lets joints stop at once. "
+    "Repeatable.",
 )
 @click.option(
     "--effort",
@@ -201,9 +205,10 @@ def drive_command(
     as keywords, and gets the robot's RobotModel as `model` and the names of its joints as `joint_names` if it
     has parameters of these names.
 
-    `zstate move` or a zstate.driving.Commander moves the joints, within the limits of the URDF; `zstate stop`
-    stops them. Each change of state is a line. After Ctrl-C the joints are stopped as after silence, and the
-    driver is closed.
+    `zstate move` or a zstate.driving.Commander moves the joints, within the limits of the URDF: those of a
+    joint, of the joints that mimic it, of its safety_controller and of ros2_control. `zstate stop` stops
+    them. Each change of state is a line. After Ctrl-C the joints are stopped as after silence, and the driver
+    is closed.
 
     A driver that fails three times in a row is stopped, and the exit code is 1. It does not connect again by
     itself: start the command again once the hardware is back, or let `zstate up` (restart = "on-failure").
@@ -253,6 +258,8 @@ def drive_command(
             f"driving {robot_name!r} ({joints}, {driver}) at {pace}; the joints {then} after "
             f"{format_duration(round(ttl * 1e9))} without a command"
         )
+        for line in _limit_lines(model, limits):
+            print_wrapped(line)
         if inputs:
             print_wrapped(
                 f"ROS 2 nodes command {', '.join(hardware.joint_names)}, in this order, on {inputs}"
@@ -277,17 +284,35 @@ def _controller_text(wires: tuple[str, ...], robot: str, name: str) -> str:
 def run_host(host: DriverHost, seconds: float | None) -> None:
     """Run the loop, with the report at its end, also after a signal or a fault.
 
-    A signal interrupts only the calling thread, which waits: never a call of the driver.
+    A signal interrupts only the calling thread, which waits: never a call of the driver. A second one does
+    not interrupt the driver's stop, which may take 3 s.
     """
-    from zstate.cli.processes import BackgroundCall
+    from zstate.cli.processes import BackgroundCall, orderly_exit
 
-    call = BackgroundCall("zstate drive", lambda: host.run(seconds=seconds))
+    with orderly_exit() as begin_end:
+        call = BackgroundCall("zstate drive", partial(_run, host, seconds))
+        try:
+            call.result()
+        finally:
+            begin_end()
+            host.close()
+            for line in _report_lines(host.report()):
+                print_wrapped(line)
+
+
+def _run(host: DriverHost, seconds: float | None) -> None:
+    """Run the loop. Raises DriverFault for what would end this thread alone, such as SystemExit of an SDK."""
     try:
-        call.result()
-    finally:
-        host.close()
-        for line in _report_lines(host.report()):
-            print_wrapped(line)
+        host.run(seconds=seconds)
+    except Exception:
+        raise
+    except BaseException as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        raise DriverFault(
+            f"the driver of {host.robot!r} raised {error!r} ({place.filename}, line {place.lineno}); it has "
+            "been stopped, and the loop has ended",
+            robot=host.robot,
+        ) from error
 
 
 def _report_lines(report: DriverReport) -> Iterator[str]:
@@ -359,6 +384,23 @@ def _limits(
             f"{unlimited[0]}=1.0"
         )
     return limits
+
+
+def _limit_lines(model: RobotModel, limits: Limits) -> Iterator[str]:
+    """What is not obvious about the ``limits`` of a driver: those by default, and those that are not used."""
+    from zstate.driving.limits import BRAKING_S, unused_ranges
+    from zstate.model.command_limits import NOT_LIMITING
+
+    names = limits.joint_names
+    is_default = (limits.acceleration == limits.velocity / BRAKING_S).tolist()
+    if any(is_default):
+        which = "the joints" if all(is_default) else ", ".join(compress(names, is_default))
+        yield f"{which} brake from their velocity limits in {BRAKING_S:g} s; --acceleration sets others"
+    for text in unused_ranges(model, names):
+        yield f"warning: {text}"
+    for finding in model.findings:
+        if NOT_LIMITING in finding.message:
+            yield f"warning: {finding.message}"
 
 
 def _by_joint(limits: Sequence[_Limit], option: str) -> float | Mapping[str, float] | None:
