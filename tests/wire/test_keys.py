@@ -100,6 +100,14 @@ def test_name_lengths_are_limited_as_in_file_systems():
         keys.full_name("r1", "a" * 1025)
 
 
+def test_no_robot_has_the_name_of_the_clock_whose_key_would_be_below_its_own():
+    with pytest.raises(InvalidInput, match="the robot name 'clock' is that of the simulated time"):
+        keys.stream_key("clock", "joint_states")
+    with pytest.raises(InvalidInput):
+        keys.robot_from_key("zstate/clock/joint_states")
+    assert keys.stream_key("r1", "map", "clock") == "zstate/r1/map/clock"
+
+
 def test_every_key_of_a_robot_lies_under_its_own_prefix():
     assert keys.stream_key("panda", "joint_states") == "zstate/panda/joint_states"
     assert keys.stream_key("panda", "tf") == "zstate/panda/tf"
@@ -111,6 +119,8 @@ def test_every_key_of_a_robot_lies_under_its_own_prefix():
     assert keys.stream_key("hall", "map", "map") == "zstate/hall/map/map"
     assert keys.stream_key("r1", "imu", "imu") == "zstate/r1/imu/imu"
     assert keys.stream_key("r1", "velocity", "wheels") == "zstate/r1/velocity/wheels"
+    assert keys.stop_key("r1", "x") == "zstate/r1/stop/x"
+    assert keys.relax_key("r1", "x") == "zstate/r1/relax/x"
     assert keys.stream_key("r1", "pose", "mocap") == "zstate/r1/pose/mocap"
     assert keys.stream_key("r1", "odometry", "odometry") == "zstate/r1/odometry/odometry"
     assert keys.lookup_key("panda") == "zstate/panda/lookup"
@@ -217,7 +227,7 @@ def test_a_robot_or_writer_name_that_is_not_text_is_refused_with_its_type(name):
         keys.stream_key("panda", "tf_static", name)
 
 
-@pytest.mark.parametrize("name", ["panda", "r1", "arm-2.left", "über", "a@b", "clock"])
+@pytest.mark.parametrize("name", ["panda", "r1", "arm-2.left", "über", "a@b", "stop"])
 def test_ordinary_names_are_unchanged(name: str):
     assert keys.check_robot(name) == name
 

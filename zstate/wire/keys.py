@@ -17,6 +17,7 @@
 ``zstate/<robot>/joint_setpoints``                JointState with joint names, of a driver, while read
 ``zstate/<robot>/driver``                         DriverState, latched
 ``zstate/<robot>/stop/<id>``                      Stop, latched: of one program that stops the driver
+``zstate/<robot>/relax/<id>``                     Stop, latched: of one that switches its torque off, too
 ``zstate/<robot>/release/<id>``                   Release, of a commander
 ``zstate/<robot>/@motion``                        a queryable: JointTrajectory or MotionCancel, to a driver
 ``zstate/<robot>/lookup``                         a queryable
@@ -55,6 +56,7 @@ Stream = Literal[
     "joint_setpoints",
     "driver",
     "stop",
+    "relax",
     "scan",
     "map",
     "imu",
@@ -70,7 +72,7 @@ ANY = "*"
 NAMED_STREAMS: frozenset[Stream] = frozenset(
     {
         *("tf_static", "transforms", "partial_joint_states", "odometry", "map"),
-        *("scan", "imu", "velocity", "pose", "stop"),
+        *("scan", "imu", "velocity", "pose", "stop", "relax"),
     }
 )
 """The streams with one key for each of the writer names of a robot."""
@@ -96,6 +98,9 @@ VERBATIM_CHUNKS = ("@writer", "@clock", "@edge", "@reader")
 MOTION_CHUNK = "@motion"
 """The chunk of requests for motions. It is verbatim, too: access control lets viewers query ``zstate/**``."""
 
+STOP_STREAMS: tuple[Stream, ...] = ("stop", "relax")
+"""The streams of stops. Access control lets every identity write the first, which never drops a load."""
+
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""
 
@@ -108,6 +113,7 @@ _MAX_KEY_LENGTH = 16_384
 
 _STREAMS: dict[str, Stream] = {stream: stream for stream in get_args(Stream)}
 _RESERVED = frozenset("/*$?#")
+_CLOCK_CHUNK = CLOCK_KEY.rpartition("/")[2]
 
 
 def check_writer(name: str) -> str:
@@ -120,6 +126,8 @@ def check_robot(name: str, what: str = "robot") -> str:
     if not isinstance(name, str):  # pyright: ignore[reportUnnecessaryIsInstance]  # e.g. of a missing variable
         raise InvalidInput(f"a {what} name is text; got {name!r} of type {type(name).__name__}")
     problem = _chunk_problem(name)
+    if what == "robot" and name == _CLOCK_CHUNK:
+        problem = f"is that of the simulated time, {CLOCK_KEY!r}"
     if problem:
         raise InvalidInput(
             f"the {what} name {shortened(name)!r} {problem}; it is one chunk of a Zenoh key: "
@@ -129,6 +137,7 @@ def check_robot(name: str, what: str = "robot") -> str:
 
 
 def _chunk_problem(name: str) -> str:
+    """Why ``name`` cannot be one chunk of a key; empty if it can."""
     if not name:
         return "is empty"
     if name.startswith("@"):
@@ -208,19 +217,29 @@ def driver_expression(robot: str) -> str:
 
 
 def stop_key(robot: str, identity: str) -> str:
-    """The key on which one program stops the driver of a robot."""
+    """The key on which one program stops the driver of a robot, whose joints hold."""
     return f"zstate/{check_robot(robot)}/stop/{identity}"
 
 
-def stop_expression(robot: str) -> str:
-    """The key expression of every Stop of ``robot``."""
-    return f"zstate/{_check_robot_or_any(robot)}/stop/*"
+def relax_key(robot: str, identity: str) -> str:
+    """The key on which one program stops the driver of a robot, and switches its torque off.
+
+    Access control separates it from the ``stop_key``: without torque, joints without brakes fall.
+    """
+    return f"zstate/{check_robot(robot)}/relax/{identity}"
 
 
-def parse_stop_key(key: str) -> tuple[str, str]:
-    """Robot and identity in a ``stop_key``."""
-    robot, identity = _parse(key, "zstate/<robot>/stop/<identity>")
-    return check_robot(robot), identity
+def stop_expressions(robot: str) -> tuple[str, ...]:
+    """The key expressions of every Stop of ``robot``, on both keys."""
+    return tuple(stream_expression(robot, stream) for stream in STOP_STREAMS)
+
+
+def parse_stop_key(key: str) -> tuple[str, str, str]:
+    """Robot, identity, and whether it is a "stop" or "relax", in a ``stop_key`` or ``relax_key``."""
+    robot, stream, identity = _parse(key, "zstate/<robot>/<stream>/<identity>")
+    if stream not in STOP_STREAMS:
+        raise _form_error(key, "zstate/<robot>/stop/<identity>")
+    return check_robot(robot), identity, stream
 
 
 def release_key(robot: str, identity: str) -> str:
@@ -231,6 +250,12 @@ def release_key(robot: str, identity: str) -> str:
 def release_expression(robot: str) -> str:
     """The key expression of every Release of ``robot``."""
     return f"zstate/{_check_robot_or_any(robot)}/release/*"
+
+
+def parse_release_key(key: str) -> tuple[str, str]:
+    """Robot and identity in a ``release_key``."""
+    robot, identity = _parse(key, "zstate/<robot>/release/<identity>")
+    return check_robot(robot), identity
 
 
 def motion_key(robot: str) -> str:

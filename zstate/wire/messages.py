@@ -26,7 +26,10 @@ from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, Stream, full_name
 
 Edges = tuple[tuple[str, str], ...]
 Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-Count = Annotated[int, Meta(ge=0)]
+SessionId = Annotated[int, Meta(ge=0)]
+"""Below 2^64, as MessagePack has no larger integers."""
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+"""One more than it can still be encoded: readers echo numbers, and count on from them."""
 Interval = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
 Mode = Literal["position", "velocity", "effort"]
@@ -91,7 +94,7 @@ class StampedMessage(Message, frozen=True, array_like=True, gc=False):
 
     stamp: Stamp
     seq: Count
-    session: Count
+    session: SessionId
 
 
 M = TypeVar("M", bound=Message)
@@ -316,7 +319,7 @@ class MotionReply(Message, frozen=True, array_like=True, gc=False):
     ``session`` is that of the driver's DriverState. A motion is valid for ``ttl`` [ns], unless it is renewed.
     """
 
-    session: Count
+    session: SessionId
     ttl: Interval
     findings: tuple[str, ...] = ()
 
@@ -327,7 +330,7 @@ OutcomeName = Literal["reached", "aborted", "replaced", "cancelled", "stopped"]
 class MotionOutcome(Message, frozen=True, array_like=True, gc=False):
     """How the motion with ``seq`` of the commander's ``session`` has ended, and why."""
 
-    session: Count
+    session: SessionId
     seq: Count
     name: OutcomeName
     reason: str = ""
@@ -336,21 +339,33 @@ class MotionOutcome(Message, frozen=True, array_like=True, gc=False):
 class Stop(StampedMessage, frozen=True, array_like=True, gc=False):
     """A stop of a driver, until it is released.
 
-    With ``how`` "hold" the joints stay where they are, with "relax" without torque. ``reason`` is shown to
-    users.
+    With ``how`` "hold" the joints stay where they are, with "relax" without torque; drivers obey "relax" on
+    the key of its own only, and hold otherwise. ``reason`` is shown to users. A stop never fails because of
+    its text: ``stop_text`` makes one that fits of any.
     """
 
     how: Literal["hold", "relax"]
     reason: str = ""
 
     def __post_init__(self) -> None:
-        if len(self.reason) > MAX_REASON_LENGTH:
-            raise InvalidInput(
-                f"the reason of a stop has at most {MAX_REASON_LENGTH} characters, not {len(self.reason)}"
-            )
+        msgspec.structs.force_setattr(self, "reason", stop_text(self.reason))
 
 
-StopIds = tuple[tuple[Count, Count], ...]
+def stop_text(text: str) -> str:
+    """``text`` as the reason of a Stop: with escapes where it is not UTF-8, and cut where it is too long."""
+    text = _encodable(text)
+    return text if len(text) <= MAX_REASON_LENGTH else f"{text[: MAX_REASON_LENGTH - 3]}..."
+
+
+def _encodable(text: str) -> str:
+    """``text`` with escapes for the bytes of file names and arguments that are not UTF-8."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+Id = tuple[SessionId, Count]
+"""A message by its ``session`` and its ``seq``."""
+
+StopIds = tuple[Id, ...]
 """Stops, each by its ``session`` and its ``seq``."""
 
 
@@ -376,7 +391,7 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     """
 
     stamp: Stamp
-    session: Count
+    session: SessionId
     program: str
     state: Literal["off", "ready", "active", "holding", "stopped", "fault"]
     reason: str
@@ -389,10 +404,10 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     ticks: Count = 0
     skipped: Count = 0
     faults: Count = 0
-    refused: dict[str, int] = {}
+    refused: dict[str, Count] = {}
     last_refusal: str = ""
     stops: StopIds = ()
-    motion: tuple[Count, Count] | None = None
+    motion: Id | None = None
     progress: float = 0.0
     outcomes: tuple[MotionOutcome, ...] = ()
     modes: tuple[Mode, ...] = ("position",)
@@ -400,8 +415,11 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
 
 def with_short_texts(state: DriverState) -> DriverState:
     """``state`` with at most ``MAX_STATE_TEXT_LENGTH`` characters of each text: readers refuse large ones."""
-    reason, last_refusal = _cut(state.reason), _cut(state.last_refusal)
-    return msgspec.structs.replace(state, reason=reason, last_refusal=last_refusal)
+    texts = {
+        name: _encodable(_cut(getattr(state, name)))
+        for name in ("program", "reason", "commander", "last_refusal")
+    }
+    return msgspec.structs.replace(state, **texts)
 
 
 def _cut(text: str) -> str:
@@ -436,7 +454,7 @@ def message_from_fields(kind: type[M], fields: Mapping[str, Any]) -> M:
 class StaticTransforms(Message, frozen=True, array_like=True, gc=False):
     """All static edges of one writer: row i of ``poses`` is ``parent_from_child`` of ``edges[i]``."""
 
-    session: Count
+    session: SessionId
     edges: Edges
     poses: bytes
 
@@ -452,7 +470,7 @@ class RobotDescription(Message, frozen=True, array_like=True, gc=False):
     format does not carry it.
     """
 
-    session: Count
+    session: SessionId
     urdf: str
     digest: str
     joint_names: tuple[str, ...]
@@ -618,7 +636,7 @@ class OccupancyGrid(Message, frozen=True, array_like=True, gc=False):
     the time of the map.
     """
 
-    session: Count
+    session: SessionId
     stamp: Stamp
     frame: str
     resolution: float
@@ -669,7 +687,7 @@ class Status(Message, frozen=True, array_like=True, gc=False):
     """
 
     stamp: Stamp
-    session: Count
+    session: SessionId
     level: Level
     program: str
     host: str
@@ -767,6 +785,9 @@ SCAN_BYTES = 810_000
 SENSOR_BYTES = 10_000
 """Odometry with the longest names of its frames takes less on each wire."""
 
+STOP_BYTES = 256_000
+"""Writers send far less; more than that is no text."""
+
 LATCHED_BYTES = GRID_CELLS + 8 * 2**10
 """A grid of ``GRID_CELLS`` takes less on each wire."""
 ATTACHMENT_BYTES = 1_024
@@ -780,7 +801,8 @@ MAX_BYTES: Mapping[Stream, int] = {
     "joint_commands": SAMPLE_BYTES,
     "joint_setpoints": SAMPLE_BYTES,
     "driver": SAMPLE_BYTES,
-    "stop": 8_000,
+    "stop": STOP_BYTES,
+    "relax": STOP_BYTES,
     "scan": SCAN_BYTES,
     "imu": SENSOR_BYTES,
     "velocity": SENSOR_BYTES,

@@ -12,7 +12,7 @@ import re
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import msgspec
 
@@ -23,7 +23,9 @@ from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     LATCHED_BYTES,
     SAMPLE_BYTES,
+    STOP_BYTES,
     ClockMessage,
+    Count,
     DriverState,
     HistoryPage,
     Imu,
@@ -39,6 +41,8 @@ from zstate.wire.messages import (
     Pose,
     Release,
     RobotDescription,
+    SessionId,
+    Stamp,
     StaticTransforms,
     Status,
     Stop,
@@ -89,6 +93,7 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "joint_setpoints": JointState,
     "driver": DriverState,
     "stop": Stop,
+    "relax": Stop,
     "scan": LaserScan,
     "map": OccupancyGrid,
     "imu": Imu,
@@ -105,7 +110,7 @@ MAX_MESSAGE_BYTES: dict[type[Message], int] = {
     ClockMessage: 1_000,
     Status: 64_000,
     DriverState: 256_000,
-    Stop: 8_000,
+    Stop: STOP_BYTES,
     Release: 64_000,
     JointTrajectory: 4_000_000,
     MotionCancel: 1_000,
@@ -136,6 +141,18 @@ def encode(message: Message) -> bytes:
     return payload
 
 
+def with_encodable_fields(state: DriverState) -> DriverState:
+    """``state`` with empty values in place of those that cannot be encoded."""
+    empty = DriverState(0, 0, "", state.state, "", (), 0)
+    fields = {name: getattr(state, name) for name in state.__struct_fields__}
+    for name, value in fields.items():
+        try:
+            _ENCODER.encode(value)
+        except Exception:  # it has several, one for each type
+            fields[name] = getattr(empty, name)
+    return DriverState(**fields)
+
+
 def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     """The message of type ``kind`` in ``payload``, whose Zenoh encoding is ``encoding``.
 
@@ -149,6 +166,8 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     if kind is OccupancyGrid and payload.startswith(_DEFLATED):
         payload = _inflated(payload)
     try:
+        if kind is Stop:
+            return _decoded_stop(payload)  # type: ignore[return-value]  # of this kind
         return _DECODERS[kind].decode(payload)  # type: ignore[return-value]  # one decoder per type
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         # msgspec raises one exception for both; only the texts differ
@@ -156,6 +175,33 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
             text = f"a {_type_name(kind)} cut off after {len(payload)} bytes"
             raise MessageError(text, reason="truncated") from None
         raise MessageError(f"a malformed {_type_name(kind)}: {error}", reason="malformed") from None
+
+
+class _StopHead(msgspec.Struct, array_like=True, gc=False):
+    """The fields of a Stop, its reason as it is encoded."""
+
+    stamp: Stamp
+    seq: Count
+    session: SessionId
+    how: Literal["hold", "relax"]
+    reason: msgspec.Raw = msgspec.Raw(b"\xa0")
+
+
+_STOP_DECODER = msgspec.msgpack.Decoder(_StopHead)
+_TEXT_DECODER = msgspec.msgpack.Decoder(str)
+_TEXT_HEADERS = {0xD9: 2, 0xDA: 3, 0xDB: 5}
+"""The size of the header of a str by its first byte; one byte for all others [MessagePack]."""
+
+
+def _decoded_stop(payload: bytes) -> Stop:
+    """The Stop in ``payload``, also if its reason is not UTF-8: a stop never fails because of its text."""
+    head = _STOP_DECODER.decode(payload)
+    encoded = bytes(head.reason)
+    try:
+        reason = _TEXT_DECODER.decode(encoded)
+    except UnicodeDecodeError:
+        reason = encoded[_TEXT_HEADERS.get(encoded[0], 1) :].decode("utf-8", "replace")
+    return Stop(head.stamp, head.seq, head.session, head.how, reason)
 
 
 def _inflated(payload: bytes) -> bytes:
