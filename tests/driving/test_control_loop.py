@@ -85,7 +85,7 @@ class Bench:
         self.random = generator
         self.clock = ManualClock(10**9, MONOTONIC)
         self.driver = Joints()
-        self.stops = StopRegister()
+        self.stops = StopRegister(local_writer(99))
         self.refusals = Refusals()
         self.outcomes: Counter[str] = Counter()
         self.waiting: list[Command] = []
@@ -101,7 +101,6 @@ class Bench:
 
         loop = ControlLoop(
             "arm",
-            local_writer(99),
             SupervisedDriver(self.driver, "arm"),
             self.stops,
             limits=LIMITS,

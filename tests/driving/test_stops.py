@@ -5,19 +5,23 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
+import numpy as np
 import pytest
 from helpers.access_routers import join, router_with_users
 from helpers.processes import DEADLINE_S, SOON_S, repeated, until
 from helpers.robots import RRBOT, wait_for_reader
+from msgspec.structs import replace
 
 from zstate import JointReading
 from zstate._util.refusals import Refusals
 from zstate.driving import Commander, DriverHost, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
-from zstate.driving.stops import StopLatch
+from zstate.driving.driver_state import DriverStatePublisher
+from zstate.driving.stops import StopLatch, StopRegister
 from zstate.driving.stops_file import ActiveStop, stops_file, write_stops
 from zstate.errors import AccessDenied, ConfigError, SecondWriter, Unreachable
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
@@ -25,10 +29,20 @@ from zstate.net.presence import local_writer
 from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher, StreamSubscriber
-from zstate.wire.keys import driver_key, release_expression, release_key, stop_expression
+from zstate.wire.identity import WriterId
+from zstate.wire.keys import (
+    driver_key,
+    relax_key,
+    release_expression,
+    release_key,
+    stop_expressions,
+    stop_key,
+)
 from zstate.wire.messages import DriverState, Release, Stop
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
+
+HOST = local_writer(7)
 
 
 class StoppedDriver(SimulatedDriver):
@@ -120,27 +134,27 @@ def test_joints_without_torque_stay_so_when_the_same_session_stops_them_again(se
 
 
 def test_a_latch_keeps_how_its_host_stopped_for_the_next_one(sessions):
-    with StopLatch(sessions[0], "arm", Refusals()) as latch:
-        latch.latch("the driver failed", local_writer(7), "relax")
-    with StopLatch(sessions[0], "arm", Refusals()) as latch:
+    with StopLatch(sessions[0], "arm", HOST, Refusals()) as latch:
+        latch.latch("the driver failed", "relax")
+    with StopLatch(sessions[0], "arm", HOST, Refusals()) as latch:
         assert [(one.reason, one.how) for one in latch.latched] == [("the driver failed", "relax")]
 
 
 def test_a_late_release_of_a_hosts_first_stop_does_not_end_its_second(sessions):
-    writer, commander = local_writer(7), local_writer(8)
+    commander = local_writer(8)
     key = release_key("arm", commander.identity)
     with (
-        StopLatch(sessions[0], "arm", Refusals()) as latch,
+        StopLatch(sessions[0], "arm", HOST, Refusals()) as latch,
         StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
     ):
         wait_for_reader(sessions[1], key)
-        latch.latch("first", writer)
+        latch.latch("first")
         other = latch.latched[0]
         first = encode(Release(0, 0, commander.session, ((other.session, other.seq),)))
         releases.put(first)
         until(lambda: not latch.latched)
-        latch.latch("second", writer)
-        latch.latch("of another session", local_writer(9))
+        latch.latch("second")
+        latch.add(ActiveStop(9, 0, "hold", "of another session", "desk"))
         releases.put(first)
         # Releases of one commander arrive in order: this one proves that the late one has been handled.
         releases.put(encode(Release(0, 1, commander.session, ((9, 0),))))
@@ -173,35 +187,35 @@ def test_parallel_stops_of_one_session_are_all_confirmed(sessions):
             assert may_read.wait(DEADLINE_S)
             return super().read(stamp)
 
-    sent: list[int] = []
+    sent: list[str] = []
     states: list[str] = []
 
     def on_stop(sample: SerializedSample) -> None:
-        sent.append(decode(sample.payload, sample.encoding, Stop).seq)
+        sent.append(decode(sample.payload, sample.encoding, Stop).reason)
 
-    def stop_it() -> None:
-        states.append(stop(sessions[1], "arm", timeout_s=SOON_S).state)
+    def stop_it(reason: str) -> None:
+        states.append(stop(sessions[1], "arm", reason, timeout_s=SOON_S).state)
 
     with hosted(sessions[0], Slow(RRBOT)), Commander(sessions[1], "arm") as arm, ExitStack() as joined:
         arm.wait_for_driver()
-        joined.enter_context(LatchedSubscriber(sessions[0], stop_expression("arm"), on_stop))
+        joined.enter_context(LatchedSubscriber(sessions[0], stop_expressions("arm"), on_stop))
         may_read.clear()
-        # No tick while both are sent: the driver obeys the second one in place of the first.
-        for number in (0, 1):
-            thread = threading.Thread(target=stop_it)
+        # No tick while both are sent: the driver obeys them together.
+        for reason in ("first", "second"):
+            thread = threading.Thread(target=stop_it, args=(reason,))
             thread.start()
             joined.callback(thread.join)
-            until(lambda number=number: number in sent)
+            until(lambda reason=reason: reason in sent)
         may_read.set()
     assert states == ["stopped", "stopped"]
 
 
 def test_hosts_on_two_networks_do_not_share_the_file_of_stops(sessions):
-    with StopLatch(sessions[0], "arm", Refusals()) as first:
+    with StopLatch(sessions[0], "arm", HOST, Refusals()) as first:
         with pytest.raises(SecondWriter, match=rf"pid {os.getpid()}' already hosts a driver of 'arm'"):
-            StopLatch(sessions[1], "arm", Refusals())
-        first.latch("door open", local_writer(7))
-    with StopLatch(sessions[1], "arm", Refusals()) as second:
+            StopLatch(sessions[1], "arm", HOST, Refusals())
+        first.latch("door open")
+    with StopLatch(sessions[1], "arm", HOST, Refusals()) as second:
         assert [one.reason for one in second.latched] == ["door open"]
 
 
@@ -217,7 +231,7 @@ def test_a_file_with_fields_of_wrong_types_is_a_stop(sessions):
 
 def test_a_robot_with_many_long_stops_can_be_released(sessions):
     path = stops_file("arm")
-    write_stops(path, [ActiveStop(1 + n, 0, "hold", "x" * 1000, "desk") for n in range(256)], {})
+    write_stops(path, [ActiveStop(1 + n, 0, "hold", f"{n:x<1000}", "desk") for n in range(256)], {})
     with hosted(sessions[0]), Commander(sessions[1], "arm") as arm:
         state = arm.wait_for_driver()
         assert state.state == "stopped"
@@ -231,12 +245,13 @@ def test_a_robot_with_many_long_stops_can_be_released(sessions):
 
 def test_a_stop_that_displaces_the_oldest_of_too_many_keeps_the_torque_off(sessions):
     relaxed = ActiveStop(1, 0, "relax", "hand inside", "desk")
-    others = [ActiveStop(2 + n, 0, "hold", "", "desk") for n in range(255)]
+    others = [ActiveStop(100 + n, 0, "hold", "", "desk") for n in range(255)]
     write_stops(stops_file("arm"), [relaxed, *others], {})
-    with StopLatch(sessions[0], "arm", Refusals()) as latch:
-        latch.latch("one more", local_writer(1000))
-        assert len(latch.latched) == 256
-        assert [one.reason for one in latch.latched if one.how == "relax"] == ["one more"]
+    with StopLatch(sessions[0], "arm", HOST, Refusals()) as latch:
+        latch.latch("one more")
+        (substitute,) = (one for one in latch.latched if one.how == "relax")
+        assert "hand inside" in substitute.reason
+        assert latch.latched[-1].reason == "one more"
 
 
 def test_a_release_returns_once_the_driver_is_no_longer_stopped(sessions):
@@ -261,3 +276,315 @@ def test_a_release_returns_once_the_driver_is_no_longer_stopped(sessions):
         present.append(ready)
         releasing.join()
     assert states == ["ready"]
+
+
+# What other programs do to a stop
+
+
+@contextmanager
+def forger(session: Session, key: str) -> Iterator[Callable[[Stop | bytes], None]]:
+    """Sends stops on the key of another program."""
+    with LatchedPublisher(session, key, ENCODINGS[Stop]) as values:
+        yield lambda one: values.set(one if isinstance(one, bytes) else encode(one))
+
+
+def key_of(stopped: DriverState) -> tuple[str, int, int]:
+    """A key with the session of the only stop of ``stopped``, its session and its number."""
+    ((session, seq),) = stopped.stops
+    return stop_key("arm", WriterId("operator", "desk", 1, 1, session).identity), session, seq
+
+
+def stops_in_file() -> list[dict[str, Any]]:
+    return json.loads(stops_file("arm").read_text())["stops"]
+
+
+@pytest.mark.parametrize("ahead", [1, 2**62])
+def test_a_stop_forged_by_another_program_masks_no_later_one_of_the_program_that_it_names(sessions, ahead):
+    with ExitStack() as opened:
+        opened.enter_context(hosted(sessions[0]))
+        arm = opened.enter_context(Commander(sessions[1], "arm"))
+        key, session, seq = key_of(stop(sessions[1], "arm", "first"))
+        assert not arm.release().stops
+        forge = opened.enter_context(forger(sessions[1], key))
+        forge(Stop(0, seq + ahead, session, "hold", "forged"))
+        until(lambda: (session, seq + ahead) in arm.wait_for_driver().stops)
+        assert not arm.release().stops
+        stopped = stop(sessions[1], "arm", "second", timeout_s=DEADLINE_S)
+        assert stopped.state == "stopped"
+        assert "second" in stopped.reason
+    with hosted(sessions[0]), Commander(sessions[1], "arm") as arm:
+        until(lambda: "second" in arm.wait_for_driver().reason)
+        assert not arm.release().stops
+        assert "third" in stop(sessions[1], "arm", "third", timeout_s=DEADLINE_S).reason
+
+
+def test_a_forged_stop_and_its_release_do_not_end_the_stop_of_the_program_that_it_names(sessions):
+    with hosted(sessions[0]), Commander(sessions[1], "arm") as arm:
+        key, session, seq = key_of(stop(sessions[1], "arm", "hand inside"))
+        with forger(sessions[1], key) as forge:
+            forge(Stop(0, seq + 1, session, "hold", "a test, ignore it"))
+            until(lambda: len(arm.wait_for_driver().stops) == 2)
+        state = arm.wait_for_driver()
+        assert "hand inside" in state.reason
+        assert "a test" in state.reason
+        release = Release(0, 0, local_writer(8).session, ((session, seq + 1),))
+        releases = StreamPublisher(
+            sessions[1], release_key("arm", local_writer(8).identity), ENCODINGS[Release]
+        )
+        with releases, repeated(lambda: releases.put(encode(release))):
+            until(lambda: arm.wait_for_driver().stops == ((session, seq),))
+        assert arm.wait_for_driver().state == "stopped"
+
+
+def test_numbers_of_stops_cannot_be_foreseen(sessions):
+    with hosted(sessions[0]), Commander(sessions[1], "arm") as arm:
+        numbers: list[int] = []
+        for _ in range(3):
+            ((_, seq),) = stop(sessions[1], "arm").stops
+            numbers.append(seq)
+            arm.release()
+    steps = np.diff(numbers)
+    assert steps.min() > 0
+    assert len(set(steps.tolist())) == 2
+
+
+@pytest.mark.parametrize("seq", [0, 2**63 - 1, 2**63, 2**64 - 1])
+def test_a_stop_in_the_name_of_the_host_does_not_end_its_reports(sessions, seq):
+    class Silent(SimulatedDriver):
+        is_silent = False
+
+        def read(self, stamp: int) -> JointReading | None:
+            reading = super().read(stamp)
+            return None if self.is_silent else reading
+
+    driver = Silent(RRBOT)
+    with hosted(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+        own = arm.wait_for_driver().session
+        key = stop_key("arm", WriterId("drive", "desk", 1, 1, own).identity)
+        with forger(sessions[1], key) as forge:
+            forge(Stop(0, seq, own, "hold", "forged"))
+            refused = "foreign" if seq < 2**63 else "malformed"
+            until(lambda: host.report().refused.get(refused) == 1)
+        with repeated(lambda: arm.send({"elbow": 0.1})):
+            until(lambda: host.state == "active")
+            driver.is_silent = True
+            until(lambda: arm.wait_for_driver().state == "stopped")
+        assert [session for session, _ in arm.wait_for_driver().stops] == [own]
+        assert "no new reading" in arm.wait_for_driver().reason
+    with hosted(sessions[0]), Commander(sessions[1], "arm") as arm:
+        assert "no new reading" in arm.wait_for_driver().reason
+
+
+def test_a_state_that_cannot_be_encoded_is_published_without_what_cannot(sessions):
+    good = DriverState(1, 5, "host", "active", "", ("elbow",), 10**8, ticks=7)
+    bad = replace(good, state="fault", reason="\udcff lost", stops=((5, 2**64),))
+    present = [good]
+    received: list[DriverState] = []
+
+    def on_state(sample: SerializedSample) -> None:
+        received.append(decode(sample.payload, sample.encoding, DriverState))
+
+    with (
+        DriverStatePublisher(sessions[0], "arm", lambda: present[-1]) as publisher,
+        LatchedSubscriber(sessions[1], driver_key("arm"), on_state),
+    ):
+        for state in (bad, good):
+            present.append(state)
+            publisher.notify()
+            until(lambda state=state: bool(received) and received[-1].state == state.state)
+    fault = next(state for state in received if state.state == "fault")
+    assert (fault.reason, fault.stops, fault.ticks) == ("\\udcff lost", (), 7)
+
+
+def test_a_damaged_file_is_kept_beside_the_next_one(sessions, caplog):
+    path = stops_file("arm")
+    path.parent.mkdir(parents=True)
+    path.write_text('{"stops": [], "released": [[7, 18446744073709551616]]}')
+    with hosted(sessions[0]), Commander(sessions[1], "arm") as arm:
+        assert str(path.with_suffix(".damaged")) in arm.wait_for_driver().reason
+        assert "are not known" in caplog.text
+        assert arm.release().state == "ready"
+    assert "18446744073709551616" in path.with_suffix(".damaged").read_text()
+    assert json.loads(path.read_text())["stops"] == []
+
+
+def test_a_flood_of_one_program_displaces_only_its_own_stops_and_none_without_a_substitute():
+    register = StopRegister(HOST)
+    register.add(ActiveStop(1, 5, "hold", "honest", "desk"))
+    register.add(ActiveStop(2, 0, "relax", "first of many", "flood"))
+    for number in range(1, 1000):
+        register.add(ActiveStop(2, number, "hold", "", "flood"))
+    kept = register.current.stops
+    assert (1, 5) in [one.id for one in kept]
+    assert len(kept) < 20
+    (substitute,) = (one for one in kept if one.session == HOST.session)
+    assert substitute.how == "relax"
+    seen = tuple(one.id for one in kept)
+    register.add(ActiveStop(2, 1000, "hold", "after the release was sent", "flood"))
+    register.release(Release(0, 0, 8, seen))
+    assert len(register.current.stops) == 2  # that stop, and a substitute for what it has displaced
+    register.release(Release(0, 1, 8, tuple(one.id for one in register.current.stops)))
+    assert register.current.stops == ()
+    register.add(ActiveStop(1, 5, "hold", "from a cache", "desk"))
+    assert register.current.stops == ()
+
+
+def test_stops_of_many_programs_are_bounded_and_a_release_ends_those_that_it_names():
+    register = StopRegister(HOST)
+    for session in range(1000, 2000):
+        register.add(ActiveStop(session, 0, "hold", "", "flood"))
+        assert len(register.current.stops) <= 256
+    register.release(Release(0, 0, 8, tuple(one.id for one in register.current.stops)))
+    assert register.current.stops == ()
+    # The release of the first is forgotten: it stops once more, and can be released once more.
+    register.add(ActiveStop(1000, 0, "hold", "from a cache", "desk"))
+    register.release(Release(0, 1, 8, ((1000, 0),)))
+    assert register.current.stops == ()
+
+
+def test_many_stops_that_arrive_together_are_written_to_the_file_at_once(sessions, monkeypatch):
+    is_held, written = threading.Event(), []
+    may_write = threading.Event()
+    may_write.set()
+    fsync = os.fsync
+
+    def slow(number: int) -> None:
+        written.append(number)
+        is_held.set()
+        assert may_write.wait(DEADLINE_S)
+        fsync(number)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    writer = local_writer(99)
+    with (
+        StopLatch(sessions[0], "arm", HOST, Refusals()) as latch,
+        forger(sessions[1], stop_key("arm", writer.identity)) as send,
+    ):
+        send(Stop(0, 0, writer.session, "hold", ""))
+        until(lambda: latch.latched)
+        may_write.clear()
+        is_held.clear()
+        send(Stop(0, 1, writer.session, "hold", ""))
+        assert is_held.wait(DEADLINE_S)
+        written.clear()
+        for number in range(2, 1002):
+            send(Stop(0, number, writer.session, "hold", ""))
+        may_write.set()
+        until(lambda: any(one.seq == 1001 for one in latch.latched))
+        until(lambda: "1001" in stops_file("arm").read_text())
+    assert len(written) < 200
+
+
+# Stops with and without torque, behind a router with access control
+
+
+FLEET = AclRoles(("arm", "r2"), ("desk",), operators=("pendant",), placers=("site",), commanders=("teleop",))
+
+
+def test_every_name_may_hold_a_driver_and_reads_that_it_has_stopped_and_only_commanders_drop_the_load(
+    tmp_path,
+):
+    with router_with_users(tmp_path, FLEET, FLEET.identities) as endpoint, ExitStack() as opened:
+        users = {name: opened.enter_context(join(endpoint, name)) for name in FLEET.identities}
+        driver = StoppedDriver()
+        opened.enter_context(hosted(users["arm"], driver))
+        arm = opened.enter_context(Commander(users["teleop"], "arm"))
+        arm.wait_for_driver(DEADLINE_S)
+        for name in ("desk", "r2", "site"):
+            assert stop(users[name], "arm", name, timeout_s=DEADLINE_S).state == "stopped"
+            with pytest.raises(Unreachable, match=r"has not confirmed within 0\.5 s that the torque is off"):
+                stop(users[name], "arm", name, how="relax", timeout_s=0.5)
+            payload = encode(Stop(0, 0, 9, "relax", name))
+            users[name].zenoh.put(
+                relax_key("arm", local_writer(9).identity), payload, encoding=ENCODINGS[Stop]
+            )
+        assert set(driver.hows) == {"hold"}
+        assert not arm.release(DEADLINE_S).stops
+        for name in ("teleop", "pendant"):
+            assert stop(users[name], "arm", name, how="relax", timeout_s=DEADLINE_S).state == "stopped"
+        assert driver.hows[-1] == "relax"
+
+
+def test_a_stop_that_asks_for_relax_on_the_key_of_all_programs_holds(sessions):
+    driver, writer = StoppedDriver(), local_writer(9)
+    with hosted(sessions[0], driver) as host, forger(sessions[1], stop_key("arm", writer.identity)) as send:
+        send(Stop(0, 3, writer.session, "relax", "drop it"))
+        until(lambda: host.state == "stopped")
+        assert driver.hows == ["hold"]
+        assert host.report().refused == {"relax": 1}
+
+
+def test_a_driver_without_torque_stays_so_until_that_stop_is_released(sessions):
+    driver = StoppedDriver()
+    with hosted(sessions[0], driver), Commander(sessions[1], "arm") as arm:
+        relaxed = stop(sessions[1], "arm", "hand inside", how="relax")
+        until(lambda: len(stops_in_file()) == 2)
+        held = {(one["session"], one["seq"]) for one in stops_in_file() if one["how"] == "hold"}
+        until(lambda: held <= set(arm.wait_for_driver().stops))
+        key = release_key("arm", local_writer(8).identity)
+        with StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases:
+            message = encode(Release(0, 0, local_writer(8).session, tuple(held)))
+            with repeated(lambda: releases.put(message)):
+                until(lambda: not held & set(arm.wait_for_driver().stops))
+        driver.hows.clear()
+        stop(sessions[0], "arm", "another")
+        until(lambda: driver.hows)
+        assert set(driver.hows) == {"relax"}
+        assert set(arm.wait_for_driver().stops) & set(relaxed.stops)
+
+
+# Texts
+
+
+@pytest.mark.parametrize(
+    "reason", ["x" * 1001, "x" * 500_000, "\udcff.urdf", "a\nb" * 600, ValueError("bus")]
+)
+def test_a_stop_never_fails_because_of_its_text(sessions, reason):
+    with hosted(sessions[0]), Commander(sessions[1], "arm"):
+        state = stop(sessions[1], "arm", reason, timeout_s=DEADLINE_S)
+        assert state.state == "stopped"
+        assert str(reason)[:1].replace("\udcff", "\\udcff") in state.reason
+
+
+@pytest.mark.parametrize(
+    "text", [b"\xda\x03\xe9" + b"x" * 1001, b"\xdb\0\x03\0\0" + b"x" * 0x30000, b"\xa2\xffx"]
+)
+def test_a_driver_obeys_a_stop_of_another_writer_whatever_its_text_is(sessions, text):
+    writer = local_writer(9)
+    payload = encode(Stop(0, 3, writer.session, "hold", ""))[:-1] + text
+    with hosted(sessions[0]) as host, forger(sessions[1], stop_key("arm", writer.identity)) as send:
+        send(payload)
+        until(lambda: host.state == "stopped")
+        until(stops_in_file)
+        (reason,) = (one["reason"] for one in stops_in_file())
+        assert "x" in reason
+        assert len(reason) <= 1000
+
+
+# Releases
+
+
+def test_a_commander_that_was_stopped_may_move_again_by_a_release_after_that_of_another(sessions):
+    with hosted(sessions[0]) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        with repeated(lambda: arm.send({"elbow": 0.1})):
+            until(lambda: host.state == "active")
+            state = stop(sessions[1], "arm")
+            releaser = local_writer(8)
+            key = release_key("arm", releaser.identity)
+            with StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases:
+                message = encode(Release(0, 0, releaser.session, state.stops))
+                with repeated(lambda: releases.put(message)):
+                    until(lambda: host.report().refused.get("not released"))
+            assert not arm.release().stops
+            until(lambda: host.state == "active")
+
+
+def test_a_release_in_the_name_of_another_program_is_refused(sessions):
+    with hosted(sessions[0]) as host, Commander(sessions[1], "arm"):
+        stopped = stop(sessions[1], "arm")
+        key = release_key("arm", local_writer(8).identity)
+        releases = StreamPublisher(sessions[1], key, ENCODINGS[Release])
+        with releases, repeated(lambda: releases.put(encode(Release(0, 0, 9, stopped.stops)))):
+            until(lambda: host.report().refused.get("foreign"))
+        assert host.state == "stopped"

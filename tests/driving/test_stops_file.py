@@ -74,10 +74,10 @@ def test_the_folder_is_on_the_disk_after_the_file(tmp_path, monkeypatch: pytest.
         fsync(number)
 
     monkeypatch.setattr(os, "fsync", keep)
-    write_stops(tmp_path / "arm.json", [STOP], {5: 0})
+    write_stops(tmp_path / "arm.json", [STOP], {5: [0, 9]})
     assert synced[-1] == tmp_path
     assert synced[0].parent == tmp_path
-    assert read_stops(tmp_path / "arm.json") == ([STOP], {5: 0})
+    assert read_stops(tmp_path / "arm.json") == ([STOP], {5: [0, 9]})
 
 
 FIELDS = {"session": 7, "seq": 3, "how": "hold", "reason": "", "who": "desk"}

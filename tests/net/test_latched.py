@@ -294,7 +294,7 @@ def test_values_and_samples_are_sent_as_the_wire_specification_lists():
             ("stream", "all streams, `status`, `release`"),
             ("value", "`robot_description`, `tf_static`, `map`, `driver`"),
             ("large", "`robot_description`, `tf_static`, `map`, `driver`"),
-            ("urgent", "`stop`"),
+            ("urgent", "`stop`, `relax`"),
         ):
             one = received[f"k/{name}"]
             priority, congestion = (

@@ -218,15 +218,19 @@ class Commander(Closeable):
     def release(self, timeout_s: float = 2.0) -> DriverState:
         """Release the stops that the driver has now, and return its state after that.
 
-        The driver moves again with the next ``send`` of this commander, from where the joints are then. A
-        stop that arrives at the same time stays. Raises Unreachable if the driver has not confirmed it within
-        ``timeout_s`` [s]; SecondWriter; and Closed.
+        The driver moves again with the next ``send`` of this commander, from where the joints are then, also
+        if another one has released the stops already. A stop that arrives at the same time stays. Raises
+        Unreachable if the driver has not confirmed it within ``timeout_s`` [s]; SecondWriter; and Closed.
         """
         deadline = time.monotonic() + check_timeout(timeout_s)
         # Not the newest state that has arrived here, which may be from before a stop that is confirmed.
         present = wait_for_state(self._session, self.robot, lambda _: True, timeout_s)
         known = present or self.wait_for_driver(timeout_s)
         while True:
+            with self._lock:
+                self._releases.put(encode(Release(*self._next_head(), known.stops)))
+            with self._has_changed:
+                self._has_changed.wait(_RELEASE_PERIOD_S)
             state = self.wait_for_driver(timeout_s)
             is_new = state.stamp >= known.stamp and not set(known.stops).intersection(state.stops)
             if is_new and (state.stops or state.state != "stopped"):  # not between the two
@@ -237,10 +241,6 @@ class Commander(Closeable):
                     "this program command it (`zstate acl --commander`)?",
                     endpoints=(),
                 )
-            with self._lock:
-                self._releases.put(encode(Release(*self._next_head(), known.stops)))
-            with self._has_changed:
-                self._has_changed.wait(_RELEASE_PERIOD_S)
 
     def close(self) -> None:
         """Send no more; the driver holds once the last command has expired, also during a motion.

@@ -27,7 +27,6 @@ from zstate.driving.stops import LatchedStops, StopRegister
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
 from zstate.errors import Closed, DriverFault, InvalidInput, MessageError, SecondWriter, format_duration
 from zstate.sources import JointReading
-from zstate.wire.identity import WriterId
 
 _LOG = logging.getLogger("zstate")
 
@@ -63,14 +62,12 @@ class ControlLoop:
     again, then ``finish``; attributes and ``present`` may be read from any. Each tick takes the commands of
     ``receive()``, oldest first; instants are those of ``clock``, and monotonic. ``publish`` and
     ``publish_setpoint`` are called with what was read and written, ``on_change`` after each change of
-    ``state`` or of a motion; ``name_of(session)`` is the program of a commander. ``writer`` is the program of
-    this loop, which latches its own stops.
+    ``state`` or of a motion; ``name_of(session)`` is the program of a commander.
     """
 
     def __init__(
         self,
         robot: str,
-        writer: WriterId,
         driver: SupervisedDriver,
         stops: StopRegister,
         *,
@@ -88,7 +85,6 @@ class ControlLoop:
         clock: Clock | None = None,
     ) -> None:
         self._robot = robot
-        self._writer = writer
         self._driver = driver
         self._stops = stops
         self._limits = limits
@@ -235,7 +231,7 @@ class ControlLoop:
         latched = self._stops.current
         if latched is self.obeyed:
             return None
-        reason = "; ".join(map(str, latched.stops))
+        reason = "; ".join(dict.fromkeys(map(str, latched.stops)))
         if latched.newest is not None and latched.arrived != self.obeyed.arrived:
             reason = reason or f"{latched.newest}, and released already"
             self._bar_active()
@@ -292,12 +288,15 @@ class ControlLoop:
         if self.state.name == "stopped":
             self._barred[session] = None
             raise MessageError(self.state.reason, reason="stopped")
-        if session in self._barred:
-            text = (
-                "it came from a commander that did not release the last stop; release with it, or reopen it"
-            )
-            raise MessageError(text, reason="not released")
         releaser, release = self._stops.released_by
+        if session == releaser:
+            self._barred.pop(session, None)  # also by a release after that of another
+        if session in self._barred:
+            mend = (
+                "start that node again" if session in self.motions.nodes else "release with it, or reopen it"
+            )
+            text = f"it came from a commander that did not release the last stop; {mend}"
+            raise MessageError(text, reason="not released")
         if session == releaser and seq < release:
             raise MessageError(f"the command {seq} was sent before the release of the stop", reason="old")
         self.targets.check_session(session, now, self._name_of)
@@ -434,7 +433,7 @@ class ControlLoop:
     def _stop_and_latch(self, reason: str) -> None:
         """Stop as after silence, until a commander releases that."""
         self._stop_driver(self._on_silence)
-        self._stops.latch(reason, self._writer, how=self._on_silence)
+        self._stops.latch(reason, self._on_silence)
 
     def _stop_driver(self, how: StopMode) -> Exception | None:
         """Stop the hardware. The next setpoint starts from the measured joints. Returns what failed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -32,9 +33,11 @@ from zstate.wire.messages import (
     to_block,
     with_short_texts,
 )
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.native import ENCODINGS, decode, encode, with_encodable_fields
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
+
+_LOG = logging.getLogger("zstate")
 
 PERIOD_S = 0.1
 SILENT_S = 5 * PERIOD_S
@@ -94,8 +97,9 @@ class DriverReport:
 class DriverStatePublisher(Closeable):
     """Publishes what ``build()`` returns, latched: after each ``notify`` and ten times a second.
 
-    Long texts are cut. It has a thread of its own, because a latched value waits for the network and a
-    control loop must not.
+    Long texts are cut. A state that cannot be encoded is published without the fields that cannot, and logged
+    once: readers must learn of a fault. It has a thread of its own, because a latched value waits for the
+    network and a control loop must not.
     """
 
     def __init__(self, session: Session, robot: str, build: Callable[[], DriverState]) -> None:
@@ -103,7 +107,8 @@ class DriverStatePublisher(Closeable):
         self._latched = LatchedPublisher(session, driver_key(robot), ENCODINGS[DriverState])
         self._has_changed = fork_safe(threading.Event())
         self._closed = False
-        self._latched.set(encode(with_short_texts(build())))
+        self._has_failed = False
+        self._publish()
         self._thread = threading.Thread(target=self._run, name="zstate driver state", daemon=True)
         self._thread.start()
 
@@ -123,10 +128,29 @@ class DriverStatePublisher(Closeable):
             while True:
                 self._has_changed.wait(PERIOD_S)
                 self._has_changed.clear()
-                # The last state is published, too: "off", or "fault".
-                self._latched.set(encode(with_short_texts(self._build())))
-                if self._closed:
+                is_last = self._closed  # that state is published, too: "off", or "fault"
+                try:
+                    self._publish()
+                except Closed:
+                    raise
+                except Exception as error:
+                    self._log_once(error)
+                if is_last:
                     return
+
+    def _publish(self) -> None:
+        state = with_short_texts(self._build())
+        try:
+            payload = encode(state)
+        except Exception as error:  # a reader that receives no state takes this host for dead
+            self._log_once(error)
+            payload = encode(with_encodable_fields(state))
+        self._latched.set(payload)
+
+    def _log_once(self, error: Exception) -> None:
+        if not self._has_failed:
+            self._has_failed = True
+            _LOG.error("the state of a driver cannot be published as it is: %r; logged once", error)
 
 
 class SetpointPublisher(Closeable):

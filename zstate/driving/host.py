@@ -144,7 +144,7 @@ class DriverHost(Closeable):
         with ExitStack() as opening:
             check_only_host(session, self.robot)
             self._publisher, self._order = self._open_publisher(session, model, opening)
-            self._stops = opening.enter_context(StopLatch(session, self.robot, self._refusals))
+            self._stops = opening.enter_context(StopLatch(session, self.robot, self._writer, self._refusals))
             setpoints = SetpointPublisher(session, self.robot, names, self._writer)
             opening.enter_context(setpoints)
             controller = get_controller(self._wires, self.robot, ros2_controller) if ros2_controller else None
@@ -157,7 +157,6 @@ class DriverHost(Closeable):
             opening.enter_context(commands)
             self._loop = ControlLoop(
                 self.robot,
-                self._writer,
                 self._driver,
                 self._stops,
                 limits=limits,

@@ -13,14 +13,21 @@ import time
 import weakref
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from typing import NamedTuple
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.driving.driver import StopMode
-from zstate.driving.stops_file import ActiveStop, HostLock, read_stops, stops_file, write_stops
+from zstate.driving.stops_file import (
+    ActiveStop,
+    HostLock,
+    StopId,
+    copy_aside,
+    read_stops,
+    stops_file,
+    write_stops,
+)
 from zstate.errors import ConfigError, InvalidInput, MessageError, Unreachable, printable
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber, cached_values
 from zstate.net.ownership import wait_for_discovery
@@ -32,12 +39,14 @@ from zstate.wire.identity import WriterId
 from zstate.wire.keys import (
     check_robot,
     driver_key,
+    parse_release_key,
     parse_stop_key,
+    relax_key,
     release_expression,
-    stop_expression,
+    stop_expressions,
     stop_key,
 )
-from zstate.wire.messages import DriverState, Release, Stop
+from zstate.wire.messages import DriverState, Release, Stop, stop_text
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
 
@@ -45,6 +54,13 @@ _LOG = logging.getLogger("zstate")
 
 _CACHES_WITHIN_S = 0.5
 _MOST_STOPS = 256
+_MOST_OF_SESSION = 8
+_MOST_RELEASED = 32
+_MOST_SENT = 64
+
+_STEP_BITS = 32
+_REPEAT_S = 0.25
+"""A stop that is not confirmed within that is sent again, with another number."""
 
 _STANDING = ("stopped", "off", "fault")
 """States in which a driver writes nothing, and has been stopped."""
@@ -59,11 +75,12 @@ def stop(
     """Stop the driver of ``robot``, and return its state once it has stopped.
 
     The driver stays stopped, also if it or this program restarts, until ``Commander.release``. "hold" leaves
-    the joints where they are, "relax" without torque. ``reason`` is shown to users. No claim is needed. Not a
-    safety-rated channel.
+    the joints where they are, "relax" without torque: behind a router with access control only commanders and
+    operators switch it off, and the joints hold for others. ``reason`` is shown to users; it is cut after
+    1000 characters, and no text makes a stop fail. No claim is needed. Not a safety-rated channel.
 
-    Raises Unreachable if no driver has confirmed the stop within ``timeout_s`` [s]. The stop stays latched in
-    ``session`` then: a driver that can be reached later obeys it.
+    It is repeated until a driver has confirmed it. Raises Unreachable if none has within ``timeout_s`` [s].
+    The stop stays latched in ``session`` then: a driver that can be reached later obeys it.
     """
     check_timeout(timeout_s)
     with _STOPPERS_LOCK:
@@ -71,7 +88,7 @@ def stop(
         stopper = stoppers.get(robot)
         if stopper is None:
             stopper = stoppers[robot] = _Stopper(session, check_robot(robot))
-    return stopper.stop(how, reason, timeout_s)
+    return stopper.stop(how, stop_text(str(reason)), timeout_s)
 
 
 class _Stopper:
@@ -82,35 +99,79 @@ class _Stopper:
         # Not the session itself: the stoppers of a session must not keep it alive.
         self._session = weakref.ref(session)
         self._writer = local_writer(secrets.randbits(32))
-        self._seq = 0
+        self._seq = secrets.randbits(_STEP_BITS)
+        self._sent: tuple[tuple[int, StopMode], ...] = ()
+        """Numbers of the last stops, and how."""
         self._lock = fork_safe_lock()
-        key = stop_key(robot, self._writer.identity)
-        self._latched = LatchedPublisher(session, key, ENCODINGS[Stop], urgent=True)
+        self._publishers: dict[StopMode, LatchedPublisher] = {}
+        self._publisher(session, "hold")
 
     def stop(self, how: StopMode, reason: str, timeout_s: float) -> DriverState:
-        with self._lock:
-            number, self._seq = self._seq, self._seq + 1
-            message = Stop(time.time_ns(), number, self._writer.session, how, reason)
-            self._latched.set(encode(message))  # before anything that takes time
+        deadline = time.monotonic() + timeout_s
         session = self._session()
         assert session is not None, "the caller has it"
-        confirmed = wait_for_state(
-            session, self._robot, lambda state: self._is_obeyed(state, number), timeout_s
+        is_held = False
+        first: int | None = None
+
+        def is_obeyed(state: DriverState) -> bool:
+            nonlocal is_held
+            assert first is not None, "a stop has been sent"
+            is_held = self._is_obeyed(state, first, "hold")
+            return is_held and self._is_obeyed(state, first, how)
+
+        while True:
+            with self._lock:
+                number = self._send(session, how, reason)
+            first = number if first is None else first
+            left_s = deadline - time.monotonic()
+            confirmed = wait_for_state(session, self._robot, is_obeyed, max(0.0, min(left_s, _REPEAT_S)))
+            if confirmed is not None:
+                return confirmed
+            if left_s <= _REPEAT_S:
+                raise self._unconfirmed(timeout_s, is_held=is_held)
+
+    def _send(self, session: Session, how: StopMode, reason: str) -> int:
+        """Send a stop, and return the number of its first message; with the lock.
+
+        A program that may not relax a driver stops it all the same.
+        """
+        hows: tuple[StopMode, ...] = ("relax", "hold") if how == "relax" else ("hold",)
+        numbers: list[int] = []
+        for one in hows:
+            # Others that may write this key cannot send a stop with the next number before this program does.
+            self._seq += 1 + secrets.randbits(_STEP_BITS)
+            message = Stop(time.time_ns(), self._seq, self._writer.session, one, reason)
+            self._publisher(session, one).set(encode(message))
+            self._sent = (*self._sent[1 - _MOST_SENT :], (self._seq, one))
+            numbers.append(self._seq)
+        return numbers[0]
+
+    def _publisher(self, session: Session, how: StopMode) -> LatchedPublisher:
+        if how not in self._publishers:
+            key = (stop_key if how == "hold" else relax_key)(self._robot, self._writer.identity)
+            self._publishers[how] = LatchedPublisher(session, key, ENCODINGS[Stop], urgent=True)
+        return self._publishers[how]
+
+    def _is_obeyed(self, state: DriverState, first: int, how: StopMode) -> bool:
+        """Whether the driver has stopped for the stop ``first`` or a later one, without torque to "relax"."""
+        latched = {seq for session, seq in state.stops if session == self._writer.session}
+        return state.state in _STANDING and any(
+            seq >= first and seq in latched and how in ("hold", sent) for seq, sent in self._sent
         )
-        if confirmed is None:
-            raise Unreachable(
-                f"no driver of {self._robot!r} has confirmed the stop within {timeout_s:g} s. Is it running, "
-                "and may this program stop it (`zstate acl`)? The stop stays latched while this session is "
-                "open",
+
+    def _unconfirmed(self, timeout_s: float, *, is_held: bool) -> Unreachable:
+        stays = "The stop stays latched while this session is open"
+        if is_held:
+            return Unreachable(
+                f"the driver of {self._robot!r} has stopped, and has not confirmed within {timeout_s:g} s "
+                "that the torque is off: behind a router with access control only commanders and operators "
+                f"switch it off (`zstate acl --commander`). {stays}",
                 endpoints=(),
             )
-        return confirmed
-
-    def _is_obeyed(self, state: DriverState, number: int) -> bool:
-        """Whether the driver has stopped for the stop ``number`` or a later one, which replaces it."""
-        mine = self._writer.session
-        return state.state in _STANDING and any(
-            session == mine and seq >= number for session, seq in state.stops
+        return Unreachable(
+            f"no driver of {self._robot!r} has confirmed the stop within {timeout_s:g} s. Is it running, "
+            f"and may this program stop it (`zstate acl`)? {stays}",
+            endpoints=(),
         )
 
 
@@ -145,82 +206,113 @@ class LatchedStops(NamedTuple):
 
 
 class StopRegister:
-    """The stops of a driver that are not released. Safe from any thread."""
+    """The stops of the driver of ``host`` that are not released. Safe from any thread.
 
-    def __init__(self) -> None:
+    Each ends by its own release only. Of more than are kept, the oldest are replaced by one stop of the host,
+    with another number for each, so that no release of it ends a stop that came later.
+    """
+
+    def __init__(self, host: WriterId) -> None:
+        self._host = host
         self._lock = fork_safe_lock()
-        self._by_session: dict[int, ActiveStop] = {}
-        self._released: dict[int, int] = {}
-        """The last released stop of each session, which its program may still cache."""
+        self._active: dict[StopId, ActiveStop] = {}
+        """The oldest first."""
+        self._released: dict[int, list[int]] = {}
+        """The numbers of the last released stops of each session, which its program may still cache."""
+        self._is_unsaved = False
+        self._own_seq = -1
+        self._displaced = 0
+        self._substitute: ActiveStop | None = None
+        """The stop in place of those that were displaced."""
         self.current = LatchedStops()
         """Another object after each change."""
         self.released_by = (0, 0)
-        """Session and ``seq`` of the last release of a stop."""
+        """Session and ``seq`` of the last release of a stop, or of one that named none."""
 
-    def latch(self, reason: str, writer: WriterId, how: StopMode = "hold") -> None:
-        """Latch a stop of this host itself, after those that it has latched before."""
+    def latch(self, reason: str, how: StopMode = "hold") -> None:
+        """Latch a stop of this host itself, and save it."""
         with self._lock:
-            session = writer.session
-            known = self._by_session.get(session)
-            seq = 1 + (self._released.get(session, -1) if known is None else known.seq)
-            self._add(ActiveStop(session, seq, how, reason, str(writer)))
+            self._add(self._own_stop(reason, how))
+        self.save()
 
     def add(self, one: ActiveStop) -> None:
-        """Latch ``one``, unless it is older than the last stop of its session, or released."""
+        """Latch ``one``, unless it is latched or released already. ``save`` follows."""
         with self._lock:
-            known = self._by_session.get(one.session)
-            is_old = known is not None and known.seq >= one.seq
-            if not is_old and self._released.get(one.session, -1) < one.seq:
+            if one.id not in self._active and one.seq not in self._released.get(one.session, ()):
                 self._add(one)
 
-    def release(self, release: Release) -> None:
-        """End the stops of ``release``, and older ones of their sessions."""
+    def save(self) -> None:
+        """Save the stops that were added."""
         with self._lock:
-            ended = [
-                session
-                for session, seq in release.stops
-                if session in self._by_session and self._by_session[session].seq <= seq
-            ]
-            for session in ended:
-                # Newest last, so that the oldest is forgotten first.
-                self._released.pop(session, None)
-                self._released[session] = self._by_session.pop(session).seq
-            while len(self._released) > _MOST_STOPS:
-                del self._released[next(iter(self._released))]
-            if ended:
-                self.released_by = (release.session, release.seq)
+            if self._is_unsaved:
+                self._save()
+
+    def release(self, *releases: Release) -> None:
+        """End the stops of ``releases``. One that names none counts once there is none."""
+        with self._lock:
+            has_ended = False
+            for release in releases:
+                ended = [one for stop_id in release.stops if (one := self._active.pop(stop_id, None))]
+                for one in ended:
+                    self._keep_released(one)
+                has_ended |= bool(ended)
+                if ended or not (release.stops or self._active):
+                    self.released_by = (release.session, release.seq)
+            if has_ended:
                 self._save()  # first: a release that is confirmed holds for the next host as well
-                self.current = self.current._replace(stops=tuple(self._by_session.values()))
+                self.current = self.current._replace(stops=tuple(self._active.values()))
+
+    def _keep_released(self, one: ActiveStop) -> None:
+        """Keep that ``one`` is released. A cached stop whose release is forgotten stops once more."""
+        seqs = self._released.pop(one.session, [])
+        self._released[one.session] = [*seqs[1 - _MOST_RELEASED :], one.seq]  # newest last
+        while len(self._released) > _MOST_STOPS:
+            del self._released[next(iter(self._released))]
+        if self._substitute is not None and one.id == self._substitute.id:
+            self._substitute, self._displaced = None, 0
+
+    def _own_stop(self, reason: str, how: StopMode) -> ActiveStop:
+        self._own_seq += 1
+        return ActiveStop(self._host.session, self._own_seq, how, stop_text(reason), str(self._host))
 
     def _add(self, one: ActiveStop) -> None:
-        """Latch ``one`` in place of the last stop of its session, or of the oldest one of too many.
+        """Latch ``one``. Of too many, the oldest one of its session, or of all, is replaced."""
+        others = [kept for kept in self._active.values() if kept is not self._substitute]
+        same = [kept for kept in others if kept.session == one.session]
+        if len(same) >= _MOST_OF_SESSION:
+            self._displace(same[0])
+        elif len(others) >= _MOST_STOPS - 1:
+            self._displace(others[0])
+        self._active[one.id] = one
+        self._is_unsaved = True
+        self.current = LatchedStops(tuple(self._active.values()), self.current.arrived + 1, one)
 
-        If that has switched the torque off, it stays off.
-        """
-        replaced = [self._by_session.pop(one.session, None)]
-        if len(self._by_session) == _MOST_STOPS:
-            replaced.append(self._by_session.pop(next(iter(self._by_session))))
-        if any(old is not None and old.how == "relax" for old in replaced):
-            one = replace(one, how="relax")
-        self._by_session[one.session] = one
-        self.current = LatchedStops(tuple(self._by_session.values()), self.current.arrived + 1, one)
-        self._save()
+    def _displace(self, oldest: ActiveStop) -> None:
+        """Let the substitute stand for ``oldest``, too. If one of them keeps the torque off, so does it."""
+        ended = [self._active.pop(one.id) for one in (oldest, self._substitute) if one is not None]
+        how: StopMode = "relax" if any(one.how == "relax" for one in ended) else "hold"
+        self._displaced += 1
+        reason = f"further stops ({self._displaced}), the last one {oldest}"
+        self._substitute = self._own_stop(reason, how)
+        self._active[self._substitute.id] = self._substitute
 
     def _save(self) -> None:
-        """Called with the lock, after a stop is latched, and before its release holds."""
+        """Called with the lock, after stops are latched, and before their release holds."""
+        self._is_unsaved = False
 
 
 class StopLatch(StopRegister, Closeable):
     """The stops of the driver of ``robot`` that are not released, from the network.
 
     They are kept in ``stops_file``, which a restarted host reads, and are read from the caches of programs
-    that have sent them. A file that cannot be read counts as a stop; one that cannot be written raises
-    ConfigError here, and is logged later. While it is open, it has the ``HostLock`` of the robot; raises
-    SecondWriter if another host has that. ``refusals`` counts invalid messages.
+    that have sent them. A file that cannot be read counts as a stop, and a damaged one is kept beside it; one
+    that cannot be written raises ConfigError here, and is logged later. While it is open, it has the
+    ``HostLock`` of the robot; raises SecondWriter if another host has that. ``host`` is the program of this
+    host, ``refusals`` counts invalid messages.
     """
 
-    def __init__(self, session: Session, robot: str, refusals: Refusals) -> None:
-        super().__init__()
+    def __init__(self, session: Session, robot: str, host: WriterId, refusals: Refusals) -> None:
+        super().__init__(host)
         self._robot = robot
         self._path = stops_file(robot)
         self._refusals = refusals
@@ -229,8 +321,12 @@ class StopLatch(StopRegister, Closeable):
             self._read_file()
             self._write_file(is_opening=True)
             wait_for_discovery(session)
-            call_for_each(cached_values(session, stop_expression(robot), _CACHES_WITHIN_S), self._on_stop)
-            opening.enter_context(LatchedSubscriber(session, stop_expression(robot), self._on_stop))
+            expressions = stop_expressions(robot)
+            for keyexpr in expressions:
+                call_for_each(cached_values(session, keyexpr, _CACHES_WITHIN_S), self._on_stop)
+            self.save()
+            stops = LatchedSubscriber(session, expressions, self._on_stop, on_batch_end=self.save)
+            opening.enter_context(stops)
             releases = StreamSubscriber(session, release_expression(robot), self._on_releases)
             opening.enter_context(releases)
             self._opened = opening.pop_all()
@@ -248,41 +344,63 @@ class StopLatch(StopRegister, Closeable):
         if not sample.payload:
             return  # the program has ended; its stop has not
         try:
-            _, identity = parse_stop_key(sample.key)
+            _, identity, stream = parse_stop_key(sample.key)
             writer = WriterId.parse(identity)
             message = decode(sample.payload, sample.encoding, Stop)
         except (MessageError, InvalidInput) as error:
             self._refusals.count(getattr(error, "reason", "foreign"), error)
             return
-        if message.session != writer.session:
-            self._refusals.count("foreign", f"the Stop of another program on {sample.key!r}")
+        if message.session != writer.session or message.session == self._host.session:
+            self._refusals.count("foreign", f"the Stop of another program on {printable(sample.key)!r}")
             return
-        reason = printable(message.reason)
-        self.add(ActiveStop(message.session, message.seq, message.how, reason, str(writer)))
+        how = message.how
+        if how == "relax" and stream != "relax":
+            how = "hold"
+            text = f"the stop of {writer} is not on the key that switches the torque off; the joints hold"
+            self._refusals.count("relax", text)
+        reason = stop_text(printable(message.reason))
+        self.add(ActiveStop(message.session, message.seq, how, reason, str(writer)))
 
     def _on_releases(self, samples: list[SerializedSample]) -> None:
+        releases: list[Release] = []
         for sample in samples:
             try:
+                _, identity = parse_release_key(sample.key)
+                session = WriterId.parse(identity).session
                 release = decode(sample.payload, sample.encoding, Release)
-            except MessageError as error:
-                self._refusals.count(error.reason, error)
+            except (MessageError, InvalidInput) as error:
+                self._refusals.count(getattr(error, "reason", "foreign"), error)
                 continue
-            self.release(release)
+            if release.session == session:
+                releases.append(release)
+            else:
+                text = f"the Release of another program on {printable(sample.key)!r}"
+                self._refusals.count("foreign", text)
+        self.release(*releases)
 
     def _read_file(self) -> None:
         try:
             stops, self._released = read_stops(self._path)
         except (OSError, ValueError) as error:
-            stops = [ActiveStop(0, 0, "hold", f"{self._path} cannot be read: {error}", "this host")]
-        self._by_session = {one.session: one for one in stops}
+            kept = ""
+            if isinstance(error, ValueError):
+                with suppress(OSError):
+                    kept = f"; it is kept as {copy_aside(self._path)}"
+            reason = f"{self._path} cannot be read: {error}{kept}"
+            _LOG.error(
+                "the stops of %r are not known: %s; it is stopped until a release", self._robot, reason
+            )
+            stops = [self._own_stop(reason, "hold")]
+        self._active = {one.id: one for one in stops}
         self.current = LatchedStops(tuple(stops), len(stops), stops[-1] if stops else None)
 
     def _save(self) -> None:
+        super()._save()
         self._write_file()
 
     def _write_file(self, *, is_opening: bool = False) -> None:
         try:
-            write_stops(self._path, tuple(self._by_session.values()), self._released)
+            write_stops(self._path, tuple(self._active.values()), self._released)
         except OSError as error:
             text = (
                 f"stops of {self._robot!r} cannot be kept in {self._path}: {error}; a restarted host would "

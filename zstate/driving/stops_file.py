@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
@@ -20,6 +21,10 @@ from zstate.wire.identity import WriterId
 _SET_IT = "set XDG_STATE_HOME to a folder that can be written"
 
 
+StopId: TypeAlias = tuple[int, int]
+"""The session and the number of a stop."""
+
+
 @dataclass(frozen=True, slots=True)
 class ActiveStop:
     """A stop that is not released: of ``who``, with the ``seq`` of that program's ``session``."""
@@ -29,6 +34,11 @@ class ActiveStop:
     how: StopMode
     reason: str
     who: str
+
+    @property
+    def id(self) -> StopId:
+        """Its session and ``seq``, by which it is released."""
+        return self.session, self.seq
 
     def __str__(self) -> str:
         return f"stopped by {self.who}" + (f": {self.reason}" if self.reason else "")
@@ -46,8 +56,8 @@ def stops_file(robot: str) -> Path:
         raise ConfigError(f"{folder}: {error} {_SET_IT}", path="XDG_STATE_HOME") from None
 
 
-def read_stops(path: Path) -> tuple[list[ActiveStop], dict[int, int]]:
-    """The stops in ``path``, and the last released one of each session; both empty without a file.
+def read_stops(path: Path) -> tuple[list[ActiveStop], dict[int, list[int]]]:
+    """The stops in ``path``, and the numbers of the last released ones by session; empty without a file.
 
     Raises OSError, and ValueError if the file is damaged.
     """
@@ -58,17 +68,19 @@ def read_stops(path: Path) -> tuple[list[ActiveStop], dict[int, int]]:
     try:
         document = json.loads(text)
         stops = [_stop(**fields) for fields in document["stops"]]
-        released = {_count(session): _count(seq) for session, seq in document["released"]}
+        released: dict[int, list[int]] = {}
+        for session, seq in document["released"]:
+            released.setdefault(_session(session), []).append(_count(seq))
     except (TypeError, KeyError, RecursionError) as error:
         raise ValueError(repr(error)) from None
     return stops, released
 
 
-def write_stops(path: Path, stops: Sequence[ActiveStop], released: Mapping[int, int]) -> None:
+def write_stops(path: Path, stops: Sequence[ActiveStop], released: Mapping[int, Sequence[int]]) -> None:
     """Write what ``read_stops`` returns, so that also a loss of power leaves all of it. Raises OSError."""
     document = {
         "stops": [asdict(one) for one in stops],
-        "released": [list(pair) for pair in released.items()],
+        "released": [[session, seq] for session, seqs in released.items() for seq in seqs],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(f".{os.getpid()}")
@@ -82,6 +94,16 @@ def write_stops(path: Path, stops: Sequence[ActiveStop], released: Mapping[int, 
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def copy_aside(path: Path) -> Path:
+    """Copy the damaged file ``path``, and return the name of the copy. Raises OSError.
+
+    The file stays until another replaces it: without one, a host that is restarted now would know no stop.
+    """
+    kept = path.with_suffix(".damaged")
+    kept.write_bytes(path.read_bytes())
+    return kept
 
 
 class HostLock(Closeable):
@@ -138,10 +160,18 @@ def _stop(*, session: object, seq: object, how: object, reason: object, who: obj
     """The stop with these fields. Raises ValueError for those that ``write_stops`` does not write."""
     if how not in ("hold", "relax") or not isinstance(reason, str) or not isinstance(who, str):
         raise ValueError(f"how {how!r}, reason {reason!r} and who {who!r} are not those of a stop")
-    return ActiveStop(_count(session), _count(seq), "hold" if how == "hold" else "relax", reason, who)
+    return ActiveStop(_session(session), _count(seq), "hold" if how == "hold" else "relax", reason, who)
+
+
+def _session(number: object) -> int:
+    return _number(number, 64)
 
 
 def _count(number: object) -> int:
-    if type(number) is not int or not 0 <= number < 2**64:
-        raise ValueError(f"{number!r} is not a number below 2^64")
+    return _number(number, 63)
+
+
+def _number(number: object, bits: int) -> int:
+    if type(number) is not int or not 0 <= number < 2**bits:
+        raise ValueError(f"{number!r} is not a number below 2^{bits}")
     return number

@@ -169,16 +169,23 @@ class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
     """Subscriber to the current value of every matching key, then to each change.
 
     ``on_value(sample)`` is called from one thread of this subscriber, for several key expressions too; the
-    payload is empty if the value was withdrawn. ``Receiver`` describes slow and failing callbacks.
+    payload is empty if the value was withdrawn. ``on_batch_end()`` is called after those that have arrived
+    together. ``Receiver`` describes slow and failing callbacks.
 
     In ROS each message of a writer of /tf_static adds to the ones before, and its cache has the last one: so
     a cached value is not handled before the live samples that arrived earlier.
     """
 
     def __init__(
-        self, session: Session, keyexprs: str | Sequence[str], on_value: Callable[[SerializedSample], None]
+        self,
+        session: Session,
+        keyexprs: str | Sequence[str],
+        on_value: Callable[[SerializedSample], None],
+        *,
+        on_batch_end: Callable[[], object] | None = None,
     ) -> None:
         self._on_value = on_value
+        self._on_batch_end = on_batch_end
         self._numbers: BoundedDict[str, int | zenoh.Timestamp] = BoundedDict()
         keyexprs = (keyexprs,) if isinstance(keyexprs, str) else keyexprs
         recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
@@ -202,7 +209,11 @@ class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
         handled.wait(_HANDLED_WITHIN_S)
 
     def _on_batch(self, batch: list[zenoh.Sample | _CachedValue]) -> None:
-        call_for_each(batch, self._on_arrival)
+        try:
+            call_for_each(batch, self._on_arrival)
+        finally:
+            if self._on_batch_end is not None:
+                self._on_batch_end()
 
     def _on_arrival(self, arrival: zenoh.Sample | _CachedValue) -> None:
         if not isinstance(arrival, _CachedValue):
