@@ -171,7 +171,7 @@ def test_release_while_another_program_commands_is_refused_with_its_name(spawn: 
 
 def test_stops_that_no_driver_confirms_fail():
     message = failure("stop", "rrbot", "--timeout", "0.3")
-    assert "rrbot: no driver has confirmed the stop within 0.3 s" in message
+    assert "rrbot: no driver of 'rrbot' has confirmed the stop within 0.3 s" in message
     assert "no robot has a driver" in failure("stop", "--all")
     assert "name the robots to stop, or give --all" in failure("stop", code=2)
     assert "leave out --relax" in failure("stop", "rrbot", "--release", "--relax", code=2)

@@ -105,6 +105,15 @@ WRITES = [
     ("desk", "zstate/r1/stop/desk", True),
     ("desk", "zstate/r1/release/desk", False),
     ("r2", "zstate/r1/stop/r2", True),
+    ("site", "zstate/r1/stop/site", True),
+    ("teleop", "zstate/r1/relax/teleop", True),
+    ("hand", "zstate/r1/relax/hand", True),
+    ("r1", "zstate/r1/relax/r1", True),
+    ("r2", "zstate/r1/relax/r2", False),
+    ("desk", "zstate/r1/relax/desk", False),
+    ("simulator", "zstate/r1/relax/simulator", False),
+    ("site", "zstate/r1/relax/site", False),
+    ("stranger", "zstate/r1/relax/stranger", False),
     ("r2", "zstate/r1/joint_commands", False),
     ("r2", "zstate/r1/release/r2", False),
     ("stranger", "zstate/r1/stop/stranger", False),
@@ -224,6 +233,29 @@ def test_robot_receives_only_the_clock_of_others(site: Site):
 
     until(publish_until_received)
     assert (taps["r2"].arrivals, taps["stranger"].arrivals) == ([], [])
+
+
+def test_every_identity_reads_the_states_of_drivers_and_nothing_else_that_they_write(site: Site):
+    robot = site.join("r1")
+    written = ("driver", "joint_setpoints", "joint_states")
+    taps = {user: SampleCollector(site.join(user), "zstate/r1/*") for user in ("r2", "site", "stranger")}
+    states = {user: SampleCollector(site.join(user), "zstate/*/driver") for user in taps}
+
+    def publish_until_received() -> bool:
+        for name in written:
+            robot.zenoh.put(f"zstate/r1/{name}", name.encode())
+        return min(len(states[user].arrivals) for user in ("r2", "site")) >= 10
+
+    until(publish_until_received)
+    assert states["stranger"].arrivals == []
+    assert all(tap.arrivals == [] for tap in taps.values())
+
+
+def test_a_robot_may_not_have_the_name_of_the_clock():
+    with pytest.raises(InvalidInput, match=r"'clock' is that of the simulated time, 'zstate/clock'"):
+        access_control(AclRoles(("clock",)))
+    with pytest.raises(InvalidInput, match="/clock of all robots"):
+        access_control(AclRoles(("r1",), wires=("ros2:namespace=clock",)))
 
 
 def test_robot_discovers_others_and_their_static_edges(site: Site):

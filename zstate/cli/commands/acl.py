@@ -9,12 +9,12 @@ import click
 from zstate.cli.output.console import print_result
 
 _ROLES = {
-    "robot": "A robot: writes its own keys; reads these and the clock",
-    "viewer": "Reads everything and writes nothing",
+    "robot": "A robot: writes its own keys; reads these, the clock and the states of drivers",
+    "viewer": "Reads everything and writes nothing but stops",
     "operator": "A commander that also calls ROS services",
     "timekeeper": "A viewer that also writes the simulated time",
     "placer": "Writes static edges as robot NAME and nothing else, for instance where robots are in a map",
-    "commander": "A viewer that also commands joints, and releases stops",
+    "commander": "A viewer that also commands joints, releases stops, and may switch the torque off",
 }
 
 
@@ -43,8 +43,9 @@ def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, .
 
     Everything that is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`)
     or a user; for a robot or a placer it is also the name in the keys. One NAME may have several roles: a
-    robot that reads other robots is also a viewer. Every NAME may stop the driver of a robot; only a
-    commander or an operator may command it, and release the stop.
+    robot that reads other robots is also a viewer. Every NAME may stop the driver of a robot, whose
+    joints then hold; only a commander or an operator may command it, switch its torque off (`zstate stop
+    --relax`), and release the stop.
 
     The router checks keys, listeners check frames: r1 writes only under zstate/r1/, and listeners accept
     frames r1/... only from those keys. The exception is the root of r1, which other writers may place in

@@ -289,7 +289,11 @@ def _problem(commander: Commander) -> str:
 @click.command("stop")
 @click.argument("robots", nargs=-1, metavar="[ROBOT]...")
 @click.option("--all", "everything", is_flag=True, help="Every robot that has a driver.")
-@click.option("--relax", is_flag=True, help="Switch the torque off, too: joints without brakes fall.")
+@click.option(
+    "--relax",
+    is_flag=True,
+    help="Switch the torque off, too: joints without brakes fall. Only commanders may.",
+)
 @click.option("--reason", default="", metavar="TEXT", help="Why; shown to users until the release.")
 @click.option("--release", is_flag=True, help="Release the stops instead, of all programs.")
 @options.timeout_option("Fail if the driver has not confirmed it after this time [s].", 2.0)
@@ -311,7 +315,8 @@ def stop_command(
     The joints stay where they are. A stop is latched: the robot stays stopped, also if its driver restarts,
     until `zstate stop ROBOT --release`, or Commander.release in a program. Then it stands until the next
     command, and motions do not continue. Every program may stop a robot; behind a router with access control
-    only commanders release it.
+    only commanders and operators release it, or switch its torque off: with --relax the joints hold for
+    others, and the exit code is 1.
 
     The exit code is 1 if a driver has not confirmed the stop, which it then may not have received.
 
@@ -369,11 +374,9 @@ def _stop(session: Session, robot: str, *, reason: str, how: StopMode, timeout_s
 
     try:
         return stop(session, robot, reason, how=how, timeout_s=timeout_s)
-    except Unreachable:
+    except Unreachable as error:
         raise Unreachable(
-            f"no driver has confirmed the stop within {timeout_s:g} s; is one running, and may this program "
-            "stop it (`zstate acl`)? One that starts later does not obey this stop",
-            endpoints=(),
+            f"{error}, which this command ends: a driver that starts later does not obey it", endpoints=()
         ) from None
 
 

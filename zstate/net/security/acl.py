@@ -24,7 +24,7 @@ from typing import Any
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import user_config
 from zstate.net.security.credentials import check_identity
-from zstate.wire.keys import CLOCK_KEY, MOTION_CHUNK, VERBATIM_CHUNKS, check_robot
+from zstate.wire.keys import CLOCK_KEY, MOTION_CHUNK, VERBATIM_CHUNKS, check_robot, check_writer
 from zstate.wire.registry import ros_options
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.types import FLOAT64_MULTI_ARRAY, JOINT_TRAJECTORY, OCCUPANCY_GRID
@@ -45,9 +45,10 @@ class AclRoles:
     """Roles of identities behind a router, by name: the common name of a certificate, or a user.
 
     A robot writes and reads its own keys; of other robots it reads their names, their static edges,
-    which it must not contradict, and their maps, as those of places; and it reads the simulated time. A
-    viewer reads everything and writes nothing but stops of drivers, which every identity may send; a
-    commander also commands joints; an operator does, too, and calls services of ROS; a timekeeper also
+    which it must not contradict, their maps, as those of places, and the states of their drivers; and it
+    reads the simulated time. A viewer reads everything and writes nothing but stops of drivers, which every
+    identity may send: the joints hold. A commander also commands joints, releases stops, and may switch the
+    torque off; an operator does, too, and calls services of ROS; a timekeeper also
     writes the simulated time. A placer writes only static edges under its own name, and reads those of the
     robots: it places their roots, as in ``fleet/map -> r1/odom``; readers with ``placers=`` accept such edges
     from these only. A name may have several roles. ``namespace`` is that of the sessions behind the router,
@@ -86,7 +87,7 @@ def check_namespace(namespace: str) -> str:
     """``namespace`` if it is empty or a valid prefix of keys. Raises InvalidInput otherwise."""
     try:
         for chunk in namespace.split("/") if namespace else ():
-            check_robot(chunk)
+            check_writer(chunk)
     except InvalidInput:
         raise InvalidInput(
             f"the namespace {namespace!r} is not made of chunks of a Zenoh key; write for instance 'site_1'"
@@ -118,7 +119,9 @@ def _native_rules(roles: AclRoles) -> Grants:
     latched = tuple(
         f"{root}/*/{stream}/*{end}" for stream in ("tf_static", "map") for end in ("", "/@adv/**")
     )
-    shared = (*latched, f"{root}/*/{_EDGE}/**", f"{root}/*/{_WRITER}/**", clock)
+    # A program that may stop a driver reads whether that has stopped.
+    drivers = tuple(f"{root}/*/driver{end}" for end in ("", "/@adv/**"))
+    shared = (*latched, *drivers, f"{root}/*/{_EDGE}/**", f"{root}/*/{_WRITER}/**", clock)
     motions = f"{root}/*/{MOTION_CHUNK}"
     for robot in dict.fromkeys(roles.robots):
         prefix = f"{root}/{check_robot(robot)}"
@@ -148,6 +151,9 @@ def _native_rules(roles: AclRoles) -> Grants:
     yield commanders, _egress("commanders are asked", SUBSCRIBE, commands)
     yield commanders, _ingress("commanders move", ("query",), (motions,))
     yield commanders, _egress("commanders are answered", PUBLISH, (motions,))
+    relaxing = (f"{root}/*/relax/*", f"{root}/*/relax/*/@adv/**")
+    yield commanders, _ingress("commanders relax", PUBLISH, relaxing)
+    yield commanders, _egress("commanders are asked for that", SUBSCRIBE, relaxing)
     stops = (f"{root}/*/stop/*", f"{root}/*/stop/*/@adv/**")
     yield roles.identities, _ingress("everyone stops", PUBLISH, stops)
     yield roles.identities, _egress("everyone is asked for stops", SUBSCRIBE, stops)
@@ -175,6 +181,8 @@ class _Ros2Rules:
         self._graph = f"@ros2_lv/{options.domain}"
         self._global = (*(("tf", "tf_static") if options.tf == "global" else ()), *_NODE_TOPICS)
         namespaces = {options.robot_namespace(robot) for robot in roles.robots}
+        if "clock" in namespaces:
+            raise InvalidInput("the topics of a robot in the namespace 'clock' include /clock of all robots")
         if len(namespaces) < len(set(roles.robots)):
             raise InvalidInput(
                 f"the robots {', '.join(map(repr, roles.robots))} would write the same topics, which access "
