@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,12 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
+from zstate.driving.driver import StopMode
 from zstate.errors import InvalidInput, RecordingError
 from zstate.model.kinematics import MovingEdges
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
+from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import local_writer
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
@@ -46,6 +48,7 @@ from zstate.wire.messages import (
     ClockMessage,
     JointCommand,
     JointState,
+    Stop,
     covariance_matrix,
     from_block,
     order_digest,
@@ -778,6 +781,23 @@ def test_commands_are_recorded_as_joint_states_and_not_replayed(sessions, tmp_pa
         player.run()
         states.joint_states(1)
         assert commands.arrivals == []
+
+
+def test_stops_with_and_without_torque_are_recorded_and_their_numbers_have_no_gaps(sessions, tmp_path):
+    path, writer = tmp_path / "run.mcap", local_writer(9)
+    with Recorder(sessions[1], path, ["arm"]) as recorder, ExitStack() as opened:
+        hows: tuple[tuple[str, StopMode], ...] = (("stop", "hold"), ("relax", "relax"))
+        for stream, how in hows:
+            key = f"zstate/arm/{stream}/{writer.identity}"
+            latched = opened.enter_context(LatchedPublisher(sessions[0], key, ENCODINGS[Stop]))
+            wait_for_reader(sessions[0], key)
+            for seq in (5, 2**40):
+                latched.set(encode(Stop(STAMP, seq, writer.session, how, "")))
+        until(lambda: count(recorder, "arm", "stop") == 4)
+        assert recorder.stats.missed == 0
+    with Recording(path) as recording:
+        found = {(program, stop.how, stop.seq) for program, stop in recording.stops("arm")}
+    assert found == {(str(writer), how, seq) for how in ("hold", "relax") for seq in (5, 2**40)}
 
 
 def test_states_motions_and_stops_of_a_driver_are_recorded_and_not_replayed(sessions, tmp_path, monkeypatch):

@@ -21,7 +21,7 @@ from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.recorder import MessageQueue, SampleWriter, recorded_streams
 from zstate.recording.storage import ROBOT
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, LATCHED_STREAMS, Stream, check_robot
+from zstate.wire.keys import ANY, LATCHED_STREAMS, STOP_STREAMS, Stream, check_robot
 from zstate.wire.messages import ClockMessage, Message, RobotDescription
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.qos import Qos
@@ -41,7 +41,7 @@ _JOIN_WITHIN_S = 0.9
 Feed = tuple[str, Stream]
 """A stream of a robot."""
 
-_OF_DRIVERS: tuple[Stream, ...] = ("driver", "stop")
+_OF_DRIVERS: tuple[Stream, ...] = ("driver", *STOP_STREAMS)
 """Drivers and stops have no tokens: their topics come with the joint states."""
 
 

@@ -5,12 +5,13 @@ stream              topic                                type
 ==================  ===================================  ====================================================
 ``joint_commands``  ``/joint_commands``                  sensor_msgs/JointState
 ``driver``          ``/diagnostics``                     diagnostic_msgs/DiagnosticArray
-``stop``            ``/stops``                           diagnostic_msgs/DiagnosticArray
+``stop, relax``     ``/stops``                           diagnostic_msgs/DiagnosticArray
 ==================  ===================================  ====================================================
 
 The ttl of a command is its ``header.frame_id``, as "ttl_ns=250000000", since joint states have no frame. A
 state or a stop is one status, whose ``values`` are the fields of the message: texts unchanged, and others in
-JSON. /diagnostics is the topic that Foxglove's and rqt's panels show; as in ROS it is one for all robots.
+JSON. Recordings have the stops of both streams as "stop". /diagnostics is the topic that Foxglove's and rqt's
+panels show; as in ROS it is one for all robots.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ DRIVER_TYPES: dict[Stream, RosType] = {
     "joint_commands": JOINT_STATE,
     "driver": DIAGNOSTIC_ARRAY,
     "stop": DIAGNOSTIC_ARRAY,
+    "relax": DIAGNOSTIC_ARRAY,
 }
 """The streams of drivers and their types, in recordings by zstate. They are never published again, since a
 replay must not move hardware."""
@@ -45,6 +47,7 @@ _LAST_NAMES: dict[Stream, str] = {
     "joint_commands": "joint_commands",
     "driver": "diagnostics",
     "stop": "stops",
+    "relax": "stops",
 }
 """The last names of their topics."""
 

@@ -32,7 +32,7 @@ from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, LATCHED_STREAMS, NAMED_STREAMS, SENSOR_STREAMS, Stream, check_robot
-from zstate.wire.messages import Message, Odometry, StampedMessage, edge_of
+from zstate.wire.messages import Message, Odometry, StampedMessage, Stop, edge_of
 from zstate.wire.protocol import SerializedSample, Wire
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.topics import SHARED
@@ -177,7 +177,8 @@ class SampleWriter:
             if isinstance(message, Odometry) and stream in self._wire.edges:
                 # On /tf, where ROS tools and readers of recordings find edges; ROS nodes publish it there.
                 encoder.write_message(robot, edge_of(message), stamp, edge_writer)
-            if is_known and isinstance(message, StampedMessage):
+            # The numbers of stops rise by any steps.
+            if is_known and isinstance(message, StampedMessage) and not isinstance(message, Stop):
                 self._gaps.add((robot, stream, message.session), message.seq)
         return messages
 
