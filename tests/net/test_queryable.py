@@ -1,16 +1,19 @@
-"""Queryables on one key, with one thread that replies."""
+"""Queryables on one key, whose replies come from threads of their session."""
 
 from __future__ import annotations
 
 import sys
 import threading
 import time
+from collections.abc import Iterable
 from concurrent.futures import Future
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from helpers.processes import SOON_S, until
 
+from zstate.net import query_workers
 from zstate.net.queryable import Queryable, Reply, RequestQueryable, parse_parameters, query
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher, StreamSubscriber
@@ -160,18 +163,94 @@ def test_thread_of_a_queryable_without_queries_does_not_wake_up(sessions: tuple[
     before = set(threading.enumerate())
     with Queryable(sessions[0], KEY, lambda _: Reply(b"x", "")):
         assert answered(sessions[1], KEY) == [(True, b"x", "zenoh/bytes")]
-        (thread,) = set(threading.enumerate()) - before
-        status = Path(f"/proc/self/task/{thread.native_id}/status")
-        counts = [_voluntary_switches(status)]
+        threads = set(threading.enumerate()) - before
+        counts = [_voluntary_switches(threads)]
         for _ in range(4):
             threading.Event().wait(0.25)
-            counts.append(_voluntary_switches(status))
+            counts.append(_voluntary_switches(threads))
     assert counts[-1] == counts[1]  # in three quarters of a second; a channel of Zenoh wakes it seven times
 
 
-def _voluntary_switches(status: Path) -> int:
-    lines = status.read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("voluntary_ctxt_switches"))
+def _voluntary_switches(threads: Iterable[threading.Thread]) -> int:
+    statuses = [Path(f"/proc/self/task/{thread.native_id}/status") for thread in threads]
+    lines = [line for status in statuses for line in status.read_text().splitlines()]
+    return sum(int(line.split()[1]) for line in lines if line.startswith("voluntary_ctxt_switches"))
+
+
+def query_threads() -> int:
+    return sum(thread.name == "zstate queries" for thread in threading.enumerate())
+
+
+def test_queryables_of_a_session_share_their_threads(sessions: tuple[Session, Session]):
+    """One that is busy with a quick answer and one that waits, however many queryables there are."""
+    writer, reader = sessions
+    with ExitStack() as opened:
+        keys = [f"zstate/r{number}/lookup" for number in range(30)]
+        for key in keys:
+            opened.enter_context(Queryable(writer, key, lambda _: Reply(b"x", "")))
+        assert query_threads() == 1
+        for key in keys:
+            answered(reader, key)
+        assert query_threads() <= 3
+    until(lambda: query_threads() == 0)
+
+
+def test_answers_that_take_long_delay_no_other_queryable(sessions: tuple[Session, Session]):
+    """A lookup in a huge buffer, or a page of history for a reader that is frozen."""
+    writer, reader = sessions
+    may_answer, busy = threading.Event(), threading.Semaphore(0)
+
+    def slow(parameters):
+        if parameters:
+            busy.release()
+            may_answer.wait(30.0)
+        return Reply(b"late", "")
+
+    with ExitStack() as opened:
+        keys = [f"zstate/r{number}/lookup" for number in range(5)]
+        for key in keys:
+            opened.enter_context(Queryable(writer, key, slow))
+            answered(reader, key)
+        opened.enter_context(Queryable(writer, KEY.replace("r1", "quick"), lambda _: Reply(b"quick", "")))
+        waiting = [reader.zenoh.get(f"{key}?slow", timeout=30.0) for key in keys]
+        for _ in keys:
+            assert busy.acquire(timeout=15.0)
+        assert answered(reader, KEY.replace("r1", "quick")) == [(True, b"quick", "zenoh/bytes")]
+        may_answer.set()
+        assert [len(list(get)) for get in waiting] == [1] * len(keys)
+
+
+def test_threads_that_are_not_needed_any_more_end(sessions: tuple[Session, Session], monkeypatch):
+    monkeypatch.setattr(query_workers, "IDLE_S", 0.05)
+    with Queryable(sessions[0], KEY, lambda _: Reply(b"x", "")):
+        answered(sessions[1], KEY)
+        until(lambda: query_threads() == 1)
+        answered(sessions[1], KEY)
+    until(lambda: query_threads() == 0)
+
+
+def test_queryables_end_with_their_session_and_close_afterwards(sessions: tuple[Session, Session]):
+    with connect() as session:
+        services = [Queryable(session, KEY, lambda _: Reply(b"x", "")) for _ in range(2)]
+        answered(sessions[1], KEY)
+    until(lambda: query_threads() == 0)
+    for service in services:
+        service.close()
+
+
+def test_answer_may_close_its_own_queryable(sessions: tuple[Session, Session]):
+    def answer(parameters):
+        if parameters:
+            service.close()
+        return Reply(b"x", "")
+
+    service = Queryable(sessions[0], KEY, answer)
+    answered(sessions[1], KEY)
+    start = time.monotonic()
+    list(sessions[1].zenoh.get(f"{KEY}?close", timeout=30.0))
+    assert time.monotonic() - start < 15.0
+    assert replies(sessions[1], KEY) == []
+    until(lambda: query_threads() == 0)
 
 
 def test_close_is_quick_and_may_be_repeated(sessions: tuple[Session, Session]):

@@ -84,6 +84,25 @@ def test_status_ends_with_its_publisher_and_leaves_no_thread(sessions):
     assert names == sorted(names), "r1 published after its publisher was closed"
 
 
+def test_publishers_of_a_session_share_a_thread_and_one_that_fails_ends_alone(sessions, monkeypatch):
+    reported: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", reported.append)
+    before = status_threads()
+    received = Statuses(sessions[1])
+
+    def broken() -> Status:
+        raise ZeroDivisionError
+
+    with ExitStack() as opened:
+        for number, status in enumerate((broken, lambda: OK, lambda: OK)):
+            opened.enter_context(StatusPublisher(sessions[0], f"r{number}", ME, status))
+        assert status_threads() == before + 1
+        until(lambda: {robot for robot, _ in received.statuses} == {"r1", "r2"})
+        until(lambda: len(received.statuses) >= 4)
+    assert status_threads() == before
+    assert [args.exc_type for args in reported] == [ZeroDivisionError]
+
+
 def test_late_subscriber_receives_only_the_status_of_the_last_second(sessions):
     asked = threading.Semaphore(0)
 

@@ -1,4 +1,4 @@
-"""Queryables (Zenoh) with one worker thread, and queries that never block a thread of Zenoh.
+"""Queryables (Zenoh), and queries that never block a thread of Zenoh.
 
 Zenoh delivers its own replies, and all local liveliness tokens, inside ``get`` and under the lock of its
 session, before the caller can read anything. A channel that is full at that moment blocks the session for
@@ -10,7 +10,8 @@ into a channel that is never full, and the limit is applied where they are read.
 from __future__ import annotations
 
 import logging
-import queue
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
@@ -20,9 +21,12 @@ from typing import NamedTuple, TypeAlias
 
 import zenoh
 
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, Unreachable, ZStateError
+from zstate.net.query_workers import QueryWorkers, leave_workers, use_workers
 from zstate.net.session import Session
-from zstate.net.streams import Receiver, call_for_each
+from zstate.net.streams import JOIN_WITHIN_S, call_for_each
 from zstate.transform import Transform
 from zstate.wire.keys import lookup_key
 from zstate.wire.lookup_request import LookupRequest, error_from_json, from_json
@@ -132,65 +136,26 @@ class Reply(NamedTuple):
     timestamp: zenoh.Timestamp | None = None
 
 
-class _WaitingQueries:
-    """A queryable and the queries that wait for its thread: the newest ``capacity``.
+class _Declared:
+    """A declared queryable, for ``Session.release``."""
 
-    A thread that waits for a channel of Zenoh wakes ten times a second, to check for signals. A robot has
-    several queryables that are rarely queried: in a process with a few hundred robots, their threads would
-    compete for the interpreter lock without a single query, and leave no time to publish.
-    """
-
-    def __init__(self, session: Session, key: str, capacity: int) -> None:
-        self._queries: queue.SimpleQueue[zenoh.Query | None] = queue.SimpleQueue()
-        self._capacity = capacity
-        self._session, self._key = session, key
-        callback = zenoh.handlers.Callback(self._add, self._end, indirect=False)
-        self._queryable = session.zenoh.declare_queryable(key, callback)
-
-    @property
-    def handler(self) -> _WaitingQueries:
-        """The channel is this object itself."""
-        return self
-
-    def _add(self, received: zenoh.Query) -> None:
-        if self._queries.qsize() >= self._capacity:
-            self.try_recv()  # the oldest: a query that is freed ends for its sender
-        self._queries.put(received)
-
-    def _end(self) -> None:
-        self._queries.put(None)
-
-    def recv(self) -> zenoh.Query:
-        """The oldest query, once there is one. Raises ZError after the end of the queryable."""
-        return self._checked(self._queries.get())
-
-    def try_recv(self) -> zenoh.Query | None:
-        """The oldest query; None without any. Raises ZError after the end of the queryable."""
-        try:
-            received = self._queries.get_nowait()
-        except queue.Empty:
-            return None
-        return self._checked(received)
-
-    def _checked(self, received: zenoh.Query | None) -> zenoh.Query:
-        if received is None:
-            self._end()  # for later calls
-            raise zenoh.ZError("the queryable is closed")
-        return received
+    def __init__(self, session: Session, key: str, queryable: zenoh.Queryable[None]) -> None:
+        self._session, self._key, self._queryable = session, key, queryable
 
     def undeclare(self) -> None:
-        """End the queryable."""
         self._queryable.undeclare()
         self._session.on_queryable_end(self._key)
 
 
-class Queryable(Receiver[zenoh.Query]):
+class Queryable(Closeable):
     """Replies to queries on ``key``, until it is closed.
 
-    ``answer(parameters)`` is called from one thread of this queryable, for one query after the other; None
-    sends no reply. Neither a slow answer nor a flood of queries delays Zenoh or publishers: queries beyond
-    ``capacity`` are lost, and ``full_batches`` counts how often that may have happened. After a full batch
-    the thread pauses, so that a flood takes no more than a quarter of one processor.
+    ``answer(parameters)`` is called in a thread of the session (``zstate.net.query_workers``), for one query
+    after the other; None sends no reply. Neither a slow answer nor a flood of queries delays Zenoh,
+    publishers or other queryables: queries beyond ``capacity`` are lost, and ``full_batches`` counts how
+    often that may have happened. After a full batch the thread pauses, so that a flood takes no more than a
+    quarter of one processor. An exception of ``answer`` is counted in ``failures``, once for queries that
+    arrived together, and the first goes to ``threading.excepthook``.
     """
 
     def __init__(
@@ -200,10 +165,82 @@ class Queryable(Receiver[zenoh.Query]):
         answer: Callable[[Mapping[str, str]], Reply | None],
         capacity: int = CAPACITY,
     ) -> None:
-        self.answered = 0
+        self.answered = self.full_batches = self.failures = 0
+        self._session = session
         self._key = key
         self._answer = answer
-        super().__init__(session, _WaitingQueries(session, key, capacity), capacity)
+        self._capacity = capacity
+        self._lock = fork_safe_lock()
+        self._queries: list[zenoh.Query] = []
+        self._has_turn = False
+        self._closed = False
+        self._answering = fork_safe_lock()
+        """Held by ``_thread``, which answers now."""
+        self._thread: threading.Thread | None = None
+        self._workers: QueryWorkers | None = use_workers(session)
+        callback = zenoh.handlers.Callback(self._add, self._leave, indirect=False)
+        try:
+            declared = session.zenoh.declare_queryable(key, callback)
+        except BaseException:
+            self._leave()
+            raise
+        self._declared = _Declared(session, key, declared)
+
+    def close(self) -> None:
+        """Stop within a second, also from inside an answer, after which none is sent."""
+        with self._lock:
+            self._closed = True
+        self._session.release(self._declared)
+        self._leave()
+        if threading.current_thread() is not self._thread and self._answering.acquire(timeout=JOIN_WITHIN_S):
+            self._answering.release()
+
+    def _add(self, received: zenoh.Query) -> None:
+        """Runs in a thread of Zenoh, which must not wait."""
+        lost: zenoh.Query | None = None  # a query that is freed ends for its sender
+        with self._lock:
+            workers = self._workers
+            if self._closed or workers is None:
+                return
+            if len(self._queries) >= self._capacity:
+                lost = self._queries.pop(0)
+            self._queries.append(received)
+            has_turn, self._has_turn = self._has_turn, True
+        del lost
+        if not has_turn:
+            workers.submit(self._run)
+
+    def _leave(self) -> None:
+        """Answer no more. Also called by Zenoh at the end of the session."""
+        with self._lock:
+            workers, self._workers = self._workers, None
+            queries, self._queries = self._queries, []
+        queries.clear()
+        if workers is not None:
+            leave_workers(self._session, workers)
+
+    def _run(self) -> None:
+        """Answer the queries that wait now; later ones have the next turn, after other queryables."""
+        with self._answering:
+            self._thread = threading.current_thread()
+            with self._lock:
+                batch, self._queries = self._queries, []
+            if len(batch) >= self._capacity:
+                self.full_batches += 1
+            try:
+                if not self._closed:
+                    self._on_batch(batch)
+            except Exception:
+                self.failures += 1
+                if self.failures == 1:
+                    threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
+            batch.clear()
+            self._thread = None
+        with self._lock:
+            workers = self._workers if self._queries else None
+            self._has_turn = workers is not None
+        if workers is not None:
+            workers.submit(self._run)
 
     def _on_batch(self, batch: list[zenoh.Query]) -> None:
         start = time.monotonic()

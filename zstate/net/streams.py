@@ -1,7 +1,7 @@
 """Sample streams (best effort, keep last): the newest sample replaces older ones, and writers never wait.
 
-Subscribers and queryables are a ``Receiver``: one daemon thread that drains a channel in batches, Zenoh's own
-or a ``SharedRing`` of several subscribers.
+A subscriber is a ``Receiver``: one daemon thread that drains a channel in batches, Zenoh's own or a
+``SharedRing`` of several subscribers.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Channel(Protocol[T_co]):
 
 
 class Subscribed(Undeclarable, Protocol[T_co]):
-    """A subscriber or queryable of any kind that delivers into a channel."""
+    """A subscriber of any kind that delivers into a channel."""
 
     @property
     def handler(self) -> Channel[T_co]: ...
