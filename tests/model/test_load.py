@@ -1,11 +1,14 @@
 """load_model and the catalog: names, paths, text, and the errors of missing ones."""
 
+import os
 import subprocess
 import sys
+import threading
 from importlib import metadata
 from pathlib import Path
 
 import pytest
+from helpers.robots import RRBOT
 
 from zstate.errors import InvalidInput, ModelError, UnknownModel
 from zstate.model import catalog
@@ -26,6 +29,45 @@ def test_a_bare_file_name_is_a_path_when_the_file_exists(tmp_path: Path, monkeyp
     (tmp_path / "onefile").write_text(TEXT)
     monkeypatch.chdir(tmp_path)
     assert load_model("onefile").name == "one"
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Path:
+    path = tmp_path / "arm.urdf"
+    os.mkfifo(path)
+    return path
+
+
+def test_a_pipe_is_read_to_its_end(pipe: Path):
+    """As of `zstate check <(xacro arm.xacro)`, whose parts come later."""
+    text = RRBOT.urdf.encode()
+
+    def write() -> None:
+        with pipe.open("wb", buffering=0) as file:
+            for part in (text[:100], text[100:]):
+                file.write(part)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    model = load_model(pipe)
+    writer.join()
+    assert model.joint_names == RRBOT.joint_names
+
+
+def test_a_pipe_of_the_shell_and_standard_input_are_read(tmp_path: Path):
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(RRBOT.urdf)
+    program = "import sys; from zstate import load_model; print(len(load_model(sys.argv[1]).joint_names))"
+    for command in ('"$1" -c "$2" <(cat "$3")', 'cat "$3" | "$1" -c "$2" /dev/stdin'):
+        arguments = ["bash", "-c", command, "bash", sys.executable, program, str(urdf)]
+        done = subprocess.run(arguments, capture_output=True, text=True, timeout=60)
+        assert (done.stdout, done.stderr) == ("2\n", "")
+
+
+def test_a_pipe_without_a_writer_is_refused(pipe: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("zstate.model.load._SILENT_S", 0.1)
+    with pytest.raises(ModelError, match=r"nothing has been written to this pipe for 0\.1 s"):
+        load_model(pipe)
 
 
 def test_a_folder_does_not_hide_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

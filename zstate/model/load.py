@@ -7,6 +7,7 @@ file, which read other files: expand only files you trust.
 from __future__ import annotations
 
 import os
+import select
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,9 @@ from zstate.model.xml import MAX_BYTES, read_document
 __all__ = ["CatalogEntry", "catalog", "is_path", "load_model"]
 
 _SUFFIXES = (".urdf", ".xacro", ".xml")
+_CHUNK_BYTES = 1 << 20
+_SILENT_S = 60.0
+"""A pipe, such as that of `<(xacro arm.xacro)`, may be silent for so long."""
 
 
 def load_model(
@@ -70,8 +74,10 @@ def is_path(source: str) -> bool:
 
 def _read(path: Path, source: str) -> bytes:
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+        data = _read_bytes(path)
+    except TimeoutError:
+        message = f"nothing has been written to this pipe for {_SILENT_S:g} s; is its writer running?"
+        raise model_error(source, message) from None
     except FileNotFoundError:
         folder = "" if path.is_absolute() else f" in {Path.cwd()}"
         raise model_error(source, f"there is no such file{folder}") from None
@@ -81,4 +87,28 @@ def _read(path: Path, source: str) -> bytes:
         raise model_error(source, f"the file cannot be read: {error}") from None
     if len(data) > MAX_BYTES:
         raise model_error(source, f"the file has more than {MAX_BYTES} bytes, which is the limit")
+    return data
+
+
+def _read_bytes(path: Path) -> bytes:
+    """The content of a file, a few bytes more than the limit at most. Raises TimeoutError for a silent pipe."""
+    data = b""
+
+    def open_at_once(name: str, flags: int) -> int:
+        return os.open(
+            name, flags | os.O_NONBLOCK
+        )  # else opening a pipe waits for its writer, maybe for ever
+
+    with open(path, "rb", buffering=0, opener=open_at_once) as file:
+        readable = select.poll()
+        readable.register(file, select.POLLIN)
+        while len(data) <= MAX_BYTES:
+            if not readable.poll(1e3 * _SILENT_S):
+                raise TimeoutError
+            chunk = file.read(_CHUNK_BYTES)
+            if chunk is None:
+                continue
+            data += chunk
+            if not chunk:
+                break
     return data
