@@ -184,6 +184,9 @@ def read_snapshot(path: Path) -> Snapshot:
         raise ConfigError(f"{str(path)!r} cannot be read: {error.strerror}", path=str(path)) from None
     except ValueError as error:
         raise ConfigError(f"{path} is not JSON: {error}", path=str(path)) from None
+    except RecursionError:
+        text = f"{path} cannot be read: its brackets are nested too deeply"
+        raise ConfigError(text, path=str(path)) from None
 
 
 def publish_snapshot(

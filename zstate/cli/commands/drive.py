@@ -450,7 +450,7 @@ def _argument(driver: str, key: str, text: str, kind: Any) -> Any:
     import msgspec
 
     value: Any = text
-    with suppress(ValueError):
+    with suppress(ValueError, RecursionError):
         value = json.loads(text)
     with suppress(msgspec.ValidationError):
         return _converted(value, kind)

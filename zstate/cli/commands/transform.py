@@ -218,6 +218,8 @@ def _parse_line(text: str) -> Transform:
         values = json.loads(text)
     except ValueError as error:
         raise InvalidInput(f"not JSON: {error}") from None
+    except RecursionError:
+        raise InvalidInput("not a transform: its brackets are nested too deeply") from None
     if not isinstance(values, dict):
         raise InvalidInput(f"a transform is a JSON object, not {type(values).__name__}")
     # `zstate tf --json` also prints how it computed the pose, which is no part of the edge.

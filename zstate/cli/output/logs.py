@@ -127,7 +127,7 @@ def _entry(line: str) -> dict[str, object] | None:
     """The JSON object in ``line``; None for any other text."""
     try:
         entry = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return cast("dict[str, object]", entry) if isinstance(entry, dict) else None
 

@@ -105,6 +105,8 @@ def read_calibration(path: Path) -> tuple[Transform, ...]:
         found = tuple(_calibrated_edges(_document(path)))
     except InvalidInput as error:
         raise ConfigError(f"{path}: {error}", path=str(path)) from None
+    except RecursionError:
+        raise ConfigError(f"{path} cannot be read: it is nested too deeply", path=str(path)) from None
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         lacking = f"has no {error.args[0]!r}" if isinstance(error, KeyError) else f"cannot be read: {error}"
         raise ConfigError(f"{path} {lacking}; a calibration is {_FORMS}", path=str(path)) from None

@@ -51,6 +51,9 @@ class TomlFile:
             raise ConfigError(f"{self.shown!r} is not UTF-8 text: {error.reason}", path=self.shown) from None
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"{self.shown} is not TOML: {error}", path=self.shown) from None
+        except RecursionError:
+            text = f"{self.shown} cannot be read: its brackets are nested too deeply"
+            raise ConfigError(text, path=self.shown) from None
 
     def error(self, place: str, text: str) -> ConfigError:
         """What is wrong at ``place``, such as "robot[1].rate", with its line."""
@@ -227,7 +230,7 @@ def _parsed_like(value: object, text: str) -> Any:
         return text
     try:
         parsed = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         parsed = None
     types = (int, float) if type(value) in (int, float) else (type(value),)
     if type(parsed) not in types:
