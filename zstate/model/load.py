@@ -91,13 +91,11 @@ def _read(path: Path, source: str) -> bytes:
 
 
 def _read_bytes(path: Path) -> bytes:
-    """The content of a file, a few bytes more than the limit at most. Raises TimeoutError for a silent pipe."""
+    """The content of a file, or a little more than the limit. Raises TimeoutError for a silent pipe."""
     data = b""
 
     def open_at_once(name: str, flags: int) -> int:
-        return os.open(
-            name, flags | os.O_NONBLOCK
-        )  # else opening a pipe waits for its writer, maybe for ever
+        return os.open(name, flags | os.O_NONBLOCK)  # or opening a pipe waits for its writer
 
     with open(path, "rb", buffering=0, opener=open_at_once) as file:
         readable = select.poll()

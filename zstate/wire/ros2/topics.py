@@ -23,7 +23,7 @@ The topics with a name of a sensor, or of a writer, are found by their type, wha
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 
 from zstate.errors import InvalidInput
 from zstate.wire.keys import ANY, Stream, wire_name
@@ -207,8 +207,17 @@ class FrameNames:
         self._robot = robot
         # With robots in a namespace, SHARED is the owner of the tf topic that all of them publish on.
         self._prefix = "" if robot == SHARED and options.namespace else options.robot_frame_prefix(robot)
-        self.edges_to_ros = lru_cache(_CACHED_ORDERS)(partial(_renamed, self.to_ros))
-        self.edges_to_zstate = lru_cache(_CACHED_ORDERS)(partial(_renamed, self.to_zstate))
+
+    # Made when used: a recording may have 65,535 channels, each with its names.
+    @cached_property
+    def edges_to_ros(self) -> Callable[[Edges], Edges]:
+        """Renames both frames of each edge."""
+        return lru_cache(_CACHED_ORDERS)(partial(_renamed, self.to_ros))
+
+    @cached_property
+    def edges_to_zstate(self) -> Callable[[Edges], Edges]:
+        """Renames both frames of each edge."""
+        return lru_cache(_CACHED_ORDERS)(partial(_renamed, self.to_zstate))
 
     def to_ros(self, name: str) -> str:
         """The name in ROS of the frame that this robot calls ``name``."""
