@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import logging
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from zstate.buffer.clock_domain import ClockDomain
 from zstate.ingest.counters import Counters
 from zstate.ingest.stamp_checks import LagDetector
+from zstate.wire.messages import JointState
 
 MS = 1_000_000
 S = 1_000 * MS
 
 
-def warning_count(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float = 0.1) -> int:
+def warning_count(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float = 0.2) -> int:
     """The number of lag warnings for samples with these ages at arrival."""
     lag = LagDetector(Counters())
     with caplog.at_level(logging.WARNING, "zstate"):
         for number, age_s in enumerate(ages_s):
-            lag.add("r1", "driver", round(age_s * S), round(number * every_s * S))
+            now = round(number * every_s * S)
+            lag.add("r1", "driver", JointState(now - round(age_s * S), number, 7, b"order", b""), now)
     return len(caplog.records)
 
 
@@ -26,6 +31,25 @@ def test_growing_lag_is_logged_once(caplog):
     assert warning_count(caplog, [1.0 + 0.1 * number for number in range(50)]) == 1
     assert "samples of 'r1', which driver writes, come 2.1 s after their stamps" in caplog.text
     assert "1.0 s shortly before" in caplog.text
+    assert "more is sent than the network carries" in caplog.text
+
+
+def test_writer_whose_stamps_stand_still_is_blamed_for_that(caplog):
+    assert warning_count(caplog, [1.0 + 0.1 * number for number in range(50)], every_s=0.1) == 1
+    assert "driver of 'r1' gives every sample the same stamp, " in caplog.text
+    assert "its source stands still" in caplog.text
+    assert "network" not in caplog.text
+
+
+def test_writer_whose_stamps_freeze_after_a_while_is_blamed_for_that(caplog):
+    running, frozen = [1.5] * 10, [1.5 + 0.2 * number for number in range(20)]
+    assert warning_count(caplog, running + frozen) == 1
+    assert "gives every sample the same stamp" in caplog.text
+
+
+@pytest.mark.parametrize("steps_s", [[5.0, 8.0], [1.2, 3.0, 9.0, 20.0]])
+def test_clock_that_is_set_back_while_it_is_off_is_no_backlog(caplog, steps_s):
+    assert warning_count(caplog, [step_s for step_s in steps_s for _ in range(5)]) == 0
 
 
 @pytest.mark.parametrize(
@@ -43,3 +67,23 @@ def test_lag_that_grows_by_less_than_a_second_is_not_logged(caplog, ages_s):
 
 def test_backlog_after_a_pause_starts_with_its_own_least_age(caplog):
     assert warning_count(caplog, [1.0, 4.0, 7.0], every_s=2.5) == 0
+
+
+def test_threads_share_the_checks(monkeypatch: pytest.MonkeyPatch):
+    """The streams of a listener have a thread each; a bounded dict alone loses entries of another thread."""
+    monkeypatch.setattr("zstate._util.bounded.MAX_ENTRIES", 8)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    domain, lag = ClockDomain("system"), LagDetector(Counters())
+
+    def add(thread: int) -> None:
+        for number in range(3000):
+            domain.place("r1", [f"other/{thread}-{number}"])
+            lag.add("r1", None, JointState(0, 0, 10_000 * thread + number, b"order", b""), 2 * S)
+
+    try:
+        with ThreadPoolExecutor(4) as threads:
+            for done in [threads.submit(add, thread) for thread in range(4)]:
+                done.result()
+    finally:
+        sys.setswitchinterval(interval)

@@ -14,7 +14,10 @@ MAX_ENTRIES = 4096
 
 
 class BoundedDict(dict[K, V]):
-    """A dict of the 4096 newest entries. Assigning to a key makes its entry the newest."""
+    """A dict of the 4096 newest entries. Assigning to a key makes its entry the newest.
+
+    Threads that assign at the same time need a lock. Reading needs none.
+    """
 
     def __setitem__(self, key: K, value: V) -> None:
         if key in self:

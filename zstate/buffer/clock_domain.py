@@ -54,11 +54,12 @@ class ClockDomain:
 
     def place(self, robot: str, children: Iterable[str]) -> None:
         """Record that writers of ``robot`` place the frames ``children``."""
-        for child in children:
-            if child.partition("/")[0] == robot:
-                self._robot_by_child.pop(child, None)
-            else:
-                self._robot_by_child[child] = robot
+        with self._lock:
+            for child in children:
+                if child.partition("/")[0] == robot:
+                    self._robot_by_child.pop(child, None)
+                else:
+                    self._robot_by_child[child] = robot
 
     def join(self, robot: str) -> None:
         """Count ``robot`` for the majority: it has samples."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from zstate._util.bounded import BoundedDict
+from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import counts_from_start, format_duration, guess_unit
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM, format_stamp
@@ -30,7 +31,7 @@ class StampCheck:
     """Counts samples stamped more than a minute from now in ``off_clock``; warns once for each program.
 
     Samples that are late by less are passed to a ``LagDetector``. ``is_described`` means that robots publish
-    descriptions, which name their clock: a robot without one yet is not checked.
+    descriptions, which name their clock: a robot without one yet is not checked. Any thread may call it.
     """
 
     def __init__(self, buffer: TransformBuffer, counters: Counters, *, is_described: bool) -> None:
@@ -38,6 +39,7 @@ class StampCheck:
         self._counters = counters
         self._is_described = is_described
         self._reported: BoundedDict[tuple[str, str], None] = BoundedDict()
+        self._lock = fork_safe_lock()
         self._lag = LagDetector(counters)
 
     def accepted_range(self) -> tuple[int, int]:
@@ -60,13 +62,15 @@ class StampCheck:
             return
         now = self._buffer.clock.now()
         if abs(sample.stamp - now) <= FAR_NS:
-            self._lag.add(robot, writer, now - sample.stamp, now)
+            self._lag.add(robot, writer, sample, now)
             return
         self._counters.for_robot(robot).count("off_clock")
         # By program, not by session: a writer that restarts with each sample would be logged each time.
         key = (robot, _program(writer))
-        if key not in self._reported:
+        with self._lock:
+            is_first = key not in self._reported
             self._reported[key] = None
+        if is_first:
             offset = sample.stamp - now
             self._counters.warn_once(
                 f"off clock {' '.join(key)}",
@@ -78,7 +82,15 @@ class StampCheck:
 
 @dataclass(slots=True)
 class _Backlog:
+    """Late samples of the same edges or joints.
+
+    ``least_ns`` is the least age, and ``new_ns`` that of the first sample with the ``stamp`` of the last one,
+    which arrived at ``last_ns``.
+    """
+
     least_ns: int
+    new_ns: int
+    stamp: int
     last_ns: int
     is_reported: bool = False
 
@@ -87,32 +99,48 @@ class LagDetector:
     """Warns once for each program when the age of its samples at arrival has grown by more than a second.
 
     Only growth counts, because the clocks of both sides may disagree. The burst after a network cut begins
-    with its oldest sample, so its age only falls.
+    with its oldest sample, so its age only falls. A stamp before the last one is that of a clock that was set
+    back, which is no backlog, and if all stamps are the same the writer's source stands still. Any thread may
+    call it.
     """
 
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
-        self._backlogs: BoundedDict[tuple[str, str], _Backlog] = BoundedDict()
+        # One writer may stamp some edges later than others, for instance those from a slow camera.
+        self._backlogs: BoundedDict[tuple[str, int, bytes], _Backlog] = BoundedDict()
+        self._lock = fork_safe_lock()
 
-    def add(self, robot: str, writer: str | None, age_ns: int, now_ns: int) -> None:
-        """Add a late sample of ``writer``, which arrived ``age_ns`` after its stamp."""
-        key = (robot, _program(writer))
-        backlog = self._backlogs.get(key)
-        if backlog is None:
-            self._backlogs[key] = _Backlog(age_ns, now_ns)
-            return
-        is_same_backlog = now_ns - backlog.last_ns <= _BACKLOG_PAUSE_NS
-        backlog.last_ns = now_ns
-        backlog.least_ns = min(backlog.least_ns, age_ns) if is_same_backlog else age_ns
-        if age_ns > backlog.least_ns + _LAG_GROWTH_NS and not backlog.is_reported:
+    def add(self, robot: str, writer: str | None, sample: Sample, now_ns: int) -> None:
+        """Add a late sample of ``writer``, which arrived at ``now_ns``."""
+        key, age_ns = (robot, sample.session, sample.order), now_ns - sample.stamp
+        with self._lock:
+            backlog = self._backlogs.get(key)
+            if backlog is None or now_ns - backlog.last_ns > _BACKLOG_PAUSE_NS:
+                is_reported = backlog is not None and backlog.is_reported
+                self._backlogs[key] = _Backlog(age_ns, age_ns, sample.stamp, now_ns, is_reported)
+                return
+            if age_ns < backlog.least_ns or sample.stamp < backlog.stamp:
+                backlog.least_ns = age_ns
+            if sample.stamp != backlog.stamp:
+                backlog.stamp, backlog.new_ns = sample.stamp, age_ns
+            backlog.last_ns, least_ns = now_ns, backlog.least_ns
+            stands_still = 2 * (age_ns - backlog.new_ns) > age_ns - least_ns
+            if age_ns <= least_ns + _LAG_GROWTH_NS or backlog.is_reported:
+                return
             backlog.is_reported = True
-            age, before = format_duration(age_ns), format_duration(backlog.least_ns)
-            self._counters.warn_once(
-                f"lag {' '.join(key)}",
-                f"{_samples_text(robot, writer)} come {age} after their stamps, {before} shortly before: "
-                "more is sent than the network carries, or than this program handles; `zstate monitor` shows "
-                "where samples wait, and a lower rate helps either way",
+        if stands_still:
+            text = (
+                f"{writer or 'a writer'} of {robot!r} gives every sample the same stamp, "
+                f"{format_stamp(sample.stamp)}: its source stands still"
             )
+        else:
+            text = (
+                f"{_samples_text(robot, writer)} come {format_duration(age_ns)} after their stamps, "
+                f"{format_duration(least_ns)} shortly before: more is sent than the network carries, or than "
+                "this program handles; `zstate monitor` shows where samples wait, and a lower rate helps "
+                "either way"
+            )
+        self._counters.warn_once(f"lag {robot} {_program(writer)}", text)
 
 
 def likely_cause(stamp: int, now: int) -> str:
