@@ -365,15 +365,20 @@ class UnknownFrame(LookupFailed):
         name: str,
         near_misses: Sequence[str] | Callable[[], Sequence[str]] = (),
         frame_count: int = 0,
+        hint: Callable[[], str] | None = None,
         **facts: Any,
     ) -> None:
         super().__init__(target, source, **facts)
         self.name = name
         self.frame_count = frame_count
+        if hint is not None:
+            self._hint = hint
         if callable(near_misses):
             self._search = near_misses
         else:
             self.near_misses = tuple(near_misses)
+
+    _hint: Callable[[], str] | None = None
 
     @cached_property
     def near_misses(self) -> tuple[str, ...]:
@@ -381,16 +386,20 @@ class UnknownFrame(LookupFailed):
         return tuple(self._search())
 
     def facts(self) -> dict[str, Any]:
-        facts = {**super().facts(), "near_misses": self.near_misses}
-        facts.pop("_search", None)
+        facts = {**super().facts(), "near_misses": self.near_misses, "hint": self.hint}
+        for private in ("_search", "_hint"):
+            facts.pop(private, None)
         return facts
+
+    @cached_property
+    def hint(self) -> str:
+        """Why the buffer has received no frame, as its listener knows it; empty without a listener."""
+        return "" if self.frame_count or self._hint is None else self._hint()
 
     def message(self) -> str:
         if not self.frame_count:
-            return (
-                f"the frame {self.name!r} is unknown: this buffer has received no frame yet; "
-                "is a publisher running, and was the listener given time (timeout_s=...)?"
-            )
+            advice = self.hint or ("is a publisher running, and was the listener given time (timeout_s=...)?")
+            return f"the frame {self.name!r} is unknown: this buffer has received no frame yet; {advice}"
         if self.near_misses:
             return f"the frame {self.name!r} is unknown; did you mean {_choices(self.near_misses)}?"
         return (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import time
 from itertools import count
 
@@ -12,7 +13,7 @@ from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, w
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock
-from zstate.errors import AmbiguousFrame, InvalidInput
+from zstate.errors import AmbiguousFrame, InvalidInput, UnknownFrame
 from zstate.model.load import load_model
 from zstate.net.clock_offset import measure_offsets
 from zstate.net.presence import announce, discover
@@ -329,6 +330,33 @@ def test_invalid_token_hides_no_other(sessions, robot):
         assert measure_offsets(reader, "*")
     for token in tokens:
         token.undeclare()
+
+
+def test_lookup_of_a_robot_that_is_not_announced_names_it_and_the_one_that_is(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "myrm") as listener:
+        with pytest.raises(UnknownFrame, match="robot 'myrm' is not announced \\(announced: no robot\\)"):
+            listener.buffer.lookup("world", "tool")
+        with StatePublisher(writer, RRBOT, "myarm", streams=["joint_states"]):
+            with pytest.raises(UnknownFrame) as raised:
+                listener.buffer.lookup("world", "tool")
+            hint = "robot 'myrm' is not announced; did you mean 'myarm'? (announced: myarm)"
+            assert str(raised.value).endswith(f"this buffer has received no frame yet; {hint}")
+            assert pickle.loads(pickle.dumps(raised.value)).hint == hint
+
+
+@pytest.mark.parametrize("robot", ["*", "myarm"])
+def test_lookup_before_the_first_frame_of_an_announced_robot_names_the_robot(sessions, robot):
+    writer, reader = sessions
+    with (
+        TransformListener(reader, robot) as listener,
+        StatePublisher(writer, RRBOT, "myarm", streams=["joint_states"]),
+    ):
+        until(listener.events)
+        with pytest.raises(UnknownFrame, match="myarm is announced, but no frame of it has arrived"):
+            listener.buffer.lookup("world", "tool")
+    with pytest.raises(UnknownFrame, match="is a publisher running"):
+        listener.buffer.lookup("world", "tool")
 
 
 @pytest.mark.parametrize("stream", ["transforms", "odometry"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from numbers import Real
 from typing import NamedTuple, get_args
@@ -99,6 +99,10 @@ class BufferCore:
     def stop(self, reason: str) -> None:
         """No more samples will come: waits fail at once, and errors name the reason. Lookups go on."""
         self._stop_reason = self._stop_reason or reason
+
+    def explain_emptiness(self, hint: Callable[[], str] | None) -> None:
+        """Let errors about unknown frames end with ``hint()`` as long as no frame has been received."""
+        self._tree.hint = hint
 
     def add_robot(
         self, model: RobotModel, prefix: str = "", *, interpolation: Interpolation = "linear"

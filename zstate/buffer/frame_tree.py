@@ -189,6 +189,8 @@ class FrameTree:
         self.domain = domain or ClockDomain()
         self.frames: dict[str, Edge | None] = {}
         self.robots: dict[str, JointTrack | None] = {}
+        self.hint: Callable[[], str] | None = None
+        """The end of errors about unknown frames as long as there is no frame."""
         self.names = FrameNameIndex()
         # By child: when its edge was removed, by a monotonic clock [s], the edge's names and its writer.
         self._removed: dict[str, tuple[float, tuple[str, str], str | None]] = {}
@@ -359,7 +361,8 @@ class FrameTree:
         if candidates := self.names.with_bare(name):
             raise AmbiguousFrame(target, source, name=name, candidates=candidates)
         near = self.names.near(name)
-        raise UnknownFrame(target, source, name=name, near_misses=near, frame_count=len(self.names))
+        count, hint = len(self.names), self.hint
+        raise UnknownFrame(target, source, name=name, near_misses=near, frame_count=count, hint=hint)
 
     def path(self, target: str, source: str) -> TreePath:
         """The edges between both. Raises UnknownFrame, AmbiguousFrame, Disconnected or ClockMismatch."""

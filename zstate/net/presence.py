@@ -22,7 +22,7 @@ import zenoh
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
-from zstate.errors import InvalidInput, Unreachable
+from zstate.errors import InvalidInput, Unreachable, ZStateError
 from zstate.net.queryable import MAX_REPLIES, Tokens, check_timeout, query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
@@ -192,6 +192,14 @@ def current_tokens(session: Session, expression: str, timeout_s: float) -> froze
 def confirmed_tokens(session: Session, expression: str) -> frozenset[str]:
     """The current liveliness tokens, queried a second time if the first reply has none."""
     return _confirmed(session, expression, ANSWER_WITHIN_S).keys
+
+
+def announced_robots(session: Session, wire: Wire) -> list[str]:
+    """The robots with announced writers, sorted; empty if the session is closed. Takes up to a second."""
+    with suppress(ZStateError, zenoh.ZError):
+        tokens = confirmed_tokens(session, wire.writers_expression(ANY))
+        return sorted({one.robot for token in tokens for one in wire.parse_token(token, ANY)})
+    return []
 
 
 def _confirmed(session: Session, expression: str, timeout_s: float) -> Tokens:

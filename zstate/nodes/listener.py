@@ -11,6 +11,7 @@ from functools import partial
 from typing import Literal, ParamSpec, TypeVar
 
 from zstate._util.closeable import Closeable
+from zstate._util.format import did_you_mean
 from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.clock import SYSTEM, Clock, SystemClock
 from zstate.errors import InvalidInput, MessageError
@@ -26,7 +27,7 @@ from zstate.ingest.stream_ingests import StreamIngests
 from zstate.ingest.transforms import StaticTransformIngests, TransformIngest
 from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import OtherTfSubscription, WriterWatch, announce_reader
+from zstate.net.presence import OtherTfSubscription, WriterWatch, announce_reader, announced_robots
 from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
@@ -114,8 +115,7 @@ class TransformListener(Closeable):
         self._robot_from_key: Callable[[str], str] = (
             self._wire.robot_from_key if self.robot == ANY else lambda _: self.robot
         )
-        is_on_system_clock = type(self.buffer.clock) is SystemClock
-        self._has_fast_path = kernel == "c" and is_on_system_clock
+        self._has_fast_path = kernel == "c" and type(self.buffer.clock) is SystemClock
         self._follow: Follow = follow
         self._on_event = on_event
         self._counters = Counters()
@@ -168,7 +168,8 @@ class TransformListener(Closeable):
                 for announcement in announce_reader(session, self._wire, name, streams):
                     opening.enter_context(announcement)
             self._opened = opening.pop_all()
-        self._pid = os.getpid()
+        self._session, self._pid = session, os.getpid()
+        self.buffer.explain_emptiness(self._explain_emptiness)
         _LISTENERS.add(self)
 
     def _received_streams(self) -> dict[Stream, StreamIngests]:
@@ -250,7 +251,25 @@ class TransformListener(Closeable):
     def close(self) -> None:
         """Stop listening; the buffer keeps its samples. A second call does nothing."""
         _LISTENERS.discard(self)
+        self.buffer.explain_emptiness(None)
         self._opened.close()
+
+    def _explain_emptiness(self) -> str:
+        """Why no frame has been received, for an error: the robots that are missing, and similar names.
+
+        Queries the tokens of all robots if one is missing, which takes up to a second.
+        """
+        if self._wire.shared:
+            return ""
+        present = {robot for robot, _ in list(self._names)}
+        missing = [name for name in self._robots if name not in (ANY, *present)]
+        if missing:
+            robots = announced_robots(self._session, self._wire)
+            names = (f"robot {name!r} is not announced{did_you_mean(name, robots)}" for name in missing)
+            return f"{'; '.join(names)} (announced: {shortened(', '.join(robots) or 'no robot')})"
+        if not present:
+            return ""
+        return f"{shortened(', '.join(sorted(present)))} is announced, but no frame of it has arrived yet"
 
     def end_after_fork(self) -> None:
         """End the buffer in a forked child, where nothing fills it."""
