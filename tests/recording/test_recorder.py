@@ -434,13 +434,15 @@ ON_A_SMALL_DISK = """
         print("ready")
         print(recorder.wait(15.0))
         print(type(recorder.failure).__name__, recorder.failure)
-        print(sum(recorder.stats.messages.values()))
+        print(sum(recorder.stats.messages.values()) - recorder.stats.lost, recorder.stats.lost)
         recorder.close()
     print("goes on")
 """
 
 
-def test_full_disk_ends_the_recording_with_a_reason_and_leaves_it_readable(sessions, spawn, tmp_path: Path):
+def test_full_disk_ends_the_recording_with_a_reason_and_what_it_has_lost_is_counted(
+    sessions, spawn, tmp_path: Path
+):
     writer = sessions[0]
     child = spawn(ON_A_SMALL_DISK, str(tmp_path / "run.mcap"))
     assert child.line() == "ready"
@@ -456,12 +458,13 @@ def test_full_disk_ends_the_recording_with_a_reason_and_leaves_it_readable(sessi
     failure = child.line()
     assert failure.startswith("RecordingError")
     assert "cannot grow" in failure
-    written = int(child.line())
+    written, lost = map(int, child.line().split())
     assert child.line() == "goes on"
     assert (child.wait(), child.stderr) == (0, "")
     with RecordingReader(tmp_path / "run.mcap") as recording:
         assert not recording.complete
-        assert 0 < sum(1 for _ in recording.records()) <= written
+        assert 0 < sum(1 for _ in recording.records()) == written
+    assert lost > 0
 
 
 def test_close_finishes_the_file_within_a_second_and_may_be_repeated(sessions, tmp_path: Path):

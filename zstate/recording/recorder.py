@@ -200,7 +200,8 @@ class RecorderStats:
     ``messages`` were written, by robot and stream (the clock belongs to the robot "ros"); ``bytes`` is the
     size of all ``files``. Messages were ``dropped`` by a full ring of this process, by a full queue or at the
     end of the recording, ``missed`` between the writers' sequence numbers, ``unwritten`` without a matching
-    description; ``refused`` counts others that could not be written, by reason.
+    description; ``refused`` counts others that could not be written, by reason. A disk that is full has
+    ``lost`` that many of the ``messages``.
     """
 
     messages: Mapping[tuple[str, Stream], int]
@@ -210,6 +211,7 @@ class RecorderStats:
     missed: int
     refused: Mapping[str, int]
     unwritten: int
+    lost: int = 0
 
     def _repr_html_(self) -> str:
         return html_of_fields(self)
@@ -250,6 +252,8 @@ class Recorder(Closeable):
         self._programs: BoundedDict[int, str] = BoundedDict()
         self._discovered: set[str] = set()
         self._pending: list[Batch] = []
+        self._handled = 0
+        """How many samples of ``_pending`` are written, queued or counted."""
         self._ends_at = math.inf
         self._starts_at: int | None = None
         self._encoder: RecordingEncoder | None = None
@@ -297,6 +301,7 @@ class Recorder(Closeable):
             missed=received.missed,
             refused=received.refused,
             unwritten=0 if encoder is None else encoder.unwritten,
+            lost=writer.lost,
         )
 
     def wait(self, timeout_s: float | None = None) -> bool:
@@ -332,6 +337,9 @@ class Recorder(Closeable):
         except Exception as error:  # any error is reported as ``failure``
             self.failure = error
             self._unsubscribe()
+            self._pending += self._queue.pop_all()
+            received = sum(len(batch.arrivals) for batch in self._pending)
+            self._counters.count("dropped", received - self._handled)
         finally:
             self._large.close()
             self._ended.set()
@@ -360,15 +368,14 @@ class Recorder(Closeable):
             for arrival in batch.arrivals:
                 if time.monotonic() > self._ends_at:
                     self._counters.count("dropped")
-                    continue
-                robot = self._samples.robot_of(batch, arrival)
-                if robot is None:
-                    continue
-                if batch.stream in LATCHED_STREAMS and self._large.accepts(robot, len(arrival.payload)):
+                elif (robot := self._samples.robot_of(batch, arrival)) is None:
+                    pass  # counted
+                elif batch.stream in LATCHED_STREAMS and self._large.accepts(robot, len(arrival.payload)):
                     self._large.put(robot, batch, arrival)
                 else:
                     self._write_arrival(robot, batch, arrival)
-        self._pending = []
+                self._handled += 1
+        self._pending, self._handled = [], 0
 
     def _new_encoder(self) -> RecordingEncoder | None:
         """None until it is known which robots the recording starts with."""

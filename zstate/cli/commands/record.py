@@ -298,7 +298,7 @@ class RecordProgress:
 
     def summary(self) -> str:
         stats, took = self._recorder.stats, time.monotonic() - self._start
-        messages = count_text(sum(stats.messages.values()), "message")
+        messages = count_text(sum(stats.messages.values()) - stats.lost, "message")
         robots = f" of {', '.join(_robots(stats))}" if _robots(stats) else ""
         where = f"{files_text(stats.files)} ({size_text(stats.bytes)})"
         lost = f"lost {_lost(stats)}" if _lost(stats) else "nothing lost"
@@ -351,6 +351,7 @@ def _robots(stats: RecorderStats) -> list[str]:
 def _lost(stats: RecorderStats) -> str:
     reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
     parts = (
+        (stats.lost, "that the disk had no space for"),
         (stats.dropped, "dropped here"),
         (stats.missed, "missed on the way"),
         (stats.unwritten, "without a description that fits"),

@@ -190,6 +190,8 @@ class SplitFile:
         self._number_of: dict[ChannelId, int] = {}
         # Bytes of the chunk in progress, without compression, and of all that precedes the first message.
         self._chunk_size = self._head_size = 0
+        self.in_chunk = 0
+        """The messages of the chunk in progress, without repeated ones: a full disk loses them."""
         self._first: int | None = None
         self._group = 0
 
@@ -233,13 +235,13 @@ class SplitFile:
         self._group = log_time
         for message, once_per_file in latched:
             if self._first is None or not once_per_file:
-                self.add(message._replace(log_time=log_time))
+                self.add(message._replace(log_time=log_time), is_repeated=True)
         if self._first is None:
             self._first = log_time
             self._head_size = self.output.size + self._chunk_size
         return True
 
-    def add(self, message: RecordedMessage) -> None:
+    def add(self, message: RecordedMessage, *, is_repeated: bool = False) -> None:
         """Write it: into memory, until the chunk is full."""
         channel, payload, log_time, publish_time, sequence = message
         number = self._number_of[channel]
@@ -247,11 +249,13 @@ class SplitFile:
         self._chunk_size += len(payload) + _MESSAGE_SIZE
         if self.output.has_whole_chunk:
             self.write_chunk()
+        else:
+            self.in_chunk += not is_repeated
 
     def write_chunk(self) -> None:
         """End the chunk, and write it to the system."""
         self.output.write_chunk()
-        self._chunk_size = 0
+        self._chunk_size = self.in_chunk = 0
 
 
 class RecordingWriter(Closeable):
@@ -299,6 +303,9 @@ class RecordingWriter(Closeable):
         self._files: list[Path] = []
         self._finished_bytes = 0
         self._is_open = True
+        self._has_failed = False
+        self.lost = 0
+        """The messages that were written into memory, and not into the file, when the disk was full."""
         self._split = self._new_split()
 
     @property
@@ -390,6 +397,8 @@ class RecordingWriter(Closeable):
             is_repeated = self._split.start_group_if_due(message.log_time, self._latched.values())
             if latched_as is None or not is_repeated or (once_per_file and not is_first):
                 self._split.add(message)
+            else:
+                self._split.in_chunk += 1  # with the repeated ones
 
     def unlatch(self, channel: ChannelId, key: str) -> None:
         """Stop repeating it."""
@@ -403,7 +412,7 @@ class RecordingWriter(Closeable):
                 self._split.write_chunk()
 
     def close(self) -> None:
-        with self._lock:
+        with self._writing():
             if self._is_open:
                 self._is_open = False
                 self._split.output.finish()
@@ -429,6 +438,8 @@ class RecordingWriter(Closeable):
             try:
                 yield
             except RecordingError:
+                if not self._has_failed:
+                    self._has_failed, self.lost = True, self._split.in_chunk
                 self._is_open = False
                 raise
 
