@@ -264,7 +264,7 @@ class MotionRefused(ZStateError):
     """A driver has refused a motion; nothing moves by it. ``findings`` are all reasons."""
 
     def __init__(self, robot: str, findings: Sequence[str]) -> None:
-        self.findings = tuple(findings)
+        self.findings = tuple(map(printable, findings))
         count = f"{len(self.findings)} finding{'s' if len(self.findings) != 1 else ''}"
         super().__init__(
             "\n  ".join((f"the driver of {robot!r} refuses the motion ({count})", *self.findings))

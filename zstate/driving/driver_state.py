@@ -17,7 +17,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.driving.driver import Setpoint
-from zstate.errors import Closed, InvalidInput, MessageError, SecondWriter, format_duration
+from zstate.errors import Closed, InvalidInput, MessageError, SecondWriter, format_duration, printable
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber, cached_values
 from zstate.net.ownership import wait_for_discovery
 from zstate.net.session import Session
@@ -218,7 +218,7 @@ class ReceivedState(NamedTuple):
         if not self.state.outcomes:
             return ""
         newest = self.state.outcomes[-1]
-        return f"{newest.name}: {newest.reason}" if newest.reason else newest.name
+        return f"{newest.name}: {printable(newest.reason)}" if newest.reason else newest.name
 
     def __str__(self) -> str:
         state, text = self.state, state_text(self.state)

@@ -21,7 +21,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.errors import InvalidInput, MessageError
+from zstate.errors import InvalidInput, MessageError, printable
 from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, Stream, full_name
 
 Edges = tuple[tuple[str, str], ...]
@@ -429,11 +429,12 @@ def _cut(text: str) -> str:
 
 def state_text(state: DriverState) -> str:
     """The state of a driver and its commander or reason, in one line."""
+    reason = printable(state.reason)
     if state.state == "active":
-        return f"active, commanded by {state.commander}"
-    if not state.reason or state.reason.startswith(f"{state.state} by "):
-        return state.reason or state.state
-    return f"{state.state}: {state.reason}"
+        return f"active, commanded by {printable(state.commander)}"
+    if not reason or reason.startswith(f"{state.state} by "):
+        return reason or state.state
+    return f"{state.state}: {reason}"
 
 
 def message_fields(message: Message) -> dict[str, Any]:

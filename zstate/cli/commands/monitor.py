@@ -30,6 +30,7 @@ from zstate.cli.output.console import (
 from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import printable
 from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, Stream, check_robot
 
 if TYPE_CHECKING:
@@ -398,7 +399,7 @@ class RobotMonitor(Closeable):
             if driver is not None:
                 print_wrapped(f"{one.robot}  driver {_driver_text(driver)}")
             for status in faulty:
-                print_wrapped(f"{one.robot}  {status.level}  {_program(status)}: {status.text}")
+                print_wrapped(printable(f"{one.robot}  {status.level}  {_program(status)}: {status.text}"))
 
     def _own_rates(self, robot: str, measure: RobotMeasure) -> dict[Stream, float]:
         """The rates of streams other than the joint states, 0 for those that are silent."""
@@ -435,7 +436,7 @@ def _driver_text(driver: ReceivedState) -> str:
     age_s = None if state.command_age is None else state.command_age * 1e-9
     reasons = ", ".join(f"{reason} {count}" for reason, count in state.refused.items())
     limited = ", ".join(state.limited)
-    return (
+    return printable(
         f"{driver}  loop {rate_text(state.rate_hz)}  skipped {state.skipped}  faults {state.faults}  "
         f"command age {time_text(age_s)}  refused {sum(state.refused.values())}"
         f"{f' ({reasons})' if reasons else ''}"

@@ -16,7 +16,15 @@ from zstate.cli import options
 from zstate.cli.commands.drive import parse_joint_value
 from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
-from zstate.errors import InvalidInput, MotionRefused, MotionTimeout, SecondWriter, Unreachable, ZStateError
+from zstate.errors import (
+    InvalidInput,
+    MotionRefused,
+    MotionTimeout,
+    SecondWriter,
+    Unreachable,
+    ZStateError,
+    printable,
+)
 
 if TYPE_CHECKING:
     from zstate.driving import Commander
@@ -164,7 +172,7 @@ def move_command(
     elif outcome.name == "reached":
         print_result(f"reached in {time.monotonic() - started:.1f} s")
     if outcome.name != "reached":
-        fail(f"the motion of {robot!r} was {outcome.name}: {outcome.reason}")
+        fail(f"the motion of {robot!r} was {outcome.name}: {printable(outcome.reason)}")
 
 
 def _check_options(*, file: bool, seconds: bool, velocity: bool, stretch: bool) -> None:
@@ -202,7 +210,8 @@ def _keep_velocities(
         with suppress(ZStateError):
             commander.send(velocities=dict.fromkeys(velocities, 0.0))
     if (state := commander.driver) is not None and state.state != "active":
-        fail(f"the joints of {commander.robot!r} have not moved: {state.last_refusal or state.state}")
+        reason = printable(state.last_refusal) or state.state
+        fail(f"the joints of {commander.robot!r} have not moved: {reason}")
 
 
 def _check_moves(commander: Commander, before: DriverState) -> None:
@@ -215,7 +224,7 @@ def _check_moves(commander: Commander, before: DriverState) -> None:
     if state.state in ("stopped", "fault", "off"):
         fail(f"the driver of {commander.robot!r} is {state_text(state)}")
     if state.state != "active" and sum(state.refused.values()) > sum(before.refused.values()):
-        fail(f"the driver of {commander.robot!r} refuses it: {state.last_refusal}")
+        fail(f"the driver of {commander.robot!r} refuses it: {printable(state.last_refusal)}")
 
 
 def _print_outcome(robot: str, outcome: str, reason: str = "", *, findings: Sequence[str] = ()) -> None:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from zstate.cli.output.console import colored, count_text, output_width
+from zstate.errors import printable
 from zstate.wire.keys import EDGE_STREAMS, JOINT_STREAMS
 
 State = Literal["ok", "warning", "broken", "skipped"]
@@ -87,7 +88,7 @@ def conclusion_text(checks: Sequence[Check]) -> str:
         text = f"first broken link: {check.name}{f' of {check.robot!r}' if check.robot else ''}"
     elif warnings := [one for one in checks if one.state == "warning"]:
         check, text = warnings[0], f"sound, with {count_text(len(warnings), 'warning')}"
-    return text + (f"\nnext: {check.next}" if check is not None and check.next else "")
+    return text + (f"\nnext: {printable(check.next)}" if check is not None and check.next else "")
 
 
 def diagnosis_json(checks: Sequence[Check]) -> dict[str, Any]:
