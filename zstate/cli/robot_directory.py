@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from zstate._util.closeable import Closeable
@@ -29,6 +29,12 @@ def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
         messages = messages_for("native")
         fail(messages.announced(robots) if robot == ANY else messages.unknown(robot, robots))
     return selected
+
+
+def check_found(robots: Sequence[RobotInfo]) -> None:
+    """Fail if there are no ``robots`` and discovery is incomplete: that is no empty fleet."""
+    if not robots and (reason := messages_for("native").incomplete_text()):
+        fail(f"no robot is found, and discovery is incomplete: {reason}")
 
 
 def only_robot(session: Session) -> str:

@@ -2,11 +2,21 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 
 import pytest
-from helpers.cli_runner import ALL_STREAMS, Spawn, failure, interrupted, published_robot, started, zstate
-from helpers.processes import until
+from helpers.cli_runner import (
+    ALL_STREAMS,
+    RRBOT,
+    Spawn,
+    failure,
+    interrupted,
+    published_robot,
+    started,
+    zstate,
+)
+from helpers.processes import find_free_port, until
 
 from zstate import StaticPublisher, connect
 from zstate.cli.commands.ls import robots_text
@@ -49,7 +59,23 @@ def test_empty_network_is_no_error():
     ended = zstate("ls")
     assert (ended.returncode, ended.stdout) == (0, b"")
     assert b"no robot is announced" in ended.stderr
+    assert b"robots of other hosts: --mode lan, or --connect" in ended.stderr
     assert json.loads(zstate("ls", "--json").stdout) == []
+
+
+@pytest.mark.parametrize("command", [("ls",), ("ls", "--json"), ("graph", "--json")], ids=" ".join)
+def test_no_robot_beside_a_stopped_program_is_no_empty_fleet(
+    spawn: Spawn, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+):
+    """The first command after Ctrl-Z of the program where the others meet."""
+    addresses = " ".join(f"127.0.0.1:{find_free_port()}" for _ in range(3))
+    monkeypatch.setenv("ZSTATE_RENDEZVOUS", addresses)
+    owner = started(spawn, "publish", RRBOT, "--source", "sine")
+    owner.line()
+    os.kill(owner.process.pid, signal.SIGSTOP)
+    message = failure(*command)
+    assert "no robot is found, and discovery is incomplete" in message
+    assert f"process {owner.process.pid} " in message
 
 
 def test_invalid_endpoint_is_named():

@@ -76,6 +76,7 @@ def graph_command(network: SessionOptions, robot: str, form: str | None, wire: s
 
 def _discover_measured_graph(session: Session) -> Graph:
     """The graph of the native wire, with the rates of the streams that move."""
+    from zstate.cli.robot_directory import check_found
     from zstate.net.graph import build_graph
     from zstate.net.presence import discover, discover_readers
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
@@ -93,6 +94,7 @@ def _discover_measured_graph(session: Session) -> Graph:
         for stream in always:
             statistics.subscribe(stream)
         robots = discover(session)
+        check_found(robots)
         readers = discover_readers(session, _READERS_WITHIN_S)
         # tf is published only while it is read: measuring must not make a publisher start.
         read = {one.robot for one in readers if one.stream == "tf"}

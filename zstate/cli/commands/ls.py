@@ -100,7 +100,7 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
 
 
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
-    from zstate.cli.robot_directory import RobotDirectory
+    from zstate.cli.robot_directory import RobotDirectory, check_found
     from zstate.net.presence import discover
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
     from zstate.wire.registry import get_wire
@@ -119,6 +119,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
                 time.sleep(_DISCOVERY_S)
                 _watch(directory.robots, text, facts, as_json=as_json)
         robots = discover(session)
+        check_found(robots)
         # A reader of tf would make a publisher send more.
         measured = [
             WriterKey(robot.name, stream, writer.session)

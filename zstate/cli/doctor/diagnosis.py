@@ -18,7 +18,7 @@ from zstate import __version__
 from zstate.cli.commands import load_command
 from zstate.cli.doctor.check import Check, broken, ok, warning
 from zstate.cli.output.console import count_text
-from zstate.cli.output.wire_text import RosMessages, is_ros, messages_for, publish_command_for
+from zstate.cli.output.wire_text import OTHER_HOSTS, RosMessages, is_ros, messages_for, publish_command_for
 from zstate.cli.session import SessionOptions, open_session
 from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import AccessDenied, Unreachable, ZStateError
@@ -234,6 +234,8 @@ def _missing_robot_check(
     if robot == ANY:
         from zstate.model.catalog import example_name
 
+        if not network.is_explicit:
+            what += f" on this host; robots of other hosts: {OTHER_HOSTS}"
         return broken("robots", what, f"zstate publish {example_name()} --source sine{options}")
     command = publish_command_for("publish", robot)
     source = "" if "FILE" in command else " --source sine"

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from zstate.wire.keys import Stream
 
 
+OTHER_HOSTS = "--mode lan, or --connect tcp/HOST:7447 to a router"
+"""The options with which commands find robots of other hosts."""
+
+
 def is_ros(wire: str) -> bool:
     """Whether ``wire``, a value of --wire, is a ROS wire format."""
     return not wire.startswith("native")
@@ -58,14 +62,19 @@ class NativeMessages:
         """The announced robots; with advice if there is none."""
         if not robots:
             from zstate.model.catalog import example_name
-            from zstate.net.rendezvous import silent_addresses
-            from zstate.net.security.connection_check import check_rendezvous  # loads ssl, which few need
 
             start = f"start one, for instance with `zstate publish {example_name()} --source sine`"
-            silent = check_rendezvous(silent_addresses())
-            advice = f"{silent.text}; `zstate doctor` shows more" if silent else start
+            advice = self.incomplete_text() or f"{start}; robots of other hosts: {OTHER_HOSTS}"
             return f"no robot is announced; {advice}"
         return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
+
+    def incomplete_text(self) -> str:
+        """Why robots of this host may be missing: a program where they meet does not answer; else empty."""
+        from zstate.net.rendezvous import silent_addresses
+        from zstate.net.security.connection_check import check_rendezvous  # loads ssl, which few need
+
+        silent = check_rendezvous(silent_addresses())
+        return "" if silent is None else f"{silent.text}; `zstate doctor` shows more"
 
     def unknown(self, robot: str, robots: Sequence[RobotInfo]) -> str:
         """That ``robot`` is not announced, and which robots are."""
