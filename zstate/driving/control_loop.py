@@ -195,6 +195,7 @@ class ControlLoop:
         doubt = self._readings.add(positions, now)
         self._read_stamp = reading.stamp
         if doubt and self._moves_by_readings(now):
+            self._limiter.doubt()
             raise InvalidInput(doubt)
         self._publish(positions, velocities, efforts, stamp if reading.stamp is None else reading.stamp)
         self._measured, self._measured_at = positions, now

@@ -214,6 +214,8 @@ class SetpointLimiter:
         self._braked: dict[int, str] = {}
         """Why joints are held that are commanded in mode "effort"."""
         self._observed: tuple[list[float], int] | None = None
+        self._is_doubtful = False
+        """Whether the joints may be elsewhere than was observed."""
 
     def start(self, positions: ArrayLike, velocities: ArrayLike | None = None) -> Limited:
         """Sets the setpoint to what is there now, after any change of state; at rest without ``velocities``.
@@ -232,6 +234,7 @@ class SetpointLimiter:
         self._positions = start
         self._efforts = [0.0] * len(start)
         self._set_modes(self._all_resting)
+        self._is_doubtful = False
         self._braked.clear()
         return self._limited(start, [False] * len(start))
 
@@ -253,6 +256,7 @@ class SetpointLimiter:
         joints in mode "effort" are derived from the positions if not given.
         """
         before, self._observed = self._observed, (positions.tolist(), now)
+        self._is_doubtful = False
         if self.has_positions_only or self._positions is None:
             return
         found = self._observed[0]
@@ -268,6 +272,10 @@ class SetpointLimiter:
             elif before is not None and 0.0 < dt_s < _LONGEST_GAP_S:
                 rate = (found[column] - before[0][column]) / dt_s
                 self._velocities[column] += (rate - self._velocities[column]) * dt_s / (dt_s + _FILTER_S)
+
+    def doubt(self) -> None:
+        """No joint enters mode "position" until the next ``observe``: it may be elsewhere, and would jump."""
+        self._is_doubtful = True
 
     def check_rates(self, rates: Rates) -> None:
         """Raises InvalidInput for efforts of joints that have no effort limit."""
@@ -375,7 +383,10 @@ class SetpointLimiter:
             self._braked.setdefault(column, self._excess_text(column, here))
         if column in self._braked:
             rate = None
-        mode = self._modes[column] = self._mode_at_rest(column) if rate is None else rate.mode
+        mode = self._mode_at_rest(column) if rate is None else rate.mode
+        if self._is_doubtful and mode == "position" != before:
+            mode, rate = before, None
+        self._modes[column] = mode
         if before != mode:
             self._rested_s[column] = 0.0
         if before == "effort" != mode:
