@@ -45,7 +45,7 @@ class QueryWorkers:
         """Run ``turn`` in a worker, soon. Does not wait."""
         self._turns.put(turn)
 
-    def end(self) -> None:
+    def close(self) -> None:
         """End all workers, after the turns that wait."""
         with self._lock:
             self._has_ended = True
@@ -113,4 +113,4 @@ def leave_workers(session: Session, workers: QueryWorkers) -> None:
         if workers.users:
             return
         _WORKERS.pop(session, None)
-    workers.end()
+    workers.close()
