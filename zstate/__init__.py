@@ -119,7 +119,14 @@ def __getattr__(name: str) -> object:
     if name == "errors":
         return import_module("zstate.errors")
     if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        if name.startswith("__"):
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        # Loaded for mistakes alone.
+        from pathlib import Path  # noqa: PLC0415
+
+        from zstate._util.other_names import missing_name  # noqa: PLC0415
+
+        raise missing_name(__name__, Path(__file__).parent, name)
     value: object = getattr(import_module(f"{__name__}.{_HOMES.get(name, 'errors')}"), name)
     globals()[name] = value
     return value

@@ -10,11 +10,12 @@ from contextlib import suppress
 from functools import partial
 from numbers import Real
 from operator import attrgetter
-from typing import NamedTuple, NoReturn, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate._util.other_names import missing_method
 from zstate.buffer.core import BufferCore
 from zstate.buffer.history import HistoryView
 from zstate.buffer.path import Plan, TransformPath, transforms_at_one_moment
@@ -87,6 +88,11 @@ class TransformBuffer(BufferCore):
         named = f" of {', '.join(robots[:3])}{more}" if robots else ""
         kept = "of a recording" if self.is_recording else f"{self.history_s:g} s of history"
         return f"<TransformBuffer: {len(self._tree.frames)} frames{named}, {kept}>"
+
+    if not TYPE_CHECKING:  # type checkers report such names themselves
+
+        def __getattr__(self, name: str) -> NoReturn:
+            raise missing_method(self, name)
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(

@@ -1,0 +1,58 @@
+"""Names of tf2, and of other folders, in the errors of attributes that do not exist."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import zstate
+from zstate._util.other_names import TF2_CLASSES, TF2_METHODS
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("Buffer", "tf2's Buffer is zstate.TransformBuffer here"),
+        ("TransformBroadcaster", "tf2's TransformBroadcaster is zstate.TransformPublisher here"),
+        ("TransformException", "tf2's TransformException is zstate.LookupFailed here"),
+        ("JointSource", "it is zstate.sources.JointSource"),
+        ("MessageError", "it is zstate.errors.MessageError"),
+    ],
+)
+def test_error_of_a_missing_name_says_where_it_is(name: str, text: str) -> None:
+    with pytest.raises(AttributeError) as caught:
+        getattr(zstate, name)
+    assert str(caught.value) == f"module 'zstate' has no attribute {name!r}; {text}"
+
+
+@pytest.mark.parametrize("name", ["Bufer", "__wrapped__", "_private", "os"])
+def test_other_missing_names_have_the_usual_error(name: str) -> None:
+    with pytest.raises(AttributeError) as caught:
+        getattr(zstate, name)
+    assert str(caught.value) == f"module 'zstate' has no attribute {name!r}"
+
+
+def test_python_suggests_the_most_similar_name() -> None:
+    program = "import zstate; zstate.TransformListner"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert "no attribute 'TransformListner'. Did you mean: 'TransformListener'?" in ended.stderr
+
+
+def test_what_is_named_instead_exists() -> None:
+    for instead in TF2_CLASSES.values():
+        for name in instead.replace("zstate.", "").split(" or "):
+            assert isinstance(getattr(zstate, name), type)
+    for instead in TF2_METHODS.values():
+        assert callable(getattr(zstate.TransformBuffer, instead.partition("(")[0]))
+
+
+def test_error_of_tf2s_methods_names_those_of_the_buffer() -> None:
+    buffer = zstate.TransformBuffer()
+    for name, text in (("lookup_transform", "lookup(target, source, at)"), ("can_transform", "can_lookup(")):
+        with pytest.raises(AttributeError, match=f"no attribute {name!r}; tf2's {name} is ") as caught:
+            getattr(buffer, name)
+        assert text in str(caught.value)
+        assert "integer nanoseconds" in str(caught.value)
+    assert not hasattr(buffer, "lookup_tranform")
