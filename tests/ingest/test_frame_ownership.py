@@ -217,10 +217,36 @@ def test_own_writers_of_a_robot_win_over_others_in_every_order(follow):
     for network in in_every_order(*steps, follow=follow):
         assert network.edges == OWN | {("r1/base", "r1/camera")}
         assert network.refused == {"foreign frame": 1}
-        assert "robot 'r1' itself" in network.ownership.counters.refusals()["foreign frame"]
+        text = network.ownership.counters.refusals()["foreign frame"]
+        assert "by robot 'r1' itself" in text or "is a frame of robot 'r1', but not its root" in text
         assert network.conflicts == [("r2", "thief", "r1/camera")]
         network.statics("r1", "mount")
-        assert ("r2/map", "r1/camera") in network.edges
+        assert network.edges == OWN  # it is no root of r1
+
+
+@FOLLOWS
+def test_other_writers_may_place_only_the_root_of_a_robot(follow):
+    steps = (
+        set_statics("r2", "thief", ("x", "r1/camera"), ("y", "r1/world")),
+        lambda network: network.model("r1"),
+        lambda network: network.sample("r2", edges=[("x", "r1/gripper")]),
+    )
+    for network in in_every_order(*steps, follow=follow):
+        assert network.edges == OWN | {("r2/y", "r1/world")}
+        assert set(network.refused) == {"foreign frame"}
+        text = network.ownership.counters.refusals()["foreign frame"]
+        assert "is a frame of robot 'r1', but not its root" in text
+
+
+def test_robot_that_places_nothing_yet_may_be_placed_by_any_frame():
+    network = Network()
+    network.ownership.add_robot("r1")
+    network.statics("r2", "site", ("map", "r1/laser"))
+    assert network.edges == {("r2/map", "r1/laser")}
+    network.statics("r1", "mount", ("base", "camera"))
+    assert network.edges == {("r1/base", "r1/camera")}
+    network.statics("r1", "mount", ("laser", "mirror"))
+    assert network.edges == {("r2/map", "r1/laser"), ("r1/laser", "r1/mirror")}
 
 
 def test_other_writers_may_place_the_root_in_their_frames_and_in_unowned_ones():

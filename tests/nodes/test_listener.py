@@ -231,6 +231,8 @@ def test_invalid_follow_and_placers_are_refused(sessions):
         TransformListener(sessions[0], "r1", placers=["site", None])
     with pytest.raises(InvalidInput, match="robot name 'a/b'"):
         TransformListener(sessions[0], "r1", placers=["a/b"])
+    with pytest.raises(InvalidInput, match="placers need the native wire"):
+        TransformListener(sessions[0], "r1", placers=["site"], wire="ros2")
 
 
 def test_close_is_fast_ends_reception_and_may_be_repeated(sessions):

@@ -477,6 +477,18 @@ class BufferCore:
                 *((edge.child, info(edge.child)) for edge in down),
             ]
 
+    def edge_of(self, frame: str) -> Edge | None:
+        """The edge that places a frame, by its full name."""
+        with self._lock:
+            return self._tree.frames.get(frame)
+
+    def is_model_root(self, frame: str) -> bool:
+        """Whether a frame, by its full name, is the root of a robot's model."""
+        with self._lock:
+            ends = (at for at, letter in enumerate(frame) if letter == "/")
+            tracks = (self._tree.robots.get(frame[:end]) for end in (0, *ends))
+            return any(track is not None and track.frame(track.model.root) == frame for track in tracks)
+
     def tree_snapshot(self) -> TreeSnapshot:
         """All frames with their edges and all robots with their tracks."""
         with self._lock:

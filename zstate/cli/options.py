@@ -394,6 +394,26 @@ reading_clock_option = click.option(
 )
 rate_option = click.option("--rate", type=RATE, default=100.0, show_default=True, help="Samples a second.")
 seconds_option = click.option("--seconds", type=SECONDS, metavar="N", help="End after N seconds.")
+
+
+def _check_placer(name: str) -> str:
+    from zstate.wire.keys import check_robot
+
+    return check_robot(name)
+
+
+def _all_placers_if_none(_: click.Context, __: click.Parameter, names: tuple[str, ...]) -> Any:
+    return names or None
+
+
+placer_option = click.option(
+    "--placer",
+    "placers",
+    type=Checked("NAME", _check_placer),
+    multiple=True,
+    callback=_all_placers_if_none,
+    help="Only robot NAME may place the roots of other robots; may be repeated. Default: every robot may.",
+)
 robot_filter_option = click.option(
     "--robot", default="*", metavar="NAME", help="Subscribe to this robot only; default: all robots."
 )

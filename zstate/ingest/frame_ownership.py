@@ -21,6 +21,7 @@ nothing conflicts with them: the buffer depends on what is published, not on the
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
@@ -144,10 +145,20 @@ class FrameOwnership:
         self._moved: dict[str, set[str]] = {}
         self._departed: BoundedDict[tuple[str, int], None] = BoundedDict()
         self._claims: dict[str, list[EdgeClaim]] = {}
-        self._outside: dict[EdgeClaim, None] = {}
+        self._sources: dict[str, dict[EdgeSource, None]] = {}
+        # The edges that place frames of other robots, by each robot that they name.
+        self._outside: dict[str, dict[EdgeClaim, None]] = {}
+        # The frames of a robot that its own edges name, those of its model, and those of model edges.
+        self._own_frames: dict[str, Counter[str]] = {}
+        self._links: dict[str, frozenset[str]] = {}
+        self._model_parents: Counter[str] = Counter()
+        self._model_children: Counter[str] = Counter()
         self._refused: dict[EdgeClaim, None] = {}
+        self._loops: dict[EdgeClaim, None] = {}
+        """The refused edges that would close a loop."""
         self._placed: dict[str, EdgeClaim] = {}
-        self._is_resolved = True
+        self._unresolved: set[str] = set()
+        """Frames whose edges must be compared again."""
         self._counter = count(1)
         self._lock = fork_safe(threading.RLock())
 
@@ -157,22 +168,34 @@ class FrameOwnership:
             return
         with self._lock:
             self._robots.add(robot)
-            if any(robot in map(frame_owner, claim.names) for claim in self._outside):
-                self.resolve()
+            self._compare_outside(robot)
+            self._resolve_marked()
 
     def add_writer(self, robot: str, session: int) -> None:
         """Add an announced writer of edges."""
         with self._lock:
             self._departed.pop((robot, session), None)
-            if self._refused:
-                self.resolve()
+            self._resolve_contested(robot, session)
 
     def remove_writer(self, robot: str, session: int) -> None:
         """Remove a writer that has left. Its edges stay until they conflict with an announced one's."""
         with self._lock:
             self._departed[robot, session] = None
-            if self._refused:
-                self.resolve()
+            self._resolve_contested(robot, session)
+
+    def _resolve_contested(self, robot: str, session: int) -> None:
+        """Compare the edges of a writer that has joined or left with those that they conflict with."""
+        if self._refused:
+            for source in self._sources.get(robot, ()):
+                if source.session == session:
+                    for claim in source.claims.values():
+                        if claim.refusal or self._loops or len(self._claims[claim.child]) > 1:
+                            self._unresolved.add(claim.child)
+        self._resolve_marked()
+
+    def _resolve_marked(self) -> None:
+        if self._unresolved:
+            self.resolve()
 
     def rename(self, source: EdgeSource, name: str) -> None:
         """Set the printed name of a source, if it is announced later than its edges."""
@@ -185,22 +208,27 @@ class FrameOwnership:
     def place_model(self, robot: str, model: RobotModel, before: JointTrack | None) -> JointTrack:
         """Replace the track ``before`` by a model; conflicting edges are withdrawn. Raises InsertRefused."""
         with self._lock:
+            links = {f"{robot}/{link}" for link in model.links} | self._links.get(robot, frozenset())
+            if self._loops:  # before the edges of an earlier model are gone
+                self._unresolved.update(*map(self._ring, links))
             if before is not None:
                 self.buffer.remove_robot(before)
             edges = frozenset((f"{robot}/{joint.parent}", f"{robot}/{joint.child}") for joint in model.joints)
             self.model_edges = {name: known for name, known in self.model_edges.items() if name != robot}
             if self._is_shared:
                 self._drop_repeated(edges)
-            has_withdrawn = self._withdraw_overlapping(robot, model)
+            self._withdraw_overlapping(robot, model)
             try:
                 track = self.buffer.add_robot(model, robot)
+                self._links[robot] = frozenset(f"{robot}/{link}" for link in model.links)
                 if self._is_shared:
                     self.model_edges[robot] = edges
                 return track
             finally:
                 self.version += self._is_shared
-                if has_withdrawn or before is not None or self._refused:
-                    self.resolve()
+                self._unresolved.update(link for link in links if link in self._claims)
+                self._compare_outside(robot)
+                self._resolve_marked()
 
     def _drop_repeated(self, edges: frozenset[EdgeNames]) -> None:
         """Remove moving edges that a model has too: those that arrived before it."""
@@ -209,8 +237,8 @@ class FrameOwnership:
                 if claim.pose is None and claim.names in edges:
                     self._drop(claim)
 
-    def _withdraw_overlapping(self, robot: str, model: RobotModel) -> bool:
-        """Withdraw the edges that conflict with a model; True if there were any."""
+    def _withdraw_overlapping(self, robot: str, model: RobotModel) -> None:
+        """Withdraw the edges that conflict with a model."""
         links = {f"{robot}/{link}" for link in model.links}
         joints = {f"{robot}/{joint.child}": joint for joint in model.joints}
         taken = [frame for frame in self.buffer.frames(joints) if frame.parent is not None]
@@ -230,8 +258,6 @@ class FrameOwnership:
             if root not in self._claims:
                 text = f"{frame.writer or 'hand'!r} placed {root!r}, the root of the model, below the model"
                 self.counters.for_robot(robot).count_refusal("loop", text)
-            return True
-        return bool(taken)
 
     def set_statics(
         self, source: EdgeSource, edges: Mapping[EdgeNames, Transform], *, adds: bool = False
@@ -252,13 +278,14 @@ class FrameOwnership:
                 claim = self._claim(source, names)
                 claim.pose, claim.published = pose, next(self._counter)
                 published.append(claim)
-            alone = [self._insert_uncontested(claim) for claim in published]
-            if self._refused or not self._is_resolved or not all(alone):
-                self.resolve(published)
+            contested = [claim for claim in published if not self._insert_uncontested(claim)]
+            self._unresolved.update(claim.child for claim in contested)
+            if self._unresolved:
+                self.resolve(contested)
 
     def _insert_uncontested(self, claim: EdgeClaim) -> bool:
         """Insert a claim that conflicts with nothing; False if conflicts must be resolved first."""
-        if self._refused or not self._is_uncontested(claim):
+        if not self._is_uncontested(claim):
             return False
         try:
             self._insert(claim)
@@ -270,8 +297,25 @@ class FrameOwnership:
         return True
 
     def _is_uncontested(self, claim: EdgeClaim) -> bool:
-        """Whether no rule and no other source conflicts with it; the buffer still may."""
-        return self._is_resolved and len(self._claims[claim.child]) == 1 and self._rank(claim) != _OTHERS
+        """Whether no rule and no other edge conflicts with it; those of the buffer's caller still may."""
+        is_alone = claim.refusal is None and len(self._claims[claim.child]) == 1
+        if not is_alone or claim.child in self._unresolved or self._rank(claim) == _OTHERS:
+            return False
+        return not self._may_close_loop(claim)
+
+    def _may_close_loop(self, claim: EdgeClaim) -> bool:
+        """Whether published edges, refused ones included, lead from its parent up to its child."""
+        frame, seen = claim.parent, set[str]()
+        while frame != claim.child and frame not in seen:
+            claims = self._claims.get(frame, ())
+            if len(claims) > 1:
+                return len(self._ring(claim.child)) > 1
+            seen.add(frame)
+            edge = claims[0] if claims else self.buffer.edge_of(frame)
+            if edge is None:
+                return False
+            frame = edge.parent
+        return frame == claim.child
 
     def admit(self, source: EdgeSource, edges: Sequence[EdgeNames]) -> Admitted:
         """Decide which of these moving edges of ``source`` may be inserted.
@@ -290,12 +334,11 @@ class FrameOwnership:
                 for names in dict.fromkeys(named.values())
                 if names not in source.claims
             ]
-            if self._refused or not all(self._is_uncontested(claim) for claim in fresh):
-                self.resolve()
-            else:
-                for claim in fresh:
-                    claim.is_accepted = True
             claims = {row: source.claims[names] for row, names in named.items()}
+            for claim in fresh:
+                claim.is_accepted = self._is_uncontested(claim)
+            self._unresolved.update(claim.child for claim in claims.values() if not claim.is_accepted)
+            self._resolve_marked()
             refusals = (claim.refusal for claim in claims.values() if claim.refusal is not None)
             refusal = next(refusals, None)
             if refusal is not None and self._is_shared:
@@ -334,8 +377,7 @@ class FrameOwnership:
         with self._lock:
             for claim in list(source.claims.values()):
                 self._drop(claim)
-            if self._refused or not self._is_resolved:
-                self.resolve()
+            self._resolve_marked()
 
     def remove_child(self, child: str) -> None:
         """Remove all published edges of ``child``."""
@@ -374,23 +416,70 @@ class FrameOwnership:
         if claim is None:
             claim = source.claims[names] = EdgeClaim(source, *names, next(self._counter))
             self._claims.setdefault(names[1], []).append(claim)
-            if frame_owner(names[1]) != source.robot:
-                self._outside[claim] = None
+            self._sources.setdefault(source.robot, {})[source] = None
+            if frame_owner(names[1]) == source.robot:
+                self._count_own(claim, 1)
+            else:
+                for robot in set(map(frame_owner, names)):
+                    self._outside.setdefault(robot, {})[claim] = None
         return claim
 
+    def _count_own(self, claim: EdgeClaim, number: int) -> None:
+        """Count an edge of a robot's own for the rules that ask what the robot places."""
+        robot = claim.source.robot
+        own = self._own_frames.setdefault(robot, Counter())
+        before = len(own)
+        for frame in claim.names:
+            if frame_owner(frame) == robot:
+                own[frame] += number
+                if not own[frame]:
+                    del own[frame]
+        if len(own) != before:
+            self._compare_outside(robot)
+        if not own:
+            del self._own_frames[robot]
+        if self._rank(claim) == _MODEL:
+            self._model_parents[claim.parent] += number
+            self._model_children[claim.child] += number
+            if self._refused:
+                self._unresolved.update(frame for frame in claim.names if frame in self._claims)
+
+    def _compare_outside(self, robot: str) -> None:
+        """Compare the edges of other robots' writers that name a frame of ``robot``."""
+        self._unresolved.update(claim.child for claim in self._outside.get(robot, ()))
+
+    def _is_root_of_model(self, frame: str) -> bool:
+        is_published = self._model_parents[frame] > 0 and not self._model_children[frame]
+        return is_published or self.buffer.is_model_root(frame)
+
     def _drop(self, claim: EdgeClaim) -> None:
-        del claim.source.claims[claim.names]
-        rest = self._claims[claim.child]
+        source, child = claim.source, claim.child
+        if self._loops and claim.is_accepted:  # before the edge is gone
+            self._unresolved |= self._ring(child)
+        del source.claims[claim.names]
+        if not source.claims:
+            del self._sources[source.robot][source]
+            if not self._sources[source.robot]:
+                del self._sources[source.robot]
+        rest = self._claims[child]
         rest.remove(claim)
+        if claim.is_accepted:
+            self._unresolved.add(child)
         if not rest:
-            del self._claims[claim.child]
-        self._outside.pop(claim, None)
+            del self._claims[child]
+            self._unresolved.discard(child)
+        if frame_owner(child) == source.robot:
+            self._count_own(claim, -1)
+        for robot in set(map(frame_owner, claim.names)).intersection(self._outside):
+            self._outside[robot].pop(claim, None)
+            if not self._outside[robot]:
+                del self._outside[robot]
         self._refused.pop(claim, None)
+        self._loops.pop(claim, None)
         # If all writers share all frames, samples that are refused as a whole have no claims.
         self.version += self._is_shared or claim.pose is None
         if self._is_in_buffer(claim):
             self.buffer.withdraw(claim.child)
-            self._is_resolved &= not rest
         if self._placed.get(claim.child) is claim:
             del self._placed[claim.child]
 
@@ -410,7 +499,8 @@ class FrameOwnership:
         self._add_frames(claim)
         self.buffer.insert_static(claim.pose, writer=claim.source.name)
         self._placed[claim.child] = claim
-        claim.is_accepted, claim.refusal = True, None
+        claim.is_accepted = True
+        self._set_refusal(claim, None)
 
     def _add_frames(self, claim: EdgeClaim) -> None:
         # Not if these are bare names of a robot's frames.
@@ -423,19 +513,29 @@ class FrameOwnership:
             return _MODEL if claim.source.is_model else _OWN
         return _OTHERS if owner in self._robots else _OWN
 
-    def resolve(self, published: Collection[EdgeClaim] = ()) -> None:
-        """Compare all edges, those in the buffer included, and make the buffer hold the accepted ones.
+    def resolve_edges(self, edges: Collection[EdgeNames]) -> None:
+        """Compare these edges with those that the buffer holds, for instance of its caller."""
+        with self._lock:
+            self._unresolved.update(self._named(names)[1] for names in edges)
+            self.resolve()
 
-        Reports refused static edges that were ``published`` just now, or accepted before.
+    def resolve(self, published: Collection[EdgeClaim] = ()) -> None:
+        """Compare the edges that may conflict, and make the buffer hold the accepted ones.
+
+        These are the edges of unresolved frames, and those that may form a loop with them: whether an edge is
+        accepted depends on no others. Reports refused static edges that were ``published`` just now, or
+        accepted before.
         """
         with self._lock:
-            accepted, roots = self._caller_edges()
-            claims = [claim for claims in self._claims.values() for claim in claims]
+            frames = self._compared_frames()
+            accepted = {frame: edge for frame in frames if (edge := self._caller_edge(frame)) is not None}
+            claims = [claim for frame in frames for claim in self._claims.get(frame, ())]
 
             def precedence(claim: EdgeClaim) -> tuple[int, bool, bool, bool, bool, int]:
                 is_departed, is_static = self._is_departed(claim), claim.pose is not None
                 is_over = is_departed and not claim.is_accepted  # of departed writers the last one counts
-                return self._rank(claim), claim.child in roots, is_departed, is_over, is_static, claim.order
+                is_root = self._is_root_of_model(claim.child)
+                return self._rank(claim), is_root, is_departed, is_over, is_static, claim.order
 
             claims.sort(key=precedence)
             refusals: dict[EdgeClaim, InsertRefused] = {}
@@ -454,8 +554,9 @@ class FrameOwnership:
                     del self._placed[claim.child]
             for claim in claims:
                 self.version += claim.pose is None and claim.is_accepted == (claim in refusals)
-                claim.is_accepted, claim.refusal = claim not in refusals, refusals.get(claim)
-            self._refused, self._is_resolved = dict.fromkeys(refusals), True
+                claim.is_accepted = claim not in refusals
+                self._set_refusal(claim, refusals.get(claim))
+            self._unresolved.clear()
             for edge in accepted.values():
                 claim = edge.claim
                 if claim is not None and (claim in published or not self._is_in_buffer(claim)):
@@ -464,29 +565,64 @@ class FrameOwnership:
                 if claim.pose is not None:
                     self._report(claim.source, refusals[claim])
 
-    def _caller_edges(self) -> tuple[dict[str, _AcceptedEdge], set[str]]:
-        """The edges in the buffer that are no claims, by child; and the roots of models."""
-        layout = self.buffer.tree_snapshot()
-        accepted: dict[str, _AcceptedEdge] = {}
-        for child, edge in layout.edges.items():
-            if edge is None:
-                continue
-            is_static, is_model = edge.kind == "static", edge.robot is not None
-            if is_static:
-                placed, found = self._placed.get(child), (edge.parent, edge.static_writer)
-                is_claimed = placed is not None and found == (placed.parent, placed.source.name)
-            else:
-                claims = self._claims.get(child, ())
-                is_claimed = any(claim.pose is None and claim.parent == edge.parent for claim in claims)
-            if is_model or not is_claimed:
-                pose = Transform.from_pose7(edge.parent, child, edge.pose) if is_static else None
-                rank = _MODEL if is_model else _CALLER
-                accepted[child] = _AcceptedEdge(edge.parent, edge.writer or "hand", rank, None, pose)
-        roots = {track.frame(track.model.root) for track in layout.robots.values()}
-        all_claims = (claim for claims in self._claims.values() for claim in claims)
-        of_models = [claim for claim in all_claims if self._rank(claim) == _MODEL]
-        roots |= {claim.parent for claim in of_models} - {claim.child for claim in of_models}
-        return accepted, roots
+    def _set_refusal(self, claim: EdgeClaim, refusal: InsertRefused | None) -> None:
+        claim.refusal = refusal
+        self._refused.pop(claim, None)
+        self._loops.pop(claim, None)
+        if refusal is not None:
+            self._refused[claim] = None
+            if refusal.reason == "loop":
+                self._loops[claim] = None
+
+    def _compared_frames(self) -> list[str]:
+        """The unresolved frames, each with those that may form a loop with it."""
+        frames: dict[str, None] = {}
+        for frame in self._unresolved:
+            if frame not in frames:
+                frames.update(dict.fromkeys(self._ring(frame)))
+        return list(frames)
+
+    def _ring(self, frame: str) -> set[str]:
+        """The frames on all loops through ``frame`` that edges would form, refused ones too; and itself."""
+        below: dict[str, list[str]] = {}
+        found, waiting = {frame}, [frame]
+        while waiting:
+            child = waiting.pop()
+            for parent in self._candidate_parents(child):
+                below.setdefault(parent, []).append(child)
+                if parent not in found:
+                    found.add(parent)
+                    waiting.append(parent)
+        ring, waiting = {frame}, [frame]
+        while waiting:
+            for child in below.get(waiting.pop(), ()):
+                if child not in ring:
+                    ring.add(child)
+                    waiting.append(child)
+        return ring
+
+    def _candidate_parents(self, child: str) -> set[str]:
+        parents = {claim.parent for claim in self._claims.get(child, ())}
+        edge = self.buffer.edge_of(child)
+        return parents if edge is None else parents | {edge.parent}
+
+    def _caller_edge(self, child: str) -> _AcceptedEdge | None:
+        """The edge in the buffer that places ``child``, unless it is a claim."""
+        edge = self.buffer.edge_of(child)
+        if edge is None:
+            return None
+        is_static, is_model = edge.kind == "static", edge.robot is not None
+        if is_static:
+            placed, found = self._placed.get(child), (edge.parent, edge.static_writer)
+            is_claimed = placed is not None and found == (placed.parent, placed.source.name)
+        else:
+            claims = self._claims.get(child, ())
+            is_claimed = any(claim.pose is None and claim.parent == edge.parent for claim in claims)
+        if is_claimed and not is_model:
+            return None
+        pose = Transform.from_pose7(edge.parent, child, edge.pose) if is_static else None
+        rank = _MODEL if is_model else _CALLER
+        return _AcceptedEdge(edge.parent, edge.writer or "hand", rank, None, pose)
 
     def _is_departed(self, claim: EdgeClaim) -> bool:
         is_unannounced = not self._is_shared and claim.pose is None and not self._is_live(claim.source)
@@ -498,6 +634,13 @@ class FrameOwnership:
         by, rank = claim.source.name, self._rank(claim)
         if rank == _OTHERS:
             rule = foreign_edge_problem(claim.source.robot, names, self._robots, self._placers)
+            if not rule and self._is_stray(child):
+                owner = frame_owner(child)
+                rule = (
+                    f"{child!r} is a frame of robot {owner!r}, but not its root, which is all that writers "
+                    f"of robot {claim.source.robot!r} may place; publish it as robot {owner!r} "
+                    f"(--robot {owner})"
+                )
             if rule:
                 return InsertRefused(rule, reason=FOREIGN_FRAME, edge=names)
         there = accepted.get(child)
@@ -526,6 +669,12 @@ class FrameOwnership:
         )
         return InsertRefused(text, reason="second parent", edge=names)
 
+    def _is_stray(self, frame: str) -> bool:
+        """Whether its robot places frames, but neither this one nor any on this one."""
+        robot = frame_owner(frame)
+        links, own = self._links.get(robot, ()), self._own_frames.get(robot, ())
+        return bool(links or own) and frame not in links and frame not in own
+
     def _prevails(self, claim: EdgeClaim, there: _AcceptedEdge | None) -> bool:
         """Whether it is the claim that is inserted, of all claims of the same edge."""
         if there is None:
@@ -543,8 +692,8 @@ class FrameOwnership:
             try:
                 self._insert(claim)
             except InsertRefused as error:  # the caller has changed the buffer since
-                claim.is_accepted, claim.refusal = False, error
-                self._refused[claim] = None
+                claim.is_accepted = False
+                self._set_refusal(claim, error)
                 self._report(claim.source, error)
 
     def _report(self, source: EdgeSource, error: InsertRefused) -> None:

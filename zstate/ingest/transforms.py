@@ -123,7 +123,7 @@ class TransformIngest(StreamIngest):
             if error is admitted.refusal or error.reason not in CONTESTED:
                 raise
         # The buffer holds a conflicting edge that was not compared yet.
-        self._ownership.resolve()
+        self._ownership.resolve_edges(edges)
         return self._insert_admitted(sample, edges, self._admit(source, edges))
 
     def _named_edges(self, names: Edges) -> Edges:

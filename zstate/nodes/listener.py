@@ -44,7 +44,7 @@ from zstate.wire.keys import (
     stream_key,
 )
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
-from zstate.wire.protocol import SerializedSample, selected_robots
+from zstate.wire.protocol import SerializedSample, Wire, selected_robots
 from zstate.wire.registry import get_wire
 
 Follow = Literal["joint_states", "tf"]
@@ -102,8 +102,6 @@ class TransformListener(Closeable):
         on_event: Callable[[WriterEvent], None] | None = None,
         placers: Collection[str] | None = None,
     ) -> None:
-        if isinstance(placers, str):
-            raise InvalidInput(f"placers is a collection of robot names, for instance {[placers]!r}")
         if follow not in ("joint_states", "tf"):
             raise InvalidInput(f"follow is 'joint_states' or 'tf', not {follow!r}")
         self._wire = get_wire(wire)
@@ -129,7 +127,7 @@ class TransformListener(Closeable):
             self.buffer,
             self._counters,
             is_shared=bool(self._wire.shared),
-            placers=None if placers is None else frozenset(map(check_robot, placers)),
+            placers=_checked_placers(placers, self._wire),
             on_conflict=self._events.add_second_edge,
         )
         self._names = self._ownership.live
@@ -446,7 +444,7 @@ class TransformListener(Closeable):
 
     def _set_followed_writer(self, samples: StreamIngests, announced: Announcement, *, alive: bool) -> None:
         robot, session = announced.robot, announced.writer.session
-        if samples.stream in EDGE_STREAMS:
+        if samples.stream in EDGE_STREAMS or (samples.stream == "tf" and not self._wire.shared):
             (self._ownership.add_writer if alive else self._ownership.remove_writer)(robot, session)
         elif self._follow == "joint_states":
             parts = self._joint_parts(robot)
@@ -468,6 +466,16 @@ class TransformListener(Closeable):
             samples.announce(robot, session, str(announced.writer))
         else:
             self._ingest_for(samples, robot, session).name_writer(session, str(announced.writer))
+
+
+def _checked_placers(placers: Collection[str] | None, wire: Wire) -> frozenset[str] | None:
+    if placers is None:
+        return None
+    if isinstance(placers, str):
+        raise InvalidInput(f"placers is a collection of robot names, for instance {[placers]!r}")
+    if wire.shared:
+        raise InvalidInput(f"placers need the native wire; on {wire.name!r} no frame belongs to a robot")
+    return frozenset(map(check_robot, placers))
 
 
 _LISTENERS: weakref.WeakSet[TransformListener] = weakref.WeakSet()

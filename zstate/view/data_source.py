@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,13 +47,14 @@ class ViewSource(Closeable):
         world: WorldData | None = None,
         history_s: float = 30.0,
         clock: Clock | None = None,
+        placers: Collection[str] | None = None,
     ) -> None:
         self.session = session
         self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
         self.listener: TransformListener | None = None
         if session is not None:
             robot = robots[0] if len(robots) == 1 else ANY
-            self.listener = TransformListener(session, robot, self.buffer, wire)
+            self.listener = TransformListener(session, robot, self.buffer, wire, placers=placers)
         self.world: WorldData = WorldSource(session, robots, wire) if world is None else world
         self._selected = frozenset(robots)
         self._version = 0

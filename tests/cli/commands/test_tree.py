@@ -45,6 +45,17 @@ def test_guides_show_parents_and_children():
     assert lines[7].startswith("            └── tool ")
 
 
+@pytest.mark.parametrize(
+    ("options", "parent"),
+    [([], "thief/x"), (["--placer", "thief"], "thief/x"), (["--placer", "site", "--placer", "fleet"], None)],
+)
+def test_only_placers_place_the_root_of_another_robot(options: list[str], parent: str | None):
+    with published_robot(), connect() as session, StaticPublisher(session, "thief", "edges") as statics:
+        statics.set(Transform("thief/x", "rrbot/world", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+        frames = json.loads("\n".join(drawn("--json", *options)))
+    assert {frame["name"]: frame["parent"] for frame in frames}["rrbot/world"] == parent
+
+
 def test_static_edges_of_other_writers_are_in_the_tree():
     with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
         statics.set(Transform("tool", "gauge", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))

@@ -63,6 +63,7 @@ _OWN_RATES: dict[Stream, str] = {"transforms": "transforms", "odometry": "odomet
 @click.option("--once", is_flag=True, help="Print one report, of the first second; give up after --timeout.")
 @options.timeout_option("How long --once waits for the pose, or for a robot.")
 @options.robot_filter_option
+@options.placer_option
 @options.json_option()
 @options.wire_option
 @options.reading_clock_option
@@ -77,6 +78,7 @@ def monitor_command(
     once: bool,
     timeout: float,
     robot: str,
+    placers: tuple[str, ...] | None,
     wire: str,
     clock: str | None,
     metrics: BindAddress | None,
@@ -113,6 +115,8 @@ def monitor_command(
 
     if robots and target is not None:
         raise click.UsageError("--robots takes no frames; --robot NAME selects a robot")
+    if robots and placers is not None:
+        raise click.UsageError("--placer is for edges, which --robots does not show")
     if metrics is not None and not robots:
         raise click.UsageError("--metrics needs --robots")
     if target is not None and source is None:
@@ -138,7 +142,13 @@ def monitor_command(
             return
         listener = opened.enter_context(
             TransformListener(
-                session, robot, wire=wire, follow=follow, clock=selected_clock, history_on_join=False
+                session,
+                robot,
+                wire=wire,
+                follow=follow,
+                clock=selected_clock,
+                history_on_join=False,
+                placers=placers,
             )
         )
         statistics = opened.enter_context(EdgeStatistics(session, robot, wire, follow, listener.buffer.clock))

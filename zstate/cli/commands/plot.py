@@ -72,6 +72,7 @@ def plot_file(file: str) -> Path:
     type=options.Checked("FILE", plot_file),
     help="PNG, SVG or PDF; default: ROBOT.png or B.png.",
 )
+@options.placer_option
 @options.wire_option
 @options.session_options
 def plot_command(
@@ -84,6 +85,7 @@ def plot_command(
     start: float | None,
     seconds: float | None,
     output: Path | None,
+    placers: tuple[str, ...] | None,
     wire: str,
 ) -> None:
     """Draw the joint positions of ROBOT over time, or the path of a frame, into a file.
@@ -115,7 +117,7 @@ def plot_command(
         with open_session(network, (wire,)) as session:
             name = robot or messages_for(wire).robot or ("*" if frames else only_robot(session))
             if frames:
-                series = _live_path(session, name, wire, frames, seconds or _LIVE_S)
+                series = _live_path(session, name, wire, frames, seconds or _LIVE_S, placers=placers)
             else:
                 series = _live_joints(session, name, wire, seconds or _LIVE_S)
     series = series.select(joints)
@@ -245,7 +247,13 @@ def _live_joints(session: Session, robot: str, wire: str, seconds: float) -> Tim
 
 
 def _live_path(
-    session: Session, robot: str, wire: str, frames: tuple[str, str], seconds: float
+    session: Session,
+    robot: str,
+    wire: str,
+    frames: tuple[str, str],
+    seconds: float,
+    *,
+    placers: tuple[str, ...] | None,
 ) -> TimeSeries:
     """The path of frame B in frame A for ``seconds`` from now on. Fails if no pose is known within 10 s."""
     from zstate.cli.waiting import PoseWaiter
@@ -255,7 +263,13 @@ def _live_path(
     with (
         RobotDirectory(session, robot, wire) as directory,
         TransformListener(
-            session, robot, wire=wire, follow=follow, history_s=history_s, history_on_join=False
+            session,
+            robot,
+            wire=wire,
+            follow=follow,
+            history_s=history_s,
+            history_on_join=False,
+            placers=placers,
         ) as listener,
     ):
         PoseWaiter(listener, directory, *frames).wait(timeout_s=_WAIT_S)

@@ -60,6 +60,7 @@ def _parse_stamp(text: str) -> int:
     help="Number of decimals; JSON has all digits.",
 )
 @options.robot_filter_option
+@options.placer_option
 @options.json_option()
 @options.wire_option
 @options.reading_clock_option
@@ -76,6 +77,7 @@ def tf_command(
     twist: bool,
     precision: int,
     robot: str,
+    placers: tuple[str, ...] | None,
     wire: str,
     clock: str | None,
     as_json: bool,
@@ -103,7 +105,12 @@ def tf_command(
         RobotDirectory(session, robot, wire) as directory,
         open_clock(session, clock, wire, timeout_s=timeout if ends else None) as selected_clock,
         TransformListener(
-            session, robot, wire=wire, follow=default_stream(wire), clock=selected_clock
+            session,
+            robot,
+            wire=wire,
+            follow=default_stream(wire),
+            clock=selected_clock,
+            placers=placers,
         ) as listener,
     ):
         waiter = PoseWaiter(listener, directory, target, source)

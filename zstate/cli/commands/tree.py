@@ -48,9 +48,12 @@ _NARROW_HEADINGS = ("frame", "rate and age", "writer")
 @click.command("tree")
 @click.argument("robot", default="*", metavar="[ROBOT]")
 @options.form_options("One JSON array of frames.", "A picture, from the top down.")
+@options.placer_option
 @options.wire_option
 @options.session_options
-def tree_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
+def tree_command(
+    network: SessionOptions, robot: str, form: str | None, placers: tuple[str, ...] | None, wire: str
+) -> None:
     """Show the frames of ROBOT, or of all announced robots, as a tree.
 
     Each edge has its kind, the rate of its samples, the age of the newest one, and its writer. In a narrow
@@ -65,7 +68,11 @@ def tree_command(network: SessionOptions, robot: str, form: str | None, wire: st
     """
     is_native, messages = not is_ros(wire), messages_for(wire)
     with open_session(network, (wire,)) as session:
-        frames = _collect_frames(session, robot) if is_native else _collect_ros_frames(session, robot, wire)
+        frames = (
+            _collect_frames(session, robot, placers)
+            if is_native
+            else _collect_ros_frames(session, robot, wire)
+        )
         now = time.time_ns()
     if form == "json":
         from zstate.clock import SYSTEM  # loads numpy
@@ -89,7 +96,9 @@ def tree_command(network: SessionOptions, robot: str, form: str | None, wire: st
     print_result(draw(tree_drawing(frames, now, in_full=not is_native), form, title))
 
 
-def _collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
+def _collect_frames(
+    session: Session, robot: str, placers: Sequence[str] | None = None
+) -> tuple[FrameInfo, ...]:
     """Every frame of ``robot``, or of all robots for "*", with rates and stamps of received samples.
 
     Prints on standard error which announced models and static edges did not arrive, or that no robot is
@@ -107,7 +116,7 @@ def _collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     from zstate.nodes.listener import TransformListener
 
     waiter = ConditionWaiter()
-    with TransformListener(session, robot) as listener:
+    with TransformListener(session, robot, placers=placers) as listener:
         listener.add_observer(waiter.notify)
         robots = discovery.result()
         if not robots:

@@ -102,6 +102,7 @@ def _point(text: str) -> tuple[float, float, float]:
     help="Initial position of the camera and, after the colon, the point it looks at [m, fixed frame]; "
     "default: all robots in sight.",
 )
+@options.placer_option
 @options.wire_option
 @options.reading_clock_option
 @options.session_options
@@ -117,6 +118,7 @@ def view_command(
     size: tuple[int, int],
     fixed_frame: str,
     camera: Camera | None,
+    placers: tuple[str, ...] | None,
     wire: str,
     clock: str | None,
 ) -> None:
@@ -185,7 +187,13 @@ def view_command(
                 publishers = [its for _, its in moved if not _has_driver(session, its)]
             selected_clock = opened.enter_context(open_clock(session, clock, wire))
             source = opened.enter_context(
-                ViewSource(session, [one.robot for one in named], wire=wire, clock=selected_clock)
+                ViewSource(
+                    session,
+                    [one.robot for one in named],
+                    wire=wire,
+                    clock=selected_clock,
+                    placers=placers,
+                )
             )
         page = opened.enter_context(ViewServer(port=0) if snapshot else ViewServer(host, port))
         view = opened.enter_context(
