@@ -189,7 +189,7 @@ class Limits:
         outside = (positions < lower - ROUNDING) | (positions > upper + ROUNDING)
         return tuple(
             f"{self.joint_names[row]!r} at {positions[row]:.9g} {self.units[row]} is outside "
-            f"{self.range_text(row)}{self._degrees_text(row, float(positions[row]))}"
+            f"{self.range_text(row)}{self.degrees_text(row, float(positions[row]))}"
             for row in np.flatnonzero(outside).tolist()
         )
 
@@ -228,7 +228,8 @@ class Limits:
             raise InvalidInput(f"{what} must be finite; not so: {bad}")
         return vector
 
-    def _degrees_text(self, row: int, value: float) -> str:
+    def degrees_text(self, row: int, value: float) -> str:
+        """A hint for a position ``value`` of the joint ``joint_names[row]`` that is probably in degrees."""
         is_angle = self.units[row] == "rad" and abs(value) > math.tau
         if is_angle and self.lower[row] <= math.radians(value) <= self.upper[row]:
             return "; this looks like degrees: convert with math.radians"

@@ -174,9 +174,11 @@ class Trajectory:
         excess = np.maximum(lower[rows] - values, values - upper[rows])
         for column, (row, at) in enumerate(zip(rows, excess.argmax(axis=0).tolist(), strict=True)):
             if excess[at, column] > ROUNDING:
+                value = float(values[at, column])
                 yield (
-                    f"{self.joint_names[column]!r} at {values[at, column]:.9g} {limits.units[row]} "
-                    f"is outside {limits.range_text(row)}, {times[at, column]:.6g} s after the start"
+                    f"{self.joint_names[column]!r} at {value:.9g} {limits.units[row]} is outside "
+                    f"{limits.range_text(row)}, {times[at, column]:.6g} s after the start"
+                    f"{limits.degrees_text(row, value)}"
                 )
 
     def _rate_findings(self, verb: str, order: int, bounds: Floats, units: list[str]) -> Iterator[str]:

@@ -6,6 +6,7 @@ import json
 import os
 import pty
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Generator
@@ -29,7 +30,7 @@ def driven(spawn: Spawn, name: str = "rrbot") -> Child:
     robot = "diffbot" if name == "diffbot" else "rrbot"
     child = started(spawn, "drive", "sim", robot, "--name", name, "--ttl", "10")
     assert child.line().startswith(f"driving {name!r}")
-    assert child.line() == "ready"
+    line_with(child, "ready")
     return child
 
 
@@ -58,13 +59,35 @@ def test_motion_beyond_the_limits_is_refused_with_all_findings_and_stretched_on_
     driven(spawn)
     fast = ("move", "rrbot", "shoulder=1", "elbow=-1", "--seconds", "0.3")
     # A cubic at rest at both ends has its largest speed, 1.5 times the mean, half-way: 1.5 * 1 / 0.3.
-    *_, shoulder, elbow = failure(*fast).splitlines()
+    # Its acceleration is 6 * 1 / 0.3^2 at both ends, and the limits are reached in 0.2 s by default.
+    *_, shoulder, elbow, starting, bending = failure(*fast).splitlines()
     assert "'shoulder' moves at 5 rad/s, above 2.5" in shoulder
     assert "'elbow' moves at -5 rad/s, above 3.5" in elbow
+    assert "'shoulder' accelerates at 66.6666667 rad/s^2, above 12.5" in starting
+    assert "'elbow' accelerates at -66.6666667 rad/s^2, above 17.5" in bending
     refused = zstate(*fast, "--json")
     document = json.loads(refused.stdout)
-    assert (refused.returncode, document["outcome"], len(document["findings"])) == (1, "refused", 2)
+    assert (refused.returncode, document["outcome"], len(document["findings"])) == (1, "refused", 4)
+    assert document["reason"] == "", "a text, as of every other outcome"
     assert json.loads(printed(*fast, "--stretch", "--json"))["outcome"] == "reached"
+
+
+def test_degrees_are_converted_on_request_and_guessed_in_a_refusal(spawn: Spawn):
+    line_with(started(spawn, "drive", "sim", "gripper", "--ttl", "10"), "ready")
+    text = failure("move", "gripper", "thumb_joint=60")
+    assert "'thumb_joint' at 60 rad is outside 0 to 1.2" in text
+    assert "s after the start; this looks like degrees" in text
+    assert "--deg takes numbers in degrees" in text
+    with connect() as session, JointStateListener(session, "gripper") as joints:
+        newest: list[JointReading] = []
+
+        def is_there(positions: list[float]) -> bool:
+            newest.extend(one for one in [joints.read(0)] if one is not None)
+            return bool(newest) and np.allclose(newest[-1].positions, positions, atol=2e-3)
+
+        # The linear joint stays in metres.
+        printed("move", "gripper", "thumb_joint=60", "finger_joint=0.03", "--deg")
+        until(lambda: is_there([0.03, np.pi / 3]))
 
 
 def test_points_of_a_file_are_followed(spawn: Spawn, tmp_path: Path):
@@ -217,6 +240,29 @@ def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: 
         until(lambda: np.allclose(measured(), 0.0, atol=0.01))
         os.write(keyboard, b"q")
         assert move.wait(DEADLINE_S) == 0
+
+
+@pytest.mark.parametrize("end", ["q", "signal"])
+def test_wheels_stop_at_once_when_the_program_of_the_keys_ends(spawn: Spawn, end: str):
+    # By its ttl the driver would turn the wheels for longer than this test waits.
+    line_with(started(spawn, "drive", "sim", "diffbot", "--ttl", f"{4 * DEADLINE_S}"), "ready")
+    with connect() as session, JointStateListener(session, "diffbot") as joints:
+        rates = np.zeros(2)
+
+        def measured() -> np.ndarray:
+            reading = joints.read(0)
+            if reading is not None and reading.velocities is not None:
+                rates[:] = reading.velocities
+            return rates
+
+        with keys_moving("diffbot") as (keyboard, move):
+            with repeated(lambda: os.write(keyboard, b"w")):
+                until(lambda: np.allclose(measured(), [4.0, 4.0], atol=0.1))
+                if end == "signal":
+                    move.send_signal(signal.SIGTERM)
+            os.write(keyboard, b"q")
+            move.wait(DEADLINE_S)
+        until(lambda: np.allclose(measured(), 0.0, atol=0.01))
 
 
 def test_keys_need_a_terminal_and_joints_that_are_wheels(spawn: Spawn):

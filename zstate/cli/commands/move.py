@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from zstate.driving import Commander
     from zstate.driving.driver import StopMode
     from zstate.driving.motion import Motion, Outcome
+    from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.wire.messages import DriverState
 
@@ -39,6 +41,7 @@ _CHECK_S = 1.0
 _WHEEL_RATE = 4.0
 _CANCELLED_WITHIN_S = 2.0
 _CACHES_WITHIN_S = 0.5
+_DEGREES_HINT = "this looks like degrees"
 
 
 def _parse_wheels(text: str) -> tuple[str, str]:
@@ -79,6 +82,7 @@ def _check_wheel_rate(rate: float) -> float:
     is_flag=True,
     help="Each VALUE is a velocity [rad/s or m/s]: move at it for --seconds, then brake.",
 )
+@click.option("--deg", is_flag=True, help="Numbers of joints that turn are in degrees, not in radians.")
 @click.option("--stretch", is_flag=True, help="Move slower where the limits need it, instead of refusing.")
 @click.option("--keys", is_flag=True, help="Drive a robot on two wheels by the keys of this terminal.")
 @click.option(
@@ -103,6 +107,7 @@ def move_command(
     seconds: float | None,
     file: str | None,
     velocity: bool,
+    deg: bool,
     stretch: bool,
     keys: bool,
     wheels: tuple[str, str] | None,
@@ -113,10 +118,11 @@ def move_command(
 ) -> None:
     """Move joints of ROBOT, which has a driver, and wait until they are there.
 
-    VALUE is a position in radians, or metres for a linear joint; other joints stay where they are. The motion
-    starts and ends at rest, and is checked as a whole against the limits of position, velocity and
-    acceleration: a motion that would leave them is refused with all findings, and nothing moves. Ctrl-C
-    cancels it, and the joints brake. The exit code is 0 if the joints have reached the last point.
+    VALUE is a position in radians, or in degrees with --deg, or metres for a linear joint; other joints stay
+    where they are. The motion starts and ends at rest, and is checked as a whole against the limits of
+    position, velocity and acceleration: a motion that would leave them is refused with all findings, and
+    nothing moves. Ctrl-C cancels it, and the joints brake. The exit code is 0 if the joints have reached the
+    last point.
 
     With --velocity the joints, such as wheels, speed up within the limit of acceleration, keep VALUE for
     --seconds, and brake, also on Ctrl-C and when this command ends otherwise. They slow down before the
@@ -130,12 +136,13 @@ def move_command(
     \b
     zstate move panda panda_joint4=-1.2 panda_joint6=2
     zstate move panda panda_joint4=-1.2 --seconds 3
+    zstate move panda panda_joint4=-70 --deg
     zstate move panda --file wave.csv --stretch
     zstate move diffbot --velocity left_wheel_joint=2 right_wheel_joint=2 --seconds 3
     zstate move rover --keys
     """
     if keys:
-        if positions or file is not None or seconds is not None or velocity or stretch or as_json:
+        if positions or file is not None or seconds is not None or velocity or deg or stretch or as_json:
             raise click.UsageError("--keys goes with --wheels, --wheel-rate and --timeout alone")
         _move_by_keys(robot, wheels, wheel_rate, timeout, network)
         return
@@ -151,20 +158,17 @@ def move_command(
         points, times_s = {joint: [value] for joint, value in numbers.items()}, [seconds or _SECONDS]
     with open_session(network) as session, Commander(session, robot) as commander:
         state = commander.wait_for_driver(timeout)
+        if deg:
+            points = _in_radians(points, _turning_joints(session, robot, timeout))
         if velocity:
-            _keep_velocities(commander, state, numbers, seconds or _SECONDS)
+            rates = {joint: values[0] for joint, values in points.items()}
+            _keep_velocities(commander, state, rates, seconds or _SECONDS)
             if as_json:
                 _print_outcome(robot, "ended")
             return
         started = time.monotonic()
-        try:
-            motion = commander.move(points, times_s, stretch=stretch or (file is None and seconds is None))
-        except MotionRefused as refusal:
-            if as_json:
-                print_json(
-                    {"robot": robot, "outcome": "refused", "reason": None, "findings": refusal.findings}
-                )
-            raise
+        is_stretched = stretch or (file is None and seconds is None)
+        motion = _begun(commander, points, times_s, stretch=is_stretched, as_json=as_json)
         print_status(f"moving {', '.join(points)} of {robot!r}; Ctrl-C cancels", event="moving", robot=robot)
         outcome = _outcome(commander, motion)
     if as_json:
@@ -188,6 +192,51 @@ def _by_joint(values: Sequence[tuple[str, float]]) -> dict[str, float]:
     if len(dict(values)) < len(values):
         raise click.UsageError("a joint is given twice")
     return dict(values)
+
+
+def _begun(
+    commander: Commander,
+    points: dict[str, list[float]],
+    times_s: list[float],
+    *,
+    stretch: bool,
+    as_json: bool,
+) -> Motion:
+    """The motion through ``points``. Raises MotionRefused, with a hint at --deg for degrees."""
+    try:
+        return commander.move(points, times_s, stretch=stretch)
+    except MotionRefused as refusal:
+        if as_json:
+            _print_outcome(commander.robot, "refused", findings=refusal.findings)
+        if any(_DEGREES_HINT in text for text in refusal.findings):
+            fail(f"{refusal}\n--deg takes numbers in degrees")
+        raise
+
+
+def _in_radians(points: dict[str, list[float]], turning: set[str]) -> dict[str, list[float]]:
+    """``points`` with the numbers of the joints ``turning`` in radians, which are given in degrees."""
+    return {
+        joint: [math.radians(value) for value in values] if joint in turning else values
+        for joint, values in points.items()
+    }
+
+
+def _turning_joints(session: Session, robot: str, timeout_s: float) -> set[str]:
+    """The joints of ``robot`` whose positions are angles, by its model. Ends the command without one."""
+    from zstate.clock import wait_interruptible
+    from zstate.sources.joint_state_listener import DescriptionSubscriber
+
+    turning: set[str] = set()
+    has_arrived = threading.Event()
+
+    def on_model(_: str, model: RobotModel) -> None:
+        turning.update(joint.name for joint in model.joints if joint.type != "prismatic")
+        has_arrived.set()
+
+    with DescriptionSubscriber(session, robot, on_model):
+        if not wait_interruptible(has_arrived, timeout_s):
+            fail(f"--deg needs the model of {robot!r}, which has not arrived within {timeout_s:g} s")
+    return turning
 
 
 def _keep_velocities(
@@ -252,7 +301,7 @@ def _outcome(commander: Commander, motion: Motion) -> Outcome:
 def _move_by_keys(
     robot: str, wheels: tuple[str, str] | None, rate: float, timeout_s: float, network: SessionOptions
 ) -> None:
-    """Turn the wheels of ``robot`` while keys are held, until q."""
+    """Turn the wheels of ``robot`` while keys are held, until q or a signal."""
     from zstate.cli.keyboard import KEYS_TEXT, HeldKey, KeyReader
     from zstate.driving import Commander
 
@@ -260,18 +309,23 @@ def _move_by_keys(
         left, right = wheels or _wheels_of(commander.wait_for_driver(timeout_s), robot)
         print_status(f"driving {left} and {right} of {robot!r}: {KEYS_TEXT}", event="driving", robot=robot)
         held, was_moving, shown = HeldKey(), False, ""
-        while True:
-            for key in reader.read(_SEND_PERIOD_S):
-                if key == "q":
-                    return
-                held.press(key, time.monotonic())
-            rates = held.wheel_rates(time.monotonic(), rate)
-            if rates is not None or was_moving:
-                commander.send(velocities=dict(zip((left, right), rates or (0.0, 0.0), strict=True)))
-            was_moving = rates is not None
-            if (problem := _problem(commander)) != shown:
-                shown = problem
-                print_status(problem or f"driving {robot!r} again", event="state", robot=robot)
+        try:
+            while True:
+                for key in reader.read(_SEND_PERIOD_S):
+                    if key == "q":
+                        return
+                    held.press(key, time.monotonic())
+                rates = held.wheel_rates(time.monotonic(), rate)
+                if rates is not None or was_moving:
+                    commander.send(velocities=dict(zip((left, right), rates or (0.0, 0.0), strict=True)))
+                was_moving = rates is not None
+                if (problem := _problem(commander)) != shown:
+                    shown = problem
+                    print_status(problem or f"driving {robot!r} again", event="state", robot=robot)
+        finally:
+            if was_moving:  # also after q and Ctrl-C: else the wheels turn until the ttl
+                with suppress(ZStateError):
+                    commander.send(velocities={left: 0.0, right: 0.0})
 
 
 def _wheels_of(state: DriverState, robot: str) -> tuple[str, str]:
