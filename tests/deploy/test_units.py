@@ -49,12 +49,30 @@ def test_unit_restarts_and_has_few_permissions(name: str):
     assert service["NoNewPrivileges"] == "true"
 
 
+def test_the_unit_of_a_driver_may_open_devices_and_keeps_the_stops():
+    service = unit("zstate-drive@.service")["Service"]
+    assert service["PrivateDevices"] == "false"
+    assert "ProtectClock" not in service, "it allows one device, and by that no other"
+    assert "AF_CAN" in service["RestrictAddressFamilies"].split()
+    assert (service["RestrictRealtime"], service["LimitRTPRIO"]) == ("false", "50")
+    assert service["SupplementaryGroups"] == "dialout"
+    # Stops are in $XDG_STATE_HOME/zstate, which systemd makes for the unit's user.
+    assert service["Environment"] == "XDG_STATE_HOME=/var/lib"
+    assert service["StateDirectory"] == "zstate"
+
+
 @pytest.mark.processes
 def test_programs_of_the_units_connect_and_exit_as_expected(spawn: Any, tmp_path):
     endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     config = tmp_path / "router.json5"
     config.write_text(f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }} }}')
-    values = {"${ROBOT_MODEL}": "rrbot", "%i": "r1", "/etc/zstate/router.json5": str(config)}
+    values = {
+        "${ROBOT_MODEL}": "rrbot",
+        "${ROBOT_DRIVER}": "sim",
+        "%i": "r1",
+        "/etc/zstate/router.json5": str(config),
+    }
+    values |= {"$DRIVE_OPTIONS": "--plant=mirror"}
 
     def start(name: str) -> Any:
         program, *arguments = shlex.split(unit(name)["Service"]["ExecStart"])
@@ -69,7 +87,13 @@ def test_programs_of_the_units_connect_and_exit_as_expected(spawn: Any, tmp_path
     router.line()
     robot = start("zstate-publish@.service")
     robot.line()
-    for name, child in (("zstate-publish@.service", robot), ("zstate-router.service", router)):
+    ends = [("zstate-publish@.service", robot), ("zstate-router.service", router)]
+    for name, child in ends:
+        if child is router:
+            driver = start("zstate-drive@.service")
+            driver.line()
+            os.kill(driver.process.pid, signal.SIGTERM)
+            assert str(driver.wait()) == unit("zstate-drive@.service")["Service"]["SuccessExitStatus"]
         os.kill(child.process.pid, signal.SIGTERM)
         assert str(child.wait()) == unit(name)["Service"]["SuccessExitStatus"]
 
