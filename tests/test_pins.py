@@ -260,7 +260,7 @@ def test_keys_of_every_json_output(tmp_path: Path):
     broken.write_text("<robot name='b'><link name='a'/><link name='b'/></robot>")
     with standing_robot():
         subprocess.run(
-            [sys.executable, "-m", "zstate", "record", recording, "--duration", "1"],
+            [sys.executable, "-m", "zstate", "record", recording, "--seconds", "1"],
             check=True, capture_output=True, timeout=30.0,
         )  # fmt: skip
         documents = {" ".join(words): zstate_json(*words, "--json") for words in JSON_COMMANDS}

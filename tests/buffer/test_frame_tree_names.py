@@ -212,6 +212,9 @@ def test_unknown_frames_come_with_near_misses() -> None:
     assert "left_camera" in error.near_misses
     assert "right_wheel" not in error.near_misses
     assert error.requested == 5
+    cut_off = failure(buffer, "base", "left")
+    assert isinstance(cut_off, UnknownFrame)
+    assert cut_off.near_misses == ("left_camera",)  # not similar, and its beginning
     assert isinstance(failure(TransformBuffer(), "x", "x"), UnknownFrame)
 
 

@@ -88,8 +88,9 @@ def test_help_is_a_command_too():
     ],
 )
 def test_the_forms_of_static_transform_publisher_are_translated(given: str, written: str):
-    message = failure("static", *given.split(), code=2)
-    assert f"static_transform_publisher; here it is\n  zstate static {written}\n" in message
+    for command in ("static", "static_transform_publisher"):
+        message = failure(command, *given.split(), code=2)
+        assert f"static_transform_publisher; here it is\n  zstate static {written}\n" in message
 
 
 def test_unknown_option_gets_a_suggestion_only_if_one_is_similar():

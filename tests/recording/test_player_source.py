@@ -68,7 +68,7 @@ def test_unknown_robot_error_lists_the_robots(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         for robot in ("a", "b"):
             bag.joints(START, {"shoulder": 0.0}, f"/{robot}/joint_states")
-    with pytest.raises(InvalidInput, match="of one robot; it has those of 'a', 'b'"):
+    with pytest.raises(InvalidInput, match="of one robot; it has those of 'a', 'b': name one of them"):
         RecordedSource(tmp_path / "bag", None, RRBOT)
 
 

@@ -166,7 +166,8 @@ class FrameNameIndex:
                 candidates = [
                     bare if (bare := _bare(full)) and bares[bare] == 1 else full for full in candidates
                 ]
-            return get_close_matches(name, candidates, n=3, cutoff=0.7)
+            near = get_close_matches(name, candidates, n=3, cutoff=0.7)
+            return near or sorted(one for one in candidates if one.startswith(name))[:3]
 
         return search
 

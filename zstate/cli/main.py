@@ -241,7 +241,10 @@ class Commands(click.Group):
                 click.echo(ctx.get_help())
                 ctx.exit()
         if args[0] not in _COMMANDS and not args[0].startswith("-"):
-            ctx.fail(f"there is no command {args[0]!r}; {command_hint(args[0], _COMMANDS)}")
+            ctx.fail(
+                _ros_static_hint(args)
+                or f"there is no command {args[0]!r}; {command_hint(args[0], _COMMANDS)}"
+            )
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -391,7 +394,7 @@ def _unquoted_path(arguments: Sequence[str]) -> str:
 
 def _ros_static_hint(arguments: Sequence[str]) -> str:
     """Arguments of ROS's static_transform_publisher, in either form, as arguments of `zstate static`."""
-    if not arguments or arguments[0] != "static":
+    if not arguments or arguments[0] not in ("static", "static_transform_publisher"):
         return ""
     static = _from_options(arguments[1:]) or _from_positions(arguments[1:])
     form = "that is the form of ROS's static_transform_publisher; here it is"

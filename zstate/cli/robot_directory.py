@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from zstate._util.closeable import Closeable
 from zstate.cli.output.console import fail
-from zstate.cli.output.wire_text import is_ros, messages_for
+from zstate.cli.output.wire_text import NativeMessages, is_ros, messages_for
 
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
@@ -33,7 +33,7 @@ def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
 
 def check_found(robots: Sequence[RobotInfo]) -> None:
     """Fail if there are no ``robots`` and discovery is incomplete: that is no empty fleet."""
-    if not robots and (reason := messages_for("native").incomplete_text()):
+    if not robots and (reason := NativeMessages().incomplete_text()):
         fail(f"no robot is found, and discovery is incomplete: {reason}")
 
 

@@ -82,17 +82,20 @@ class Grid:
         A point with NaN is outside. z matters only if ``origin`` is tilted. Raises InvalidInput for other
         shapes.
         """
-        columns, rows = self._cell_coordinates(points)
-        height, width = self.cells.shape
-        # As floats: far points have no int64 coordinates. NaN fails each comparison.
-        is_inside = (columns >= 0.0) & (columns < width) & (rows >= 0.0) & (rows < height)
+        columns, rows, is_inside = self._cell_coordinates(points)
         found = np.full(len(columns), UNKNOWN, dtype=np.int8)
         inside = rows[is_inside].astype(np.intp), columns[is_inside].astype(np.intp)
         found[is_inside] = self.cells[inside]
         return found
 
-    def _cell_coordinates(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Columns and rows of points in ``frame``, with fractions."""
+    def covers(self, x: float, y: float) -> bool:
+        """Whether the point x, y in ``frame`` [m] is inside the grid, over a known cell or not."""
+        return bool(self._cell_coordinates([(x, y)])[2][0])
+
+    def _cell_coordinates(
+        self, points: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Columns and rows of points in ``frame``, with fractions, and whether each is inside."""
         array = real_numbers(points, "points")
         if array.ndim != 2 or array.shape[1] not in (2, 3):
             raise InvalidInput(f"points in a grid have the shape (N, 2) or (N, 3); got {array.shape}")
@@ -100,7 +103,9 @@ class Grid:
             array = np.column_stack((array, np.zeros(len(array))))
         with np.errstate(invalid="ignore"):
             columns, rows, _ = self.origin.inverse().apply(array).T / self.resolution
-        return columns, rows
+        height, width = self.cells.shape
+        # As floats: far points have no int64 coordinates. NaN fails each comparison.
+        return columns, rows, (columns >= 0.0) & (columns < width) & (rows >= 0.0) & (rows < height)
 
     def to_image(self) -> NDArray[np.uint8]:
         """The grid as RGBA, (height, width, 4), the row of the largest y first.

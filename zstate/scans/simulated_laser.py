@@ -80,6 +80,7 @@ class SimulatedLaser:
         self._angles = rays.angle_min + rays.angle_increment * np.arange(ray_count)
         self._resolution = grid.resolution
         self._origin = grid.planar_origin()
+        self._grid = grid
         self._distances = free_distances(grid.cells >= OCCUPIED_FROM)
         self._noise_m = noise_m
         self._random = np.random.default_rng(seed)
@@ -88,6 +89,10 @@ class SimulatedLaser:
     def sweep_ns(self) -> int:
         """The time from the first ray to the last [ns]."""
         return self._rays.end_stamp
+
+    def is_on_map(self, x: float, y: float) -> bool:
+        """Whether a sensor at x, y [m] in the grid's frame is inside the grid."""
+        return self._grid.covers(x, y)
 
     def stamps(self, stamp: int) -> NDArray[np.int64]:
         """The instant of each ray [ns] of the scan that starts at ``stamp``: (ray_count,)."""
@@ -174,6 +179,8 @@ class MountedLaser:
         self._laser, self._buffer = laser, buffer
         self._frame, self._map_frame = frame, map_frame
         self._last = -1
+        self.is_off_map = False
+        """Whether the laser was outside the map at its last sweep."""
 
     @property
     def target(self) -> str:
@@ -215,6 +222,7 @@ class MountedLaser:
         if not valid.all():
             return None
         self._last = end
+        self.is_off_map = not self._laser.is_on_map(*poses[-1, :2].tolist())
         return self._laser.scan_in_space(first, poses)
 
     def _newest(self, target: str, stamp: int) -> int:

@@ -67,7 +67,7 @@ def test_without_panda_demo_shows_rrbot_and_prints_how_to_install_more():
 
 
 def test_ctrl_c_ends_both_processes_with_the_summary(spawn: Spawn):
-    demo = started(spawn, "demo", "--robot", RRBOT)
+    demo = started(spawn, "demo", RRBOT)
     publisher = publisher_of(demo)
     demo.line()
     interrupted(demo)

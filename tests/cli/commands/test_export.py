@@ -63,7 +63,7 @@ def test_wrong_usage_is_explained(run: Path, tmp_path: Path):
     both = ("--rate", "10", "--stamps", str(stamps))
     assert "exclude each other" in failure("export", str(run), "--csv", *both, code=2)
     assert "joint_states of 'leg'; it has those of 'arm'" in failure(
-        "export", str(run), "--csv", "--robot", "leg", "--pose", "map", "arm/tool"
+        "export", str(run), "leg", "--csv", "--pose", "map", "arm/tool"
     )
     assert "'arm/tol'" in failure("export", str(run), "--csv", "--pose", "map", "arm/tol")
     assert not run.with_suffix(".csv").exists()

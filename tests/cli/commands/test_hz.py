@@ -22,6 +22,13 @@ def test_hz_prints_rostopic_style_figures_once_a_second(spawn: Spawn):
     interrupted(command)
 
 
+def test_hz_ends_after_the_seconds_that_are_given():
+    with published_robot():
+        ended = zstate("hz", "rrbot", "--seconds", "1.5", "--json")
+    assert ended.returncode == 0
+    assert len(ended.stdout.splitlines()) == 2  # each of a second, the second one to its end
+
+
 @pytest.mark.parametrize("stream", ["joint_states", "tf"])
 def test_json_has_the_numbers_of_either_stream(stream: str):
     with published_robot():

@@ -34,7 +34,7 @@ def test_live_odometry_drives_the_rover_and_its_recording_gives_a_report_and_a_p
     file, plot = tmp_path / "run.mcap", tmp_path / "run.png"
     with connect() as session, TransformListener(session, "rover") as listener:
         listener.buffer.wait("odom", "base_footprint", timeout_s=DEADLINE_S)
-        assert zstate("record", str(file), "rover", "--duration", "4").returncode == 0
+        assert zstate("record", str(file), "rover", "--seconds", "4").returncode == 0
         # It drives its square as soon as it has an odometry.
         until(lambda: listener.buffer.lookup("odom", "base_footprint").translation[0] > 0.1)
     replayed = zstate("odometry", "rover", "--file", SETTINGS, "--replay", str(file), "--plot", str(plot))

@@ -102,7 +102,7 @@ def test_a_recording_is_drawn_whole_or_in_part(tmp_path: Path):
     needs_matplotlib()
     recording, joints, path = (tmp_path / name for name in ("run.mcap", "joints.svg", "path.svg"))
     with published_robot():
-        assert zstate("record", str(recording), "--duration", "1.5").returncode == 0
+        assert zstate("record", str(recording), "--seconds", "1.5").returncode == 0
     ended = zstate("plot", "--file", str(recording), "--joint", "elbow", "--output", str(joints))
     assert "1 curve, " in ended.stdout.decode(), ended.stderr
     assert "shoulder" not in texts(joints)

@@ -37,7 +37,7 @@ def test_ctrl_c_ends_a_recording_with_a_complete_file_and_a_summary(spawn: Spawn
 def test_a_duration_ends_it_and_only_the_chosen_robot_is_recorded(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with published_robot("left"), published_robot("right"):
-        ended = zstate("record", str(path), "left", "--duration", "1")
+        ended = zstate("record", str(path), "left", "--seconds", "1")
     assert ended.returncode == 0, ended.stderr
     assert read_info(path).robots == ("left",)
     with RecordingReader(path) as reader:
@@ -61,16 +61,16 @@ def test_record_prints_the_reason_while_it_waits_and_the_start(spawn: Spawn, tmp
 
 
 def test_empty_recording_fails_with_the_reason(tmp_path: Path):
-    message = failure("record", str(tmp_path / "run.mcap"), "--duration", "1")
+    message = failure("record", str(tmp_path / "run.mcap"), "--seconds", "1")
     assert "nothing was recorded: no robot is announced" in message
     assert "nothing was recorded: robot 'r1' is not announced" in failure(
-        "record", str(tmp_path / "other.mcap"), "r1", "--duration", "1"
+        "record", str(tmp_path / "other.mcap"), "r1", "--seconds", "1"
     )
 
 
 def test_the_suffix_is_added_and_a_file_that_exists_is_kept_unless_it_may_be_overwritten(tmp_path: Path):
     with published_robot():
-        given = ("record", str(tmp_path / "run"), "--duration", "0.7")
+        given = ("record", str(tmp_path / "run"), "--seconds", "0.7")
         assert f"recording into '{tmp_path}/run.mcap'" in zstate(*given).stderr.decode()
         before = (tmp_path / "run.mcap").read_bytes()
         message = failure(*given)
@@ -84,21 +84,21 @@ def test_the_suffix_is_added_and_a_file_that_exists_is_kept_unless_it_may_be_ove
 def test_a_recording_is_split_by_time_and_all_files_are_named(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with published_robot():
-        ended = zstate("record", str(path), "--duration", "2.5", "--split-seconds", "1")
+        ended = zstate("record", str(path), "--seconds", "2.5", "--split-seconds", "1")
     assert f"into 3 files, {path} to run_2.mcap (" in ended.stdout.decode()
     assert len(read_info(path).files) == 3
 
 
 def test_losses_are_reported(tmp_path: Path):
     with published_robot(streams=("joint_states",)):
-        ended = zstate("record", str(tmp_path / "run.mcap"), "rrbot", "--duration", "1")
+        ended = zstate("record", str(tmp_path / "run.mcap"), "rrbot", "--seconds", "1")
     assert re.search(r"lost \d+ without a description that fits", ended.stdout.decode())
 
 
 def test_ros_robot_is_recorded_over_its_wire(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with connect() as session, StatePublisher(session, load_model("rrbot"), "r1", wires=("ros2",)):
-        ended = zstate("record", str(path), "--wire", "ros2", "--mode", "peer", "--duration", "1.5")
+        ended = zstate("record", str(path), "--wire", "ros2", "--mode", "peer", "--seconds", "1.5")
     assert ended.returncode == 0, ended.stderr
     assert {channel.topic for channel in read_info(path).channels} == {"/robot_description", "/tf_static"}
     assert "no wire 'nonsense'" in failure("record", "x", "--wire", "nonsense", code=2)
@@ -106,7 +106,7 @@ def test_ros_robot_is_recorded_over_its_wire(tmp_path: Path):
 
 def test_invalid_limits_and_names_are_refused(tmp_path: Path):
     path = str(tmp_path / "run.mcap")
-    for option in ("--duration", "--split-size", "--split-seconds"):
+    for option in ("--seconds", "--split-size", "--split-seconds"):
         for value in ("0", "-1", "nan", "inf"):
             assert option in failure("record", path, option, value, code=2)
     assert "'a/b'" in failure("record", path, "a/b")
@@ -139,9 +139,9 @@ def test_start_times_replace_directives_and_a_second_start_makes_a_second_file(
     monkeypatch.chdir(tmp_path)
     with published_robot():
         before = datetime.now().replace(microsecond=0)
-        first = zstate("record", "--duration", "1.2")
+        first = zstate("record", "--seconds", "1.2")
         contents = {path: path.read_bytes() for path in tmp_path.iterdir()}
-        assert zstate("record", "--duration", "1.2").returncode == 0
+        assert zstate("record", "--seconds", "1.2").returncode == 0
         after = datetime.now()
     one, two = sorted(path.name for path in tmp_path.iterdir())
     assert [path.name for path in contents] == [one]
@@ -155,7 +155,7 @@ def test_files_of_a_split_recording_have_the_time_of_its_start(tmp_path: Path):
     pattern = str(tmp_path / "%%-%Y-%j.mcap")
     with published_robot():
         today = datetime.now()
-        ended = zstate("record", pattern, "--duration", "1.5", "--split-seconds", "1")
+        ended = zstate("record", pattern, "--seconds", "1.5", "--split-seconds", "1")
     assert ended.returncode == 0, ended.stderr
     first = f"%-{today:%Y-%j}"
     assert {path.name for path in tmp_path.iterdir()} == {f"{first}.mcap", f"{first}_1.mcap"}
@@ -180,11 +180,11 @@ def test_keep_deletes_the_oldest_recordings_at_the_start_and_after_each_split(tm
     other = tmp_path / "run.mcap"
     with published_robot():
         for path in (old, other):
-            assert zstate("record", str(path), "--duration", "1").returncode == 0
+            assert zstate("record", str(path), "--seconds", "1").returncode == 0
         notes.write_text("not a recording")
         # A second of this robot has more than 1 kB, so only the file being written stays.
         ended = zstate(
-            *("record", str(tmp_path / "rec-%Y%m%d-%H%M%S.mcap"), "--duration", "3.5"),
+            *("record", str(tmp_path / "rec-%Y%m%d-%H%M%S.mcap"), "--seconds", "3.5"),
             *("--split-seconds", "1", "--keep", "1kB"),
         )
     assert ended.returncode == 0, ended.stderr
@@ -200,13 +200,13 @@ def test_keep_deletes_the_oldest_recordings_at_the_start_and_after_each_split(tm
 def test_keep_deletes_by_age(tmp_path: Path):
     pattern = str(tmp_path / "rec-%Y%m%d-%H%M%S.mcap")
     with published_robot():
-        assert zstate("record", pattern, "--duration", "1").returncode == 0
+        assert zstate("record", pattern, "--seconds", "1").returncode == 0
         (first,) = tmp_path.iterdir()
-        ended = zstate("record", pattern, "--duration", "1", "--keep", "1h")
+        ended = zstate("record", pattern, "--seconds", "1", "--keep", "1h")
         assert first.exists()
         assert "--keep deletes recordings at this start only" in ended.stderr.decode()
         written = first.stat().st_mtime
-        ended = zstate("record", pattern, "--duration", "1", "--keep", f"{time.time() - written:.3f}s")
+        ended = zstate("record", pattern, "--seconds", "1", "--keep", f"{time.time() - written:.3f}s")
     assert not first.exists()
     assert "; deleted 1 file (" in ended.stdout.decode()
 

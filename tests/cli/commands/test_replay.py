@@ -61,7 +61,7 @@ def test_writers_have_the_name_of_their_command(file: str, spawn: Spawn):
 
 
 def test_replay_prints_progress_each_second(file: str, spawn: Spawn):
-    child = started(spawn, "replay", file, "--rate", "0.1", "--duration", "0.2")
+    child = started(spawn, "replay", file, "--rate", "0.1", "--seconds", "0.2")
     child.line()
     until(lambda: "of 0.2 s" in child.stderr)
     assert "samples" in child.stderr
@@ -77,7 +77,7 @@ def test_live_robot_is_not_replayed_without_takeover(file: str):
 
 def test_a_part_can_be_replayed(file: str):
     # From 200 to 300 ms: the samples of 200 to 290 ms arrived a little later than their stamps.
-    last = zstate("replay", file, "--start", "0.2", "--duration", "0.1", "--rate", "inf").stdout.decode()
+    last = zstate("replay", file, "--start", "0.2", "--seconds", "0.1", "--rate", "inf").stdout.decode()
     assert "as fast as possible" in last
     assert "replayed 10 samples" in last
 

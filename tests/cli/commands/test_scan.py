@@ -91,6 +91,17 @@ def test_simulated_scans_hit_the_walls_while_the_robot_drives(spawn: Spawn, hall
     assert scans.dropped == {}
 
 
+def test_a_laser_that_is_outside_the_map_is_a_warning(spawn: Spawn, hall: str):
+    with connect() as session, StaticPublisher(session, "r1", "mount") as statics:
+        statics.set(Transform.from_rpy("r1/base", "r1/laser", (3.1, 0.0, 0.3), (0.0, 0.0, 0.0)))
+        child = started(spawn, "scan", "r1", "--frame", "laser", "--simulate", hall)
+        child.line()
+        documents("r1")
+        assert "is outside the map" not in child.stderr
+        statics.set(Transform.from_rpy("r1/base", "r1/laser", (3.3, 0.0, 0.3), (0.0, 0.0, 0.0)))
+        until(lambda: "laser is outside the map, which stands in r1/base" in child.stderr)
+
+
 def test_map_stands_in_its_frame_once_the_robot_has_that(spawn: Spawn, hall: str):
     """The hall's axes are turned by a quarter against the robot's root, and 1 m in front of it."""
     with connect() as session, StaticPublisher(session, "r1", "mount") as statics:

@@ -88,7 +88,6 @@ class Demo(NamedTuple):
 @click.command("demo")
 @click.argument("robot", required=False)
 @options.xacro_arguments
-@click.option("--robot", "robot_option", metavar="ROBOT", help="Same as the argument.")
 @click.option("--world", is_flag=True, help="Put rrbot into a room, which its laser sweeps.")
 @options.rate_option
 @options.seconds_option
@@ -99,7 +98,6 @@ def demo_command(
     *,
     robot: str | None,
     xacro_args: dict[str, str],
-    robot_option: str | None,
     world: bool,
     rate: float,
     seconds: float | None,
@@ -135,15 +133,13 @@ def demo_command(
 
             run_rover(session, rate)
         return
-    if robot and robot_option and robot != robot_option:
-        raise click.UsageError(f"two robots are named, {robot!r} and {robot_option!r}; give one")
-    source = robot or robot_option or (_ARM if world else example_name())
+    source = robot or (_ARM if world else example_name())
     if world:
         if source != _ARM or xacro_args:
             raise click.UsageError(f"--world is for {_ARM!r} alone; got {source!r}")
         _run(_robot_in_room(), rate, seconds)
         return
-    if not (robot or robot_option) and source != _DEFAULT:
+    if not robot and source != _DEFAULT:
         print_status(
             f"{_DEFAULT!r} is not installed (pip install 'zstate[robots]'), so this shows {source!r}"
         )

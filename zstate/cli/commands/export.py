@@ -42,7 +42,7 @@ def _read_stamps(file: str) -> NDArray[np.int64]:
 
 @click.command("export")
 @click.argument("file", metavar="RECORDING")
-@click.option("--robot", metavar="NAME", help="The robot; default: the only one with joint states.")
+@click.argument("robot", required=False)
 @click.option(
     "--pose",
     "poses",
@@ -76,8 +76,10 @@ def export_command(
     output: str | None,
     overwrite: bool,
 ) -> None:
-    """Write the joint states of RECORDING, and poses of frames, as a table with one row for each instant.
+    """Write the joint states of ROBOT in RECORDING, and poses of frames, as a table with one row for each
+    instant.
 
+    ROBOT may be left out if only one robot has joint states.
     Columns are stamp [ns], position.JOINT, velocity.JOINT and effort.JOINT as far as recorded, and
     TARGET.SOURCE.x to .qw of each --pose; numbers that are not known are NaN. At --rate or --stamps,
     positions are interpolated as in lookups, and velocities and efforts are left out.
@@ -86,7 +88,7 @@ def export_command(
 
     \b
     zstate export run.mcap --parquet                         # run.parquet
-    zstate export run.mcap --csv --rate 50 --pose panda_link0 panda_hand
+    zstate export run.mcap panda --csv --rate 50 --pose panda_link0 panda_hand
     zstate export run.mcap --parquet --stamps images.txt --output images.parquet
     """
     if kind is None:

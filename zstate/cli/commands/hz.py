@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,7 @@ _SETTLING_S = 0.1
     help="Measure the last N samples.",
 )
 @click.option("--once", is_flag=True, help="Print one measurement, of the first second, and exit.")
+@options.seconds_option
 @options.timeout_option("How long --once waits for the first sample [s].")
 @options.json_option()
 @options.wire_option
@@ -53,6 +55,7 @@ def hz_command(
     stream: Stream,
     window: int,
     once: bool,
+    seconds: float | None,
     timeout: float,
     as_json: bool,
     wire: str,
@@ -66,7 +69,7 @@ def hz_command(
     \b
     zstate hz
     zstate hz panda
-    zstate hz panda --stream transforms
+    zstate hz panda --stream transforms --seconds 10
     zstate hz diffbot --stream scan
     zstate hz --wire ros2                              # /joint_states
     zstate hz --wire ros2 --stream tf --once           # /tf
@@ -87,7 +90,8 @@ def hz_command(
         reader.first(timeout if once else None)
         _read_for(_SETTLING_S, reader, MessageStatistics(2))  # what queued up while this process was starting
         deadline, silent = time.monotonic() + timeout, False
-        while True:
+        end = math.inf if seconds is None else time.monotonic() + seconds
+        while time.monotonic() < end:
             count, facts = _read_for(1.0, reader, statistics), statistics.facts()
             if facts is not None and (count or once):
                 if as_json:

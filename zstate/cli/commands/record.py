@@ -62,7 +62,7 @@ def _parse_keep(text: str) -> Keep:
 @click.argument("file", default=_DEFAULT_FILE)
 @click.argument("robots", metavar="[ROBOT]...", nargs=-1)
 @options.wire_option
-@click.option("--duration", type=options.SECONDS, help="Stop after S seconds.")
+@options.seconds_option
 @click.option(
     "--split-size",
     type=options.number("MB", _at_least(0.1, "MB")),
@@ -87,7 +87,7 @@ def record_command(
     file: str,
     robots: tuple[str, ...],
     wire: str,
-    duration: float | None,
+    seconds: float | None,
     split_size: float | None,
     split_seconds: float | None,
     keep: Keep | None,
@@ -114,7 +114,7 @@ def record_command(
     \b
     zstate record
     zstate record run.mcap
-    zstate record run.mcap panda --duration 60
+    zstate record run.mcap panda --seconds 60
     zstate record run.mcap --wire ros2:domain=5 --split-size 500
     zstate record rec-%Y%m%d-%H%M%S.mcap --split-size 500 --keep 50GB
     """
@@ -146,7 +146,7 @@ def record_command(
         ):
             progress = RecordProgress(recorder, directory, robots, retention)
             try:
-                _show(recorder, progress, duration)
+                _show(recorder, progress, seconds)
             finally:
                 recorder.close()
                 recorder.wait(_INDEX_WITHIN_S)  # the index of a large file takes its time on a busy machine
@@ -204,10 +204,10 @@ def _refusal_text(error: RecordingError, pattern: FilePattern) -> str:
     return text
 
 
-def _show(recorder: Recorder, progress: RecordProgress, duration: float | None) -> None:
-    """Show progress until the recording has ended, or for ``duration`` seconds."""
+def _show(recorder: Recorder, progress: RecordProgress, seconds: float | None) -> None:
+    """Show progress until the recording has ended, or for ``seconds``."""
     progress.watch_disk()
-    until = math.inf if duration is None else time.monotonic() + duration
+    until = math.inf if seconds is None else time.monotonic() + seconds
 
     def is_over(pause_s: float) -> bool:
         return recorder.wait(min(pause_s, max(0.0, until - time.monotonic()))) or time.monotonic() >= until

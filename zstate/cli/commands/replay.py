@@ -45,7 +45,7 @@ def _check_speed(rate: float) -> float:
     metavar="S",
     help="Start S seconds after the start of the recording.",
 )
-@click.option("--duration", type=options.SECONDS, help="Replay S seconds of the recording.")
+@click.option("--seconds", type=options.SECONDS, metavar="N", help="Replay N seconds of the recording.")
 @click.option("--loop", is_flag=True, help="Start again at the end, until Ctrl-C.")
 @options.wires_option
 @options.takeover_option
@@ -56,7 +56,7 @@ def replay_command(
     robots: tuple[str, ...],
     rate: float,
     start: float,
-    duration: float | None,
+    seconds: float | None,
     loop: bool,
     wires: tuple[str, ...],
     takeover: bool,
@@ -70,11 +70,11 @@ def replay_command(
     Recorded commands of drivers are never published: a replay moves no hardware.
 
     A recording of maps alone, or of models and static edges, has no samples: they are published until Ctrl-C,
-    or for --duration.
+    or for --seconds.
 
     \b
     zstate replay run.mcap
-    zstate replay run.mcap panda --rate 0.5 --start 30 --duration 10 --loop
+    zstate replay run.mcap panda --rate 0.5 --start 30 --seconds 10 --loop
     zstate replay bag_folder --wire ros2:domain=5
     """
     from zstate.cli.processes import BackgroundCall
@@ -90,7 +90,7 @@ def replay_command(
             wires=wires,
             rate=rate,
             start_s=start,
-            duration_s=duration,
+            duration_s=seconds,
             loop=loop,
             takeover=takeover,
         ) as player,

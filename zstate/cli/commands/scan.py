@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.session import Session
     from zstate.scans import RangeSource, Scan, SimulatedLaser
+    from zstate.scans.simulated_laser import MountedLaser
 
 _RATE_HZ = 30.0
 _RAYS_PER_TURN = 1440
@@ -158,7 +159,22 @@ def _mounted_laser(  # noqa: PLR0917 - one use, in the order of the options
         fail(f"no scan in {seconds:g} s: {reason()}")
     shown = messages.translate(source.target)
     print_status(f"simulating a scanner in {frame}; the map stands in {shown}")
-    return source
+    return _WatchedLaser(source, f"{frame} is outside the map, which stands in {shown}")
+
+
+class _WatchedLaser:
+    """The sweeps of ``source``; prints ``warning`` each time that it has left the map."""
+
+    def __init__(self, source: MountedLaser, warning: str) -> None:
+        self._source, self._warning = source, warning
+        self._was_off_map = False
+
+    def read(self, stamp: int) -> Scan | None:
+        scan, is_off_map = self._source.read(stamp), self._source.is_off_map
+        if is_off_map and not self._was_off_map:
+            print_status(self._warning, event="off the map", level="warning")
+        self._was_off_map = is_off_map
+        return scan
 
 
 class _DummyLaser:

@@ -65,7 +65,7 @@ def plan_processes(cell: Cell, file: Path, settings: Mapping[str, str]) -> list[
     for spec, table in _specs(cell, file, settings):
         if spec.name in specs:
             other = tables[spec.name].place
-            raise table.error(f"{other} is called {spec.name!r} already; give one of them another name")
+            raise table.error(f"{other} is called {spec.name!r} already; give one of them another `name`")
         specs[spec.name], tables[spec.name] = spec, table
     if not specs:
         raise ConfigError(f"{file} starts nothing; it has no {_STARTED}")
