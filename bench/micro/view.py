@@ -45,8 +45,8 @@ from bench.measure import cpu_ns
 from bench.micro.processes import running_command, running_process, use_own_rendezvous
 from zstate import SineSource, StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import SystemClock
+from zstate.model.mesh_paths import MeshPaths
 from zstate.rate import Rate
-from zstate.view.mesh_paths import MeshPaths
 
 RATE_HZ = 30.0
 SETTLE_S = 5.0

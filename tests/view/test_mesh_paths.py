@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from zstate.view.mesh_paths import MeshPaths, MissingFile
+from zstate.model.mesh_paths import MeshPaths, MissingFile
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ trimesh = pytest.importorskip("trimesh")
 
 from zstate import load_model  # noqa: E402
 from zstate.model.geometry import Box, Cylinder, MeshFile, Shape, Sphere, read_shapes  # noqa: E402
+from zstate.model.mesh_paths import MissingFile  # noqa: E402
 from zstate.se3 import IDENTITY  # noqa: E402
 from zstate.view.mesh_geometry import smooth_normals  # noqa: E402
-from zstate.view.mesh_paths import MissingFile  # noqa: E402
 from zstate.view.meshes import MeshAsset, Meshes  # noqa: E402
 
 HERE = Path(__file__).parent

@@ -24,9 +24,9 @@ from trimesh.resolvers import FilePathResolver
 from trimesh.units import unit_conversion
 
 from zstate.model.geometry import Box, Color, Cylinder, MeshFile, Shape, Sphere
+from zstate.model.mesh_paths import MeshPaths, MissingFile
 from zstate.view.gltf import GREY, Glb
 from zstate.view.mesh_geometry import Material, Mesh, primitive, smooth_normals
-from zstate.view.mesh_paths import MeshPaths, MissingFile
 
 _T = TypeVar("_T")
 _Source = Path | tuple[Box | Cylinder | Sphere, bool]

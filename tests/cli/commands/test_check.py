@@ -37,6 +37,21 @@ def test_a_sound_model_is_drawn_as_a_tree():
     assert len(lines) == 7
 
 
+def test_a_missing_mesh_is_a_warning_with_its_line_and_where_it_was_searched(tmp_path: Path):
+    mesh = '<visual><geometry><mesh filename="{}"/></geometry></visual>'
+    visuals = "".join(mesh.format(uri) for uri in ("there.stl", "hand.stl", "package://nowhere/base.stl"))
+    file = tmp_path / "arm.urdf"
+    file.write_text(SOUND.replace('<link name="hand"/>', f'<link name="hand">\n{visuals}</link>'))
+    (tmp_path / "there.stl").touch()
+    ended = zstate("check", str(file), "--json")
+    assert ended.returncode == 0
+    first, second = json.loads(ended.stdout)["findings"]
+    assert (first["line"], first["severity"]) == (4, "warning")
+    assert first["message"].startswith("the mesh 'hand.stl' is missing, so it is not drawn: ")
+    assert str(tmp_path) in first["message"]
+    assert "there is no package 'nowhere'" in second["message"]
+
+
 def test_each_error_has_its_line():
     ended = zstate("check", "-", stdin=WITHOUT_LIMIT.encode())
     headline, finding = ended.stdout.decode().splitlines()

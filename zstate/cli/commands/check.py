@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,6 +18,7 @@ from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitt
 from zstate.errors import FindingLike, ModelError
 
 if TYPE_CHECKING:
+    from zstate.model.findings import Finding
     from zstate.model.robot import Joint, RobotModel
 
 Findings = Sequence[FindingLike]
@@ -54,7 +56,7 @@ def check_command(
     model, findings = None, ()
     try:
         model = load_model(sys.stdin.buffer.read() if file == "-" else file, xacro_args=xacro_args)
-        findings = model.findings
+        findings = (*model.findings, *_missing_meshes(model, file))
     except ModelError as error:
         if not error.findings:
             raise
@@ -64,6 +66,24 @@ def check_command(
     else:
         print_wrapped(_report(name, model, findings, fix_hints=fix_hints, joint_table=joint_table))
     raise SystemExit(0 if model else 1)
+
+
+def _missing_meshes(model: RobotModel, source: str) -> Iterator[Finding]:
+    """A warning for each mesh file that cannot be found, as `zstate view` looks for them."""
+    from zstate.model.findings import Finding
+    from zstate.model.geometry import MeshFile, read_shapes
+    from zstate.model.mesh_paths import MeshPaths, MissingFile
+
+    # Relative paths start at the URDF file; models of the catalog have packages only.
+    path = Path.cwd() / "stdin" if source == "-" else Path(source)
+    paths = MeshPaths(path.parent if source == "-" or path.is_file() else None)
+    lines = model.urdf.splitlines()
+    shapes, _ = read_shapes(model)
+    for uri in dict.fromkeys(shape.geometry.uri for shape in shapes if isinstance(shape.geometry, MeshFile)):
+        found = paths.find(uri)
+        if isinstance(found, MissingFile):
+            line = next((number for number, text in enumerate(lines, 1) if uri in text), None)
+            yield Finding(line, f"the mesh {uri!r} is missing, so it is not drawn: {found.why}", "warning")
 
 
 def _report(

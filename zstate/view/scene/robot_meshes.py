@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from zstate import se3
 from zstate.buffer.snapshot import FrameTable, Mask, Poses, Rows
 from zstate.model.geometry import Color, Shape
-from zstate.view.mesh_paths import MissingFile
+from zstate.model.mesh_paths import MissingFile
 from zstate.view.meshes import MeshAsset, MeshLoader, MeshRequest
 from zstate.view.scene.frames import FrameNodes, in_frame, set_instances, wxyzs
 
