@@ -76,6 +76,15 @@ def test_ellipse_has_the_mahalanobis_distance_of_95_percent_around_the_base_on_t
     assert np.allclose(ellipse[:, 2], 0.005)
 
 
+def test_label_at_the_ellipse_shows_what_it_is(shown: Shown):
+    (label,) = handles(shown.server, viser.LabelHandle).values()
+    assert label.text == "position, 95 %"
+    assert np.linalg.norm(shown.points("ellipse") - label.position, axis=1).min() < 1e-6
+    shown.buffer.insert(Transform("r1/odom", "r1/base", (21.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0), 21 * S))
+    shown.show()
+    assert not label.visible  # the covariance is not known
+
+
 def test_in_a_frame_of_the_robot_the_path_moves_and_not_the_base(shown: Shown):
     shown.show(fixed="r1/base")
     assert np.allclose(shown.points("path")[-1], [0.0, 0.0, 0.0], atol=1e-6)

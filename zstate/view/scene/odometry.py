@@ -18,6 +18,8 @@ _PERIOD_NS = 100_000_000
 _ELLIPSE_SEGMENTS = 64
 _LIFT_M = 0.005
 _WIDTH_PX = 2.0
+_LABEL = "position, 95 %"
+_LABEL_SCALE = 0.85
 _COLORS = ((25, 113, 194), (232, 89, 12), (47, 158, 68), (174, 62, 201))
 _CHI_SQUARE_95 = -2.0 * math.log(0.05)
 """5.991, the 95 % quantile of chi-square with two degrees of freedom."""
@@ -67,7 +69,10 @@ def _uncertain_edges(tree: FrameTable) -> list[Edge]:
 
 
 class EdgePath:
-    """The drawn path and ellipse of ``edge``, (parent, child), in a node that is at the parent."""
+    """The drawn path and ellipse of ``edge``, (parent, child), in a node that is at the parent.
+
+    A label at the ellipse shows what it is.
+    """
 
     def __init__(self, scene: viser.SceneApi, path: str, edge: Edge, color: tuple[int, int, int]) -> None:
         self._scene = scene
@@ -77,6 +82,7 @@ class EdgePath:
         self._root = scene.add_frame(path, show_axes=False)
         self._line: viser.LineSegmentsHandle | None = None
         self._ellipse: viser.LineSegmentsHandle | None = None
+        self._label: viser.LabelHandle | None = None
         self._drawn: tuple[int, float] | None = None
 
     def show(self, buffer: TransformBuffer, place: Place, at: int | None, path_s: float) -> None:
@@ -91,7 +97,9 @@ class EdgePath:
         if (end, path_s) != self._drawn:
             self._drawn = end, path_s
             self._line = self._drawn_line(self._line, "path", _path(buffer, self._edge, end, path_s))
-            self._ellipse = self._drawn_line(self._ellipse, "ellipse", _ellipse(buffer, self._edge, end))
+            ellipse = _ellipse(buffer, self._edge, end)
+            self._ellipse = self._drawn_line(self._ellipse, "ellipse", ellipse)
+            self._show_label(ellipse)
 
     def _drawn_line(
         self, line: viser.LineSegmentsHandle | None, name: str, points: NDArray[np.float64]
@@ -110,6 +118,20 @@ class EdgePath:
         return self._scene.add_line_segments(
             f"{self._path}/{name}", segments, self._color, thickness=_WIDTH_PX, thickness_units="screen"
         )
+
+    def _show_label(self, ellipse: NDArray[np.float64]) -> None:
+        """Label the ellipse where its x is largest; hide the label of none."""
+        if self._label is not None:
+            self._label.visible = len(ellipse) > 0
+        if len(ellipse) == 0:
+            return
+        if self._label is None:
+            name = f"{self._path}/label"
+            self._label = self._scene.add_label(
+                name, _LABEL, font_screen_scale=_LABEL_SCALE, anchor="center-left"
+            )
+        x, y, z = ellipse[ellipse[:, 0].argmax()].tolist()
+        self._label.position = (x, y, z)
 
     def remove(self) -> None:
         """Remove it from the scene."""
