@@ -10,26 +10,26 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 
 import numpy as np
 import pytest
 from helpers.manual_cdr import rosbags_numbers
 from helpers.processes import DEADLINE_S, repeated, until
-from helpers.raw_ros_nodes import COMMANDS, RosPublisher, announced_publisher
-from helpers.robots import RRBOT, wait_for_reader
+from helpers.raw_ros_nodes import COMMANDS, RosNode, RosPublisher, announced_publisher, attachment
+from helpers.robots import RRBOT, SampleCollector, wait_for_reader
 
 from zstate import JointReading, StatePublisher, load_model
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.driving.driver import Setpoint, StopMode
 from zstate.driving.stops import stops_file, wait_for_state
 from zstate.errors import DriverFault, InvalidInput, MotionRefused, SecondWriter
-from zstate.net.presence import confirmed_tokens, local_writer
+from zstate.net.presence import announce, confirmed_tokens, local_writer
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.sources import JointStateListener
-from zstate.wire.keys import release_key, writer_expression
+from zstate.wire.keys import release_key, writer_expression, writer_key
 from zstate.wire.messages import DriverState, JointCommand, Release, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
@@ -246,16 +246,22 @@ def test_commands_of_another_session_are_refused_while_the_first_are_valid(sessi
 
 @contextmanager
 def raw_commands(session: Session) -> Iterator:
+    """``put`` for commands of the announced sessions 7 and 8."""
     key = "zstate/arm/joint_commands"
-    with StreamPublisher(session, key, ENCODINGS[JointCommand]) as publisher:
+    with ExitStack() as opened:
+        for number in (7, 8):
+            token = writer_key("arm", "joint_commands", local_writer(number, "raw").identity)
+            opened.enter_context(announce(session, token))
+        publisher = opened.enter_context(StreamPublisher(session, key, ENCODINGS[JointCommand]))
         wait_for_reader(session, key)
         yield publisher.put
 
 
-def command(seq: int = 0, ttl: int = 0, **positions: float) -> bytes:
+def command(seq: int = 0, ttl: int = 0, session: int = 7, age_s: float = 0.0, **positions: float) -> bytes:
     names = tuple(positions)
     block = to_block(list(positions.values()))
-    return encode(JointCommand(0, seq, 7, order_digest(names), block, names=names, ttl=ttl))
+    head = (time.time_ns() - round(age_s * 1e9), seq, session, order_digest(names))
+    return encode(JointCommand(*head, block, names=names, ttl=ttl))
 
 
 @pytest.mark.parametrize(
@@ -327,6 +333,65 @@ def test_an_old_command_is_refused(sessions):
     assert driver.written()[:, 1].max() <= 0.1
 
 
+def test_a_command_that_was_sent_earlier_than_its_ttl_moves_nothing(sessions):
+    """As one that waited before a slow link, or for the end of a cut: in order, and after silence."""
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+        put(command(0, elbow=0.1))
+        until(lambda: host.state == "active")
+        until(lambda: host.state == "holding")
+        rests = driver.written()[-1]
+        for number in range(1, 101):
+            put(command(number, shoulder=50.0, elbow=1.0, age_s=10.0 - 0.01 * number))
+            until(lambda number=number: host.report().refused == {"late": number})
+        state = wait_for_state(sessions[1], "arm", lambda one: one.refused == {"late": 100}, DEADLINE_S)
+        assert state is not None
+        assert "it has waited for" in state.last_refusal
+        assert state.received == (7, 100)
+        assert (driver.written()[-1] == rests).all()
+        put(command(101, elbow=0.2))
+        until(lambda: host.state == "active")
+
+
+def test_commands_of_a_session_that_is_not_announced_are_refused_like_its_motions(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+        numbers = iter(range(10**6))
+
+        def is_refused() -> bool:
+            put(command(next(numbers), session=9, shoulder=50.0))
+            return host.report().refused.get("no claim", 0) > 50
+
+        until(is_refused)
+        assert set(host.report().refused) == {"no claim"}
+        until(lambda: is_refused() and host.state == "holding")
+        written = len(driver.written())
+        until(lambda: is_refused() and len(driver.written()) > written + 20)
+        assert (driver.written()[written:] == driver.written()[-1]).all()
+
+
+def test_a_commander_that_has_closed_moves_nothing_by_what_arrives_later(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver) as host:
+        numbers = iter(range(10**6))
+        with StreamPublisher(sessions[1], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as publisher:
+            with raw_commands(sessions[1]) as put:
+
+                def is_moved() -> bool:
+                    put(command(next(numbers), shoulder=50.0))
+                    return host.state == "active"
+
+                until(is_moved)
+
+            def is_refused() -> bool:
+                publisher.put(command(next(numbers), shoulder=50.0))
+                return bool(host.report().refused.get("no claim"))
+
+            until(is_refused)
+            assert set(host.report().refused) == {"no claim"}
+            until(lambda: is_refused() and host.state == "holding")
+
+
 def test_a_stop_is_latched_and_released_by_the_commander(sessions):
     driver = RecordingDriver()
     with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
@@ -356,7 +421,11 @@ def test_a_stop_is_released_at_once_after_it_by_the_same_program(sessions):
 
 def test_a_commander_that_did_not_release_the_stop_does_not_move_the_robot_by_a_release(sessions):
     driver = RecordingDriver()
-    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+    with (
+        running(sessions[0], driver) as host,
+        Commander(sessions[1], "arm") as arm,
+        raw_commands(sessions[1]) as put,
+    ):
         numbers = iter(range(10**6))
 
         def send(condition) -> None:
@@ -370,8 +439,7 @@ def test_a_commander_that_did_not_release_the_stop_does_not_move_the_robot_by_a_
         stop(sessions[1], "arm")
         send(lambda: host.report().refused.get("stopped"))
         written = len(driver.written())
-        with Commander(sessions[1], "arm") as arm:
-            assert arm.release().state == "ready"
+        assert arm.release().state == "ready"
         send(lambda: host.report().refused.get("not released", 0) > 3)
         assert len(driver.written()) == written
 
@@ -543,6 +611,88 @@ def test_a_commander_checks_what_it_sends(sessions):
             arm.send({})
         with pytest.raises(InvalidInput, match=r"a ttl of 1\.0 s is longer than 250\.0 ms"):
             arm.send({"elbow": 0.0}, ttl_s=1.0)
+        with pytest.raises(InvalidInput, match=r"by joint, such as \{'elbow': 0\.4\}, not as list"):
+            arm.send([0.1, 0.2])
+        with pytest.raises(InvalidInput, match="a position of a joint is a number: could not convert"):
+            arm.send({"elbow": "fast"})
+
+
+# What a commander knows of a driver that does not obey
+
+
+def test_a_commander_says_why_its_commands_are_refused(sessions):
+    narrow = Limits(RRBOT.joint_names, [-1.0, -0.5], [1.0, 0.5], [2.0, 2.0], [np.inf, np.inf])
+    with running(sessions[0], RecordingDriver(), limits=narrow), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver(DEADLINE_S)
+        assert arm.problem == ""
+        send_until(arm, {"elbow": 9.0}, lambda: arm.problem)
+        assert re.match("the driver of 'arm' refuses commands: .*'elbow'.* 9", arm.problem), arm.problem
+        send_until(arm, {"elbow": 0.1}, lambda: arm.problem == "")
+        stop(sessions[0], "arm", "door open")
+        send_until(arm, {"elbow": 0.1}, lambda: arm.problem.startswith("stopped by"))
+        assert "door open" in arm.problem
+
+
+def test_nothing_is_sent_to_a_silent_driver_and_the_newest_once_it_is_back(sessions, caplog):
+    key = "zstate/arm/joint_commands"
+    with Commander(sessions[1], "arm") as arm, closing(SampleCollector(sessions[0], key)) as sent:
+        wait_for_reader(sessions[1], key)
+        assert arm.problem == "the driver of 'arm' is silent: nothing is sent until it publishes its state"
+        for number in range(100):
+            arm.send({"elbow": 0.001 * number}, ttl_s=0.2)
+        send_until(arm, {"shoulder": 0.1}, lambda: caplog.records)
+        assert [record.message for record in caplog.records] == [arm.problem]
+        assert sent.arrivals == []
+        driver = RecordingDriver()
+        with running(sessions[0], driver):
+            send_until(arm, {"elbow": 0.2}, lambda: driver.written().size and driver.written()[-1, 1] == 0.2)
+            assert arm.problem == ""
+        until(lambda: arm.driver is None)
+        count = len(sent.arrivals)
+        arm.send({"elbow": 0.3})
+        assert arm.problem
+        assert len(sent.arrivals) == count
+
+
+def test_a_commander_of_a_fast_link_is_not_held_back(sessions):
+    """At about 1 kHz, where the driver confirms commands ten times a second."""
+    key = "zstate/arm/joint_commands"
+    with (
+        running(sessions[0], RecordingDriver()),
+        Commander(sessions[1], "arm") as arm,
+        closing(SampleCollector(sessions[0], key)) as sent,
+    ):
+        arm.wait_for_driver(DEADLINE_S)
+        wait_for_reader(sessions[1], key)
+        pause = threading.Event()
+        for number in range(1000):
+            arm.send({"elbow": 1e-6 * number})
+            pause.wait(1e-4)
+        until(lambda: len(sent.arrivals) == 1000)
+
+
+def test_a_command_that_is_sent_before_the_first_state_of_the_driver_arrives_moves_the_joint(sessions):
+    driver = RecordingDriver()
+    with running(sessions[0], driver, ttl_s=10.0), Commander(sessions[1], "arm") as arm:
+        arm.send({"elbow": 0.1}, ttl_s=10.0)
+        until(lambda: driver.written().size and driver.written()[-1, 1] == 0.1)
+
+
+def test_waiting_for_a_driver_returns_the_state_that_ended_the_wait(sessions):
+    """The state may be half a second old in the next moment."""
+
+    class Flickering(Commander):
+        looks = 0
+
+        @property
+        def driver(self) -> DriverState | None:
+            self.looks += 1
+            return super().driver if self.looks == 1 else None
+
+    with running(sessions[0], RecordingDriver()), Flickering(sessions[1], "arm") as arm:
+        until(lambda: arm._state)
+        arm.looks = 0
+        assert arm.wait_for_driver().joint_names == RRBOT.joint_names
 
 
 # Stops that a driver, a second run or a new commander could have undone
@@ -572,9 +722,7 @@ def test_joints_of_an_expired_commander_come_to_rest_when_another_one_takes_over
 
         def taken_over() -> bool:
             # Sent all the time, so that it takes over in the tick in which the first command expires.
-            names, block = ("elbow",), to_block([0.1])
-            number = next(other)
-            put(encode(JointCommand(0, number, 8, order_digest(names), block, names=names)))
+            put(command(next(other), session=8, elbow=0.1))
             return bool(driver.written()[-1, 1] == 0.1)
 
         until(taken_over)
@@ -1116,6 +1264,32 @@ def test_bad_commands_of_ros_nodes_are_refused_and_move_nothing(sessions):
             "outside limits": 1,
         }
     assert driver.written().size == 0
+
+
+def test_a_command_of_a_ros_node_that_was_sent_earlier_than_the_ttl_moves_nothing(sessions):
+    driver = RecordingDriver()
+    with (
+        running(sessions[0], driver, **CONTROLLED) as host,
+        announced_publisher(sessions[1], "teleop", COMMANDS) as node,
+    ):
+        publish_until(node, [0.1, 0.0], lambda: host.state == "active")
+        until(lambda: host.state == "holding")
+        rests = driver.written()[-1]
+        for number in range(1, 21):
+            sent = time.time_ns() - 10 * 10**9
+            node.put(rosbags_numbers([50.0, 1.0]), attachment(node.seq + number, node.gid, sent))
+            until(lambda number=number: host.report().refused == {"late": number})
+        assert (driver.written()[-1] == rests).all()
+        node.seq += 20
+        publish_until(node, [0.2, 0.0], lambda: host.state == "active")
+
+
+def test_commands_of_a_ros_node_that_is_not_announced_are_refused(sessions):
+    with running(sessions[0], RecordingDriver(), **CONTROLLED) as host:
+        node = RosNode(sessions[1], "teleop").publisher(COMMANDS).wait_for_reader()
+        with closing(node):
+            publish_until(node, [0.1, 0.0], lambda: host.report().refused.get("no claim"))
+            assert set(host.report().refused) == {"no claim"}
 
 
 def test_a_ros_node_that_commanded_a_stopped_robot_does_not_move_it_after_the_release(sessions):

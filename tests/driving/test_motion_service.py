@@ -374,7 +374,7 @@ def test_a_request_for_more_than_the_joints_of_the_driver_is_refused(sessions):
 
 def test_a_repeated_request_is_the_same_motion_and_an_older_one_is_refused(sessions):
     request = JointTrajectory(0, 3, 7, ("elbow",), to_block([0.2]), to_block([0.1]))
-    renewal = encode(JointCommand(0, 4, 7, order_digest(()), names=(), motion=3))
+    renewal = encode(JointCommand(time.time_ns(), 4, 7, order_digest(()), names=(), motion=3))
     key = "zstate/arm/joint_commands"
     driver = Written()
     with (

@@ -117,7 +117,7 @@ class RosPublisher:
         """Publishes ``payload`` with the next attachment, or with the attachment ``extra``."""
         if extra == "next":
             self.seq += 1
-            extra = attachment(self.seq, self.gid)
+            extra = attachment(self.seq, self.gid, now())
         self.publisher.put(payload, attachment=extra)
 
     def joints(self, stamp: int, names: Sequence[str], *blocks: Sequence[float]) -> None:

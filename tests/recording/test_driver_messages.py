@@ -43,6 +43,9 @@ STATE = DriverState(
     ),
     outcomes=tuple(MotionOutcome(1, k, name, "5") for k, name in enumerate(get_args(OutcomeName))),
     modes=("position", "velocity"),
+    instant=11,
+    received=(12, 13),
+    transit_excess=14,
 )
 STOP = Stop(5, 0, 9, "relax", "7")
 

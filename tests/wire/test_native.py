@@ -121,16 +121,21 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     ),
     "command": (
         JointCommand(
-            *(STAMP, 300, 2**63 + 5, order_digest(("j1",))), to_block([0.25]), names=("j1",), ttl=100
+            *(STAMP, 300, 2**63 + 5, order_digest(("j1",))),
+            to_block([0.25]),
+            names=("j1",),
+            ttl=100,
+            echo=(7, 9),
         ),
-        header(10)[:-8]
+        header(11)[:-8]
         + order_digest(("j1",))
         + bin8(struct.pack("<d", 0.25))
         + NIL * 2
         + b"\x91"
         + fixstr("j1")
         + b"\x64"
-        + NIL,
+        + NIL
+        + b"\x92\x07\x09",
     ),
     "stop": (
         Stop(STAMP, 300, 2**63 + 5, "hold", "door open"),
@@ -144,8 +149,9 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         DriverState(
             *(5, 7, "host", "active", "", NAMES, 100, "teleop", 6, ("j2",), 0.5, 4, 3, 2, {"old": 1}, "late"),
             *(((8, 9),), (7, 3), 0.25, (MotionOutcome(7, 2, "reached", "in time"),), ("effort", "velocity")),
+            *(11, (7, 4), 12),
         ),
-        b"\xdc\x00\x15\x05\x07"
+        b"\xdc\x00\x18\x05\x07"
         + fixstr("host")
         + fixstr("active")
         + fixstr("")
@@ -170,7 +176,8 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + fixstr("in time")
         + b"\x92"
         + fixstr("effort")
-        + fixstr("velocity"),
+        + fixstr("velocity")
+        + b"\x0b\x92\x07\x04\x0c",
     ),
     "statics": (
         StaticTransforms(7, (("b", "c"),), to_block([0, 0, 1, 0, 0, 0, 1])),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import secrets
 import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
+from typing import NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -18,6 +20,7 @@ from zstate.driving.commands import check_named
 from zstate.driving.driver_state import SILENT_S
 from zstate.driving.motion import Motion, Points, rows_block
 from zstate.driving.stops import wait_for_state
+from zstate.driving.transit import CommandWindow, DriverClock
 from zstate.errors import (
     Closed,
     InvalidInput,
@@ -48,11 +51,14 @@ from zstate.wire.messages import (
     MotionReply,
     Release,
     order_digest,
+    state_text,
     to_block,
 )
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
+
+_LOG = logging.getLogger("zstate")
 
 _RELEASE_PERIOD_S = 0.1
 
@@ -64,13 +70,29 @@ _REPLY_WITHIN_S = 5.0
 _REQUEST_PERIOD_S = 0.05
 """A session that has just connected has not discovered the queryable of the driver yet."""
 
+_LONGEST_UNSENT_NS = 250_000_000
+"""A command for a driver that is not known yet waits for so long, unless it has a ttl of its own."""
+
+_MODES: tuple[Mode, ...] = ("position", "velocity", "effort")
+
+
+class _Unsent(NamedTuple):
+    """A command that was given at ``stamp`` [ns], at the monotonic instant ``given_at``."""
+
+    stamp: int
+    given_at: int
+    names: tuple[str, ...]
+    blocks: tuple[bytes | None, ...] = (None, None, None)
+    ttl: int = 0
+    motion: int | None = None
+
 
 class Commander(Closeable):
     """Sends setpoints and motions to the driver of ``robot``; a robot has one commander at a time.
 
     SecondWriter, which names the first, is raised if another commander is active, and by ``send`` if both
-    opened at once. ``program`` is this commander's name for others; default: the script's name. A context
-    manager; safe from any thread. Not a safety-rated channel.
+    opened at once. ``problem`` is why the driver does not obey. ``program`` is this commander's name for
+    others; default: the script's name. A context manager; safe from any thread. Not a safety-rated channel.
     """
 
     def __init__(self, session: Session, robot: str, *, program: str = "") -> None:
@@ -85,6 +107,15 @@ class Commander(Closeable):
         self._is_closing = fork_safe(threading.Event())
         self._lock = fork_safe_lock()
         self._state: tuple[DriverState, float] | None = None
+        self._unsent: dict[tuple[frozenset[str], int | None], _Unsent] = {}
+        """The newest commands that wait for their turn, by joints and motion, oldest first."""
+        self._window, self._driver_clock = CommandWindow(), DriverClock()
+        self._refused = (0, 0)
+        """The session of the driver's host, and its count of refused commands."""
+        self._refused_at = -math.inf
+        """When that count has grown [s, monotonic]."""
+        self._silent_since = time.monotonic()
+        self._has_logged = False
         self._has_changed = fork_safe(threading.Condition())
         with ExitStack() as opening:
             announced = Announcement(self.robot, "joint_commands", identity)
@@ -109,18 +140,39 @@ class Commander(Closeable):
             return None
         return newest[0]
 
+    @property
+    def problem(self) -> str:
+        """Why the driver does not do what is sent, as far as is known; empty if it does.
+
+        It is silent, and nothing is sent; or stopped, at fault or off; it has refused commands of any program
+        within the last half second; or its link carries fewer commands than are sent.
+        """
+        state = self.driver
+        if state is None:
+            return f"the driver of {self.robot!r} is silent: nothing is sent until it publishes its state"
+        if state.state in ("stopped", "fault", "off"):
+            return state_text(state)
+        if time.monotonic() - self._refused_at < SILENT_S:
+            return f"the driver of {self.robot!r} refuses commands: {state.last_refusal}"
+        waiting_ns = self._window.waiting_ns(time.monotonic_ns())
+        if waiting_ns > max(state.ttl, SILENT_S * 1e9):
+            return (
+                f"the driver of {self.robot!r} has not confirmed a command of {format_duration(waiting_ns)} "
+                "ago: the link is slow, and newer commands replace those that wait for it"
+            )
+        return ""
+
     def wait_for_driver(self, timeout_s: float = 2.0) -> DriverState:
         """The state of the driver, once it is known. Raises Unreachable after ``timeout_s`` [s]."""
         check_timeout(timeout_s)
         with self._has_changed:
-            if not self._has_changed.wait_for(lambda: self.driver is not None, timeout_s):
-                raise Unreachable(
-                    f"no driver of {self.robot!r} has published its state within {timeout_s:g} s; start it "
-                    "first: `zstate drive`, or a program with a DriverHost",
-                    endpoints=(),
-                )
-            state = self.driver
-        assert state is not None
+            state = self._has_changed.wait_for(lambda: self.driver, timeout_s)
+        if state is None:
+            raise Unreachable(
+                f"no driver of {self.robot!r} has published its state within {timeout_s:g} s; start it "
+                "first: `zstate drive`, or a program with a DriverHost",
+                endpoints=(),
+            )
         return state
 
     def send(
@@ -133,41 +185,37 @@ class Commander(Closeable):
     ) -> None:
         """Send positions [rad] or [m], velocities per s, or efforts [Nm] or [N] by joint; returns at once.
 
-        Each joint has one of them; others keep their commands. They are valid for ``ttl_s`` [s] after their
-        arrival, by default and at most for the driver's own limit: then the driver holds the joints, wheels
-        at zero velocity. Send again before. The driver refuses positions outside limits, and modes that it
-        does not have, and exceeds no limit of position, velocity, acceleration and effort: a joint in mode
-        "velocity" arrives at its position limit at rest, one in mode "effort" that leaves its range or
-        exceeds its velocity limit is held, see ``SetpointLimiter``. ``driver`` has the counts and the newest
-        reason.
+        Each joint has one of them; others keep their commands. They are valid for ``ttl_s`` [s], by default
+        and at most for the driver's own limit: then the driver holds the joints, wheels at zero velocity.
+        Send again before. The driver refuses positions outside limits, and modes that it does not have, and
+        exceeds no limit of position, velocity, acceleration and effort: a joint in mode "velocity" arrives at
+        its position limit at rest, one in mode "effort" that leaves its range or exceeds its velocity limit
+        is held, see ``SetpointLimiter``. ``problem`` is why it does not obey, ``driver`` has the counts.
+
+        On a link that is slower than the commands, and while the driver is silent, the newest command of the
+        same joints waits in place of older ones, for its ttl at most.
 
         Raises InvalidInput for no joints, for numbers that are not finite, for a joint with several of them,
         and, if the driver's state is known, for an unknown joint, a mode that it does not have, and a ttl
         that is too long; SecondWriter; and Closed. If it raises, nothing was sent.
         """
-        given: tuple[tuple[Mode, Mapping[str, float] | None], ...] = (
-            ("position", positions),
-            ("velocity", velocities),
-            ("effort", efforts),
-        )
-        numbers: dict[Mode, dict[str, float]] = {
-            mode: {name: float(value) for name, value in values.items()} for mode, values in given if values
-        }
+        numbers: dict[Mode, dict[str, float]] = {}
+        for mode, values in zip(_MODES, (positions, velocities, efforts), strict=True):
+            if values is not None and (by_joint := _by_joint(values, mode)):
+                numbers[mode] = by_joint
         check_named(numbers)
         if ttl_s is not None:
             check_timeout(ttl_s)
         ttl = 0 if ttl_s is None else max(1, round(ttl_s * 1e9))
         names = tuple(name for values in numbers.values() for name in values)
         self._check_against_driver(names, tuple(numbers), ttl)
-        blocks = [
+        blocks = tuple(
             to_block([values.get(name, math.nan) for name in names])
             if (values := numbers.get(mode))
             else None
-            for mode, _ in given
-        ]
-        with self._lock:
-            head = (*self._next_head(), order_digest(names))
-            self._writer.write(encode(JointCommand(*head, *blocks, names=names, ttl=ttl)))
+            for mode in _MODES
+        )
+        self._offer(names, blocks, ttl)
 
     def move(
         self,
@@ -247,18 +295,77 @@ class Commander(Closeable):
 
         A second call does nothing.
         """
+        with self._lock, suppress(ZStateError):
+            self._send_unsent(is_last=True)
         with self._lock:
             self._closed = True
         self._is_closing.set()
         self._opened.close()
 
-    def _next_head(self) -> tuple[int, int, int]:
-        """Stamp, number and session of the next message; with the lock. Raises SecondWriter and Closed."""
+    def _check(self) -> None:
+        """Raise SecondWriter and Closed."""
         if self._closed:
             raise Closed(f"the commander of {self.robot!r} is closed")
         self._claim.check()
+
+    def _next_head(self) -> tuple[int, int, int]:
+        """Stamp, number and session of the next message; with the lock. Raises SecondWriter and Closed."""
+        self._check()
         self._seq += 1
         return time.time_ns(), self._seq - 1, self._session_id
+
+    def _offer(
+        self,
+        names: tuple[str, ...] = (),
+        blocks: tuple[bytes | None, ...] = (None, None, None),
+        ttl: int = 0,
+        motion: int | None = None,
+    ) -> None:
+        """Send a command, or keep it in place of those of its joints that wait.
+
+        Raises SecondWriter and Closed.
+        """
+        with self._lock:
+            self._check()
+            joints = frozenset(names)
+            for key in [key for key in self._unsent if key[1] == motion and key[0] <= joints]:
+                del self._unsent[key]
+            command = _Unsent(time.time_ns(), time.monotonic_ns(), names, blocks, ttl, motion)
+            self._unsent[joints, motion] = command
+            self._send_unsent()
+
+    def _send_unsent(self, *, is_last: bool = False) -> None:
+        """Send what waits and is still valid, as much as the link takes, or all; with the lock."""
+        state, now = self.driver, time.monotonic_ns()
+        if state is None:
+            self._log_silence()
+        newest = self._state
+        longest = _LONGEST_UNSENT_NS if newest is None else newest[0].ttl
+        for key, command in list(self._unsent.items()):
+            if now - command.given_at >= (command.ttl or longest):
+                del self._unsent[key]
+            elif state is not None and (is_last or self._window.has_room(now)):
+                del self._unsent[key]
+                self._write(command, now)
+
+    def _write(self, command: _Unsent, now: int) -> None:
+        _, seq, session = self._next_head()
+        message = JointCommand(
+            *(command.stamp, seq, session, order_digest(command.names)),
+            *command.blocks,
+            names=command.names,
+            ttl=command.ttl,
+            motion=command.motion,
+            echo=self._driver_clock.at(command.given_at),
+        )
+        self._window.sent(seq, now)
+        self._writer.write(encode(message))
+
+    def _log_silence(self) -> None:
+        """Log once for each silence of the driver that nothing is sent; with the lock."""
+        if not self._has_logged and time.monotonic() - self._silent_since > SILENT_S:
+            self._has_logged = True
+            _LOG.warning("%s", self.problem, extra={"event": "silent", "robot": self.robot})
 
     def _request(self, message: JointTrajectory | MotionCancel) -> MotionReply:
         """The reply of the driver. A request that has not reached it is repeated.
@@ -312,9 +419,7 @@ class Commander(Closeable):
         with suppress(ZStateError):  # without renewals the motion ends
             while motion.outcome is None and not self._is_closing.is_set():
                 if not motion.is_cancelled:
-                    with self._lock:
-                        head = (*self._next_head(), order_digest(()))
-                        self._writer.write(encode(JointCommand(*head, names=(), motion=number)))
+                    self._offer(motion=number)
                 self._is_closing.wait(ttl / 3e9)
                 state_at = started_at if self._state is None else max(started_at, self._state[1])
                 if time.monotonic() - state_at > silent_s:
@@ -347,11 +452,43 @@ class Commander(Closeable):
             )
 
     def _on_state(self, sample: SerializedSample) -> None:
+        arrived = time.monotonic_ns()
         with suppress(MessageError):
             state = decode(sample.payload, sample.encoding, DriverState)
+            with self._lock:  # first: what is sent once the state is known has its echo
+                self._take_confirmation(state, arrived)
             with self._has_changed:
                 self._state = (state, time.monotonic())
                 for motion in self._motions:
                     motion.update(state)
                 self._motions = [motion for motion in self._motions if motion.outcome is None]
                 self._has_changed.notify_all()
+            with self._lock, suppress(ZStateError):  # the next call raises it
+                if self._unsent and not self._closed:
+                    self._send_unsent()
+
+    def _take_confirmation(self, state: DriverState, arrived: int) -> None:
+        """Take what ``state`` reports of commands; with the lock."""
+        self._silent_since, self._has_logged = time.monotonic(), False
+        refused, self._refused = self._refused, (state.session, sum(state.refused.values()))
+        if refused[0] == state.session and self._refused[1] > refused[1]:
+            self._refused_at = time.monotonic()
+        if self._driver_clock.session != state.session:
+            self._window = CommandWindow()  # a host that has restarted confirms nothing from before
+        self._driver_clock.update(state, arrived)
+        session, seq = state.received or (0, -1)
+        confirmed = seq if session == self._session_id else -1
+        self._window.update(confirmed, state.transit_excess or 0, state.ttl, arrived)
+
+
+def _by_joint(values: Mapping[str, float], mode: Mode) -> dict[str, float]:
+    """The numbers of joints. Raises InvalidInput for anything else."""
+    if not isinstance(values, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]  # callers may err
+        raise InvalidInput(
+            f"commands are given by joint, such as {{'elbow': 0.4}}, not as {type(values).__name__}: a list "
+            "does not say which joint is which"
+        )
+    try:
+        return {name: float(value) for name, value in values.items()}
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"a {mode} of a joint is a number: {error}") from None

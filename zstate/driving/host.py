@@ -53,6 +53,9 @@ from zstate.wire.registry import as_wire_names, get_controller, get_wire
 if TYPE_CHECKING:
     from zstate.wire.ros2.wire import Ros2Controller
 
+_RECENT_NS = 1_000_000_000
+"""For so long the excess of the newest command is reported."""
+
 
 class DriverHost(Closeable):
     """Owns ``driver``, publishes its joints as the state of ``robot``, and writes what a ``Commander`` sends.
@@ -62,7 +65,8 @@ class DriverHost(Closeable):
     milliseconds. ``realtime`` "fifo" and "spin" are described in ``zstate.rate.control_loop_pace``.
 
     A command is valid for its own ttl or for ``ttl_s`` [s], which is also the longest that is granted,
-    counted from its arrival on the monotonic clock. When the last one has expired, ``on_silence`` "hold"
+    counted from its sending: one that a slow link delivers later is refused, see ``zstate.driving.transit``.
+    When the last one has expired, ``on_silence`` "hold"
     brakes the joints and keeps writing that position, "relax" switches their torque off. ``limits`` are those
     of the model by default: positions outside them are refused, and faster motion is slowed; a
     ``Commander.move`` that is too fast is refused. The first setpoint after any change of state is at the
@@ -148,8 +152,9 @@ class DriverHost(Closeable):
             setpoints = SetpointPublisher(session, self.robot, names, self._writer)
             opening.enter_context(setpoints)
             controller = get_controller(self._wires, self.robot, ros2_controller) if ros2_controller else None
-            commands = CommandReceiver(
+            self._commands = commands = CommandReceiver(
                 *(session, self.robot, names, self._ttl_ns, self._refusals),
+                driver=self._writer.session,
                 modes=driver.modes,
                 controller=controller,
                 ros2_mode=ros2_mode,
@@ -309,6 +314,8 @@ class DriverHost(Closeable):
         rate = None if self._rate is None else self._rate.report()
         obeyed = self._stops.current if state.name in ("off", "fault") else loop.obeyed
         motion, progress = loop.motions.underway
+        received, now = self._commands.newest, time.monotonic_ns()
+        excess = received.excess if received and now - received.arrived < _RECENT_NS else None
         return DriverState(
             time.time_ns(),
             self._writer.session,
@@ -318,7 +325,7 @@ class DriverHost(Closeable):
             self._names,
             self._ttl_ns,
             self._name_of(targets.session) if targets.session else "",
-            max(0, time.monotonic_ns() - targets.arrived) if targets.session else None,
+            max(0, now - targets.arrived) if targets.session else None,
             setpoint.limited if setpoint is not None else (),
             0.0 if rate is None else rate.rate_hz,
             0 if rate is None else rate.ticks,
@@ -331,6 +338,9 @@ class DriverHost(Closeable):
             progress,
             loop.motions.outcomes,
             tuple(sorted(self._driver.modes)),
+            now,
+            None if received is None else received[:2],
+            excess,
         )
 
     def _name_of(self, session: int) -> str:
@@ -349,4 +359,6 @@ class DriverHost(Closeable):
         session = announced.writer.session
         if alive:  # also for messages about a commander that has gone
             self._programs[session] = str(announced.writer)
-        self._loop.targets.set_announced(session, alive, time.monotonic_ns())
+        now = time.monotonic_ns()
+        self._commands.set_announced(session, alive, now)
+        self._loop.targets.set_announced(session, alive, now)

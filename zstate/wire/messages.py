@@ -225,7 +225,9 @@ class JointCommand(Sample, frozen=True, array_like=True, gc=False):
     velocities and an arm by positions at the same tick. A block of a mode that no joint has is None. They are
     valid for ``ttl`` [ns] after they have arrived; 0 stands for the driver's own limit. A driver refuses a
     command without names, unless it is for a ``motion``: the ``seq`` of a JointTrajectory of the same
-    session, which stays valid for ``ttl`` by that.
+    session, which stays valid for ``ttl`` by that. ``echo`` is the session of the newest DriverState that
+    the commander has, and an instant of that driver's clock at or before the sending [ns]: its ``instant``,
+    and the time since it arrived. A driver takes the age of a command from it, else from ``stamp``.
     """
 
     positions: bytes | None = None
@@ -234,6 +236,7 @@ class JointCommand(Sample, frozen=True, array_like=True, gc=False):
     names: tuple[str, ...] | None = None
     ttl: Interval = 0
     motion: Count | None = None
+    echo: tuple[SessionId, Interval] | None = None
 
     def __post_init__(self) -> None:
         blocks = (self.positions, self.velocities, self.efforts)
@@ -387,7 +390,10 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     commands by reason, the newest described by ``last_refusal``. ``motion`` is under way, by session and
     ``seq`` of its JointTrajectory, and ``progress`` is the part of its duration that has passed, 0 to 1.
     ``outcomes`` are those of the last motions, newest last. ``modes`` are those in which joints may be
-    commanded. ``stamp`` [ns] is of the driver's system clock.
+    commanded. ``stamp`` [ns] is of the driver's system clock, ``instant`` [ns] of its monotonic clock: only
+    for the ``echo`` of commanders. ``received`` is the newest command, by session and ``seq``, also if it was
+    refused, and ``transit_excess`` [ns] is how much longer it was under way than the fastest of its session,
+    None unless it arrived within the last second.
     """
 
     stamp: Stamp
@@ -411,6 +417,9 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     progress: float = 0.0
     outcomes: tuple[MotionOutcome, ...] = ()
     modes: tuple[Mode, ...] = ("position",)
+    instant: Interval = 0
+    received: Id | None = None
+    transit_excess: Interval | None = None
 
 
 def with_short_texts(state: DriverState) -> DriverState:

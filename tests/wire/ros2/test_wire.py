@@ -290,10 +290,12 @@ def test_publishers_of_commands_are_commanders_by_the_name_of_their_node():
     assert [controller().parse_token(other, "r1") for other in others] == [()] * 3
 
 
-def test_a_command_has_the_number_of_its_publisher():
-    sample = arrival(rosbags_numbers([0.5, -1.0]), key=key_of(COMMANDS))
-    session, seq, positions = controller().decode_command(sample)
+def test_a_command_has_the_number_of_its_publisher_and_the_time_of_its_sending():
+    sent = attachment(7, GID, 1_700_000_000_123_456_789)
+    sample = arrival(rosbags_numbers([0.5, -1.0]), sent, key=key_of(COMMANDS))
+    session, seq, stamp, positions = controller().decode_command(sample)
     assert (session, seq) == (int.from_bytes(GID[:8], "little"), 7)
+    assert stamp == 1_700_000_000_123_456_789
     assert positions.tolist() == [0.5, -1.0]
     with pytest.raises(MessageError, match="no attachment"):
         controller().decode_command(arrival(rosbags_numbers([0.5]), None))

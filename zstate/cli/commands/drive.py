@@ -125,7 +125,7 @@ _LIMIT = options.Checked("[JOINT=]V", _parse_limit)
     type=options.SECONDS,
     default=0.25,
     show_default=True,
-    help="How long a command is valid at most, from its arrival; then the joints hold, or relax.",
+    help="How long a command is valid at most, from its sending; then the joints hold, or relax.",
 )
 @click.option(
     "--on-silence",

@@ -207,10 +207,14 @@ class Ros2DdsWire(Ros2Wire):
 
 
 class RosCommand(NamedTuple):
-    """``positions`` (n,) that a ROS node with the writer number ``session`` has sent as message ``seq``."""
+    """``positions`` (n,) that a ROS node with the writer number ``session`` has sent as message ``seq``.
+
+    ``stamp`` [ns] is the time of sending, by the clock of the node.
+    """
 
     session: int
     seq: int
+    stamp: int
     positions: NDArray[np.float64]
 
 
@@ -244,19 +248,19 @@ class Ros2Controller:
 
     def decode_command(self, arrival: SerializedSample) -> RosCommand:
         """The command in a sample received under ``commands``. Raises MessageError."""
-        session, seq = self._origin(arrival)
-        return RosCommand(session, seq, decode_numbers(arrival.payload))
+        session, seq, stamp = self._origin(arrival)
+        return RosCommand(session, seq, stamp, decode_numbers(arrival.payload))
 
     def decode_trajectory(self, arrival: SerializedSample) -> RosMotion:
         """The motion in a sample received under ``trajectories``. Raises MessageError."""
-        session, seq = self._origin(arrival)
+        session, seq, _ = self._origin(arrival)
         return RosMotion(session, decode_trajectory(arrival.payload, session, seq))
 
-    def _origin(self, arrival: SerializedSample) -> tuple[int, int]:
-        """The writer's session and the sequence number. Raises MessageError."""
+    def _origin(self, arrival: SerializedSample) -> tuple[int, int, int]:
+        """The writer's session, the sequence number, and the time of sending. Raises MessageError."""
         check_size("joint_commands", arrival.size or len(arrival.payload))
         attachment = unpack_attachment(arrival.attachment)
-        return session_from_gid(attachment.gid), attachment.seq
+        return session_from_gid(attachment.gid), attachment.seq, attachment.source_time
 
     def reader_tokens(self, zid: str, number: Callable[[], int]) -> tuple[str, ...]:
         """The liveliness tokens of the controller as a node with its subscriptions, in the session ``zid``.

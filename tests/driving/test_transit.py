@@ -1,0 +1,191 @@
+"""The age of commands without clocks in common, and how many of them may be under way."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import pytest
+
+from zstate.driving.transit import CommandAges, CommandWindow, DriverClock
+from zstate.errors import MessageError
+from zstate.wire.messages import DriverState
+
+MS = 1_000_000
+S = 1000 * MS
+TTL = 250 * MS
+HOST = 5
+START = 1000 * S
+"""Of the driver's clock."""
+
+
+def state(instant: int, session: int = HOST) -> DriverState:
+    return DriverState(0, session, "host", "ready", "", ("elbow",), TTL, instant=instant)
+
+
+class Link:
+    """A commander whose monotonic clock is ``ahead`` [ns] and runs at ``rate``, and its driver."""
+
+    def __init__(self, ahead: int = 77 * S, rate: float = 1.0) -> None:
+        self.ages, self.clock = CommandAges(HOST, TTL), DriverClock()
+        self._ahead, self._rate = ahead, rate
+
+    def there(self, now: int) -> int:
+        """The commander's monotonic clock."""
+        return round((now - START) * self._rate) + START + self._ahead
+
+    def report(self, published: int, took: int) -> None:
+        self.clock.update(state(published), self.there(published + took))
+
+    def command(self, sent: int, took: int, session: int = 1) -> int:
+        """The excess of a command."""
+        return self.ages.excess(session, 0, sent + took, self.clock.at(self.there(sent)))
+
+
+def test_the_excess_is_what_a_command_took_longer_than_the_fastest_of_its_session():
+    link = Link()
+    link.report(START, 5 * MS)
+    assert link.command(START + 10 * MS, took=20 * MS) == 0
+    assert link.command(START + 20 * MS, took=90 * MS) == pytest.approx(70 * MS, abs=MS // 10)
+    assert link.command(START + 30 * MS, took=3 * MS) == 0
+    assert link.command(START + 40 * MS, took=20 * MS) == pytest.approx(17 * MS, abs=MS // 10)
+    assert link.command(START + 50 * MS, took=20 * MS, session=2) == 0
+
+
+def test_a_first_command_that_has_waited_is_not_the_measure_of_the_others():
+    link = Link()
+    link.report(START, 5 * MS)
+    for number in range(100):
+        excess = link.command(START + number * 10 * MS, took=3 * S)
+        assert excess == pytest.approx(3005 * MS, abs=5 * MS)
+    assert link.command(START + S, took=10 * MS) == 0
+
+
+def test_old_commands_stay_old_at_rest_after_silence_and_with_a_steady_delay():
+    """What a bounded queue delivers after the death of its sender: all of it equally old."""
+    link = Link()
+    link.report(START, 5 * MS)
+    assert link.command(START, took=5 * MS) == 0
+    for number in range(1, 2000):
+        assert link.command(START + number * 10 * MS, took=16 * S) > 15 * S
+    assert link.command(START + 30 * S, took=3600 * S) > 3500 * S
+
+
+@pytest.mark.parametrize("rate", [1.0 - 5e-4, 1.0, 1.0 + 5e-4], ids=["slow", "equal", "fast"])
+def test_no_age_is_underestimated_by_more_than_the_shortest_way_there_and_back(rate: float):
+    """For ten minutes of random delays; clocks that differ by what NTP may slew."""
+    generator = np.random.default_rng(3)
+    link, shortest, worst_over = Link(rate=rate), 10**18, 0
+    for number in range(12_000):
+        now = START + number * 50 * MS
+        link.report(now, int(generator.uniform(2, 40)) * MS)
+        way = int(generator.choice([3, 3, 3, 50, 2000]) * MS)
+        shortest = min(shortest, way)
+        excess = link.command(now + 45 * MS, way)
+        assert excess + shortest + 2 * MS < TTL or way > TTL / 2
+        assert way <= excess + shortest + 45 * MS
+        worst_over = max(worst_over, excess - way)
+    assert worst_over < 45 * MS
+
+
+def test_a_command_that_answers_another_host_or_a_later_instant_is_refused():
+    link = Link()
+    with pytest.raises(MessageError, match="another host of this driver") as caught:
+        link.ages.excess(1, 0, START, (HOST + 1, START))
+    assert caught.value.reason == "late"
+    with pytest.raises(MessageError, match=r"its echo is 1\.0 ms ahead"):
+        link.ages.excess(1, 0, START, (HOST, START + MS))
+
+
+def test_steps_of_the_system_clock_of_a_commander_do_not_matter():
+    link = Link()
+    link.report(START, MS)
+    for stamp in (-(2**63), 2**63 - 1, 0):
+        assert link.ages.excess(1, stamp, START + 10 * MS, link.clock.at(link.there(START + 9 * MS))) < MS
+
+
+def test_without_an_echo_the_excess_is_counted_by_stamps():
+    ages = CommandAges(HOST, TTL)
+    assert ages.excess(1, 1_700_000_000 * S, START) == 0
+    assert ages.excess(1, 1_700_000_000 * S + 10 * MS, START + 310 * MS) == pytest.approx(300 * MS, abs=MS)
+    assert ages.excess(1, 1_700_000_001 * S, START + 990 * MS) == 0
+    for session, stamp in enumerate((-(2**63), 2**63 - 1, 0), start=2):
+        assert ages.excess(session, stamp, START) == 0
+
+
+def test_without_an_echo_a_slow_clock_is_followed_and_one_that_is_set_back_is_not():
+    ages = CommandAges(HOST, TTL)
+    for second in range(3600):
+        assert ages.excess(1, round(second * S * (1 - 5e-4)), START + second * S) < 2 * MS
+    set_back = 3600 * S - 5 * S
+    assert ages.excess(1, set_back, START + 3600 * S) > 3 * S
+
+
+class Queue:
+    """A link that carries ``per_s`` commands, one after the other, in simulated time."""
+
+    def __init__(self, per_s: float) -> None:
+        self.window = CommandWindow()
+        self._takes = round(S / per_s)
+        self._under_way: deque[tuple[int, int, int]] = deque()
+        self._free_at = self._seq = 0
+        self.newest, self.excess = -1, 0
+        self.longest = 0
+        self.arrived = 0
+
+    def run(self, start: int, seconds: float, rate_hz: float) -> None:
+        """Sends at ``rate_hz`` what the window permits; the driver reports ten times a second."""
+        self.longest = self.arrived = 0
+        for number in range(round(seconds * rate_hz)):
+            now = start + round(number * S / rate_hz)
+            if self.window.has_room(now):
+                self._free_at = max(self._free_at, now) + self._takes
+                self._seq += 1
+                self._under_way.append((now, self._free_at, self._seq))
+                self.window.sent(self._seq, now)
+            while self._under_way and self._under_way[0][1] <= now:
+                sent, arrives, seq = self._under_way.popleft()
+                self.newest, self.excess = seq, arrives - sent - self._takes
+                self.longest = max(self.longest, self.excess)
+                self.arrived += 1
+            if number % round(rate_hz / 10) == 0:
+                self.window.update(self.newest, self.excess, TTL, now)
+
+
+def test_a_fast_link_carries_every_command_at_1_khz():
+    queue = Queue(per_s=100_000.0)
+    queue.run(0, 5.0, 1000.0)
+    assert queue.arrived >= 4999
+
+
+@pytest.mark.parametrize("per_s", [8.0, 15.0, 40.0])
+def test_on_a_slow_link_commands_wait_for_less_than_the_ttl_once_the_first_have_drained(per_s: float):
+    queue = Queue(per_s)
+    queue.run(0, 20.0, 200.0)
+    assert queue.longest > TTL
+    queue.run(20 * S, 20.0, 200.0)
+    assert queue.longest < TTL
+    assert queue.arrived >= 20
+
+
+def test_a_link_that_becomes_fast_again_carries_every_command():
+    queue = Queue(per_s=10.0)
+    queue.run(0, 20.0, 200.0)
+    queue._takes = S // 100_000
+    queue.run(20 * S, 5.0, 200.0)
+    queue.run(25 * S, 5.0, 200.0)
+    assert queue.arrived >= 999
+
+
+def test_commands_that_are_lost_do_not_close_the_window():
+    window = CommandWindow()
+    for now in range(0, 3 * S, 100 * MS):  # halved, as none is confirmed
+        if window.has_room(now):
+            window.sent(now, now)
+        window.update(-1, 0, TTL, now)
+    sent = 0
+    for now in range(3 * S, 13 * S, 10 * MS):
+        if window.has_room(now):
+            window.sent(now, now)
+            sent += 1
+    assert 9 <= sent <= 12

@@ -1,0 +1,148 @@
+"""How old commands are when they arrive, and how many may be under way; no clocks in common, no threads.
+
+A slow link, and the queues before it, deliver commands seconds after they were sent, also after the death of
+their sender. A driver therefore counts the validity of a command from its sending.
+
+It finds that instant by an echo of its own clock. Each DriverState has its ``instant``; a commander adds the
+time since that state has arrived, and sends the sum with each command. The command was sent at that instant
+of the driver's clock, or later by what the state was under way. The difference to the arrival, the *transit*,
+is the way of the state and of the command together: its least in a session is the shortest way there and
+back, and what a command takes longer than that, its *excess*, is time that it has waited. The clock of the
+commander may be wrong, or set: its steps do not matter, only its rate.
+
+A ROS node echoes nothing. Its transit is the arrival less its stamp, which has an unknown constant: the
+excess is the same, but a first command that has waited counts as fresh. A node whose clock is set back is
+refused until it is restarted: nothing tells its commands from old ones.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from zstate._util.bounded import BoundedDict
+from zstate.errors import MessageError, format_duration
+from zstate.wire.messages import DriverState
+
+_MOST_DRIFT = 1e-3
+"""Of a clock against another: above what NTP slews by, 500 ppm, and an oscillator is off by."""
+
+_KEPT_NS = 10_000_000_000
+"""For so long a state of the driver is used in place of those that took longer."""
+
+_LOST_NS = 1_000_000_000
+"""A command that is not confirmed after this time counts as lost."""
+
+_LATE_NS = 300_000_000
+"""Above the period of the driver's states: a command is confirmed within that time on a good link."""
+
+_MOST_UNCONFIRMED = 1024
+
+
+class CommandAges:
+    """The excess of the commands that arrive at a driver, by session. For one thread.
+
+    ``driver`` is the session of the driver's host, and ``ttl_ns`` the longest validity that it grants. All
+    instants are of its monotonic clock [ns].
+    """
+
+    def __init__(self, driver: int, ttl_ns: int) -> None:
+        self._driver = driver
+        self._ttl_ns = ttl_ns
+        self._echoed: BoundedDict[int, int] = BoundedDict()
+        """The least transit of each session."""
+        self._stamped: BoundedDict[int, tuple[int, int]] = BoundedDict()
+        """That of sessions which echo nothing, and when it was measured."""
+
+    def excess(self, session: int, stamp: int, arrived: int, echo: tuple[int, int] | None = None) -> int:
+        """How much longer a command was under way than the fastest of its ``session`` [ns].
+
+        All of its transit, while no command of the session has had one below the longest ttl: they may all
+        have waited. Raises MessageError for an ``echo`` that is not of this driver.
+        """
+        if echo is None:
+            return self._stamped_excess(session, arrived - stamp, arrived)
+        driver, instant = echo
+        if driver != self._driver:
+            text = "it answers another host of this driver, such as one that has ended"
+            raise MessageError(text, reason="late")
+        transit = arrived - instant
+        if transit < 0:
+            text = f"its echo is {format_duration(-transit)} ahead of the driver's own clock"
+            raise MessageError(text, reason="echo")
+        least = self._echoed[session] = min(transit, self._echoed.get(session, transit))
+        return transit - least if least < self._ttl_ns else transit
+
+    def _stamped_excess(self, session: int, transit: int, arrived: int) -> int:
+        least, since = self._stamped.get(session, (transit, arrived))
+        least = min(transit, least + int((arrived - since) * _MOST_DRIFT))
+        self._stamped[session] = least, arrived
+        return transit - least
+
+
+class DriverClock:
+    """The clock of a driver as its commander knows it: never ahead of it, behind by what a state takes."""
+
+    def __init__(self) -> None:
+        self.session: int = 0
+        """Of the driver's host; 0 before its first state."""
+        self._offset: int = 0
+        self._measured_at: int = 0
+
+    def update(self, state: DriverState, arrived: int) -> None:
+        """Take the instant of a state that has arrived at ``arrived`` [ns, monotonic clock of here]."""
+        offset = state.instant - arrived
+        age = arrived - self._measured_at
+        if state.session != self.session or age > _KEPT_NS or offset >= self._offset - int(age * _MOST_DRIFT):
+            self.session, self._offset, self._measured_at = state.session, offset, arrived
+
+    def at(self, now: int) -> tuple[int, int]:
+        """The echo of a command that is sent at ``now`` [ns, monotonic clock of here]."""
+        drift = int(abs(now - self._measured_at) * _MOST_DRIFT)
+        return self.session, max(0, now + self._offset - drift)
+
+
+class CommandWindow:
+    """How many commands may be under way without a confirmation of the driver. For one thread at a time.
+
+    As many as a commander sends on a link that carries them. Where they wait, the number is halved with each
+    state of the driver, down to one, and doubled each time so many did not wait.
+    """
+
+    def __init__(self) -> None:
+        self._size = _MOST_UNCONFIRMED
+        self._unconfirmed: deque[tuple[int, int]] = deque()
+        """Number and instant of sending of each, oldest first."""
+        self._last = self._grows_at = -1
+        """The last number that was sent, and the one at whose confirmation the size may grow next."""
+
+    def has_room(self, now: int) -> bool:
+        """Whether one more may be sent at ``now`` [ns, monotonic]."""
+        while self._unconfirmed and now - self._unconfirmed[0][1] > _LOST_NS:
+            self._unconfirmed.popleft()
+        return len(self._unconfirmed) < self._size
+
+    def sent(self, seq: int, now: int) -> None:
+        """The command ``seq`` was sent at ``now``."""
+        self._unconfirmed.append((seq, now))
+        self._last = seq
+
+    def update(self, confirmed: int, excess: int, ttl: int, now: int) -> None:
+        """Take a state of the driver, whose newest command is ``confirmed``, and waited for ``excess`` [ns].
+
+        It is -1 if the driver has none of this commander.
+        """
+        before, waited = len(self._unconfirmed), self.waiting_ns(now)
+        while self._unconfirmed and self._unconfirmed[0][0] <= confirmed:
+            self._unconfirmed.popleft()
+        has_news = len(self._unconfirmed) < before
+        if waited > max(ttl, _LATE_NS) or (has_news and excess > ttl // 4):
+            self._size = max(1, min(self._size, before) // 2)
+        elif has_news and before >= self._size and confirmed >= self._grows_at:
+            self._size = min(2 * self._size, _MOST_UNCONFIRMED)
+        else:
+            return
+        self._grows_at = self._last + self._size  # once as many have shown whether they wait
+
+    def waiting_ns(self, now: int) -> int:
+        """For how long the oldest command waits for its confirmation; 0 without any."""
+        return now - self._unconfirmed[0][1] if self._unconfirmed else 0
