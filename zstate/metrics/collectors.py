@@ -268,6 +268,10 @@ class DriverMetrics:
                 age_s = state.command_age * 1e-9 + received.age_s
                 text = "The time since the newest command arrived."
                 gauge("zstate_driver_command_age_seconds", text, age_s, robot=robot)
+            if state.transit_excess is not None:
+                text = "How much longer the newest command was under way than the fastest of its session."
+                excess_s = state.transit_excess * 1e-9
+                gauge("zstate_driver_transit_excess_seconds", text, excess_s, robot=robot)
         return families
 
 

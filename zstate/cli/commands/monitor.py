@@ -444,11 +444,12 @@ def _driver_text(driver: ReceivedState) -> str:
 
     state = driver.state
     age_s = None if state.command_age is None else state.command_age * 1e-9
+    waited = "" if state.transit_excess is None else f", waited {time_text(state.transit_excess * 1e-9)}"
     reasons = ", ".join(f"{reason} {count}" for reason, count in state.refused.items())
     limited = ", ".join(state.limited)
     return printable(
         f"{driver}  loop {rate_text(state.rate_hz)}  skipped {state.skipped}  faults {state.faults}  "
-        f"command age {time_text(age_s)}  refused {sum(state.refused.values())}"
+        f"command age {time_text(age_s)}{waited}  refused {sum(state.refused.values())}"
         f"{f' ({reasons})' if reasons else ''}"
         f"{f'  slowed by limits {limited}' if limited else ''}"
         f"{f'  last motion {driver.last_motion}' if driver.last_motion else ''}"
@@ -461,6 +462,7 @@ def _driver_facts(driver: ReceivedState) -> dict[str, Any]:
     names = ("program", "state", "reason", "commander", "rate_hz", "ticks", "skipped", "faults", "refused")
     facts: dict[str, Any] = {name: getattr(state, name) for name in names}
     facts["command_age_s"] = None if state.command_age is None else state.command_age * 1e-9
+    facts["transit_excess_s"] = None if state.transit_excess is None else state.transit_excess * 1e-9
     facts["motion_progress"] = None if state.motion is None else state.progress
     return {**facts, "last_motion": driver.last_motion, "age_s": driver.age_s}
 

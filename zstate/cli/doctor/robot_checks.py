@@ -219,7 +219,11 @@ def _commander_check(robot: str, state: DriverState, commanders: Sequence[Writer
 
 
 def _commands_check(state: DriverState) -> Check:
-    """Whether commands arrive before the last one expires."""
+    """Whether commands arrive before the last one expires, and in time."""
+    if state.transit_excess is not None and state.transit_excess > state.ttl // 2:
+        waited, ttl = format_duration(state.transit_excess), format_duration(state.ttl)
+        text = f"the newest waited for {waited} on its way, where commands are valid for {ttl} at most"
+        return warning("commands", f"{text}: the link is too slow for them", "zstate monitor --robots")
     if state.command_age is None:
         return skipped("commands", "the driver has accepted none yet")
     age, ttl = format_duration(state.command_age), format_duration(state.ttl)

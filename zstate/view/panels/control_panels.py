@@ -243,6 +243,8 @@ class _DriverPanel:
         if state.command_age is not None:
             age = format_duration(state.command_age)
             rows += [("commander", state.commander), ("newest command", f"{age} ago")]
+        if state.transit_excess is not None:
+            rows.append(("it waited for", format_duration(state.transit_excess)))
         rows.append(("failed calls", str(state.faults)))
         if state.refused:
             rows += [("refused", refused), ("newest refusal", state.last_refusal)]
