@@ -126,6 +126,29 @@ def test_a_motion_follows_its_trajectory_and_reaches_the_last_point(sessions):
     driver.assert_follows(planned, [1])
 
 
+def test_a_motion_without_times_takes_a_second_or_as_long_as_the_limits_need(sessions):
+    driver = Written()
+    slow = Limits.of(RRBOT, velocity=0.5, acceleration=50.0)
+    with arm_of(sessions, driver, limits=slow) as arm:
+        assert arm.move({"elbow": 0.05}).wait(DEADLINE_S).name == "reached"
+        quick = len(driver.setpoints)
+        assert arm.move({"elbow": [0.75]}).wait(DEADLINE_S).name == "reached"
+        assert driver.setpoints[-1][1] == pytest.approx(0.75)
+        assert len(driver.setpoints) - quick > 0.7 / 0.5 * RATE_HZ, "at 0.5 rad/s"
+        with pytest.raises(
+            InvalidInput, match=r"one position for each joint, and 'elbow' has 2; give the time"
+        ):
+            arm.move({"elbow": [0.1, 0.2]})
+
+
+def test_times_that_are_no_list_are_refused_with_an_example(sessions):
+    with Commander(sessions[0], "arm") as arm:
+        with pytest.raises(InvalidInput, match=r"such as times_s=\[2\.0\] for one point; got 2\.0"):
+            arm.move({"elbow": 1.0}, times_s=2.0)
+        with pytest.raises(InvalidInput, match="points have a number for each of the 2 times; 'elbow' has"):
+            arm.move({"elbow": 1.0}, [1.0, 2.0])
+
+
 def test_a_motion_that_exceeds_limits_is_refused_with_every_finding_or_stretched(sessions):
     driver = Written()
     narrow = Limits(RRBOT.joint_names, [-1.0, -1.0], [1.0, 1.0], [2.0, 2.0], [20.0, 20.0])

@@ -70,6 +70,9 @@ _REPLY_WITHIN_S = 5.0
 _REQUEST_PERIOD_S = 0.05
 """A session that has just connected has not discovered the queryable of the driver yet."""
 
+_SECONDS = 1.0
+"""A motion without times takes so long, or longer."""
+
 _LONGEST_UNSENT_NS = 250_000_000
 """A command for a driver that is not known yet waits for so long, unless it has a ttl of its own."""
 
@@ -219,8 +222,8 @@ class Commander(Closeable):
 
     def move(
         self,
-        points: Points,
-        times_s: Sequence[float] | ArrayLike,
+        points: Points | Mapping[str, float],
+        times_s: Sequence[float] | ArrayLike | None = None,
         *,
         velocities: Points | None = None,
         accelerations: Points | None = None,
@@ -232,10 +235,11 @@ class Commander(Closeable):
     ) -> Motion:
         """Move joints through ``points``, positions [rad] or [m] by joint, at ``times_s`` [s], (T,).
 
-        The motion starts at the present joints, at once or at the stamp ``start`` [ns]. Other joints rest,
-        or follow ``send``.
-        See ``Trajectory`` for ``velocities`` and ``accelerations``, by joint as well. The driver checks the
-        whole motion against its limits before it accepts it; with ``stretch`` it slows it to fit instead.
+        Without times each joint has one position, at which it arrives after a second, or as much later as the
+        limits need. The motion starts at the present joints, at once or at the stamp ``start`` [ns]. Other
+        joints rest, or follow ``send``. See ``Trajectory`` for ``velocities`` and ``accelerations``, by joint
+        as well. The driver checks the whole motion against its limits before it accepts it; with ``stretch``
+        it slows it to fit instead.
 
         The motion ends as "aborted" if a joint is more than ``path_tolerance`` [rad] or [m] from the path, or
         more than ``goal_tolerance`` from the last point ``goal_time_s`` [s] after its time. This commander
@@ -246,7 +250,12 @@ class Commander(Closeable):
         Raises MotionRefused with all ``findings``, InvalidInput for unusable numbers, Unreachable if no
         driver has replied within 5 s, SecondWriter, and Closed.
         """
+        if times_s is None:
+            points, times_s, stretch = _one_point(points), [_SECONDS], True
         times = real_numbers(times_s, "times_s")
+        if times.ndim != 1:
+            example = "; such as times_s=[2.0] for one point" if times.ndim == 0 else ""
+            raise InvalidInput(f"times_s has one number for each point{example}; got {times_s!r}")
         names = tuple(points)
         rates, changes = (
             None if rows is None else rows_block(rows, names, times, what)
@@ -492,3 +501,14 @@ def _by_joint(values: Mapping[str, float], mode: Mode) -> dict[str, float]:
         return {name: float(value) for name, value in values.items()}
     except (TypeError, ValueError) as error:
         raise InvalidInput(f"a {mode} of a joint is a number: {error}") from None
+
+
+def _one_point(points: Points | Mapping[str, float]) -> Points:
+    """One position for each joint as points. Raises InvalidInput for several of them."""
+    columns = {name: real_numbers(values, f"points of {name!r}") for name, values in points.items()}
+    if several := [name for name, column in columns.items() if column.size != 1]:
+        raise InvalidInput(
+            f"a motion without times_s has one position for each joint, and {several[0]!r} has "
+            f"{columns[several[0]].size}; give the time of each point in seconds: times_s=[1.0, 2.0]"
+        )
+    return {name: column.reshape(1) for name, column in columns.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -119,8 +120,8 @@ def rows_block(numbers: Points, names: Sequence[str], times: ArrayLike, what: st
         for name, column in zip(names, columns, strict=True)
         if column.shape != count
     ]
-    if len(count) != 1 or wrong:
+    if wrong:
         raise InvalidInput(
-            f"{what} have a number for each of the times, of shape {count}; {', '.join(wrong)}"
+            f"{what} have a number for each of the {math.prod(count)} times; {', '.join(wrong)}"
         )
     return to_block(np.stack(columns, axis=1))

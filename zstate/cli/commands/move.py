@@ -155,7 +155,8 @@ def move_command(
     if file is not None:
         points, times_s = _read_points(file)
     else:
-        points, times_s = {joint: [value] for joint, value in numbers.items()}, [seconds or _SECONDS]
+        points = {joint: [value] for joint, value in numbers.items()}
+        times_s = None if seconds is None else [seconds]
     with open_session(network) as session, Commander(session, robot) as commander:
         state = commander.wait_for_driver(timeout)
         if deg:
@@ -167,8 +168,7 @@ def move_command(
                 _print_outcome(robot, "ended")
             return
         started = time.monotonic()
-        is_stretched = stretch or (file is None and seconds is None)
-        motion = _begun(commander, points, times_s, stretch=is_stretched, as_json=as_json)
+        motion = _begun(commander, points, times_s, stretch=stretch, as_json=as_json)
         print_status(f"moving {', '.join(points)} of {robot!r}; Ctrl-C cancels", event="moving", robot=robot)
         outcome = _outcome(commander, motion)
     if as_json:
@@ -197,7 +197,7 @@ def _by_joint(values: Sequence[tuple[str, float]]) -> dict[str, float]:
 def _begun(
     commander: Commander,
     points: dict[str, list[float]],
-    times_s: list[float],
+    times_s: list[float] | None,
     *,
     stretch: bool,
     as_json: bool,
@@ -319,7 +319,7 @@ def _move_by_keys(
                 if rates is not None or was_moving:
                     commander.send(velocities=dict(zip((left, right), rates or (0.0, 0.0), strict=True)))
                 was_moving = rates is not None
-                if (problem := _problem(commander)) != shown:
+                if (problem := commander.problem) != shown:
                     shown = problem
                     print_status(problem or f"driving {robot!r} again", event="state", robot=robot)
         finally:
@@ -337,16 +337,6 @@ def _wheels_of(state: DriverState, robot: str) -> tuple[str, str]:
             f"{', '.join(state.joint_names)}"
         )
     return found[0][0], found[1][0]
-
-
-def _problem(commander: Commander) -> str:
-    """Why the driver does not obey; empty if it does, as far as is known."""
-    from zstate.driving.driver_state import state_text
-
-    state = commander.driver
-    if state is None:
-        return f"the driver of {commander.robot!r} is silent"
-    return state_text(state) if state.state in ("stopped", "fault") else ""
 
 
 @click.command("stop")
