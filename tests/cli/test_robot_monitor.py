@@ -156,7 +156,7 @@ def test_a_driver_has_a_line_of_its_own_and_is_in_the_metrics(sessions, host_dri
     assert line.startswith("arm  ")
     assert re.match(
         r"arm  driver active, commanded by teleop@\S+ pid \d+  loop [\d.]+ Hz  skipped \d+  faults 0  "
-        r"command age [\d.]+ ms  refused 0",
+        r"command age [\d.]+ ms, waited [\d.]+ [mu]s  refused 0",
         driver,
     )
     assert rows[row("zstate_driver_state", robot="arm", state="active")] == 1.0

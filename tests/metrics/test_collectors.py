@@ -271,5 +271,6 @@ def test_a_driver_has_its_state_refused_commands_and_the_age_of_the_newest(sessi
     assert rows[row("zstate_driver_refused_total", robot="arm", reason="foreign")] >= 1.0
     assert rows[row("zstate_driver_ticks_total", robot="arm")] > 0.0
     assert rows[row("zstate_driver_command_age_seconds", robot="arm")] > 0.0
+    assert 0.0 <= rows[row("zstate_driver_transit_excess_seconds", robot="arm")] < 1.0
     states = [value for (name, _), value in ended.items() if name == "zstate_driver_state"]
     assert sorted(states) == [0.0] * 6 + [1.0]
