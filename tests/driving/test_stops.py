@@ -413,7 +413,7 @@ def test_a_flood_of_one_program_displaces_only_its_own_stops_and_none_without_a_
     register.add(ActiveStop(1, 5, "hold", "honest", "desk"))
     register.add(ActiveStop(2, 0, "relax", "first of many", "flood"))
     for number in range(1, 1000):
-        register.add(ActiveStop(2, number, "hold", "", "flood"))
+        register.add(ActiveStop(2, number, "hold", str(number), "flood"))
     kept = register.current.stops
     assert (1, 5) in [one.id for one in kept]
     assert len(kept) < 20
@@ -427,6 +427,15 @@ def test_a_flood_of_one_program_displaces_only_its_own_stops_and_none_without_a_
     assert register.current.stops == ()
     register.add(ActiveStop(1, 5, "hold", "from a cache", "desk"))
     assert register.current.stops == ()
+
+
+def test_a_stop_that_is_repeated_replaces_the_last_one_and_an_earlier_release_does_not_end_it():
+    register = StopRegister(HOST)
+    register.add(ActiveStop(1, 0, "hold", "door open", "desk"))
+    for number in range(1, 100):
+        register.add(ActiveStop(1, number, "hold", "door open", "desk"))
+        register.release(Release(0, number, 8, ((1, number - 1),)))
+        assert [one.id for one in register.current.stops] == [(1, number)]
 
 
 def test_stops_of_many_programs_are_bounded_and_a_release_ends_those_that_it_names():
@@ -492,7 +501,7 @@ def test_every_name_may_hold_a_driver_and_reads_that_it_has_stopped_and_only_com
         arm.wait_for_driver(DEADLINE_S)
         for name in ("desk", "r2", "site"):
             assert stop(users[name], "arm", name, timeout_s=DEADLINE_S).state == "stopped"
-            with pytest.raises(Unreachable, match=r"has not confirmed within 0\.5 s that the torque is off"):
+            with pytest.raises(Unreachable, match=r"holds its joints, .* 0\.5 s that their torque is off"):
                 stop(users[name], "arm", name, how="relax", timeout_s=0.5)
             payload = encode(Stop(0, 0, 9, "relax", name))
             users[name].zenoh.put(

@@ -11,7 +11,7 @@ import secrets
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from typing import NamedTuple
 
@@ -60,7 +60,9 @@ _MOST_SENT = 64
 
 _STEP_BITS = 32
 _REPEAT_S = 0.25
-"""A stop that is not confirmed within that is sent again, with another number."""
+"""A stop that is not confirmed within that is sent again, with another number; then after twice that, ..."""
+
+STAYS_LATCHED = "The stop stays latched while this session is open"
 
 _STANDING = ("stopped", "off", "fault")
 """States in which a driver writes nothing, and has been stopped."""
@@ -110,7 +112,7 @@ class _Stopper:
         deadline = time.monotonic() + timeout_s
         session = self._session()
         assert session is not None, "the caller has it"
-        is_held = False
+        is_held, pause_s = False, _REPEAT_S
         first: int | None = None
 
         def is_obeyed(state: DriverState) -> bool:
@@ -124,11 +126,12 @@ class _Stopper:
                 number = self._send(session, how, reason)
             first = number if first is None else first
             left_s = deadline - time.monotonic()
-            confirmed = wait_for_state(session, self._robot, is_obeyed, max(0.0, min(left_s, _REPEAT_S)))
+            confirmed = wait_for_state(session, self._robot, is_obeyed, max(0.0, min(left_s, pause_s)))
             if confirmed is not None:
                 return confirmed
-            if left_s <= _REPEAT_S:
+            if left_s <= pause_s:
                 raise self._unconfirmed(timeout_s, is_held=is_held)
+            pause_s *= 2.0
 
     def _send(self, session: Session, how: StopMode, reason: str) -> int:
         """Send a stop, and return the number of its first message; with the lock.
@@ -160,19 +163,17 @@ class _Stopper:
         )
 
     def _unconfirmed(self, timeout_s: float, *, is_held: bool) -> Unreachable:
-        stays = "The stop stays latched while this session is open"
-        if is_held:
-            return Unreachable(
-                f"the driver of {self._robot!r} has stopped, and has not confirmed within {timeout_s:g} s "
-                "that the torque is off: behind a router with access control only commanders and operators "
-                f"switch it off (`zstate acl --commander`). {stays}",
-                endpoints=(),
-            )
-        return Unreachable(
+        text = (
             f"no driver of {self._robot!r} has confirmed the stop within {timeout_s:g} s. Is it running, "
-            f"and may this program stop it (`zstate acl`)? {stays}",
-            endpoints=(),
+            f"and may this program stop it (`zstate acl`)? {STAYS_LATCHED}"
         )
+        if is_held:
+            text = (
+                f"the driver of {self._robot!r} has stopped and holds its joints, but has not confirmed "
+                f"within {timeout_s:g} s that their torque is off: behind a router with access control only "
+                "commanders and operators switch it off (`zstate acl --commander`)"
+            )
+        return Unreachable(text, endpoints=())
 
 
 def wait_for_state(
@@ -276,19 +277,22 @@ class StopRegister:
         return ActiveStop(self._host.session, self._own_seq, how, stop_text(reason), str(self._host))
 
     def _add(self, one: ActiveStop) -> None:
-        """Latch ``one``. Of too many, the oldest one of its session, or of all, is replaced."""
-        others = [kept for kept in self._active.values() if kept is not self._substitute]
-        same = [kept for kept in others if kept.session == one.session]
-        if len(same) >= _MOST_OF_SESSION:
-            self._displace(same[0])
-        elif len(others) >= _MOST_STOPS - 1:
-            self._displace(others[0])
+        """Latch ``one``. It replaces one that reads alike, or, of too many, the oldest."""
+        same = [kept for kept in self._active.values() if kept.session == one.session]
+        alike = [kept for kept in same if (kept.how, str(kept)) == (one.how, str(one))]
+        if alike:  # a program that repeats its stop; a release from before does not end it
+            del self._active[alike[0].id]
+        elif len(same) >= _MOST_OF_SESSION:
+            self._displace(same)
+        elif len(self._active) >= _MOST_STOPS - 1:
+            self._displace(self._active.values())
         self._active[one.id] = one
         self._is_unsaved = True
         self.current = LatchedStops(tuple(self._active.values()), self.current.arrived + 1, one)
 
-    def _displace(self, oldest: ActiveStop) -> None:
-        """Let the substitute stand for ``oldest``, too. If one of them keeps the torque off, so does it."""
+    def _displace(self, stops: Iterable[ActiveStop]) -> None:
+        """Let the substitute stand for the oldest of ``stops``. If it keeps the torque off, so does that."""
+        oldest = next(one for one in stops if one is not self._substitute)
         ended = [self._active.pop(one.id) for one in (oldest, self._substitute) if one is not None]
         how: StopMode = "relax" if any(one.how == "relax" for one in ended) else "hold"
         self._displaced += 1

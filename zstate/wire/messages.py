@@ -406,7 +406,7 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     commander: str = ""
     command_age: Interval | None = None
     limited: tuple[str, ...] = ()
-    rate_hz: float = 0.0
+    rate_hz: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0
     ticks: Count = 0
     skipped: Count = 0
     faults: Count = 0
@@ -414,7 +414,7 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     last_refusal: str = ""
     stops: StopIds = ()
     motion: Id | None = None
-    progress: float = 0.0
+    progress: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     outcomes: tuple[MotionOutcome, ...] = ()
     modes: tuple[Mode, ...] = ("position",)
     instant: Interval = 0

@@ -424,13 +424,13 @@ def _driven_robots(session: Session) -> list[str]:
 
 def _stop(session: Session, robot: str, *, reason: str, how: StopMode, timeout_s: float) -> DriverState:
     from zstate.driving import stop
+    from zstate.driving.stops import STAYS_LATCHED
 
     try:
         return stop(session, robot, reason, how=how, timeout_s=timeout_s)
     except Unreachable as error:
-        raise Unreachable(
-            f"{error}, which this command ends: a driver that starts later does not obey it", endpoints=()
-        ) from None
+        text = str(error).replace(STAYS_LATCHED, "One that starts later does not obey this stop")
+        raise Unreachable(text, endpoints=()) from None
 
 
 def _release(session: Session, robot: str, *, timeout_s: float) -> DriverState:
