@@ -66,7 +66,7 @@ def host_driver(
     from zstate.driving import DriverHost, Limits, SimulatedDriver
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    limits = Limits.of(RRBOT, velocity=2.0)
+    limits = Limits.of(RRBOT, velocity=2.0, acceleration=float("inf"))
     with ExitStack() as opened:
 
         def hosted(**options: Any) -> DriverHost:
