@@ -106,8 +106,8 @@ NOT_FOR_USERS = {"docs", "test", "lint", "mujoco"}
 WITHOUT_IMPORTS = {"cmeel-urdfdom", "cmeel-tinyxml2", "cmeel-console-bridge", "example-robot-data"}
 
 PURE = {"model", "buffer", "wire"}
-# The loader and the catalog find and read model files; xacro is expanded in a process of its own.
-READS_FILES = {"model/load.py", "model/xacro_expansion.py", "model/catalog.py"}
+# The loader, the catalog and the search for meshes read files; xacro is expanded in a process of its own.
+READS_FILES = {"model/load.py", "model/xacro_expansion.py", "model/catalog.py", "model/mesh_paths.py"}
 READS_ENVIRONMENT = {"wire/registry.py"}  # ROS_DOMAIN_ID
 IMPURE_MODULES = {
     "io",
