@@ -63,6 +63,8 @@ class ReferenceHistory:
     def __init__(self, width: int, span_ns: int) -> None:
         self.width = width
         self.span_ns = span_ns
+        # The stamps of a view, and how many slots at its front never had a sample: no reader sees them.
+        self._unused: tuple[NDArray[np.int64] | None, int] = None, 0
         self.view = self._empty(_MIN_CAPACITY)
 
     def _empty(self, capacity: int) -> HistoryView:
@@ -113,6 +115,9 @@ class ReferenceHistory:
         if view.size and stamp <= view.newest:
             if not self.reaches(stamp):
                 return False
+            if stamp < view.oldest:
+                self._insert_before(stamp, row)
+                return True
             kept, old = view.kept_stamps(), view.kept_rows()
             at = int(kept.searchsorted(stamp))
             after = at + 1 if kept[at] == stamp else at
@@ -136,6 +141,20 @@ class ReferenceHistory:
             first += int(stamps[first:end].searchsorted(limit))
         self.view = HistoryView(stamps, rows, first, end + 1)
         return True
+
+    def _insert_before(self, stamp: int, row: NDArray[np.float64]) -> None:
+        """Insert the oldest sample: a writer's past arrives newest first."""
+        view, size = self.view, self.view.size
+        if self._unused[0] is not view.stamps or self._unused[1] != view.first or not view.first:
+            spare = _MIN_CAPACITY + size // 8
+            fresh = self._empty(2 * spare + size + 1)
+            fresh.stamps[spare + 1 : spare + 1 + size] = view.kept_stamps()
+            fresh.rows[spare + 1 : spare + 1 + size] = view.kept_rows()
+            view = fresh._replace(first=spare + 1, end=spare + 1 + size)
+        at = view.first - 1
+        view.stamps[at], view.rows[at] = stamp, row
+        self._unused = view.stamps, at
+        self.view = view._replace(first=at)
 
 
 class ReferenceFastPath(Generic[W]):

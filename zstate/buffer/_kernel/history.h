@@ -8,6 +8,8 @@ typedef struct {
     Block *block; /* never NULL; samples first to end are there */
     Py_ssize_t first;
     Py_ssize_t end;
+    Py_ssize_t
+        unused; /* slots at the front of the block that never had a sample: no reader sees them */
     Py_ssize_t width;
     int64_t span_ns;
     bool is_closed; /* another history takes its place */
@@ -105,6 +107,7 @@ typedef struct {
     Py_ssize_t at;
     Py_ssize_t first;
     Py_ssize_t end;
+    Py_ssize_t unused;
 } Slot;
 
 static bool
@@ -125,7 +128,7 @@ moved_to_front(History *self)
         return false;
     memmove(block->stamps, block->stamps + self->first, size * 8);
     memmove(block->rows, block->rows + (size_t)self->first * width, size * width * 8);
-    self->first = 0;
+    self->first = self->unused = 0;
     self->end = (Py_ssize_t)size;
     return true;
 }
@@ -137,7 +140,7 @@ slot_behind(History *self, Slot *slot)
     Py_ssize_t size = self->end - self->first;
     if (self->end < block->capacity || moved_to_front(self)) {
         Py_INCREF(block);
-        *slot = (Slot){block, self->end, self->first, self->end + 1};
+        *slot = (Slot){block, self->end, self->first, self->end + 1, self->unused};
         return 0;
     }
     /* Both copies exist for a moment, and a long history of a large robot is megabytes: room for an
@@ -146,7 +149,26 @@ slot_behind(History *self, Slot *slot)
     if (fresh == NULL)
         return -1;
     block_copy(fresh, 0, block, self->first, self->end);
-    *slot = (Slot){fresh, size, 0, size + 1};
+    *slot = (Slot){fresh, size, 0, size + 1, 0};
+    return 0;
+}
+
+/* The slot before the first sample: a writer's past arrives newest first. */
+static int
+slot_before(const History *self, Slot *slot)
+{
+    Block *block = self->block;
+    if (self->unused > 0 && self->unused == self->first) {
+        Py_INCREF(block);
+        *slot = (Slot){block, self->first - 1, self->first - 1, self->end, self->unused - 1};
+        return 0;
+    }
+    Py_ssize_t size = self->end - self->first, spare = SMALLEST_CAPACITY + size / 8;
+    Block *fresh = block_new(2 * spare + size + 1, self->width);
+    if (fresh == NULL)
+        return -1;
+    block_copy(fresh, spare + 1, block, self->first, self->end);
+    *slot = (Slot){fresh, spare, spare, spare + 1 + size, spare};
     return 0;
 }
 
@@ -163,7 +185,7 @@ slot_among(const History *self, int64_t stamp, Slot *slot)
         return -1;
     block_copy(fresh, 0, block, self->first, place);
     block_copy(fresh, at + 1, block, after, self->end);
-    *slot = (Slot){fresh, at, 0, at + 1 + self->end - after};
+    *slot = (Slot){fresh, at, 0, at + 1 + self->end - after, 0};
     return 0;
 }
 
@@ -173,6 +195,8 @@ slot_for(History *self, int64_t stamp, Slot *slot)
 {
     if (is_empty(self) || stamp > newest_of(self))
         return slot_behind(self, slot);
+    if (stamp < self->block->stamps[self->first])
+        return slot_before(self, slot);
     return slot_among(self, stamp, slot);
 }
 
@@ -191,6 +215,7 @@ slot_publish(History *self, const Slot *slot)
     self->block = slot->block;
     self->first = slot->first;
     self->end = slot->end;
+    self->unused = slot->unused;
     Py_DECREF(old);
     const int64_t *stamps = self->block->stamps;
     int64_t limit = limit_of(self, newest_of(self));
@@ -238,7 +263,7 @@ history_clear(History *self, PyObject *Py_UNUSED(ignored))
         return NULL;
     Block *old = self->block;
     self->block = fresh;
-    self->first = self->end = 0;
+    self->first = self->end = self->unused = 0;
     Py_DECREF(old);
     Py_RETURN_NONE;
 }
@@ -450,7 +475,7 @@ history_replace(History *self, PyObject *const *args, Py_ssize_t count)
         return NULL;
     Block *old = self->block;
     self->block = fresh;
-    self->first = 0;
+    self->first = self->unused = 0;
     self->end = size;
     Py_DECREF(old);
     Py_RETURN_NONE;

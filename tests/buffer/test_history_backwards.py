@@ -1,0 +1,62 @@
+"""A writer's past arrives newest first: samples inserted before those that a history has."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+
+from zstate.buffer.history import History, ReferenceHistory
+
+HISTORIES = pytest.mark.parametrize("make", list(dict.fromkeys([History, ReferenceHistory])))
+
+
+@HISTORIES
+def test_past_is_not_copied_for_each_sample(make: type[History]):
+    history, blocks = make(1, 10**12), []
+    for stamp in range(10_000, 0, -1):
+        history.insert(stamp, np.array([float(stamp)]))
+        start = history.view.stamps.ctypes.data
+        if not blocks or blocks[-1] != start:
+            blocks.append(start)
+    assert len(blocks) < 60  # each an eighth larger than the last
+    view = history.view
+    assert view.kept_stamps().tolist() == list(range(1, 10_001))
+    assert view.kept_rows()[:, 0].tolist() == list(range(1, 10_001))
+
+
+@HISTORIES
+@pytest.mark.parametrize("seed", range(5))
+def test_samples_in_any_order_are_sorted_and_leave_earlier_views_unchanged(make: type[History], seed: int):
+    choose, span = random.Random(seed), 400
+    history = make(2, span)
+    kept: dict[int, float] = {}
+    views: list[tuple[object, list[int], list[list[float]]]] = []
+    front = back = 1000
+    for step in range(3000):
+        way = choose.random()
+        if way < 0.5:
+            stamp = front = front - choose.randrange(1, 3)
+        elif way < 0.9:
+            stamp = back = back + choose.randrange(1, 3)
+        else:
+            stamp = choose.randrange(front, back + 1)
+        inserted = history.insert(stamp, np.array([float(step), -1.0]))
+        newest = max(kept, default=stamp)
+        assert inserted == (stamp >= newest - span)
+        if inserted:
+            kept[stamp] = float(step)
+            kept = {at: number for at, number in kept.items() if at >= max(kept) - span}
+        front, back = min(kept), max(kept)
+        view = history.view
+        assert view.kept_stamps().tolist() == sorted(kept)
+        assert view.kept_rows()[:, 0].tolist() == [kept[at] for at in sorted(kept)]
+        if step % 50 == 0:
+            views.append((view, view.kept_stamps().tolist(), view.kept_rows().tolist()))
+        if choose.random() < 0.002:
+            history.clear()
+            kept.clear()
+            front = back = 1000
+    for view, stamps, rows in views:
+        assert (view.kept_stamps().tolist(), view.kept_rows().tolist()) == (stamps, rows)
