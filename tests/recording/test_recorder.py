@@ -26,7 +26,7 @@ from zstate.model.kinematics import MovingEdges
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 from zstate.net.latched import LatchedPublisher
-from zstate.net.presence import local_writer
+from zstate.net.presence import announce, local_writer
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
@@ -44,6 +44,7 @@ from zstate.recording.recording import Recording
 from zstate.scans import Grid, MapPublisher, ScanPublisher
 from zstate.sources import SineSource
 from zstate.transform import Transform
+from zstate.wire.keys import writer_key
 from zstate.wire.messages import (
     ClockMessage,
     JointCommand,
@@ -751,17 +752,21 @@ def test_withdrawn_map_keeps_static_edges_of_its_name(sessions, tmp_path: Path):
 
 
 def test_commands_are_recorded_as_joint_states_and_not_replayed(sessions, tmp_path):
-    path = tmp_path / "run.mcap"
+    path, teleop = tmp_path / "run.mcap", local_writer(9, "teleop")
+    renewal = JointCommand(STAMP, 0, 9, order_digest(()), names=(), motion=0)
+    setpoint = JointCommand(
+        STAMP, 1, 9, order_digest(("elbow",)), to_block([0.25]), names=("elbow",), ttl=50_000_000
+    )
     with (
         StatePublisher(sessions[0], RRBOT, "arm") as publisher,
         Recorder(sessions[1], path, ["arm"]) as recorder,
-        Commander(sessions[0], "arm", program="teleop") as commander,
+        announce(sessions[0], writer_key("arm", "joint_commands", teleop.identity)),
+        StreamPublisher(sessions[0], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as commands,
     ):
         wait_for_stream_readers(sessions[0], "arm", "joint_states", "joint_commands")
         publisher.publish([0.0, 0.0])
-        with StreamPublisher(sessions[0], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as renewal:
-            renewal.put(encode(JointCommand(STAMP, 0, 1, order_digest(()), names=(), motion=0)))
-        commander.send({"elbow": 0.25}, ttl_s=0.05)
+        for command in (renewal, setpoint):
+            commands.put(encode(command))
         until(lambda: recorder.stats.messages.get(("arm", "joint_commands")))
         until(lambda: recorder.stats.messages.get(("arm", "joint_states")))
         assert recorder.stats.refused == {}
