@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -74,16 +75,19 @@ def test_threads_share_the_checks(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("zstate._util.bounded.MAX_ENTRIES", 8)
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
-    domain, lag = ClockDomain("system"), LagDetector(Counters())
+    domain, lag, started = ClockDomain("system"), LagDetector(Counters()), threading.Barrier(4)
 
     def add(thread: int) -> None:
-        for number in range(3000):
-            domain.place("r1", [f"other/{thread}-{number}"])
-            lag.add("r1", None, JointState(0, 0, 10_000 * thread + number, b"order", b""), 2 * S)
+        # Large batches: with single calls, threads rarely meet in the few instructions that need the lock.
+        states = [JointState(0, 0, 10**6 * thread + number, b"order", b"") for number in range(20_000)]
+        started.wait(60)
+        domain.place("r1", [f"other/{thread}-{number}" for number in range(60_000)])
+        for state in states:
+            lag.add("r1", None, state, 2 * S)
 
     try:
-        with ThreadPoolExecutor(4) as threads:
-            for done in [threads.submit(add, thread) for thread in range(4)]:
+        with ThreadPoolExecutor(4) as pool:
+            for done in [pool.submit(add, thread) for thread in range(4)]:
                 done.result()
     finally:
         sys.setswitchinterval(interval)
