@@ -17,7 +17,7 @@ from helpers.cli_runner import (
 )
 from helpers.processes import Child, until
 
-from zstate import StatePublisher, connect, load_model
+from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 
 pytestmark = pytest.mark.processes
 
@@ -76,6 +76,16 @@ def test_a_pose_is_waited_for_with_the_reason():
         assert "did you mean 'lower'" in failure("wait", "frame", "base", "lwer", "--timeout", "0.6")
 
 
+@pytest.mark.parametrize(("placer", "timeout", "code"), [("thief", "30", 0), ("site", "1", 1)])
+def test_only_placers_place_the_root_of_the_robot_of_a_pose(placer: str, timeout: str, code: int):
+    with published_robot(), connect() as session, StaticPublisher(session, "thief", "edges") as statics:
+        statics.set(Transform("thief/x", "rrbot/world", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+        outcome = waited(
+            "frame", "thief/x", "rrbot/world", "--timeout", timeout, "--placer", placer, code=code
+        )
+    assert outcome["ready"] is (code == 0)
+
+
 def test_a_router_may_come_late(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = started(spawn, "wait", "router", endpoint)
@@ -108,6 +118,7 @@ def test_ctrl_c_ends_a_wait(spawn: Spawn):
 
 def test_wait_arguments_are_checked():
     assert "name a robot" in failure("wait", "robot", code=2)
+    assert "--placer is for `zstate wait frame" in failure("wait", "robot", "r1", "--placer", "site", code=2)
     assert "two frames" in failure("wait", "frame", "base", code=2)
     assert "'robto' is not one of" in failure("wait", "robto", code=2)
     assert "contains '/'" in failure("wait", "robot", "a/b")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import click
 
@@ -18,10 +19,18 @@ from zstate.errors import Unreachable, ZStateError
 @click.argument("names", nargs=-1, metavar="[NAME]...")
 @options.timeout_option("Fail after this time, with the reason [s].", 30.0)
 @options.json_option("One JSON object, also after the timeout.")
+@options.placer_option
 @options.wire_option
 @options.session_options
 def wait_command(
-    *, network: SessionOptions, what: str, names: tuple[str, ...], timeout: float, as_json: bool, wire: str
+    *,
+    network: SessionOptions,
+    what: str,
+    names: tuple[str, ...],
+    timeout: float,
+    as_json: bool,
+    placers: tuple[str, ...] | None,
+    wire: str,
 ) -> None:
     """Wait until a robot, a frame or a router is available.
 
@@ -39,8 +48,11 @@ def wait_command(
         raise click.UsageError("name a robot, for instance `zstate wait robot panda`")
     if what == "frame" and len(names) != 2:
         raise click.UsageError("a pose has two frames: `zstate wait frame A B` waits for the pose of B in A")
+    if what != "frame" and placers is not None:
+        raise click.UsageError("--placer is for `zstate wait frame A B`")
     began, reason, text = time.monotonic(), None, ""
-    waits = {"robot": _wait_for_robots, "frame": _wait_for_pose, "router": _wait_for_router}
+    wait_for_pose = partial(_wait_for_pose, placers=placers)
+    waits = {"robot": _wait_for_robots, "frame": wait_for_pose, "router": _wait_for_router}
     try:
         text = waits[what](network, names, wire, timeout)
     except click.UsageError:
@@ -78,7 +90,14 @@ def _wait_for_robots(network: SessionOptions, names: tuple[str, ...], wire: str,
         return f"ready: {', '.join(ready)}"
 
 
-def _wait_for_pose(network: SessionOptions, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+def _wait_for_pose(
+    network: SessionOptions,
+    names: tuple[str, ...],
+    wire: str,
+    timeout_s: float,
+    *,
+    placers: tuple[str, ...] | None,
+) -> str:
     from zstate.cli.output.wire_text import default_stream
     from zstate.cli.robot_directory import RobotDirectory
     from zstate.cli.waiting import PoseWaiter
@@ -89,7 +108,7 @@ def _wait_for_pose(network: SessionOptions, names: tuple[str, ...], wire: str, t
     with (
         open_session(network, (wire,), timeout_s=timeout_s) as session,
         RobotDirectory(session, "*", wire) as directory,
-        TransformListener(session, wire=wire, follow=default_stream(wire)) as listener,
+        TransformListener(session, wire=wire, follow=default_stream(wire), placers=placers) as listener,
     ):
         PoseWaiter(listener, directory, target, source).wait(
             timeout_s=max(round(deadline - time.monotonic(), 1), 0.1)
