@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from helpers.robots import RRBOT, STAMP
+import math
+from typing import Any
+
+import pytest
+from helpers.robots import RRBOT, STAMP, assert_pose
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.history import History, HistoryView
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
@@ -125,3 +130,100 @@ def test_unusable_history_is_counted_once_per_page():
     bad = [JointState(STAMP + seq * PERIOD, seq, 7, ORDER, to_block([0.0])) for seq in range(30)]
     assert not history.ingest.insert_history(bad)
     assert (history.counters.stats().refused, history.counts) == ({"bad numbers": 1}, (1, 0, 0))
+
+
+@pytest.fixture
+def single_inserts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The stamps of samples that were inserted one by one: among others, each copies the history."""
+    stamps: list[int] = []
+    for name in ("insert", "try_insert"):
+        insert = getattr(History, name)
+
+        def counted(history: History, stamp: int, *numbers: object, insert: Any = insert) -> object:
+            stamps.append(stamp)
+            return insert(history, stamp, *numbers)
+
+        monkeypatch.setattr(History, name, counted)
+    return stamps
+
+
+def fill(history: HistoryIngest, first: int, end: int, page: int = 100) -> bool:
+    """Samples ``first`` up to ``end`` come from the cache, the newest page first."""
+    wanted = True
+    for start in range(end - page, first - 1, -page):
+        wanted = history.ingest.insert_history(states(start, start + page))
+    return wanted
+
+
+def view_of(history: HistoryIngest) -> HistoryView:
+    track = history.ingest._track
+    assert track is not None
+    return track.history.view
+
+
+@pytest.mark.parametrize("shows_first", [True, False])
+@pytest.mark.parametrize("size", [1000, 10_000])
+def test_samples_of_a_gap_are_not_inserted_one_by_one(
+    single_inserts: list[int], size: int, shows_first: bool
+):
+    """Each would copy the history: the work for a gap would grow with its square."""
+    history = HistoryIngest(history_s=1e6)
+    history.receive(*states(0, 100))
+    if shows_first:
+        history.receive(*states(100 + size, 110 + size))
+    before = view_of(history)
+    stamps = before.kept_stamps().tolist()
+    single_inserts.clear()
+    assert not fill(history, 0, 100 + size)
+    assert single_inserts == []
+    if not shows_first:
+        history.receive(*states(100 + size, 110 + size))
+    assert history.counts[2] == size
+    view = view_of(history)
+    assert view.kept_stamps().tolist() == [STAMP + seq * PERIOD for seq in range(110 + size)]
+    assert view.kept_rows()[:, 0].tolist() == [0.01 * seq for seq in range(110 + size)]
+    assert before.kept_stamps().tolist() == stamps
+
+
+def test_gap_is_filled_no_further_than_the_buffer_reaches():
+    for shows_first in (True, False):
+        history = HistoryIngest(history_s=10.0)
+        history.receive(*states(0, 5), *(states(1500, 1501) if shows_first else ()))
+        assert not fill(history, 0, 1500)
+        newest = 1500 if shows_first else 1499
+        kept = view_of(history).kept_stamps().tolist()
+        assert kept == [STAMP + seq * PERIOD for seq in range(newest - 1000, newest + 1)]
+        assert history.counts[2] == 1000 + (not shows_first)
+
+
+def test_samples_of_a_gap_end_at_one_that_cannot_be_used():
+    history = HistoryIngest()
+    history.receive(*states(0, 5), *states(50, 51))
+    page = states(5, 50)
+    page[20] = JointState(page[20].stamp, page[20].seq, 7, ORDER, to_block([math.nan, 0.0]))
+    assert not history.ingest.insert_history(page)
+    assert history.counts == (6, 45, 24)
+    assert history.counters.stats().refused == {"bad numbers": 1}
+    assert history.stamps_known == [*range(5), *range(26, 51)]
+
+
+def test_velocities_of_a_gap_are_recalled():
+    history = HistoryIngest()
+    live = [
+        JointState(state.stamp, state.seq, 7, ORDER, state.positions, to_block([1.0, 2.0]))
+        for state in states(0, 50)
+    ]
+    history.receive(*live[:5], live[49])
+    assert not history.ingest.insert_history([*states(5, 10), *live[10:49]])
+    rows = view_of(history).kept_rows()
+    assert rows[:, 2].tolist() == pytest.approx([1.0] * 5 + [math.nan] * 5 + [1.0] * 40, nan_ok=True)
+
+
+def test_live_samples_go_on_after_a_gap_was_filled():
+    history = HistoryIngest()
+    history.receive(*states(0, 5), *states(50, 51))
+    before = history.buffer.lookup("world", "tool", STAMP + 2 * PERIOD)
+    assert not history.ingest.insert_history(states(0, 50))
+    history.receive(*states(51, 60))
+    assert history.stamps_known == list(range(60))
+    assert_pose(history.buffer.lookup("world", "tool", STAMP + 2 * PERIOD), before.matrix)

@@ -16,7 +16,7 @@ from zstate._util.format import did_you_mean
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.covariance_path import compile_path_with_covariances
 from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreeSnapshot
-from zstate.buffer.history import FastPath, HistoryView, insert_together, keep_only_around
+from zstate.buffer.history import FastPath, HistoryView, insert_together, keep_only_around, merged
 from zstate.buffer.path import TransformPath
 from zstate.buffer.pose_tracks import (
     EdgeNames,
@@ -252,6 +252,46 @@ class BufferCore:
                 self._tree.invalidate(track)
         return self._count(track, inserted=inserted)
 
+    def insert_past_joints(
+        self, track: JointTrack, samples: Iterable[tuple[int, ArrayLike, ArrayLike | None]]
+    ) -> int:
+        """Insert instants of a robot, newest first, all of them with one copy of its history.
+
+        An instant is a stamp [ns], positions and velocities, as ``insert_joints`` takes them.
+
+        Returns how many were inserted: those before the first one that ``insert_joints`` has to handle, as
+        it is not older than the one before it, or not usable, or because the row has no column for it. None
+        is inserted if all that the track has is newer: then each insert costs the same. Raises InsertRefused
+        as ``insert_joints``.
+        """
+        stamps: list[int] = []
+        rows: list[NDArray[np.float64]] = []
+        with self._lock:
+            self._check_owned(track)
+            oldest, newest = track.history.oldest, track.history.newest
+            if oldest is None or newest is None or self._has_own_inserts():
+                return 0
+            for stamp, positions, velocities in samples:
+                newest = max(newest, stamp)
+                is_next = not stamps or stamp < stamps[-1]
+                if not is_next or stamp < newest - track.history.span_ns:
+                    break
+                if velocities is not None and not track.has_velocities:
+                    break
+                try:
+                    rates = None if velocities is None else track.model.check_velocities(velocities)
+                    rows.append(track.row(track.check_positions(positions), rates))
+                except InvalidInput:
+                    break
+                stamps.append(stamp)
+            if not stamps or stamps[0] < oldest:
+                return 0
+            times = np.array(stamps[::-1], dtype=np.int64)
+            track.history = merged(track.history, times, np.array(rows[::-1]))
+            self._tree.invalidate(track)
+        self._waiters.notify(track)
+        return len(stamps)
+
     def fast_path(self, counts: dict[str, int], *sources: object) -> FastPath[Waiter]:
         """A fast path into this buffer for the messages of one writer, see ``FastPath``."""
         return self._waiters.fast_path(counts, *sources)
@@ -269,11 +309,7 @@ class BufferCore:
         checks: those of floating joints, of edges in several tracks, or any unless the clock is the system's.
         Nor is one if a subclass overrides the methods that insert samples, for instance to measure them.
         """
-        methods = type(self).insert_joints, type(self).insert_many
-        if type(self.clock) is not SystemClock or methods != (
-            BufferCore.insert_joints,
-            BufferCore.insert_many,
-        ):
+        if type(self.clock) is not SystemClock or self._has_own_inserts():
             return
         if not isinstance(place, JointTrack):
             track = self._pose_tracks.whole_track(place)
@@ -281,6 +317,11 @@ class BufferCore:
             track = place if place.has_plain_joints else None
         if track is not None:
             self._waiters.expect_next(fast_path, track, message, versions)
+
+    def _has_own_inserts(self) -> bool:
+        """Whether a subclass overrides the methods that insert samples, for instance to measure them."""
+        methods = type(self).insert_joints, type(self).insert_many
+        return methods != (BufferCore.insert_joints, BufferCore.insert_many)
 
     def _check_owned(self, track: Track) -> None:
         if track.owner is self._owner:

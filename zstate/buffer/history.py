@@ -245,6 +245,24 @@ else:
             return HistoryView(arrays[1], arrays[2], first, end)
 
 
+def merged(history: History, stamps: NDArray[np.int64], rows: NDArray[np.float64]) -> History:
+    """A history of the same samples and of these, whose stamps ascend: one copy of all.
+
+    It takes the place of ``history``, which refuses samples of a ``FastPath`` from now on. A sample of a
+    stamp that ``history`` has replaces the one there. Those older than the span of the newest are left out.
+    """
+    history.close()
+    view = history.view
+    both = np.concatenate((view.kept_stamps(), stamps))
+    order = np.argsort(both, kind="stable")  # of two samples of one stamp, the one of ``rows`` is behind
+    is_last = np.append(np.diff(both[order]) > 0, [True])
+    order = order[is_last]
+    order = order[both[order] >= int(both[order[-1]]) - history.span_ns]
+    fresh = History(history.width, history.span_ns)
+    fresh.replace(both[order], np.concatenate((view.kept_rows(), rows))[order])
+    return fresh
+
+
 def keep_only_around(history: History, stamps: NDArray[np.int64]) -> None:
     """Keep the first sample, the last, and those around each of ``stamps`` [ns]."""
     view = history.view

@@ -121,11 +121,17 @@ class JointTrack:
             wider = History(self.history.width + self.model.velocity_count, self.history.span_ns)
             wider.replace(old.kept_stamps(), np.hstack((old.kept_rows(), missing)))
             self.history = wider
+        return self.history.insert(stamp, self.row(positions, velocities))
+
+    def row(
+        self, positions: NDArray[np.float64], velocities: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
+        """A row of the history; ``velocities`` only if it has columns for them."""
         if not self.has_velocities:
-            return self.history.insert(stamp, positions)
+            return positions
         if velocities is None:
             velocities = np.full(self.model.velocity_count, np.nan)
-        return self.history.insert(stamp, np.concatenate((positions, velocities)))
+        return np.concatenate((positions, velocities))
 
     def samples(self, view: HistoryView, start: int | None, end: int | None) -> JointTrajectory:
         """Copies of the samples in ``view`` with stamps in [start, end) [ns]; None is no limit."""

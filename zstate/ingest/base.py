@@ -203,10 +203,12 @@ class StreamIngest(ABC):
         """Insert samples from the writer's cache, oldest first; True if still older ones are wanted.
 
         Inserts only missing samples, counted as "recalled". They are inserted newest first: the known
-        history grows backwards, so that it never has a gap that is about to be filled.
+        history grows backwards, so that it never has a gap that is about to be filled. Those that fill a gap
+        between others are inserted together, because each insert there copies the history.
         """
         self.has_data = True
-        for sample in reversed(samples):
+        together = self._insert_past_counted(samples)
+        for sample in reversed(samples[: len(samples) - together]):
             with self._lock:  # for each, so that live samples need not wait for all
                 if self._is_dropped or not self._accept_session(sample):
                     return False
@@ -214,6 +216,35 @@ class StreamIngest(ABC):
                     return False
                 self._missing.stop_at(sample.seq)
         return bool(self._missing) or self._is_missing(samples[0].seq - 1)
+
+    def _insert_past_counted(self, samples: Sequence[Sample]) -> int:
+        """Insert the newest of ``samples`` together, as many as can be. Returns how many are handled."""
+        with self._lock:
+            if self._is_dropped or not self._accept_session(samples[-1]):
+                return 0
+            missing = [sample for sample in reversed(samples) if self._is_missing(sample.seq)]
+            if len(missing) < 2:
+                return 0
+            try:
+                count = self._insert_past(missing)
+            except (InvalidInput, MessageError):
+                return 0  # it is counted when the samples are inserted one by one
+            if not count:
+                return 0
+            inserted = missing[:count]
+            for sample in inserted:
+                self._advance(sample)
+            self._newest_recalled_seq = max(self._newest_recalled_seq, inserted[0].seq)
+            self._counters.count("recalled", count)
+            self._missing.stop_at(inserted[-1].seq)
+            return sum(sample.seq >= inserted[-1].seq for sample in samples)
+
+    def _insert_past(self, samples: Sequence[Sample]) -> int:
+        """Insert the first of ``samples``, newest first, with one copy of the history. Returns how many.
+
+        Raises InvalidInput or MessageError if nothing was inserted.
+        """
+        return 0
 
     def _is_missing(self, seq: int) -> bool:
         # After a network cut, history may arrive before the first live sample, which shows the gap.

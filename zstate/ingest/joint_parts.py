@@ -20,8 +20,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count
 
+from numpy.typing import ArrayLike
+
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
+from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, MessageError
 from zstate.ingest.base import ClockSetBack, StreamIngest
@@ -41,6 +44,21 @@ _MAX_SETS = 16
 def joint_order(model: RobotModel) -> JointOrder:
     """Reader of the joint states of robots with this model, or of the drivers of this part of one."""
     return JointOrder(model.joint_names, coordinate_names(model), velocity_columns_by_position(model))
+
+
+def insert_past(
+    buffer: TransformBuffer, track: JointTrack, order: JointOrder, samples: Sequence[Sample]
+) -> int:
+    """Insert the first of ``samples``, newest first, with one copy of the track's history; how many."""
+    past: list[tuple[int, ArrayLike, ArrayLike | None]] = []
+    for sample in samples:
+        assert isinstance(sample, JointState)
+        try:
+            numbers = order.read(sample)
+        except MessageError:
+            break
+        past.append((sample.stamp, numbers.positions, numbers.velocities))
+    return buffer.insert_past_joints(track, past)
 
 
 class JointNames:
@@ -283,6 +301,13 @@ class PartialJointStateIngest(StreamIngest):
             return self._buffer.insert_joints(part.track, sample.stamp, sample.positions)
         numbers = part.order.read(sample)
         return self._buffer.insert_joints(part.track, sample.stamp, numbers.positions, numbers.velocities)
+
+    def _insert_past(self, samples: Sequence[Sample]) -> int:
+        assert isinstance(samples[0], JointState)
+        part = self._parts.part_of(samples[0], others=self._others)
+        if part is None or any(sample.order != samples[0].order for sample in samples):
+            return 0
+        return insert_past(self._buffer, part.track, part.order, samples)
 
     def _fast_place(self, sample: Sample) -> JointTrack | None:
         assert isinstance(sample, JointState)

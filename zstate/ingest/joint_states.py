@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, ModelError
 from zstate.ingest.base import ClockSetBack, StreamIngest
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.joint_parts import RobotParts, joint_order
+from zstate.ingest.joint_parts import RobotParts, insert_past, joint_order
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.wire.joint_order import JointOrder
@@ -71,6 +72,9 @@ class JointStateIngest(StreamIngest):
             return self._buffer.insert_joints(track, sample.stamp, sample.positions)
         numbers = self._order.read(sample)
         return self._buffer.insert_joints(track, sample.stamp, numbers.positions, numbers.velocities)
+
+    def _insert_past(self, samples: Sequence[Sample]) -> int:
+        return 0 if self._track is None else insert_past(self._buffer, self._track, self._order, samples)
 
     def _fast_place(self, sample: Sample) -> JointTrack | None:
         return self._track if sample.order == self._order.digest else None
