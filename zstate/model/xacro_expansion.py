@@ -16,7 +16,7 @@ import sys
 from collections import Counter
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
-from importlib import import_module, util
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from zstate.model.findings import Finding, model_error
 _CPU_S = 30
 _WITHIN_S = 60.0
 _MEMORY_BYTES = 2 << 30
+_MISSING = "this is a xacro file, which must be expanded: pip install 'zstate[xacro]'"
 _TOO_SLOW = f"its expansion has taken {_WITHIN_S:g} s, which is the limit"
 _TOO_LONG = f"its expansion takes more than {_CPU_S} s of CPU, which is the limit"
 _TOO_LARGE = f"its expansion needs more than {_MEMORY_BYTES >> 30} GiB of memory, which is the limit"
@@ -48,9 +49,6 @@ def expand_xacro(
     file of the text, if there is one: includes are relative to it, and packages are searched from there
     upwards (with xacrodoc) or where ROS has them. Raises ModelError with the cause in one line.
     """
-    if util.find_spec("xacro") is None:
-        message = "this is a xacro file, which must be expanded: pip install 'zstate[xacro]'"
-        raise model_error(source, message)
     request = {
         "modules": sys.path,
         "text": text,
@@ -66,9 +64,7 @@ def expand_xacro(
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise model_error(
-            source, f"its expansion takes more than {_WITHIN_S:g} s, which is the limit"
-        ) from None
+        raise model_error(source, _TOO_SLOW) from None
     if done.returncode == -signal.SIGXCPU:
         raise model_error(source, _TOO_LONG)
     try:
@@ -103,7 +99,11 @@ def answer_request(text: str, path: str | None, args: dict[str, str]) -> None:
     urdf, failure = "", ""
     warnings: Counter[str] = Counter()
     try:
-        urdf = _expand(text, path, used, warnings)
+        import_module("xacro")
+    except ImportError:
+        failure = _MISSING
+    try:
+        urdf = "" if failure else _expand(text, path, used, warnings)
     except Exception as error:  # the file's own expressions may raise anything
         cause = " ".join(str(error).split()) or type(error).__name__
         hint = ""

@@ -29,9 +29,9 @@ def late_s(result: Result, bytes_per_s: float) -> float:
 
 @pytest.mark.parametrize("fault", get_args(Fault))
 def test_joints_rest_within_the_ttl_after_their_commander_on_a_slow_link(fault: Fault):
-    result = trial(3000.0, 100.0, fault, drive_s=3.0)
+    result = trial(10_000.0, 200.0, fault, drive_s=3.0)
     assert result.active > 0.0
-    assert late_s(result, 3000.0) < _SLACK_S
+    assert late_s(result, 10_000.0) < _SLACK_S
 
 
 def test_old_commands_do_not_wait_on_a_slow_link_behind_which_the_robot_moves():

@@ -121,11 +121,16 @@ def _silent_check(probe: RobotProbe, session: Session) -> Check:
 
 
 def _waits_checks(probe: RobotProbe) -> Iterator[Check]:
-    """A finding for each program of the robot that waits for streams without a writer."""
-    streams: dict[str, list[str]] = {}
+    """A finding for each program of the robot that waits for streams without a writer.
+
+    The check of joint_states names those that wait for joints alone, and has better advice.
+    """
+    streams: dict[str, list[Stream]] = {}
     for stream, reader in sorted(probe.waits.items()):
         streams.setdefault(str(reader), []).append(stream)
     for program, waited in streams.items():
+        if JOINT_STREAMS.issuperset(waited):
+            continue
         names, have = " and ".join(waited), "has" if len(waited) == 1 else "have"
         text = (
             f"{program} waits for {names} of {probe.info.name!r}, which {have} no writer: the program that "
