@@ -236,7 +236,7 @@ def test_a_cancellation_that_a_blocked_driver_delays_is_repeated_until_it_is_car
 
 def test_a_request_whose_commander_has_gone_moves_nothing(sessions):
     driver = Written()
-    request = JointTrajectory(0, 3, 7, ("elbow",), to_block([0.2]), to_block([0.1]))
+    request = JointTrajectory(time.time_ns(), 3, 7, ("elbow",), to_block([0.2]), to_block([0.1]))
     with hosted(sessions[0], driver, ttl_s=0.3), announced(sessions[1]):
         until(
             lambda: [one.findings for one in replies_to(sessions[1], "zstate/arm/@motion", request)] == [()]
@@ -355,7 +355,7 @@ def test_a_request_of_another_session_is_refused_while_a_motion_is_valid(session
     with arm_of(sessions, driver) as arm:
         motion = arm.move({"elbow": [1.0]}, [5.0])
         # It is not even planned, which would find that there is no such joint.
-        request = JointTrajectory(0, 0, 7, ("elbw",), to_block([1.0]), to_block([0.0]))
+        request = JointTrajectory(time.time_ns(), 0, 7, ("elbw",), to_block([1.0]), to_block([0.0]))
         replies: list[MotionReply] = []
         with announced(sessions[1]):
             until(lambda: replies.extend(replies_to(sessions[1], "zstate/arm/@motion", request)) or replies)
@@ -366,7 +366,7 @@ def test_a_request_of_another_session_is_refused_while_a_motion_is_valid(session
 
 
 def test_a_request_of_a_program_that_is_not_announced_as_a_commander_is_not_planned(sessions):
-    request = JointTrajectory(0, 0, 7, ("elbw",), to_block([1.0]), to_block([0.0]))
+    request = JointTrajectory(time.time_ns(), 0, 7, ("elbw",), to_block([1.0]), to_block([0.0]))
     with hosted(sessions[0], Written()) as host:
 
         def is_refused() -> bool:
@@ -384,7 +384,7 @@ def test_a_request_for_more_than_the_joints_of_the_driver_is_refused(sessions):
             (70_000, "bytes, where motions of this driver take"),
         ):
             names = tuple(f"joint_{number}" for number in range(count))
-            request = JointTrajectory(0, 0, 7, names, to_block([1.0]), to_block([0.0] * count))
+            request = JointTrajectory(time.time_ns(), 0, 7, names, to_block([1.0]), to_block([0.0] * count))
             found: list[MotionReply] = []
 
             def is_answered(request=request, found=found) -> bool:
@@ -396,7 +396,7 @@ def test_a_request_for_more_than_the_joints_of_the_driver_is_refused(sessions):
 
 
 def test_a_repeated_request_is_the_same_motion_and_an_older_one_is_refused(sessions):
-    request = JointTrajectory(0, 3, 7, ("elbow",), to_block([0.2]), to_block([0.1]))
+    request = JointTrajectory(time.time_ns(), 3, 7, ("elbow",), to_block([0.2]), to_block([0.1]))
     renewal = encode(JointCommand(time.time_ns(), 4, 7, order_digest(()), names=(), motion=3))
     key = "zstate/arm/joint_commands"
     driver = Written()
@@ -421,9 +421,33 @@ def test_a_repeated_request_is_the_same_motion_and_an_older_one_is_refused(sessi
         still = wait_for_state(sessions[1], "arm", lambda state: state.ticks > reached.ticks, DEADLINE_S)
         assert still is not None
         assert (still.motion, still.outcomes) == (None, reached.outcomes)
-        older = JointTrajectory(0, 2, 7, ("elbow",), to_block([0.2]), to_block([0.0]))
+        older = JointTrajectory(time.time_ns(), 2, 7, ("elbow",), to_block([0.2]), to_block([0.0]))
         (reply,) = replies_to(sessions[1], "zstate/arm/@motion", older)
         assert reply.findings == ("the motion 2 comes after a newer one",)
+
+
+def test_a_motion_request_that_has_waited_for_seconds_is_refused_while_its_commander_is_alive(sessions):
+    """As on a slow link: the caller has given up, and its later commands are valid."""
+    driver = Written()
+    with hosted(sessions[0], driver), announced(sessions[1]):
+        state = wait_for_state(sessions[1], "arm", lambda state: state.state == "ready", DEADLINE_S)
+        assert state is not None
+
+        def answer(number: int, instant: int) -> tuple[str, ...]:
+            request = JointTrajectory(
+                *(time.time_ns(), number, 7, ("elbow",), to_block([0.2]), to_block([0.1])),
+                echo=(state.session, instant),
+            )
+            replies: list[MotionReply] = []
+            until(lambda: replies.extend(replies_to(sessions[1], "zstate/arm/@motion", request)) or replies)
+            return replies[0].findings
+
+        assert answer(3, state.instant) == ()
+        (finding,) = answer(4, state.instant - 10_000_000_000)
+        assert "it has waited for 1" in finding
+        assert "is valid for 1.0 s" in finding
+        (finding,) = answer(5, 1 << 62)
+        assert "ahead of the driver's own clock" in finding
 
 
 def replies_to(session: Session, selector: str, message: JointTrajectory | MotionCancel) -> list[MotionReply]:
@@ -460,7 +484,7 @@ def test_only_commanders_may_request_motions(tmp_path):
         opened.enter_context(hosted(session_of("arm"), driver))
         arm = opened.enter_context(Commander(session_of("teleop"), "arm"))
         assert arm.move({"elbow": [0.1]}, [0.2]).wait(DEADLINE_S).name == "reached"
-        request = JointTrajectory(0, 0, 7, ("elbow",), to_block([1.0]), to_block([0.0]))
+        request = JointTrajectory(time.time_ns(), 0, 7, ("elbow",), to_block([1.0]), to_block([0.0]))
         desk = session_of("desk")
         for selector in ("zstate/arm/@motion", "zstate/*/@motion", "zstate/**"):
             assert replies_to(desk, selector, request) == []
@@ -616,7 +640,7 @@ def test_a_driver_without_positions_refuses_motions(sessions):
         arm.wait_for_driver(DEADLINE_S)
         with pytest.raises(InvalidInput, match="mode position is not one of them"):
             arm.move({"elbow": [1.0]}, [3.0])
-        request = JointTrajectory(0, 0, 7, ("elbow",), to_block([1.0]), to_block([1.0]))
+        request = JointTrajectory(time.time_ns(), 0, 7, ("elbow",), to_block([1.0]), to_block([1.0]))
         answers: list[MotionReply] = []
         with announced(sessions[1]):
             until(lambda: answers.extend(replies_to(sessions[1], "zstate/arm/@motion", request)) or answers)

@@ -282,16 +282,17 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     "trajectory": (
         JointTrajectory(
             *(STAMP, 300, 2**63 + 5, ("j1",), to_block([0.5, 1.0]), to_block([0.25, 0.75])),
-            *(None, None, 5, True, 0.2, 0.1, 3.0),
+            *(None, None, 5, True, 0.2, 0.1, 3.0, (7, 9)),
         ),
-        header(13)[:-10]
+        header(14)[:-10]
         + b"\x91"
         + fixstr("j1")
         + bin8(struct.pack("<2d", 0.5, 1.0))
         + bin8(struct.pack("<2d", 0.25, 0.75))
         + NIL * 2
         + b"\x05\xc3"
-        + b"".join(b"\xcb" + struct.pack(">d", number) for number in (0.2, 0.1, 3.0)),
+        + b"".join(b"\xcb" + struct.pack(">d", number) for number in (0.2, 0.1, 3.0))
+        + b"\x92\x07\x09",
     ),
     "cancel": (MotionCancel(STAMP, 300, 2**63 + 5, 7), header(4)[:-10] + b"\x07"),
     "motion reply": (

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from typing import NamedTuple
 
+import msgspec
 from numpy.typing import ArrayLike
 
 from zstate._util.closeable import Closeable
@@ -20,7 +21,7 @@ from zstate.driving.commands import check_named
 from zstate.driving.driver_state import SILENT_S
 from zstate.driving.motion import Motion, Points, rows_block
 from zstate.driving.stops import wait_for_state
-from zstate.driving.transit import CommandWindow, DriverClock
+from zstate.driving.transit import REQUEST_TTL_NS, CommandWindow, DriverClock
 from zstate.errors import (
     Closed,
     InvalidInput,
@@ -247,8 +248,9 @@ class Commander(Closeable):
         after commands. A robot has one motion at a time; a new one, or a ``send`` for one of its joints,
         replaces it.
 
-        Raises MotionRefused with all ``findings``, InvalidInput for unusable numbers, Unreachable if no
-        driver has replied within 5 s, SecondWriter, and Closed.
+        Raises MotionRefused with all ``findings``, also if the request has waited for a second on its way;
+        InvalidInput for unusable numbers; Unreachable if no driver has replied within 5 s, or a second later
+        on a slow link: then it does not start any more; SecondWriter; and Closed.
         """
         if times_s is None:
             points, times_s, stretch = _one_point(points), [_SECONDS], True
@@ -379,21 +381,22 @@ class Commander(Closeable):
     def _request(self, message: JointTrajectory | MotionCancel) -> MotionReply:
         """The reply of the driver. A request that has not reached it is repeated.
 
-        So is a cancellation that the driver has not carried out.
+        So is a cancellation that the driver has not carried out. The last one is waited for until the driver
+        would refuse it, so that nothing starts after that.
         """
         key, deadline = motion_key(self.robot), time.monotonic() + _REPLY_WITHIN_S
-        payload, encoding = encode(message), ENCODINGS[type(message)]
         refused = ""
         while (left_s := deadline - time.monotonic()) > 0.0:
-            for reply in query(self._session.zenoh, key, left_s, payload=payload, encoding=encoding):
-                if reply.ok is not None:
-                    with suppress(MessageError):
-                        answer = decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), MotionReply)
-                        if not (answer.findings and isinstance(message, MotionCancel)):
-                            return answer
-                        refused = "; ".join(answer.findings)
+            sent = self._with_echo(message)
+            timeout_s = left_s + REQUEST_TTL_NS * 1e-9
+            for answer in () if sent is None else self._replies(key, sent, timeout_s):
+                if not (answer.findings and _is_repeated(sent, answer)):
+                    return answer
+                refused = "; ".join(answer.findings)
             if self._is_closing.wait(_REQUEST_PERIOD_S):
                 raise Closed(f"the commander of {self.robot!r} is closed")
+        if refused and isinstance(message, JointTrajectory):
+            raise MotionRefused(self.robot, (refused,))
         if refused:
             raise Unreachable(
                 f"the driver of {self.robot!r} has not cancelled the motion within {_REPLY_WITHIN_S:g} s: "
@@ -405,6 +408,27 @@ class Commander(Closeable):
             "this program command it (`zstate acl --commander`)?",
             endpoints=(),
         )
+
+    def _with_echo(self, message: JointTrajectory | MotionCancel) -> JointTrajectory | MotionCancel | None:
+        """``message`` as it is sent now; None for a motion while the driver is not known."""
+        if isinstance(message, MotionCancel):
+            return message
+        with self._lock:
+            if not self._driver_clock.session:
+                return None
+            return msgspec.structs.replace(message, echo=self._driver_clock.at(time.monotonic_ns()))
+
+    def _replies(
+        self, key: str, message: JointTrajectory | MotionCancel, timeout_s: float
+    ) -> list[MotionReply]:
+        payload, encoding = encode(message), ENCODINGS[type(message)]
+        answers: list[MotionReply] = []
+        for reply in query(self._session.zenoh, key, timeout_s, payload=payload, encoding=encoding):
+            if reply.ok is not None:
+                with suppress(MessageError):
+                    payload_bytes = reply.ok.payload.to_bytes()
+                    answers.append(decode(payload_bytes, str(reply.ok.encoding), MotionReply))
+        return answers
 
     def _started(self, number: int, reply: MotionReply) -> Motion:
         """The motion with that number, which a thread renews until it has ended."""
@@ -488,6 +512,14 @@ class Commander(Closeable):
         session, seq = state.received or (0, -1)
         confirmed = seq if session == self._session_id else -1
         self._window.update(confirmed, state.transit_excess or 0, state.ttl, arrived)
+
+
+def _is_repeated(sent: JointTrajectory | MotionCancel | None, answer: MotionReply) -> bool:
+    """Whether a request that was refused is sent again: a cancellation, or a motion for another host.
+
+    A host that has restarted refuses the echo of the last one, until its own state has arrived here.
+    """
+    return not (isinstance(sent, JointTrajectory) and sent.echo and sent.echo[0] == answer.session)
 
 
 def _by_joint(values: Mapping[str, float], mode: Mode) -> dict[str, float]:

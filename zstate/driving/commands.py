@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.driving.driver import Mode
 from zstate.driving.setpoint_limiter import Rate, Rates
-from zstate.driving.transit import CommandAges
+from zstate.driving.transit import CommandAdmission
 from zstate.errors import InvalidInput, MessageError, format_duration, printable
 from zstate.net.presence import announce
 from zstate.net.session import Session
@@ -41,9 +41,6 @@ _SLACK_BYTES = 1024
 
 _OVERTAKEN_NS = 200_000_000
 """A command may arrive so much later than the end of the token of its commander."""
-
-_TOKEN_WITHIN_NS = 500_000_000
-"""The token of a commander may arrive so much later than its first command."""
 
 NO_DEADLINE = -1
 NO_RATES: Mapping[int, Rate] = {}
@@ -77,18 +74,6 @@ class Command:
         return np.append(self.columns, list(self.rates)).astype(np.intp) if self.rates else self.columns
 
 
-class Received(NamedTuple):
-    """A command, by ``session`` and ``seq``, that took ``excess`` [ns] longer than the fastest.
-
-    It has arrived at ``arrived`` [ns, monotonic].
-    """
-
-    session: int
-    seq: int
-    excess: int
-    arrived: int
-
-
 _Decoder: TypeAlias = "Callable[[SerializedSample, int], Command]"
 
 
@@ -96,11 +81,9 @@ class CommandReceiver(Closeable):
     """Receives the commands of ``robot`` for ``joint_names``; ``drain`` returns those that can be used.
 
     A command counts from its sending, for its own ttl or for ``ttl_ns``, which is also the longest that is
-    granted: one that arrives later is refused. So is one of a session that ``set_announced`` has not named,
-    but for the first half second, in which its token may be under way. ``modes`` are those of the driver,
-    whose host has the session ``driver``. ROS nodes send commands to the ``controller``, if there is one,
-    in the order of ``joint_names``, all in mode ``ros2_mode`` and without a ttl. ``refusals`` counts the
-    commands that cannot be used by reason.
+    granted: the ``admission`` refuses one that arrives later. ``modes`` are those of the driver.
+    ROS nodes send commands to the ``controller``, if there is one, in the order of ``joint_names``, all in
+    mode ``ros2_mode`` and without a ttl. ``refusals`` counts the commands that cannot be used by reason.
     """
 
     def __init__(
@@ -111,7 +94,7 @@ class CommandReceiver(Closeable):
         ttl_ns: int,
         refusals: Refusals,
         *,
-        driver: int = 0,
+        admission: CommandAdmission,
         modes: Collection[Mode] = ("position",),
         controller: Ros2Controller | None = None,
         ros2_mode: Mode = "position",
@@ -123,12 +106,7 @@ class CommandReceiver(Closeable):
         self._most_bytes = _SLACK_BYTES + 100 * len(joint_names) + 2 * len(self._names_text.encode())
         self._ttl_ns = ttl_ns
         self._refusals = refusals
-        self._ages = CommandAges(driver, ttl_ns)
-        self._announced: set[int] = set()
-        self._unannounced: BoundedDict[int, int] = BoundedDict()
-        """Since when sessions without a token send commands, or have lost it [ns, monotonic]."""
-        self.newest: Received | None = None
-        """The newest command of an announced session, also if it was refused; may be read from any thread."""
+        self._admission = admission
         self._inboxes: list[tuple[StreamInbox, _Decoder]] = []
         with ExitStack() as opening:
             self._subscribe(session, stream_key(robot, "joint_commands"), self._read, opening)
@@ -147,15 +125,6 @@ class CommandReceiver(Closeable):
             for arrived, sample in inbox.drain()
             if (command := self._decoded(decode_sample, sample, arrived)) is not None
         ]
-
-    def set_announced(self, session: int, alive: bool, now: int) -> None:
-        """The commander or ROS node of ``session`` is announced, or not any more; for any thread."""
-        if alive:
-            self._announced.add(session)
-            self._unannounced.pop(session, None)
-        elif session in self._announced:
-            self._unannounced[session] = now
-            self._announced.discard(session)
 
     def close(self) -> None:
         self._opened.close()
@@ -184,32 +153,6 @@ class CommandReceiver(Closeable):
             text = f"{size} bytes, where a command for these joints takes {self._most_bytes} at most"
             raise MessageError(text, reason="too large")
 
-    def _deadline(
-        self, head: tuple[int, int, int], ttl: int, arrived: int, echo: tuple[int, int] | None = None
-    ) -> int:
-        """Until when a command with ``head``, stamp, number and session, is valid.
-
-        Raises MessageError for one that is too old, or whose session is not announced.
-        """
-        stamp, seq, session = head
-        if session not in self._announced:
-            since = self._unannounced.setdefault(session, arrived)
-            if arrived - since > _TOKEN_WITHIN_NS:
-                text = f"a command of session {session:x}, which is not announced as a commander"
-                raise MessageError(text, reason="no claim")
-        excess = self._ages.excess(session, stamp, arrived, echo)
-        self.newest = Received(session, seq, excess, arrived)
-        if excess >= ttl:
-            cause = "the link is too slow for its commands and this ttl, or its program was frozen"
-            if echo is None:
-                cause += ", or its clock was set back: then restart it"
-            raise MessageError(
-                f"it has waited for {format_duration(excess)} on its way, and is valid for "
-                f"{format_duration(ttl)}: {cause}",
-                reason="late",
-            )
-        return arrived - excess + ttl
-
     def _read(self, sample: SerializedSample, now: int) -> Command:
         """The command in ``sample``. Raises MessageError with the reason why it is refused."""
         message = decode(sample.payload, sample.encoding, JointCommand)
@@ -217,7 +160,7 @@ class CommandReceiver(Closeable):
             text = f"a ttl of {format_duration(message.ttl)} is longer than {format_duration(self._ttl_ns)}"
             raise MessageError(f"{text}, which this driver grants at most", reason="ttl")
         sent = (message.stamp, message.seq, message.session)
-        deadline = self._deadline(sent, message.ttl or self._ttl_ns, now, message.echo)
+        deadline = self._admission.deadline(sent, message.ttl or self._ttl_ns, now, message.echo)
         if message.motion is not None:
             head = (message.session, message.seq, NO_COLUMNS, NO_POSITIONS)
             return Command(*head, now, deadline, message.motion)
@@ -240,7 +183,7 @@ class CommandReceiver(Closeable):
     def _read_from_ros(self, controller: Ros2Controller, sample: SerializedSample, now: int) -> Command:
         """The command of a ROS node in ``sample``. Raises MessageError with the reason why it is refused."""
         session, seq, stamp, numbers = controller.decode_command(sample)
-        deadline = self._deadline((stamp, seq, session), self._ttl_ns, now)
+        deadline = self._admission.deadline((stamp, seq, session), self._ttl_ns, now)
         names, mode = tuple(self._columns), self._ros2_mode
         if len(numbers) != len(names):
             raise MessageError(

@@ -36,6 +36,7 @@ from zstate.driving.limits import Limits
 from zstate.driving.motion_service import MotionService
 from zstate.driving.stops import StopLatch
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver, check_arguments
+from zstate.driving.transit import CommandAdmission, CommandAges
 from zstate.errors import Closed
 from zstate.model.robot import RobotModel
 from zstate.net.at_exit import forked_text
@@ -152,9 +153,11 @@ class DriverHost(Closeable):
             setpoints = SetpointPublisher(session, self.robot, names, self._writer)
             opening.enter_context(setpoints)
             controller = get_controller(self._wires, self.robot, ros2_controller) if ros2_controller else None
-            self._commands = commands = CommandReceiver(
+            ages = CommandAges(self._writer.session, self._ttl_ns)
+            self._admission = CommandAdmission(ages)
+            commands = CommandReceiver(
                 *(session, self.robot, names, self._ttl_ns, self._refusals),
-                driver=self._writer.session,
+                admission=self._admission,
                 modes=driver.modes,
                 controller=controller,
                 ros2_mode=ros2_mode,
@@ -176,7 +179,7 @@ class DriverHost(Closeable):
                 name_of=self._name_of,
                 on_change=self._notify,
             )
-            self._open_requests(session, controller, opening)
+            self._open_requests(session, ages, controller, opening)
             opening.callback(driver.close)
             driver.open()
             opening.callback(self._driver.disable)
@@ -202,7 +205,9 @@ class DriverHost(Closeable):
         is_same = order == list(range(len(order)))
         return opening.enter_context(publisher), None if is_same else np.array(order, dtype=np.intp)
 
-    def _open_requests(self, session: Session, controller: Ros2Controller | None, opening: ExitStack) -> None:
+    def _open_requests(
+        self, session: Session, ages: CommandAges, controller: Ros2Controller | None, opening: ExitStack
+    ) -> None:
         """Receive motions, and watch their senders and those of commands."""
         program = self._writer.program
         for token in announce_reader(session, get_wire("native"), self.robot, ["joint_commands"], program):
@@ -213,6 +218,7 @@ class DriverHost(Closeable):
             self._writer.session,
             self._loop.motions,
             self._refusals,
+            ages=ages,
             controller=controller,
         )
         opening.enter_context(requests)
@@ -314,7 +320,7 @@ class DriverHost(Closeable):
         rate = None if self._rate is None else self._rate.report()
         obeyed = self._stops.current if state.name in ("off", "fault") else loop.obeyed
         motion, progress = loop.motions.underway
-        received, now = self._commands.newest, time.monotonic_ns()
+        received, now = self._admission.newest, time.monotonic_ns()
         excess = received.excess if received and now - received.arrived < _RECENT_NS else None
         return DriverState(
             time.time_ns(),
@@ -360,5 +366,5 @@ class DriverHost(Closeable):
         if alive:  # also for messages about a commander that has gone
             self._programs[session] = str(announced.writer)
         now = time.monotonic_ns()
-        self._commands.set_announced(session, alive, now)
+        self._admission.set_announced(session, alive, now)
         self._loop.targets.set_announced(session, alive, now)

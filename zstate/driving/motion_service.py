@@ -7,8 +7,8 @@ control loop adopts it at its next tick. A cancellation does not wait for a plan
 The time of a motion advances at each tick that writes a setpoint, by the time since the last one, and by one
 period at most. A tick that was missed or late delays the motion; no step becomes longer by it. A motion is
 valid for the host's ttl, unless its commander renews it: then the joints brake, as they do after commands. It
-rests until its commander is known to be alive, by a first renewal or by an earlier command that is valid: a
-request that was delivered late moves nothing.
+rests until its commander is known to be alive, by a first renewal or by an earlier command that is valid. A
+request that has not started a second after its sending is refused: its caller may have given up.
 
 A ROS node does not renew what it sends: its motion is valid while the node is announced, by its liveliness
 token. As in ros2_control, points that are due already are left out, and a trajectory without points ends the
@@ -37,6 +37,7 @@ from zstate._util.refusals import Refusals
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
 from zstate.driving.limits import Limits
 from zstate.driving.trajectory import Trajectory
+from zstate.driving.transit import REQUEST_TTL_NS, CommandAges, check_waited
 from zstate.errors import InvalidInput, MessageError, format_duration
 from zstate.net.queryable import Reply, RequestAnswer, RequestQueryable
 from zstate.net.session import Session
@@ -414,10 +415,12 @@ class MotionService(Closeable):
         executor: MotionExecutor,
         refusals: Refusals,
         *,
+        ages: CommandAges,
         controller: Ros2Controller | None = None,
     ) -> None:
         self._host_session = host_session
         self._executor = executor
+        self._ages = ages
         self._refusals = refusals
         self._most_bytes = 8 * MOTION_POINTS * (1 + 3 * len(executor.limits.joint_names)) + _NAMES_BYTES
         self._commanders: set[int] = set()
@@ -449,13 +452,13 @@ class MotionService(Closeable):
         if not self._places.acquire(blocking=False):
             self._refusals.count("overrun", f"{_MOST_PLANS} motions wait to be planned")
             return None
-        planned = self._planner.submit(self._plan_and_reply, payload, encoding)
+        planned = self._planner.submit(self._plan_and_reply, payload, encoding, time.monotonic_ns())
         planned.add_done_callback(lambda _: self._places.release())
         return planned
 
-    def _plan_and_reply(self, payload: bytes, encoding: str) -> Reply | None:
+    def _plan_and_reply(self, payload: bytes, encoding: str, arrived: int) -> Reply | None:
         """The reply to a request for a motion; None if it is not from a commander that is announced."""
-        findings = self._counted(lambda: self._take(payload, encoding))
+        findings = self._counted(lambda: self._take(payload, encoding, arrived))
         return None if findings is None else self._reply(findings)
 
     def _reply(self, findings: _Findings) -> Reply:
@@ -484,7 +487,7 @@ class MotionService(Closeable):
         self._executor.call(lambda _: self._executor.cancel(cancel))
         return ()
 
-    def _take(self, payload: bytes, encoding: str) -> _Findings | None:
+    def _take(self, payload: bytes, encoding: str, arrived: int) -> _Findings | None:
         """Hand the request to the loop, or return the findings; None if its commander is not announced.
 
         The token of a new commander may arrive after its request, which is repeated without a reply. Raises
@@ -498,26 +501,39 @@ class MotionService(Closeable):
             text = f"a motion of session {request.session:x}, which is not announced as a commander"
             self._refusals.count("no claim", text)
             return None
-        return self._plan_and_start(request)
+        return self._plan_and_start(request, request.stamp, arrived)
 
     def _take_from_ros(self, controller: Ros2Controller, sample: SerializedSample) -> _Findings:
         """The same for a message of a ROS node."""
-        session, request = controller.decode_trajectory(sample)
+        session, sent, request = controller.decode_trajectory(sample)
         if request is None:
             self._executor.call(lambda _: self._executor.cancel_of(session))
             return ()
-        return self._plan_and_start(without_past(request, time.time_ns()))
+        arrived = time.monotonic_ns()
+        return self._plan_and_start(without_past(request, time.time_ns()), sent, arrived)
 
-    def _plan_and_start(self, request: JointTrajectory) -> _Findings:
+    def _plan_and_start(self, request: JointTrajectory, sent: int, arrived: int) -> _Findings:
+        """Plan and start what was ``sent`` [ns, clock of its sender], and ``arrived`` [ns, monotonic]."""
         if self._executor.is_known(request):
             return ()
+        excess = self._ages.excess(request.session, sent, arrived, request.echo)
+
+        def start(now: int) -> None:
+            check_in_time(now)
+            self._executor.start(planned, now)
+
+        def check_in_time(now: int) -> None:
+            waited = excess + max(0, now - arrived)
+            check_waited(waited, REQUEST_TTL_NS, has_echo=request.echo is not None)
+
+        check_in_time(arrived)
         if "position" not in (modes := self._executor.modes):
             has = " and ".join(sorted(modes))
             raise MessageError(f"a motion needs mode position; this driver has mode {has}", reason="mode")
         self._check_in_loop(request)  # first: to plan takes time from the control loop
         planned = plan(request, self._executor.limits, self._executor.present(), time.time_ns())
         if not planned.findings:
-            self._executor.call(lambda now: self._executor.start(planned, now))
+            self._executor.call(start)
         return planned.findings
 
     def _check_in_loop(self, request: JointTrajectory) -> None:

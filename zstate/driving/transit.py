@@ -1,4 +1,4 @@
-"""How old commands are when they arrive, and how many may be under way; no clocks in common, no threads.
+"""How old commands are when they arrive, and how many may be under way; no clocks in common.
 
 A slow link, and the queues before it, deliver commands seconds after they were sent, also after the death of
 their sender. A driver therefore counts the validity of a command from its sending.
@@ -18,8 +18,10 @@ refused until it is restarted: nothing tells its commands from old ones.
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 from zstate._util.bounded import BoundedDict
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import MessageError, format_duration
 from zstate.wire.messages import DriverState
 
@@ -37,9 +39,15 @@ _LATE_NS = 300_000_000
 
 _MOST_UNCONFIRMED = 1024
 
+_TOKEN_WITHIN_NS = 500_000_000
+"""The token of a commander may arrive so much later than its first command."""
+
+REQUEST_TTL_NS = 1_000_000_000
+"""A request for a motion that has not started so long after its sending starts no more."""
+
 
 class CommandAges:
-    """The excess of the commands that arrive at a driver, by session. For one thread.
+    """The excess of the commands that arrive at a driver, by session. Safe from any thread.
 
     ``driver`` is the session of the driver's host, and ``ttl_ns`` the longest validity that it grants. All
     instants are of its monotonic clock [ns].
@@ -48,6 +56,7 @@ class CommandAges:
     def __init__(self, driver: int, ttl_ns: int) -> None:
         self._driver = driver
         self._ttl_ns = ttl_ns
+        self._lock = fork_safe_lock()
         self._echoed: BoundedDict[int, int] = BoundedDict()
         """The least transit of each session."""
         self._stamped: BoundedDict[int, tuple[int, int]] = BoundedDict()
@@ -60,7 +69,8 @@ class CommandAges:
         have waited. Raises MessageError for an ``echo`` that is not of this driver.
         """
         if echo is None:
-            return self._stamped_excess(session, arrived - stamp, arrived)
+            with self._lock:
+                return self._stamped_excess(session, arrived - stamp, arrived)
         driver, instant = echo
         if driver != self._driver:
             text = "it answers another host of this driver, such as one that has ended"
@@ -69,7 +79,8 @@ class CommandAges:
         if transit < 0:
             text = f"its echo is {format_duration(-transit)} ahead of the driver's own clock"
             raise MessageError(text, reason="echo")
-        least = self._echoed[session] = min(transit, self._echoed.get(session, transit))
+        with self._lock:
+            least = self._echoed[session] = min(transit, self._echoed.get(session, transit))
         return transit - least if least < self._ttl_ns else transit
 
     def _stamped_excess(self, session: int, transit: int, arrived: int) -> int:
@@ -77,6 +88,74 @@ class CommandAges:
         least = min(transit, least + int((arrived - since) * _MOST_DRIFT))
         self._stamped[session] = least, arrived
         return transit - least
+
+
+def check_waited(waited: int, ttl: int, *, has_echo: bool) -> None:
+    """Raise MessageError for a command or request that has ``waited`` for its ``ttl`` or longer [ns]."""
+    if waited < ttl:
+        return
+    cause = "the link is too slow for it, or its program was frozen"
+    if not has_echo:
+        cause += ", or its clock was set back: then restart it"
+    raise MessageError(
+        f"it has waited for {format_duration(waited)} on its way, and is valid for {format_duration(ttl)}: "
+        f"{cause}",
+        reason="late",
+    )
+
+
+class Received(NamedTuple):
+    """A command, by ``session`` and ``seq``, that took ``excess`` [ns] longer than the fastest.
+
+    It has arrived at ``arrived`` [ns, monotonic].
+    """
+
+    session: int
+    seq: int
+    excess: int
+    arrived: int
+
+
+class CommandAdmission:
+    """Which commands count, and until when: those of announced sessions, from their sending for their ttl.
+
+    Commands of a session that is not announced count for half a second, in which its token may be under way.
+    """
+
+    def __init__(self, ages: CommandAges) -> None:
+        self._ages = ages
+        self._announced: set[int] = set()
+        self._unannounced: BoundedDict[int, int] = BoundedDict()
+        """Since when sessions without a token send commands, or have lost it [ns, monotonic]."""
+        self.newest: Received | None = None
+        """The newest command of an announced session, also if it was refused; may be read from any thread."""
+
+    def set_announced(self, session: int, alive: bool, now: int) -> None:
+        """The commander or ROS node of ``session`` is announced, or not any more; for any thread."""
+        if alive:
+            self._announced.add(session)
+            self._unannounced.pop(session, None)
+        elif session in self._announced:
+            self._unannounced[session] = now
+            self._announced.discard(session)
+
+    def deadline(
+        self, head: tuple[int, int, int], ttl: int, arrived: int, echo: tuple[int, int] | None = None
+    ) -> int:
+        """Until when a command with ``head``, stamp, number and session, is valid. For one thread.
+
+        Raises MessageError for one that is too old, or whose session is not announced.
+        """
+        stamp, seq, session = head
+        if session not in self._announced:
+            since = self._unannounced.setdefault(session, arrived)
+            if arrived - since > _TOKEN_WITHIN_NS:
+                text = f"a command of session {session:x}, which is not announced as a commander"
+                raise MessageError(text, reason="no claim")
+        excess = self._ages.excess(session, stamp, arrived, echo)
+        self.newest = Received(session, seq, excess, arrived)
+        check_waited(excess, ttl, has_echo=echo is not None)
+        return arrived - excess + ttl
 
 
 class DriverClock:

@@ -183,11 +183,20 @@ def check_may_write(session: Session, robot: str, token: str) -> None:
             time.sleep(_PERMISSION_ROUND_S)
     raise AccessDenied(
         f"the router does not let {probe.identity} write as robot {robot!r}: it drops {token!r}, and would "
-        "drop samples without an error. Is this the identity of that robot? If so, the "
-        f"access control of the router lacks the rules '{robot} writes' and '{robot} reads', which "
-        f"`zstate acl --robot {robot}` prints, with --wire for those of ROS; routers read it when they start",
+        f"drop samples without an error. {_advice(robot, token, probe.identity)}; routers read it when they start",
         reason="not allowed to write",
         endpoint=token,
+    )
+
+
+def _advice(robot: str, token: str, identity: str) -> str:
+    """What lets ``identity`` write what ``token`` announces."""
+    if "joint_commands" in token:
+        return f"Only commanders command a robot: `zstate acl --robot {robot} --commander {identity}` lets it"
+    return (
+        "Is this the identity of that robot? If so, the access control of the router lacks the rules "
+        f"'{robot} writes' and '{robot} reads', which `zstate acl --robot {robot}` prints, with --wire for "
+        "those of ROS"
     )
 
 

@@ -262,7 +262,8 @@ class JointTrajectory(StampedMessage, frozen=True, array_like=True, gc=False):
     or [m], ``velocities`` per s, and ``accelerations`` per s^2 are blocks of (T, n), row by row. With
     ``stretch`` the motion is slowed to fit the limits. Joints may be ``path_tolerance`` [rad] or [m] from the
     path, and must be within ``goal_tolerance`` of the last point ``goal_time`` [s] after it. The session and
-    ``seq`` identify the motion.
+    ``seq`` identify the motion. ``echo`` is that of a JointCommand: a driver starts no motion a second after
+    the sending.
     """
 
     names: tuple[str, ...]
@@ -275,6 +276,7 @@ class JointTrajectory(StampedMessage, frozen=True, array_like=True, gc=False):
     path_tolerance: float = PATH_TOLERANCE
     goal_tolerance: float = GOAL_TOLERANCE
     goal_time: float = GOAL_TIME_S
+    echo: tuple[SessionId, Interval] | None = None
 
     def __post_init__(self) -> None:
         _check_numbers(self.times)

@@ -219,9 +219,13 @@ class RosCommand(NamedTuple):
 
 
 class RosMotion(NamedTuple):
-    """The motion that a ROS node with the writer number ``session`` requests; None ends its motion."""
+    """The motion that a ROS node with the writer number ``session`` requests; None ends its motion.
+
+    ``stamp`` is when it was sent [ns].
+    """
 
     session: int
+    stamp: int
     request: JointTrajectory | None
 
 
@@ -253,8 +257,8 @@ class Ros2Controller:
 
     def decode_trajectory(self, arrival: SerializedSample) -> RosMotion:
         """The motion in a sample received under ``trajectories``. Raises MessageError."""
-        session, seq, _ = self._origin(arrival)
-        return RosMotion(session, decode_trajectory(arrival.payload, session, seq))
+        session, seq, stamp = self._origin(arrival)
+        return RosMotion(session, stamp, decode_trajectory(arrival.payload, session, seq))
 
     def _origin(self, arrival: SerializedSample) -> tuple[int, int, int]:
         """The writer's session, the sequence number, and the time of sending. Raises MessageError."""
