@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from typing import NamedTuple
 
-import msgspec
 from numpy.typing import ArrayLike
 
 from zstate._util.closeable import Closeable
@@ -54,6 +53,7 @@ from zstate.wire.messages import (
     order_digest,
     state_text,
     to_block,
+    with_echo,
 )
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
@@ -416,7 +416,7 @@ class Commander(Closeable):
         with self._lock:
             if not self._driver_clock.session:
                 return None
-            return msgspec.structs.replace(message, echo=self._driver_clock.at(time.monotonic_ns()))
+            return with_echo(message, *self._driver_clock.at(time.monotonic_ns()))
 
     def _replies(
         self, key: str, message: JointTrajectory | MotionCancel, timeout_s: float

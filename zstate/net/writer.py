@@ -183,16 +183,20 @@ def check_may_write(session: Session, robot: str, token: str) -> None:
             time.sleep(_PERMISSION_ROUND_S)
     raise AccessDenied(
         f"the router does not let {probe.identity} write as robot {robot!r}: it drops {token!r}, and would "
-        f"drop samples without an error. {_advice(robot, token, probe.identity)}; routers read it when they start",
+        f"drop samples without an error. {_advice(robot, token)}; "
+        "routers read it when they start",
         reason="not allowed to write",
         endpoint=token,
     )
 
 
-def _advice(robot: str, token: str, identity: str) -> str:
-    """What lets ``identity`` write what ``token`` announces."""
+def _advice(robot: str, token: str) -> str:
+    """What lets an identity write what ``token`` announces."""
     if "joint_commands" in token:
-        return f"Only commanders command a robot: `zstate acl --robot {robot} --commander {identity}` lets it"
+        return (
+            "Only commanders command a robot and release its stops: `zstate acl --robot "
+            f"{robot} --commander NAME` prints the rules for the identity NAME"
+        )
     return (
         "Is this the identity of that robot? If so, the access control of the router lacks the rules "
         f"'{robot} writes' and '{robot} reads', which `zstate acl --robot {robot}` prints, with --wire for "

@@ -297,6 +297,11 @@ class JointTrajectory(StampedMessage, frozen=True, array_like=True, gc=False):
             raise InvalidInput(f"goal_time is finite and not negative [s], not {self.goal_time}")
 
 
+def with_echo(request: JointTrajectory, driver: int, instant: int) -> JointTrajectory:
+    """``request`` with the echo of the session ``driver`` and an ``instant`` of its clock [ns]."""
+    return msgspec.structs.replace(request, echo=(driver, instant))
+
+
 def without_past(request: JointTrajectory, stamp: int) -> JointTrajectory:
     """``request`` without the first points that are due at ``stamp`` [ns]. Raises InvalidInput if all are."""
     times = from_block(request.times)
