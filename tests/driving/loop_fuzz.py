@@ -15,6 +15,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ from zstate.driving.setpoint_limiter import Rate as JointRate
 from zstate.driving.stops import StopRegister
 from zstate.driving.stops_file import ActiveStop
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
+from zstate.driving.transit import CommandAdmission, CommandAges
 from zstate.errors import DriverFault, InvalidInput, MessageError
 from zstate.net.presence import local_writer
 from zstate.rate import Rate
@@ -41,6 +43,8 @@ Floats = NDArray[np.float64]
 FOLLOWING = 0.2
 ROUNDING = 1e-7
 SESSIONS = (1, 2, 3, 4, 5)
+HOST = 99
+GRACE_NS = 500_000_000
 NODE = 77
 """A ROS node, whose motions are valid while it is announced."""
 
@@ -156,7 +160,7 @@ class Plant:
 class Fuzz:
     """A control loop with random limits, modes, commanders and faults. Each ``tick`` checks its setpoints.
 
-    Commands go to the loop as from a ``CommandReceiver``; ``arriving`` is the place for its rules.
+    Commands go to the loop through the admission of a host. Each is sent and waits on its way, up to seconds.
     """
 
     def __init__(self, seed: int) -> None:
@@ -180,13 +184,20 @@ class Fuzz:
         self.ttl_ns = int(random.choice([20, 250, 1000])) * 1_000_000
         self.on_silence: StopMode = "relax" if random.random() < 0.3 else "hold"
         self.has_velocities, self.has_stamps = random.random() < 0.5, random.random() < 0.7
-        self.stops = StopRegister()
+        self.stops = StopRegister(local_writer(HOST))
         self.refusals = Refusals()
         self.waiting: list[Command] = []
         self.session, self.seq = SESSIONS[0], 0
         self.nodes: set[int] = set()
         self.valid_until = 0
         """No command that was sent is valid later, and no motion."""
+        self.admission = CommandAdmission(CommandAges(HOST, self.ttl_ns))
+        self.announced = set(SESSIONS)
+        self.unannounced: dict[int, int] = {}
+        self.shortest: dict[int, int] = {}
+        """The shortest way of a command, by session [ns]."""
+        for session in SESSIONS:
+            self.admission.set_announced(session, True, self.clock.now())
         self.happened: Counter[str] = Counter()
         self.last: Setpoint | None = None
         """Of the present run of setpoints, which ends with a stop of the driver."""
@@ -210,7 +221,6 @@ class Fuzz:
 
         loop = ControlLoop(
             "arm",
-            local_writer(99),
             SupervisedDriver(self.driver, "arm"),
             self.stops,
             limits=self.limits,
@@ -260,9 +270,28 @@ class Fuzz:
         self.happened[self.loop.state.name] += 1
 
     def arriving(self, command: Command) -> None:
-        """``command`` is received. A host refuses those of sessions that are not announced before this."""
-        self.valid_until = max(self.valid_until, command.deadline)
-        self.waiting.append(command)
+        """``command``, which was given just now, is received after it has waited."""
+        ttl, kind, session = command.deadline - command.arrived, self.random.random(), command.session
+        way = self.random.uniform(0.0, 2e6 if kind < 0.85 else 2.0 * self.ttl_ns if kind < 0.95 else 1e10)
+        now, sent = self.clock.now(), self.clock.now() - round(way)
+        echo = (HOST, max(0, sent))
+        way = now - echo[1]
+        self.shortest[session] = least = min(way, self.shortest.get(session, way))
+        since = now
+        if session not in self.announced:
+            since = self.unannounced.setdefault(session, now)
+        is_claimed = session in self.announced or now - since <= GRACE_NS
+        due = echo[1] + ttl + (least if least < self.ttl_ns else 0)
+        if is_claimed:  # the truth, whatever the admission says
+            self.valid_until = max(self.valid_until, due)
+        try:
+            deadline = self.admission.deadline((sent, command.seq, session), ttl, now, echo)
+        except MessageError as error:
+            self.happened[f"not admitted: {error.reason}"] += 1
+            return
+        self._require(is_claimed, f"session {session} moves joints and is not announced")
+        self._require(deadline <= due, f"a command of session {session} moves joints after its ttl")
+        self.waiting.append(replace(command, deadline=deadline))
 
     def renew(self) -> None:
         underway = self.loop.motions.underway[0]
@@ -305,14 +334,26 @@ class Fuzz:
 
     def take_over(self) -> None:
         self.session = int(self.random.choice(SESSIONS))
+        if self.random.random() < 0.8:
+            self.announce(self.session, alive=True)
         self.command()
 
     def second_commander(self) -> None:
         self.command(int(self.random.choice(SESSIONS)))
 
     def token(self) -> None:
-        session = int(self.random.choice(SESSIONS))
-        self.loop.targets.set_announced(session, bool(self.random.random() < 0.5), self.clock.now())
+        self.announce(int(self.random.choice(SESSIONS)), alive=bool(self.random.random() < 0.5))
+
+    def announce(self, session: int, *, alive: bool) -> None:
+        now = self.clock.now()
+        if alive:
+            self.announced.add(session)
+            self.unannounced.pop(session, None)
+        elif session in self.announced:
+            self.announced.remove(session)
+            self.unannounced[session] = now
+        self.admission.set_announced(session, alive, now)
+        self.loop.targets.set_announced(session, alive, now)
 
     def node(self) -> None:
         """The ROS node is announced, or has ended."""

@@ -28,5 +28,7 @@ def test_no_history_of_commands_stops_and_faults_has_a_setpoint_that_must_not_be
         "token",
     }
     assert min(happened[name] for name in states | events) > 20
+    assert happened["not admitted: no claim"]
+    assert happened["not admitted: late"]
     assert happened["refused: not released"]
     assert happened["refused: outside limits"]

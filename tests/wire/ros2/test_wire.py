@@ -303,9 +303,10 @@ def test_a_command_has_the_number_of_its_publisher_and_the_time_of_its_sending()
 
 def test_a_motion_has_the_numbers_of_its_publisher_and_of_the_message():
     payload = rosbags_trajectory(0, ["elbow"], (0.5, ([1.0],)))
-    session, request = controller().decode_trajectory(arrival(payload, key=key_of(TRAJECTORY)))
+    session, sent, request = controller().decode_trajectory(arrival(payload, key=key_of(TRAJECTORY)))
     assert request is not None
     assert session == request.session == int.from_bytes(GID[:8], "little")
+    assert sent == 1
     assert (request.seq, request.names) == (7, ("elbow",))
 
 
