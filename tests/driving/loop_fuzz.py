@@ -195,7 +195,7 @@ class Fuzz:
         self.announced = set(SESSIONS)
         self.unannounced: dict[int, int] = {}
         self.shortest: dict[int, int] = {}
-        """The shortest way of a command, by session [ns]."""
+        """The shortest way of a command that was announced, by session [ns]."""
         for session in SESSIONS:
             self.admission.set_announced(session, True, self.clock.now())
         self.happened: Counter[str] = Counter()
@@ -276,11 +276,13 @@ class Fuzz:
         now, sent = self.clock.now(), self.clock.now() - round(way)
         echo = (HOST, max(0, sent))
         way = now - echo[1]
-        self.shortest[session] = least = min(way, self.shortest.get(session, way))
         since = now
         if session not in self.announced:
             since = self.unannounced.setdefault(session, now)
         is_claimed = session in self.announced or now - since <= GRACE_NS
+        least = min(way, self.shortest.get(session, way))
+        if is_claimed:  # a driver measures no way of others
+            self.shortest[session] = least
         due = echo[1] + ttl + (least if least < self.ttl_ns else 0)
         if is_claimed:  # the truth, whatever the admission says
             self.valid_until = max(self.valid_until, due)
