@@ -52,6 +52,12 @@ def test_other_user_cannot_write_the_robot_and_the_error_names_the_reason(router
     assert received == []
 
 
+def test_a_viewer_that_releases_stops_is_told_that_only_commanders_do(router: str):
+    message = failure("stop", "r1", "--release", "--user", "desk")
+    assert "Only commanders command a robot and release its stops" in message
+    assert "`zstate acl --robot r1 --commander NAME`" in message
+
+
 def test_invalid_names_are_refused():
     assert "cannot be the name of an identity" in failure("acl", "--robot", "a/b")
     assert "give at least one of --robot NAME" in failure("acl", code=2)
