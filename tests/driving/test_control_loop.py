@@ -365,6 +365,16 @@ def test_joints_with_power_and_without_two_readings_are_stopped_after_the_ttl(
     assert not driver.setpoints
 
 
+def test_a_host_that_is_late_after_enabling_does_not_stop_a_sound_driver():
+    driver = Scripted()
+    bench = scripted(driver)
+    drive(bench, 1)
+    assert driver.is_enabled
+    bench.clock.set(bench.clock.now() + 2 * TTL_NS)
+    drive(bench, 5)
+    assert (bench.loop.state.name, bench.loop.faults) == ("active", 0)
+
+
 def test_a_joint_a_little_outside_its_limits_moves_inwards():
     driver = Scripted()
     bench = scripted(driver, (1.3, 0.0))

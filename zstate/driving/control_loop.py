@@ -36,6 +36,9 @@ StateName = Literal["off", "ready", "active", "holding", "stopped", "fault"]
 NO_READING = "no two readings that agree have arrived yet"
 """The reason of "ready" until the joints are known."""
 
+_LEAST_TICKS = 5
+"""A host that is late has had too few ticks for two readings: that is no fault of the driver."""
+
 StepDuration: TypeAlias = "Callable[[int, int], float]"
 """For how long joints move at ``now`` that moved last at ``since`` [ns]: in s."""
 
@@ -125,6 +128,8 @@ class ControlLoop:
         self._moved_at = 0
         """When the last setpoint was made: steps are no longer than the time since then."""
         self._enabled_at = 0
+        self._powered_ticks = 0
+        """Since the joints have power, without a setpoint."""
         self._read_stamp: int | None = None
         """Of the last reading, if the driver gives stamps."""
         self._offset = 0
@@ -214,11 +219,12 @@ class ControlLoop:
     def _check_following(self, now: int) -> None:
         """Stop if a joint does not follow its setpoints, or is not measured any more."""
         if self._driver.is_enabled and self.setpoint is None:
-            waited_ns = now - self._enabled_at
-            reason = "the joints have power, and there are no two readings of them that agree"
-            reason = f"{reason} for {format_duration(waited_ns)}"
-            if waited_ns > self._following.oldest_ns:
-                self._stop_and_latch(reason)
+            self._powered_ticks += 1
+            known_at = self._measured_at if self._readings.is_confirmed else 0
+            waited_ns = now - max(self._enabled_at, known_at)
+            if waited_ns > self._following.oldest_ns and self._powered_ticks >= _LEAST_TICKS:
+                reason = "the joints have power, and there are no two readings of them that agree"
+                self._stop_and_latch(f"{reason} for {format_duration(waited_ns)}")
         elif self._measured is not None:
             reason = self._following.deviation(self._measured, self._measured_at, now)
             if reason:
@@ -349,6 +355,7 @@ class ControlLoop:
         self._measured_at = 0
         failure = self._driver.enable()
         self._enabled_at = self._now()
+        self._powered_ticks = 0
         return failure
 
     def _start(self, now: int) -> Exception | None:
