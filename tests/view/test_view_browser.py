@@ -62,6 +62,17 @@ def picture(view_tab) -> NDArray[np.int16]:
     raise AssertionError("the picture keeps changing")
 
 
+def until_fitted(view: View) -> None:
+    """Waits until the camera fits all meshes and maps: the view fits it again when the last one is loaded."""
+
+    def is_fitted() -> bool:
+        scene, fitted = view.scene, view._fitted_to
+        versions = scene.layout.version, scene.world.version
+        return not scene.busy and not view._fitted_busy and fitted is not None and fitted[2:] == versions
+
+    until(is_fitted, PATIENCE_S)
+
+
 def changed(before: NDArray[np.int16], after: NDArray[np.int16]) -> Mask:
     return np.abs(before - after).max(axis=2) > 10
 
@@ -86,7 +97,7 @@ def test_robot_meshes_are_drawn_at_the_poses_of_their_links(robot: str, open_tab
         shown = show_view(sessions[1])
         until(lambda: robot in shown.source.models)
         view_tab = open_tab(shown.page.url)
-        until(lambda: not shown.view.scene.busy, PATIENCE_S)
+        until_fitted(shown.view)
         # The page has the fitted camera when a click has come through it.
         field(view_tab, "Visuals").click()
         until(lambda: not shown.view.scene.visuals)
@@ -173,7 +184,7 @@ def test_ellipse_of_a_base_is_drawn_where_it_is(open_tab, show_view, sessions):
         shown = show_view(sessions[1], "rrbot")
         until(lambda: {"rrbot/odom", "rrbot/tool"} <= set(shown.source.snapshot().tree.names))
         view_tab = open_tab(shown.page.url)
-        until(lambda: not shown.view.scene.busy, PATIENCE_S)
+        until_fitted(shown.view)
         # The page has the fitted camera when a click has come through it.
         field(view_tab, "Odometry").click()
         until(lambda: not shown.view.scene.odometry.is_on)
@@ -206,7 +217,8 @@ def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):
         world = shown.view.scene.world
         until(lambda: shown.source.world.maps_at(None) and "rrbot" in shown.source.models)
         view_tab = open_tab(shown.page.url)
-        until(lambda: world.version == 1 and not shown.view.scene.busy, PATIENCE_S)
+        until(lambda: world.version == 1, PATIENCE_S)
+        until_fitted(shown.view)
         # The page has the map and the fitted camera when a click has come through it.
         field(view_tab, "Maps").click()
         until(lambda: not world.maps)
