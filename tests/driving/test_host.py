@@ -364,7 +364,7 @@ def test_commands_of_a_session_that_is_not_announced_are_refused_like_its_motion
             return host.report().refused.get("no claim", 0) > 50
 
         until(is_refused)
-        assert set(host.report().refused) == {"no claim"}
+        assert set(host.report().refused) - {"overrun"} == {"no claim"}
         until(lambda: is_refused() and host.state == "holding")
         written = len(driver.written())
         until(lambda: is_refused() and len(driver.written()) > written + 20)
@@ -717,9 +717,13 @@ def test_a_second_run_obeys_a_stop_that_is_still_latched(sessions):
 def test_joints_of_an_expired_commander_come_to_rest_when_another_one_takes_over(sessions):
     driver = RecordingDriver()
     with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
-        put(command(shoulder=3.0, ttl=50_000_000))
-        until(lambda: host.state == "active")
-        other = iter(range(10**6))
+        first, other = iter(range(10**6)), iter(range(10**6))
+
+        def is_active() -> bool:  # a command may expire before a late tick
+            put(command(next(first), shoulder=3.0, ttl=50_000_000))
+            return host.state == "active"
+
+        until(is_active)
 
         def taken_over() -> bool:
             # Sent all the time, so that it takes over in the tick in which the first command expires.

@@ -62,13 +62,15 @@ def picture(view_tab) -> NDArray[np.int16]:
     raise AssertionError("the picture keeps changing")
 
 
-def until_fitted(view: View) -> None:
-    """Waits until the camera fits all meshes and maps: the view fits it again when the last one is loaded."""
+def until_fitted(shown) -> None:
+    """Waits until the camera fits all frames, meshes and maps; the view fits it again after each."""
 
     def is_fitted() -> bool:
-        scene, fitted = view.scene, view._fitted_to
-        versions = scene.layout.version, scene.world.version
-        return not scene.busy and not view._fitted_busy and fitted is not None and fitted[2:] == versions
+        scene, fitted = shown.view.scene, shown.view._fitted_to
+        if scene.busy or shown.view._fitted_busy or fitted is None:
+            return False
+        tracks = tuple(shown.source.snapshot().tree.tracks_of)
+        return (fitted[1][1], *fitted[2:]) == (tracks, scene.layout.version, scene.world.version)
 
     until(is_fitted, PATIENCE_S)
 
@@ -97,7 +99,7 @@ def test_robot_meshes_are_drawn_at_the_poses_of_their_links(robot: str, open_tab
         shown = show_view(sessions[1])
         until(lambda: robot in shown.source.models)
         view_tab = open_tab(shown.page.url)
-        until_fitted(shown.view)
+        until_fitted(shown)
         # The page has the fitted camera when a click has come through it.
         field(view_tab, "Visuals").click()
         until(lambda: not shown.view.scene.visuals)
@@ -184,7 +186,7 @@ def test_ellipse_of_a_base_is_drawn_where_it_is(open_tab, show_view, sessions):
         shown = show_view(sessions[1], "rrbot")
         until(lambda: {"rrbot/odom", "rrbot/tool"} <= set(shown.source.snapshot().tree.names))
         view_tab = open_tab(shown.page.url)
-        until_fitted(shown.view)
+        until_fitted(shown)
         # The page has the fitted camera when a click has come through it.
         field(view_tab, "Odometry").click()
         until(lambda: not shown.view.scene.odometry.is_on)
@@ -218,7 +220,7 @@ def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):
         until(lambda: shown.source.world.maps_at(None) and "rrbot" in shown.source.models)
         view_tab = open_tab(shown.page.url)
         until(lambda: world.version == 1, PATIENCE_S)
-        until_fitted(shown.view)
+        until_fitted(shown)
         # The page has the map and the fitted camera when a click has come through it.
         field(view_tab, "Maps").click()
         until(lambda: not world.maps)
