@@ -117,7 +117,7 @@ def wait_until_under_way(motion: Motion) -> None:
 
 def test_a_motion_follows_its_trajectory_and_reaches_the_last_point(sessions):
     driver = Written()
-    with arm_of(sessions, driver) as arm:
+    with arm_of(sessions, driver, ttl_s=1.0) as arm:
         motion = arm.move({"elbow": [0.2, 0.1]}, [0.3, 0.6])
         assert motion.wait(DEADLINE_S).name == "reached"
         assert motion.progress == 1.0
