@@ -12,7 +12,7 @@ commander may be wrong, or set: its steps do not matter, only its rate.
 
 A ROS node echoes nothing. Its transit is the arrival less its stamp, which has an unknown constant: the
 excess is the same, but a first command that has waited counts as fresh. A node whose clock is set back is
-refused until it is restarted: nothing tells its commands from old ones.
+refused until it is restarted: its commands look like old ones.
 """
 
 from __future__ import annotations

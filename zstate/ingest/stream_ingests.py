@@ -91,7 +91,7 @@ class StreamIngests:
         return self._ingests.get((robot, session if self.is_shared else 0))
 
     def add(self, ingest: StreamIngest, session: int) -> StreamIngest:
-        """Add the ingest of a session. Returns the one that another thread has added meanwhile, if any."""
+        """Add the ingest of a session. Returns the one to use: another thread may have added one before."""
         key = ingest.robot, session if self.is_shared else 0
         with self._lock:
             known = self._ingests.setdefault(key, ingest)

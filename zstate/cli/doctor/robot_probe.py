@@ -453,7 +453,7 @@ def find_unresponsive(session: Session, probes: Sequence[RobotProbe], within_s: 
 
     A stopped process receives the query and lets it time out, or its lease ended after it was found, and
     it is not announced any more. Where a router denies the query, it ends at once without a reply, which
-    is not counted; nor is a writer that publishes meanwhile.
+    is not counted; nor is a writer whose samples arrive before the replies.
     """
     silent = {(one.info.name, writer) for one in probes for writer in one.silent_writers()}
     if not silent:
