@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zstate.odometry.fusion import Estimate, Inertia, started
+from zstate.odometry.fusion import MOST_BIAS, Estimate, Inertia, started
 from zstate.odometry.invariant_filter import (
     GRAVITY,
     POSITION,
@@ -38,7 +38,7 @@ _REST_RATE, _REST_FORCE = 0.1, 0.4
 _YAW, _POSITION = 1e-4, 1e-4
 _TILT, _COARSE_TILT = 0.02, 0.2
 _SPEED = 2.0
-_GYRO_BIAS, _UNKNOWN_GYRO_BIAS, _ACCEL_BIAS = 0.01, 0.02, 0.05
+_GYRO_BIAS, _UNKNOWN_GYRO_BIAS, _ACCEL_BIAS = 0.01, 0.002, 0.05
 _TURN = 0.3
 """Of a turn by wheels, as a part of it: they may slip, or skid."""
 
@@ -75,7 +75,8 @@ def align(
     if is_at_rest:
         rates = [rate for stamp, rate in turns if chosen[0].stamp <= stamp <= chosen[-1].stamp]
         turn = np.mean(rates, axis=0) if rates else np.zeros(3)
-        gyro_bias, bias_sigma = gyro - turn, math.hypot(_GYRO_BIAS, _TURN * math.sqrt(turn @ turn))
+        if float(np.abs(gyro - turn).max()) < MOST_BIAS:
+            gyro_bias, bias_sigma = gyro - turn, math.hypot(_GYRO_BIAS, _TURN * math.sqrt(turn @ turn))
     sigmas = np.repeat((tilt, _SPEED, _POSITION, bias_sigma, _ACCEL_BIAS), 3)
     sigmas[2] = _YAW
     covariance = np.diag(sigmas**2)

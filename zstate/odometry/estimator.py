@@ -26,16 +26,20 @@ from zstate.errors import InFuture, InPast, InvalidInput, NoData
 from zstate.odometry.alignment import Alignment, align, start_at
 from zstate.odometry.fusion import (
     COASTING_RATE_DENSITY,
+    LOST_NS,
     SILENCE_NS,
     STANDSTILL,
     Contacts,
+    Displacement,
     Estimate,
     Fusion,
     Heading,
     Inertia,
     Reading,
     Steps,
+    imu_remarks,
     is_still,
+    odom_pose,
 )
 from zstate.odometry.health import Outcome, SourceHealth, SourceRecord
 from zstate.odometry.invariant_filter import FilterState, Floats, ImuNoise, Measurement
@@ -49,7 +53,7 @@ from zstate.odometry.measurements import (
     pose,
     yaw_curvature,
 )
-from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions
+from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions, displacement
 from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
 
 IMU, WHEELS, FEET, CONTACTS = "imu", "wheels", "feet", "contacts"
@@ -96,7 +100,7 @@ class BaseState:
     is_coasting: bool
 
 
-_Input: TypeAlias = Inertia | Reading | Heading | Contacts | Steps
+_Input: TypeAlias = Inertia | Reading | Displacement | Heading | Contacts | Steps
 
 
 class _Event:
@@ -347,13 +351,29 @@ class BaseEstimator:
         )
 
     def _remark(self, name: str, record: SourceRecord, last: Estimate | None, newest: int) -> str:
+        """What the fusion has to say of a source."""
+        found = list[str]()
         if name == IMU and record.stamps and newest - max(record.stamps) > SILENCE_NS:
-            return "silent; the base is predicted from its last velocity and its wheels, with large noise"
-        compass = None if last is None else last.compasses.get(name)
+            found.append(
+                "silent; the base is predicted from its last velocity and its wheels, with large noise"
+            )
+        if last is None:
+            return "; ".join(found)
+        if name == IMU:
+            found += imu_remarks(last)
+        run = last.runs.get(name)
+        if run is not None and newest - run.start > LOST_NS:
+            found.append(
+                f"rejected for {(newest - run.start) * 1e-9:.1f} s in a row: the estimate is lost, unless another "
+                "source confirms it"
+            )
+        compass = last.compasses.get(name)
         if compass is not None and compass.deviation > 0.0:
             degrees = math.degrees(math.sqrt(compass.deviation))
-            return f"off by about {degrees:.2g} degrees as the base moves, and weighted so"
-        return ""
+            found.append(
+                f"off by about {degrees:.2g} degrees against the gyro as the base moves, and weighted so"
+            )
+        return "; ".join(found)
 
     def _mount(self, frame: str) -> Floats:
         """imu_from_frame, (4, 4), which must be static."""
@@ -394,8 +414,14 @@ class BaseEstimator:
     def _insert_displacement(
         self, wheels: Wheels, first: tuple[int, dict[str, float]], second: tuple[int, dict[str, float]]
     ) -> None:
-        measured = wheels.velocity(first[1], second[1], (second[0] - first[0]) * 1e-9)
+        seconds = (second[0] - first[0]) * 1e-9
+        measured = wheels.velocity(first[1], second[1], seconds)
         self._newest = max(self._newest or second[0], second[0])
+        if second[0] - first[0] > COAST_NS:
+            mount = self._mount(wheels.frame or self.base)
+            way, turn = displacement(measured, seconds)
+            self._insert(_Event(WHEELS, Displacement(second[0], first[0], way, turn, mount), way.tolist()))
+            return
         self._insert_velocity(
             (first[0] + second[0]) // 2, measured, wheels.frame, WHEELS, wheels.noise.scale, has_rate=True
         )
@@ -420,9 +446,11 @@ class BaseEstimator:
         reading = Reading(
             stamp,
             measure,
-            is_still(linear, math.sqrt(noise[0, 0]), rate),
+            is_still(linear, rate),
             None if rate is None else mount[:3, :3] @ rate,
             scale=scale,
+            upright=mount[:3, 2],
+            speed=math.sqrt(linear @ linear),
         )
         self._insert(_Event(source, reading, linear.tolist()))
 
@@ -500,6 +528,8 @@ class BaseEstimator:
         if isinstance(reading, Steps):
             assert self._legs is not None
             return self._fusion.after_steps(self._legs, estimate, reading, following)
+        if isinstance(reading, Displacement):
+            return self._fusion.after_pause(estimate, reading, following)
         if isinstance(reading, Heading):
             return self._fusion.after_heading(estimate, event.source, reading, following)
         return self._fusion.after_reading(estimate, event.source, reading, following)
@@ -567,11 +597,17 @@ class BaseEstimator:
 
     def _state_of(self, estimate: Estimate) -> BaseState:
         settled = self._fusion.settled(estimate)
-        matrix, pose_covariance = frame_pose(settled.state, self._imu_from_base)
+        _, pose_covariance = frame_pose(settled.state, self._imu_from_base)
         pose_covariance[:2, :2] += yaw_curvature(pose_covariance)
+        matrix, corrected = odom_pose(estimate, self._imu_from_base)
+        pose_covariance += np.outer(corrected, corrected)
         density = COASTING_RATE_DENSITY if estimate.is_coasting else self._noise.gyro
         variance = density * density / estimate.sampled_s
+        if estimate.vibration is not None:
+            variance = max(variance, float(estimate.vibration.variance[:3].max()))
         twist, twist_covariance = frame_twist(settled.state, self._imu_from_base, estimate.rate, variance)
+        along = estimate.drift.scale * twist[:3]
+        twist_covariance[:3, :3] += np.outer(along, along)
         pose7 = (*matrix[:3, 3].tolist(), *se3.quaternion_from_matrix(matrix[:3, :3]))
         # Names and numbers are our own: checks would take as long as a prediction.
         transform = Transform.trusted(self.odom, self.base, pose7, estimate.stamp, "exact")

@@ -3,18 +3,23 @@
 ``Estimate`` has all that decides on the next event, so that events can be replayed from any estimate that was
 kept.
 
-- Between events the IMU is interpolated, and predicts. Without samples for more than 0.1 s, the base keeps
-  its velocity in its own axes, and turns at the rate of the wheels, with large noise. If the wheels are
-  silent, too, it turns at the last rate, give or take a constant 0.5 rad/s.
-- A reading whose NIS exceeds the 99.9 % gate is rejected. After two seconds of rejections that agree with one
-  another, the estimate follows: the variance of what they measure grows by their squared residual.
+- Between events the IMU is interpolated, and predicts. Its white noise is the stated one or, if larger, that
+  of its samples against their neighbours: a robot that drives vibrates, which no data sheet states. A sample
+  that jumps like a shock is not integrated, and may be wrong by its jump.
+- Without samples for more than 0.1 s, the base keeps its velocity in its own axes, and turns at the rate of
+  the wheels, with large noise. If the wheels are silent, too, it turns at the last rate, give or take a
+  constant 0.5 rad/s. The displacement of the wheels over such a pause replaces all of that.
+- A reading whose NIS exceeds the 99.9 % gate is rejected. After two seconds of rejections in a row, the
+  estimate follows: it forgets its velocity, or place, and keeps biases and tilt.
 - If wheels and gyro agree for 0.1 s that the base stands, its velocity is zero, and the gyro measures its own
-  bias.
+  bias. Wheels that roll nearly straight measure it as well, but never better than they are straight.
 - A heading is relative to the first one of its source: the odometry frame has no north. The error of a
   compass turns with the robot and its place and does not average out. So the variance of the yaw is never
   lowered below that of the source, which is the stated one or, if larger, the mean square that its
   innovations have shown for 20 s. A compass that is wrong by tens of degrees loses its weight; one that is
-  right still bounds the drift. Until it has shown which, in the first minutes, it may be off by 0.5 rad.
+  right still bounds the drift. It may be off by 0.5 rad until it has been read in all directions.
+- The pose of the odometry frame is continuous (REP 105): it is the integral of the predictions. What a
+  reading corrects of the place or the yaw remains an ``Offset``, whose square is part of the covariance.
 """
 
 from __future__ import annotations
@@ -26,23 +31,31 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zstate import se3
 from zstate.odometry.health import Outcome, gate
 from zstate.odometry.invariant_filter import (
     GRAVITY,
     GYRO_BIAS,
     POSITION,
     ROTATION,
+    VELOCITY,
     FilterState,
     Floats,
     ImuNoise,
     Measurement,
     corrected,
+    forgotten,
+    initial_state,
     innovation,
+    plain_covariance,
     predict,
     updated,
+    white_noise,
+    with_plain_covariance,
 )
 from zstate.odometry.legs import Foot, Legs, updated_by_feet
-from zstate.odometry.measurements import heading, zero_velocity
+from zstate.odometry.measurements import heading, yaw_rate, zero_velocity
+from zstate.odometry.rotations import rotation_exp, skew
 
 SILENCE_NS = 100_000_000
 """Without samples of the IMU for longer, the base coasts."""
@@ -51,6 +64,10 @@ STANDSTILL = "standstill"
 """The name of zero-velocity updates as a source."""
 
 _REACQUIRE_NS, _REACQUIRE_COUNT = 2_000_000_000, 10
+LOST_NS = 1_000_000_000
+"""A source is rejected for so long: the estimate is called lost."""
+_REMEMBERED_NS = 30_000_000_000
+"""An event is told of for so long."""
 _LONGEST_STEP_S = 0.1
 _REST_NS = 100_000_000
 _WHEELS_VALID_NS = 300_000_000
@@ -58,13 +75,43 @@ _REST_SPEED = 0.02
 """[m/s] The velocity of a base at rest is zero up to this standard deviation: it may rock."""
 _REST_RATE = 1e-3  # rad/s
 _STILL_SPEED, _STILL_RATE = 0.005, 0.02
-"""[m/s], [rad/s]: wheels at rest measure no more, unless their noise is larger."""
+"""[m/s], [rad/s]: wheels at rest measure no more. Stated sigmas are no bound: drivers state generous ones."""
 _REST_FORCE = 0.5
 """[m/s^2] The specific force of a base at rest differs from gravity by less; a bias is part of it."""
 
+_VIBRATION_S = 1.0
+"""The noise of the samples of the IMU is averaged for so long."""
+_SHOCK = np.repeat((10.0, 50.0), 3)
+"""[rad/s], [m/s^2]: no sample of an IMU differs from the one before by more, but in a shock or by a fault."""
+
+_WHEEL_TURN, _WHEEL_SLIP, _WHEEL_TURN_S = 0.02, 1.0, 1.0
+"""The yaw rate by wheels is wrong by 0.02 rad/s, and by as much as they turn, independently each second."""
+_STRAIGHT = 0.005
+"""[rad/s] And by so much for ever: radii differ. Wheels do not make the bias of the gyro surer than that."""
+_APART, _APART_S = 3.0, 5.0
+"""So many standard deviations apart, in the mean of so many seconds, the gyro is not what it was taken for."""
+
+_LEAST_SPEED_BOUND = 2.0
+"""[m/s] The velocity of a base that nothing measures is so unsure, or twice the fastest that was measured."""
+_TILT_BOUND, _YAW_BOUND = 0.3, math.pi
+"""[rad] Standard deviations after a pause: a base does not fall over."""
+_PAUSE_NS = 500_000_000
+_PAUSE_SLIP, _PAUSE_PLACE, _PAUSE_YAW, _PAUSE_TILT = 0.3, 0.02, 0.02, 0.02
+"""Of a displacement by wheels over a pause: a part of it, [m], [rad] and [rad]."""
+
+_TILT_RATE = 0.05
+"""[rad/s] The tilt of the continuous pose follows that of the estimate so fast."""
+_PLACE_RATE, _YAW_RATE = 0.2, 0.1
+"""[m/s], [rad/s] It follows measured poses so fast."""
+
+MOST_BIAS = 0.03
+"""[rad/s] A gyro that measures more while wheels stand is turned: it may be carried, or on a turntable."""
+_COMPARED_S, _COMPARED_RATE, _COMPARED_SCALE = 20.0, 0.05, 1.6
+"""The yaw rates of wheels and gyro are compared for so long, if above it [rad/s], up to this factor."""
+
 _DEVIATION_S = 20.0
-_UNPROVEN, _PROVING_S = 0.5, 100.0
-"""[rad], [s]: the standard deviation of a compass at its first reading, whose square falls to 1/e so fast."""
+_UNPROVEN, _SECTORS = 0.5, 12
+"""[rad] The standard deviation of a compass at first, and in how many directions it is proven."""
 _SAMPLED_S, _SAMPLED_GAIN = 0.01, 0.05
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
@@ -91,7 +138,9 @@ class Reading(NamedTuple):
     """A measurement: a function of the state and of the IMU's rate at that instant.
 
     ``is_still`` is of velocities, else None; ``angular`` is their rate in the IMU's axes [rad/s], (3,), if
-    known. ``is_position``: it measures the position in the world.
+    known, and ``upright`` the z axis of the frame there. ``is_position``: it measures the position in the
+    world. ``scale`` is the standard deviation of a constant relative error of a velocity, ``speed`` its
+    length [m/s].
     """
 
     stamp: int
@@ -100,6 +149,21 @@ class Reading(NamedTuple):
     angular: Floats | None = None
     is_position: bool = False
     scale: float = 0.0
+    upright: Floats | None = None
+    speed: float = 0.0
+
+
+class Displacement(NamedTuple):
+    """The way of a base by its wheels since the stamp ``since``, over a pause of other data.
+
+    ``way`` (3,) [m] is in the axes of the frame at the beginning, and ``turn`` [rad] about its z axis.
+    """
+
+    stamp: int
+    since: int
+    way: Floats
+    turn: float
+    imu_from_frame: Floats
 
 
 class Heading(NamedTuple):
@@ -128,11 +192,10 @@ class Steps(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Rejections of a source in a row that agree with one another."""
+    """Rejections of a source in a row, since ``start``."""
 
     start: int
     length: int
-    residual: Floats
 
 
 class Compass(NamedTuple):
@@ -140,7 +203,7 @@ class Compass(NamedTuple):
 
     ``start`` is the stamp of its first reading, ``offset`` its yaw minus ours then, and ``offset_variance``
     that of our yaw then. ``deviation`` is the variance by which its errors exceed the stated one, and
-    ``excess`` their present mean.
+    ``excess`` their present mean. ``sectors`` are the directions in which it was read.
     """
 
     start: int
@@ -149,6 +212,58 @@ class Compass(NamedTuple):
     offset_variance: float
     excess: float
     deviation: float
+    sectors: frozenset[int]
+
+
+class Vibration(NamedTuple):
+    """The noise of the samples of the IMU: ``variance`` of gyro and accelerometer in each axis, (6,).
+
+    ``values`` are the last sample as it was received, (6,), and ``change`` its difference to the one before;
+    ``count`` are those in the mean. ``white`` is the squared density of the noise to predict with, (6,).
+    """
+
+    values: Floats
+    change: Floats | None
+    variance: Floats
+    count: int
+    white: Floats
+
+
+class Turning(NamedTuple):
+    """The yaw rates by wheels and by the gyro less its bias, in motion: means of the last 20 s.
+
+    They are those of their squares and product. ``apart`` is that of their difference while the wheels roll
+    straight [rad/s], ``rolled`` that of the absolute rate by wheels then. ``time_s`` is how long there was
+    motion, ``straight_s`` how much of it was straight, up to 20 s.
+    """
+
+    time_s: float = 0.0
+    wheels: float = 0.0
+    gyro: float = 0.0
+    both: float = 0.0
+    straight_s: float = 0.0
+    apart: float = 0.0
+    rolled: float = 0.0
+
+
+class Offset(NamedTuple):
+    """From the estimate to the continuous pose of the IMU: ``rotation @ place + shift``. ``rotation`` (3, 3).
+
+    It was last changed at ``stamp``. ``is_followed``: it fades, as poses are measured in the odometry frame.
+    """
+
+    rotation: Floats
+    shift: Floats
+    stamp: int
+    is_followed: bool = False
+
+
+class Pause(NamedTuple):
+    """Data of all sources paused until ``stamp`` for ``seconds``. ``is_bridged``: wheels measured the way."""
+
+    stamp: int
+    seconds: float
+    is_bridged: bool
 
 
 class Rest(NamedTuple):
@@ -181,6 +296,9 @@ class Estimate(NamedTuple):
     ``moved_at`` is the stamp of the last velocity that was not zero, ``angular`` the rate by wheels in the
     IMU's axes [rad/s], ``wheels_at`` their stamp. ``touching`` are the feet on the ground, if measured.
     ``sampled_s`` is the mean time between samples of the IMU, over which the noise of a rate is averaged.
+    ``fastest`` is the greatest speed that was measured [m/s]. ``anchor`` is the estimate at the last reading
+    before the wheels and the IMU fell silent. ``lost_at`` is when the estimate last followed a source that it
+    had rejected. ``turn_at_rest`` is the rate of the gyro while wheels stand, if too large for a bias [rad/s].
     """
 
     stamp: int
@@ -190,12 +308,21 @@ class Estimate(NamedTuple):
     imu: Inertia | None
     rest: Rest
     drift: Drift
+    offset: Offset
     is_coasting: bool = False
     sampled_s: float = _SAMPLED_S
     wheels_at: int | None = None
     moved_at: int = 0
     angular: Floats | None = None
     touching: frozenset[str] | None = None
+    vibration: Vibration | None = None
+    turning: Turning = Turning()
+    turn_at_rest: float = 0.0
+    biased_at: int | None = None
+    fastest: float = 0.0
+    anchor: Estimate | None = None
+    pause: Pause | None = None
+    lost_at: int | None = None
     runs: dict[str, Run] = {}  # noqa: RUF012 - replaced, never written to
     compasses: dict[str, Compass] = {}  # noqa: RUF012 - replaced, never written to
 
@@ -203,7 +330,8 @@ class Estimate(NamedTuple):
 def started(stamp: int, state: FilterState) -> Estimate:
     """The first estimate, before any event."""
     rate, force = state.gyro_bias, state.rotation.T @ -GRAVITY + state.accel_bias
-    return Estimate(stamp, state, rate, force, None, _new_rest(stamp), Drift(state.position))
+    offset = Offset(np.eye(3), np.zeros(3), stamp)
+    return Estimate(stamp, state, rate, force, None, _new_rest(stamp), Drift(state.position), offset)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,6 +344,8 @@ class Fusion:
     def after_inertia(self, before: Estimate, sample: Inertia) -> tuple[Estimate, Outcome | None]:
         """The estimate at a sample of the IMU; with an outcome if the base was found to stand."""
         estimate = self.predicted(before, sample.stamp, sample)
+        vibration = self._vibration(before, sample)
+        sample = _without_shock(before, sample)
         start, size, gyro, accel, was_still = estimate.rest
         rest = Rest(start, size + 1, gyro + sample.gyro, accel + sample.accel, was_still)
         sampled_s = estimate.sampled_s
@@ -228,6 +358,7 @@ class Fusion:
             is_coasting=False,
             rest=rest,
             sampled_s=sampled_s,
+            vibration=vibration,
         )
         if sample.stamp - start < _REST_NS:
             return estimate, None
@@ -239,16 +370,56 @@ class Fusion:
         """The estimate after a reading, and its outcome. ``following`` is the next sample of the IMU."""
         estimate = self.predicted(before, reading.stamp, following)
         if reading.is_still is not None:
-            estimate = estimate._replace(
+            estimate = self._with_turn(estimate, reading)._replace(
                 wheels_at=reading.stamp,
                 moved_at=estimate.moved_at if reading.is_still else reading.stamp,
                 angular=reading.angular,
+                fastest=max(estimate.fastest, reading.speed),
             )
         if reading.scale > estimate.drift.scale:
             estimate = estimate._replace(drift=estimate.drift._replace(scale=reading.scale))
         if reading.is_position:
             estimate = self.settled(estimate)
-        return _gated(estimate, source, reading.measure(estimate.state, estimate.rate))
+            estimate = estimate._replace(offset=estimate.offset._replace(is_followed=True))
+        return _gated(
+            estimate, source, reading.measure(estimate.state, estimate.rate), is_position=reading.is_position
+        )
+
+    def after_pause(
+        self, before: Estimate, reading: Displacement, following: Inertia | None
+    ) -> tuple[Estimate, Outcome | None]:
+        """The estimate after a displacement by wheels; without an outcome if other data have not paused."""
+        estimate = self.predicted(before, reading.stamp, following)
+        anchor, pause, seconds = estimate.anchor, estimate.pause, (reading.stamp - reading.since) * 1e-9
+        if anchor is None or pause is None or abs(anchor.stamp - reading.since) > _PAUSE_NS:
+            return estimate, None
+        if reading.stamp - pause.stamp > _PAUSE_NS or pause.seconds < seconds - 2e-9 * _PAUSE_NS:
+            return estimate, None
+        state, frame = anchor.state, reading.imu_from_frame
+        turned = frame[:3, :3] @ rotation_exp(np.array((0.0, 0.0, reading.turn))) @ frame[:3, :3].T
+        way = state.rotation @ (frame[:3, 3] + frame[:3, :3] @ reading.way - turned @ frame[:3, 3])
+        length = math.sqrt(reading.way @ reading.way)
+        # The yaw before the pause, and what it is unsure by, turns the way.
+        carry = np.eye(15)
+        carry[POSITION, ROTATION] = -skew(way)
+        covariance = carry @ plain_covariance(state)[:15, :15] @ carry.T
+        forgotten(covariance, VELOCITY, (_REST_SPEED + 2.0 * length / seconds) ** 2)
+        added = np.zeros(15)
+        added[ROTATION] = _PAUSE_TILT**2, _PAUSE_TILT**2, (_PAUSE_YAW + _PAUSE_SLIP * abs(reading.turn)) ** 2
+        added[POSITION] = (_PAUSE_PLACE + _PAUSE_SLIP * length) ** 2
+        state = initial_state(
+            rotation=state.rotation @ turned,
+            velocity=np.zeros(3),
+            position=state.position + way,
+            gyro_bias=state.gyro_bias,
+            accel_bias=state.accel_bias,
+            covariance=covariance + np.diag(added),
+        )
+        # Not a correction: the way was driven, so that the continuous pose has it as well.
+        estimate = estimate._replace(
+            state=state, offset=anchor.offset, pause=Pause(reading.stamp, seconds, is_bridged=True)
+        )
+        return estimate, Outcome("accepted", math.nan, 0)
 
     def after_heading(
         self, before: Estimate, source: str, reading: Heading, following: Inertia | None
@@ -263,17 +434,18 @@ class Fusion:
         settled = self.settled(estimate)
         variance = float(row @ settled.state.covariance @ row)
         if compass is None:
-            first = Compass(reading.stamp, reading.stamp, residual, variance, 0.0, 0.0)
+            sectors = frozenset((_sector(reading.yaw),))
+            first = Compass(reading.stamp, reading.stamp, residual, variance, 0.0, 0.0, sectors)
             return _with_compass(estimate, source, first), Outcome("accepted", 1.0, 1)
         # The first reading has an error as well, and that of our yaw then is part of the present one.
         expected = variance + 2.0 * reading.variance
         share = 1.0 - math.exp(-(reading.stamp - compass.stamp) * 1e-9 / _DEVIATION_S)
         excess = compass.excess + share * (residual * residual - expected - compass.excess)
         deviation = max(compass.deviation, excess)
-        compass = compass._replace(stamp=reading.stamp, excess=excess, deviation=deviation)
+        sectors = compass.sectors | {_sector(reading.yaw)}
+        compass = compass._replace(stamp=reading.stamp, excess=excess, deviation=deviation, sectors=sectors)
         estimate = _with_compass(estimate, source, compass)
-        age_s = (reading.stamp - compass.start) * 1e-9
-        deviation = max(deviation, _UNPROVEN * _UNPROVEN * math.exp(-age_s / _PROVING_S))
+        deviation = max(deviation, (_UNPROVEN * (1.0 - len(sectors) / _SECTORS)) ** 2)
         nis = residual * residual / expected
         if residual * residual > gate(1) * (expected + deviation):
             return estimate, Outcome("rejected", nis, 1)
@@ -281,9 +453,7 @@ class Fusion:
         if variance > floor:
             # Such a noise lowers the variance to the floor: 1 / variance + 1 / noise = 1 / floor.
             noise = np.array([[variance * floor / (variance - floor)]])
-            estimate = estimate._replace(
-                state=updated(estimate.state, measurement._replace(covariance=noise))
-            )
+            estimate = _moved(estimate, updated(estimate.state, measurement._replace(covariance=noise)))
         return estimate, Outcome("accepted", nis, 1)
 
     def after_steps(
@@ -302,7 +472,7 @@ class Fusion:
                 efforts=reading.efforts,
             )
         state, squares = updated_by_feet(estimate.state, reading.feet, touching, gate(3))
-        estimate = estimate._replace(state=state)
+        estimate = _moved(estimate, state)
         if not squares:
             return estimate, None
         fate = "accepted" if max(squares.values()) <= gate(3) else "rejected"
@@ -338,6 +508,12 @@ class Fusion:
         until = stamp if following is None else following.stamp
         if until - last > SILENCE_NS or (before.imu is None and following is None):
             return self._coasted(before, stamp)
+        white = white_noise(self.noise) if before.vibration is None else before.vibration.white
+        if following is not None and before.vibration is not None:
+            shock = _shock(before.vibration, following)
+            if shock is not None:
+                following = _without_shock(before, following)
+                white = white + shock * ((following.stamp - last) * 1e-9)
         rate, force = _interpolated(before.imu, following, stamp)
         if before.is_coasting or before.imu is None:
             before = before._replace(rate=rate, force=force)
@@ -345,7 +521,9 @@ class Fusion:
         dt_s = (stamp - before.stamp) * 1e-9
         if self._has_drift:
             before = before._replace(drift=_drifted(before, gyro, dt_s))
-        state = predict(before.state, gyro, accel, dt_s, self.noise, contact_noise=self._foot_slip)
+        state = predict(
+            before.state, gyro, accel, dt_s, self.noise, contact_noise=self._foot_slip, white=white
+        )
         return before._replace(stamp=stamp, state=state, rate=rate, force=force, is_coasting=False)
 
     @property
@@ -357,26 +535,120 @@ class Fusion:
         return 0.0 if self.legs is None else self.legs.noise.slip
 
     def _coasted(self, before: Estimate, stamp: int) -> Estimate:
+        if not before.is_coasting:
+            before = before._replace(anchor=before._replace(anchor=None))
         state = before.state
         angular, density = before.angular, COASTING_RATE_DENSITY
-        is_known = before.wheels_at is not None and stamp - before.wheels_at <= _COASTING_WHEELS_NS
+        end = min(stamp, before.stamp + _PAUSE_NS)
+        is_known = before.wheels_at is not None and end - before.wheels_at <= _COASTING_WHEELS_NS
         if angular is None or not is_known:
             angular = before.rate - state.gyro_bias
             # The angle of an unknown constant rate has the variance (s t)^2, whose growth is 2 s^2 t.
-            silent_s = 0.0 if before.imu is None else (stamp - before.imu.stamp) * 1e-9
+            silent_s = 0.0 if before.imu is None else (end - before.imu.stamp) * 1e-9
             density = max(density, _UNKNOWN_RATE * math.sqrt(2.0 * silent_s))
-        noise = replace(self.noise, gyro=density, accel=_COASTING_FORCE_DENSITY)
-        left = (stamp - before.stamp) * 1e-9
+        white = np.repeat((density, _COASTING_FORCE_DENSITY), 3) ** 2
+        left = (end - before.stamp) * 1e-9
         count = max(1, math.ceil(left / _LONGEST_STEP_S))
         rate = angular + state.gyro_bias
         force = before.force
         for _ in range(count):
             body_velocity = state.rotation.T @ state.velocity
             force = np.cross(angular, body_velocity) - state.rotation.T @ GRAVITY + state.accel_bias
-            state = predict(state, rate, force, left / count, noise, contact_noise=self._foot_slip)
-        return before._replace(
-            stamp=stamp, state=state, rate=rate, force=force, is_coasting=True, rest=_new_rest(stamp)
+            state = predict(
+                state, rate, force, left / count, self.noise, contact_noise=self._foot_slip, white=white
+            )
+        state = _bounded(state, _speed_bound(before))
+        estimate = before._replace(
+            stamp=end,
+            state=state,
+            rate=rate,
+            force=force,
+            is_coasting=True,
+            vibration=None,
+            rest=_new_rest(stamp),
         )
+        return estimate if end == stamp else self._paused(estimate, stamp)
+
+    def _paused(self, estimate: Estimate, stamp: int) -> Estimate:
+        """The estimate after a pause of all data: the base stays, and may have driven anywhere."""
+        state, speed = estimate.state, _speed_bound(estimate)
+        seconds = (stamp - estimate.stamp) * 1e-9
+        covariance = plain_covariance(state)[:15, :15]
+        forgotten(covariance, VELOCITY, speed * speed)
+        added = np.zeros(15)
+        added[_YAW] = min(_UNKNOWN_RATE * seconds, _YAW_BOUND) ** 2
+        added[POSITION] = (speed * seconds) ** 2
+        added[GYRO_BIAS] = self.noise.gyro_bias**2 * seconds
+        state = initial_state(
+            rotation=state.rotation,
+            velocity=np.zeros(3),
+            position=state.position,
+            gyro_bias=state.gyro_bias,
+            accel_bias=state.accel_bias,
+            covariance=covariance + np.diag(added),
+        )
+        anchor = estimate.anchor
+        assert anchor is not None  # it coasts
+        return estimate._replace(
+            stamp=stamp,
+            state=_bounded(state, speed),
+            rate=state.gyro_bias,
+            pause=Pause(stamp, (stamp - anchor.stamp) * 1e-9, is_bridged=False),
+        )
+
+    def _vibration(self, before: Estimate, sample: Inertia) -> Vibration:
+        """The noise of the IMU with one more sample: three of them are in line but for their noise.
+
+        The second difference of white noise with the variance s has the variance 6 s.
+        """
+        values = np.concatenate((sample.gyro, sample.accel))
+        last = before.vibration
+        if last is None or before.imu is None or sample.stamp <= before.imu.stamp:
+            return Vibration(values, None, np.zeros(6), 0, white_noise(self.noise))
+        change, variance, count = values - last.values, last.variance, last.count
+        if last.change is not None and not (np.abs(change) > _SHOCK).any():
+            count += 1
+            share = max((sample.stamp - before.imu.stamp) * 1e-9 / _VIBRATION_S, 1.0 / count)
+            bend = change - last.change
+            variance = variance + min(share, 1.0) * (bend * bend / 6.0 - variance)
+        white = np.maximum(white_noise(self.noise), variance * before.sampled_s)
+        return Vibration(values, change, variance, count, white)
+
+    def _with_turn(self, estimate: Estimate, reading: Reading) -> Estimate:
+        """The estimate after the yaw rate of wheels, which measures the bias of the gyro if they roll straight.
+
+        Slip and unequal radii last: readings within a second count as one.
+        """
+        axis, angular, wheels_at = reading.upright, reading.angular, estimate.wheels_at
+        if axis is None or angular is None or wheels_at is None or estimate.is_coasting:
+            return estimate
+        state, vibration = estimate.state, estimate.vibration
+        dt_s = min((reading.stamp - wheels_at) * 1e-9, _WHEEL_TURN_S)
+        if dt_s <= 0.0 or reading.is_still:
+            return estimate
+        rate = float(axis @ angular)
+        measurement = yaw_rate(state, rate, 0.0, axis, estimate.rate)
+        row = measurement.jacobian[0]
+        gyro = rate - float(measurement.residual[0])
+        noise = 0.0 if vibration is None else float((axis * axis) @ vibration.variance[:3])
+        estimate = estimate._replace(turning=_after_turn(estimate.turning, rate, gyro, noise, dt_s))
+        variance = float(row @ state.covariance @ row)
+        turning = estimate.turning
+        bound = _APART * math.hypot(_STRAIGHT, math.sqrt(variance), _WHEEL_SLIP * turning.rolled)
+        if turning.straight_s > _APART_S and abs(turning.apart) > bound:
+            # It was zeroed while it turned, or its bias is larger than that of a usual gyro.
+            covariance = state.covariance.copy()
+            covariance[GYRO_BIAS, GYRO_BIAS] += np.outer(axis, axis) * turning.apart**2
+            state = state._replace(covariance=covariance)
+            estimate = estimate._replace(state=state, turning=Turning(), biased_at=estimate.stamp)
+            variance += turning.apart**2
+        spread = math.hypot(_WHEEL_TURN, _WHEEL_SLIP * rate)
+        error = spread * spread * _WHEEL_TURN_S / dt_s + noise
+        floor = _STRAIGHT * _STRAIGHT
+        if variance <= floor or (rate - gyro) ** 2 > gate(1) * (variance + spread * spread + noise):
+            return estimate
+        error = max(error, variance * floor / (variance - floor))
+        return _moved(estimate, updated(state, measurement._replace(covariance=np.array([[error]]))))
 
     def _at_end_of_rest(self, estimate: Estimate) -> tuple[Estimate, Outcome | None]:
         """The estimate with a zero velocity, if the base stood in this interval and in the one before."""
@@ -388,24 +660,188 @@ class Fusion:
             and stamp - wheels_at <= _WHEELS_VALID_NS
             and estimate.moved_at < rest.start - _REST_NS
         )
-        sigma = max(_REST_RATE, self.noise.gyro / math.sqrt((stamp - rest.start) * 1e-9))
+        assert estimate.vibration is not None  # after a sample
+        seconds = (stamp - rest.start) * 1e-9
+        noise = max(self.noise.gyro**2 / seconds, float(estimate.vibration.variance[:3].max()) / rest.size)
+        sigma = math.sqrt(max(_REST_RATE**2, noise))
         bias_variance = float(np.diag(state.covariance)[GYRO_BIAS].max())
+        turn = float(np.abs(gyro).max())
+        is_plausible = turn < MOST_BIAS or bias_variance < (0.1 * MOST_BIAS) ** 2
         is_still = (
             wheels_stand
+            and is_plausible
             and float(np.abs(gyro - state.gyro_bias).max()) < 3.5 * math.sqrt(bias_variance + sigma * sigma)
             and abs(math.sqrt(accel @ accel) + GRAVITY[2]) < _REST_FORCE
         )
-        estimate = estimate._replace(rest=_new_rest(stamp, was_still=is_still))
+        estimate = estimate._replace(
+            rest=_new_rest(stamp, was_still=is_still),
+            turn_at_rest=turn if wheels_stand and not is_plausible else 0.0,
+        )
         if not (is_still and rest.was_still):
-            return estimate, None
+            return self._within_bounds(estimate), None
         return _gated(estimate, STANDSTILL, zero_velocity(state, gyro, _REST_SPEED, sigma))
 
+    def _within_bounds(self, estimate: Estimate) -> Estimate:
+        """The estimate with a velocity that is plausible, if nothing measures it any more."""
+        wheels_at, state, bound = estimate.wheels_at, estimate.state, _speed_bound(estimate)
+        if wheels_at is None or estimate.stamp - wheels_at <= _PAUSE_NS:
+            return estimate
+        largest = max(
+            float(np.diag(state.covariance)[VELOCITY].max()), float(state.velocity @ state.velocity)
+        )
+        if largest <= bound * bound:
+            return estimate
+        slow = zero_velocity(state, state.gyro_bias, bound, 1.0)
+        return _moved(
+            estimate, updated(state, Measurement(*(part[:3] for part in slow[:2]), np.eye(3) * bound**2))
+        )
 
-def is_still(linear: Floats, sigma: float, angular: Floats | None) -> bool:
-    """Whether a velocity, (3,) [m/s] with the standard deviation ``sigma``, is that of a base at rest."""
+
+def is_still(linear: Floats, angular: Floats | None) -> bool:
+    """Whether a velocity, (3,) [m/s] and [rad/s], is that of a base at rest."""
     if angular is not None and float(angular @ angular) > _STILL_RATE**2:
         return False
-    return float(linear @ linear) <= max(_STILL_SPEED, sigma) ** 2
+    return float(linear @ linear) <= _STILL_SPEED**2
+
+
+def odom_pose(estimate: Estimate, imu_from_frame: Floats) -> tuple[Floats, Floats]:
+    """The continuous pose of a frame, (4, 4), and by how much the estimate differs from it.
+
+    That is (6,): position, then rotation about the axes of the world, as in ``Transform.covariance``.
+    """
+    state, offset = estimate.state, estimate.offset
+    point = state.position + state.rotation.dot(imu_from_frame[:3, 3])
+    matrix = np.eye(4)
+    matrix[:3, :3] = offset.rotation.dot(state.rotation).dot(imu_from_frame[:3, :3])
+    matrix[:3, 3] = offset.rotation.dot(point) + offset.shift
+    quaternion = se3.quaternion_from_matrix(offset.rotation.T)
+    return matrix, np.concatenate((point - matrix[:3, 3], se3.rotation_vector(quaternion, se3.SCALARS)))
+
+
+def imu_remarks(estimate: Estimate) -> list[str]:
+    """What the IMU, and the prediction from it, have come to, in sentences."""
+    found = [disagreement(estimate.turning)]
+    if estimate.turn_at_rest:
+        found.append(
+            f"the gyro reads {estimate.turn_at_rest:.2g} rad/s while the wheels stand: the base is turned, or the "
+            f"bias is larger than {MOST_BIAS:g} rad/s and is found on a straight drive"
+        )
+    if _is_recent(estimate, estimate.biased_at):
+        found.append("its bias was wrong, as wheels that roll straight show; it is measured anew")
+    if _is_recent(estimate, estimate.lost_at):
+        found.append(
+            "the estimate was lost and follows the sources that it had rejected; its place is unsure"
+        )
+    pause = estimate.pause
+    if pause is not None and _is_recent(estimate, pause.stamp):
+        how = "wheels measured the way" if pause.is_bridged else "the base may have driven anywhere meanwhile"
+        found.append(f"all data paused for {pause.seconds:.1f} s: {how}")
+    return [text for text in found if text]
+
+
+def _is_recent(estimate: Estimate, stamp: int | None) -> bool:
+    return stamp is not None and estimate.stamp - stamp < _REMEMBERED_NS
+
+
+def disagreement(turning: Turning) -> str:
+    """A sentence on the yaw rates of wheels and gyro if they contradict each other; else empty."""
+    wheels, gyro = math.sqrt(turning.wheels), math.sqrt(max(0.0, turning.gyro))
+    if turning.time_s < _APART_S or max(wheels, gyro) < _COMPARED_RATE:
+        return ""
+    alike = turning.both / max(wheels * gyro, _COMPARED_RATE**2)
+    if alike < -0.5:
+        cause = "in opposite directions: the mount of the IMU is mirrored, or left and right are swapped"
+    elif gyro < 0.2 * wheels:
+        cause = (
+            "so the gyro does not turn with the base (frozen, or mounted about another axis), or wheels slip"
+        )
+    elif alike < 0.5:
+        cause = "at different times: one of them is wrong"
+    elif not 1.0 / _COMPARED_SCALE < wheels / gyro < _COMPARED_SCALE:
+        cause = f"so the track is about {wheels / gyro:.2g} times as wide, or the wheels slip"
+    else:
+        return ""
+    return f"the wheels turn the base by {wheels:.2g} rad/s and the gyro by {gyro:.2g} (rms of 20 s), {cause}"
+
+
+def _after_turn(before: Turning, rate: float, gyro: float, noise: float, dt_s: float) -> Turning:
+    time_s = before.time_s + dt_s
+    share = dt_s / min(time_s, _COMPARED_S)
+    weighted_s = dt_s / (1.0 + (rate / _WHEEL_TURN) ** 2)
+    straight_s = min(before.straight_s + weighted_s, _COMPARED_S)
+    part = weighted_s / straight_s
+    return Turning(
+        time_s,
+        before.wheels + share * (rate * rate - before.wheels),
+        before.gyro + share * (gyro * gyro - noise - before.gyro),
+        before.both + share * (rate * gyro - before.both),
+        straight_s,
+        before.apart + part * (rate - gyro - before.apart),
+        before.rolled + part * (abs(rate) - before.rolled),
+    )
+
+
+def _speed_bound(estimate: Estimate) -> float:
+    return max(_LEAST_SPEED_BOUND, 2.0 * estimate.fastest)
+
+
+def _bounded(state: FilterState, speed: float) -> FilterState:
+    """The state with plausible standard deviations of tilt, yaw and velocity."""
+    covariance = plain_covariance(state)
+    sigmas = np.sqrt(np.diag(covariance))
+    bounds = np.full(len(sigmas), math.inf)
+    bounds[:6] = _TILT_BOUND, _TILT_BOUND, _YAW_BOUND, speed, speed, speed
+    if (sigmas <= bounds).all():
+        return state
+    factors = np.minimum(1.0, bounds / np.maximum(sigmas, 1e-300))
+    return with_plain_covariance(state, covariance * np.outer(factors, factors))
+
+
+def _shock(before: Vibration, sample: Inertia) -> Floats | None:
+    """The variance of a sample that jumps, (6,); None for all others."""
+    change = np.concatenate((sample.gyro, sample.accel)) - before.values
+    is_shock = np.abs(change) > _SHOCK
+    return np.where(is_shock, change * change, 0.0) if is_shock.any() else None
+
+
+def _without_shock(before: Estimate, sample: Inertia) -> Inertia:
+    """The sample, with the numbers that jump as they were before. One that stays there is believed."""
+    if before.vibration is None or before.imu is None:
+        return sample
+    shock = _shock(before.vibration, sample)
+    if shock is None:
+        return sample
+    gyro, accel = np.where(shock[:3] > 0.0, before.imu.gyro, sample.gyro), sample.accel
+    return Inertia(sample.stamp, gyro, np.where(shock[3:] > 0.0, before.imu.accel, accel))
+
+
+def _moved(estimate: Estimate, state: FilterState) -> Estimate:
+    """The estimate corrected to ``state``, while the continuous pose stays, but for a tilt.
+
+    ``place`` is that of the IMU. Tilt, and poses that are measured, are followed slowly.
+    """
+    before, offset = estimate.state, estimate.offset
+    place = offset.rotation.dot(before.position) + offset.shift
+    rotation = offset.rotation.dot(before.rotation).dot(state.rotation.T)
+    elapsed_s = (estimate.stamp - offset.stamp) * 1e-9
+    # The offset turns the vertical into the first two numbers; turning it back levels the pose.
+    x, y = float(rotation[0, 2]), float(rotation[1, 2])
+    angle = math.hypot(x, y)
+    if angle > 1e-12:
+        part = min(1.0, _TILT_RATE * elapsed_s / angle)
+        rotation = rotation_exp(np.array((y * part, -x * part, 0.0))).dot(rotation)
+    if offset.is_followed:
+        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+        most = _YAW_RATE * elapsed_s
+        rotation = rotation_exp(np.array((0.0, 0.0, -max(-most, min(yaw, most))))).dot(rotation)
+        gap = state.position - place
+        place = place + gap * min(1.0, _PLACE_RATE * elapsed_s / max(math.sqrt(gap @ gap), 1e-12))
+    offset = Offset(rotation, place - rotation.dot(state.position), estimate.stamp, offset.is_followed)
+    return estimate._replace(state=state, offset=offset)
+
+
+def _sector(yaw: float) -> int:
+    return math.floor(yaw / math.tau * _SECTORS) % _SECTORS
 
 
 def _drifted(before: Estimate, gyro: Floats, dt_s: float) -> Drift:
@@ -435,38 +871,41 @@ def _interpolated(last: Inertia | None, following: Inertia | None, stamp: int) -
     )
 
 
-def _gated(estimate: Estimate, source: str, measurement: Measurement) -> tuple[Estimate, Outcome]:
+def _gated(
+    estimate: Estimate, source: str, measurement: Measurement, *, is_position: bool = False
+) -> tuple[Estimate, Outcome]:
     state, dimension = estimate.state, len(measurement.residual)
     found = innovation(state, measurement)
     nis = found.nis
     if nis <= gate(dimension):
         if source in estimate.runs:
             estimate = _with_run(estimate, source, None)
-        state = corrected(state, measurement, found)
-        return estimate._replace(state=state), Outcome("accepted", nis, dimension)
-    run = _continued(estimate, source, measurement)
+        return _moved(estimate, corrected(state, measurement, found)), Outcome("accepted", nis, dimension)
+    run = estimate.runs.get(source) or Run(estimate.stamp, 0)
+    run = Run(run.start, run.length + 1)
     if run.length < _REACQUIRE_COUNT or estimate.stamp - run.start < _REACQUIRE_NS:
         return _with_run(estimate, source, run), Outcome("rejected", nis, dimension)
-    state = updated(_inflated(state, measurement), measurement)
-    return _with_run(estimate._replace(state=state), source, None), Outcome("reacquired", nis, dimension)
+    forget = _without_place if is_position else _without_velocity
+    state = updated(forget(state, measurement.residual, (estimate.stamp - run.start) * 1e-9), measurement)
+    estimate = _moved(_with_run(estimate, source, None), state)._replace(lost_at=estimate.stamp)
+    return estimate, Outcome("reacquired", nis, dimension)
 
 
-def _continued(estimate: Estimate, source: str, measurement: Measurement) -> Run:
-    """The run of rejections with this one; a new one if its residual does not agree with the last one."""
-    residual = measurement.residual
-    run = estimate.runs.get(source)
-    if run is None:
-        return Run(estimate.stamp, 1, residual)
-    change = residual - run.residual
-    # Two readings that agree differ by the noise of both.
-    is_same = float(change @ np.linalg.solve(2.0 * measurement.covariance, change)) <= gate(len(residual))
-    return Run(run.start, run.length + 1, residual) if is_same else Run(estimate.stamp, 1, residual)
+def _without_velocity(state: FilterState, residual: Floats, seconds: float) -> FilterState:
+    """The state with an unknown velocity: it was wrong by the residual for so long."""
+    error = float(residual[:3] @ residual[:3])
+    covariance = forgotten(state.covariance.copy(), VELOCITY, error)
+    covariance[POSITION, POSITION] += np.eye(3) * (error * seconds * seconds)
+    return state._replace(covariance=covariance)
 
 
-def _inflated(state: FilterState, measurement: Measurement) -> FilterState:
-    """The state with the variance of an error that explains the residual, the smallest such error."""
-    error = np.linalg.pinv(measurement.jacobian) @ measurement.residual
-    return state._replace(covariance=state.covariance + np.outer(error, error))
+def _without_place(state: FilterState, residual: Floats, seconds: float) -> FilterState:
+    """The state with an unknown position and yaw: they are wrong by the residual."""
+    del seconds
+    covariance = forgotten(plain_covariance(state), POSITION, float(residual[:3] @ residual[:3]))
+    if len(residual) == 6:
+        forgotten(covariance, slice(_YAW, _YAW + 1), float(residual[5] ** 2))
+    return with_plain_covariance(state, covariance)
 
 
 def _with_run(estimate: Estimate, source: str, run: Run | None) -> Estimate:

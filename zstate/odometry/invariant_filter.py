@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from functools import cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -134,8 +134,7 @@ def initial_state(
     state = FilterState(
         rotation, velocity, position, gyro_bias, accel_bias, (), np.zeros((0, 3)), np.asarray(covariance)
     )
-    invariant_from_plain = _invariant_from_plain(state)
-    return state._replace(covariance=invariant_from_plain @ covariance @ invariant_from_plain.T)
+    return with_plain_covariance(state, covariance)
 
 
 def plain_covariance(state: FilterState) -> Floats:
@@ -148,6 +147,21 @@ def plain_covariance(state: FilterState) -> Floats:
     return plain_from_invariant @ state.covariance @ plain_from_invariant.T
 
 
+def with_plain_covariance(state: FilterState, covariance: Floats) -> FilterState:
+    """The state whose plain errors have ``covariance``, in the order of ``plain_covariance``."""
+    invariant_from_plain = _invariant_from_plain(state)
+    return state._replace(covariance=invariant_from_plain @ covariance @ invariant_from_plain.T)
+
+
+def forgotten(covariance: Floats, rows: slice, variance: float) -> Floats:
+    """Set the errors ``rows`` to be independent of all others, with ``variance`` each, in place."""
+    covariance[rows] = 0.0
+    covariance[:, rows] = 0.0
+    block = covariance[rows, rows]
+    np.fill_diagonal(block, variance)
+    return covariance
+
+
 def predict(
     state: FilterState,
     gyro: Floats,
@@ -156,6 +170,7 @@ def predict(
     noise: ImuNoise,
     *,
     contact_noise: float = 0.0,
+    white: Floats | None = None,
 ) -> FilterState:
     """The state ``dt_s`` seconds later, from an IMU's rate [rad/s] and specific force [m/s^2] in its axes.
 
@@ -164,7 +179,8 @@ def predict(
     only. White noise is a bias of this step alone, of the variance density^2 / dt; what its changes inside
     the step do is exact for the accelerometer, ``dt^3 / 12`` of the position, and left out for the gyro. The
     walks of the biases are of first order. ``contact_noise`` [m/sqrt(s)] is the drift of contacts, as feet
-    slip.
+    slip. ``white``, (6,), are the squared densities of white noise of gyro and accelerometer in each axis, by
+    default those of ``noise``.
     """
     # The orientation at the end, its mean in the step, and the integral of the integral, in units of dt.
     turned = state.rotation @ gammas((gyro - state.gyro_bias) * dt_s)
@@ -191,10 +207,12 @@ def predict(
     transition[POSITION, ACCEL_BIAS] = turned[2] * (-dt_s * dt_s)
     if state.feet:
         transition[15:, GYRO_BIAS] = shifts[6:]
-    white, walks = _noise_variances(noise, contact_noise, size)
+    walks = _walks(noise, contact_noise, size)
+    if white is None:
+        white = white_noise(noise)
     effects = transition[:, 9:15] - _constant_biases(size)
     added = walks * dt_s
-    added[POSITION] = noise.accel * noise.accel * dt_s**3 / 12.0
+    added[POSITION] = white[3:].max() * dt_s**3 / 12.0
 
     covariance: Floats = transition.dot(state.covariance).dot(transition.T)
     covariance += (effects * (white / dt_s)).dot(effects.T)
@@ -333,9 +351,13 @@ def _constant_biases(size: int) -> Floats:
     return np.eye(size)[:, 9:15].copy()
 
 
-@cache
-def _noise_variances(noise: ImuNoise, contact_noise: float, size: int) -> tuple[Floats, Floats]:
-    """Squared densities: of the white noise of gyro and accelerometer, (6,), and of walks, (size,)."""
-    white = np.repeat((noise.gyro, noise.accel), 3) ** 2
-    walks = np.repeat((0.0, noise.gyro_bias, noise.accel_bias, contact_noise), (9, 3, 3, size - 15)) ** 2
-    return white, walks
+@lru_cache(maxsize=64)
+def white_noise(noise: ImuNoise) -> Floats:
+    """Squared densities of the white noise of gyro and accelerometer, (6,). Not to be written to."""
+    return np.repeat((noise.gyro, noise.accel), 3) ** 2
+
+
+@lru_cache(maxsize=64)
+def _walks(noise: ImuNoise, contact_noise: float, size: int) -> Floats:
+    """Squared densities of the random walks of the errors: (size,)."""
+    return np.repeat((0.0, noise.gyro_bias, noise.accel_bias, contact_noise), (9, 3, 3, size - 15)) ** 2

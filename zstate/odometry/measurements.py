@@ -50,6 +50,17 @@ def body_velocity(
     return Measurement(linear - expected, jacobian, covariance)
 
 
+def yaw_rate(state: FilterState, rate: float, variance: float, upright: Floats, gyro: Floats) -> Measurement:
+    """The rate about the axis ``upright`` of the IMU's axes, (3,) [rad/s], as wheels measure it.
+
+    It is that of ``gyro`` less its bias.
+    """
+    jacobian = np.zeros((1, len(state.covariance)))
+    jacobian[0, GYRO_BIAS] = -upright
+    residual = rate - float(upright.dot(gyro - state.gyro_bias))
+    return Measurement(np.array([residual]), jacobian, np.array([[variance]]))
+
+
 def zero_velocity(state: FilterState, gyro: Floats, velocity_sigma: float, rate_sigma: float) -> Measurement:
     """A body at rest: six numbers, its velocity [m/s] and rate [rad/s] are zero up to these sigmas.
 

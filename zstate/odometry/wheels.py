@@ -276,6 +276,19 @@ def check_wheel_positions(wheels: Wheels, positions: Mapping[str, float]) -> dic
     return found
 
 
+def displacement(measured: WheelVelocity, seconds: float) -> tuple[Floats, float]:
+    """The way in the axes at its beginning [m], (3,), and the turn [rad] of a mean velocity of ``seconds``.
+
+    It is an arc: the integral of a velocity that turns evenly.
+    """
+    turn = float(measured.angular[2]) * seconds
+    way = measured.linear * seconds
+    sine = math.sin(turn) / turn if abs(turn) > 1e-6 else 1.0
+    versine = (1.0 - math.cos(turn)) / turn if abs(turn) > 1e-6 else 0.5 * turn
+    x, y, z = way.tolist()
+    return np.array((sine * x - versine * y, versine * x + sine * y, z)), turn
+
+
 def _rolling(speed: float, yaw_rate: float, noise: WheelNoise) -> WheelVelocity:
     """The velocity of a base that cannot drive sideways."""
     return WheelVelocity(np.array([speed, 0.0, 0.0]), np.array([0.0, 0.0, yaw_rate]), noise.covariance(speed))
