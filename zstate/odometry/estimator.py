@@ -362,9 +362,9 @@ class BaseEstimator:
         if name == IMU:
             found += imu_remarks(last)
         run = last.runs.get(name)
-        if run is not None and newest - run.start > LOST_NS:
+        if run is not None and run.stamp - run.start > LOST_NS and newest - run.stamp < LOST_NS:
             found.append(
-                f"rejected for {(newest - run.start) * 1e-9:.1f} s in a row: the estimate is lost, unless another "
+                f"rejected for {(run.stamp - run.start) * 1e-9:.1f} s in a row: the estimate is lost, unless another "
                 "source confirms it"
             )
         compass = last.compasses.get(name)

@@ -99,6 +99,8 @@ _PAUSE_NS = 500_000_000
 _PAUSE_SLIP, _PAUSE_PLACE, _PAUSE_YAW, _PAUSE_TILT = 0.3, 0.02, 0.02, 0.02
 """Of a displacement by wheels over a pause: a part of it, [m], [rad] and [rad]."""
 
+_SHORT_S = 0.2
+"""Corrections of the place that follow one another within this time are of the velocity between them."""
 _TILT_RATE = 0.05
 """[rad/s] The tilt of the continuous pose follows that of the estimate so fast."""
 _PLACE_RATE, _YAW_RATE = 0.2, 0.1
@@ -112,7 +114,7 @@ _COMPARED_S, _COMPARED_RATE, _COMPARED_SCALE = 20.0, 0.05, 1.6
 _DEVIATION_S = 20.0
 _UNPROVEN, _SECTORS = 0.5, 12
 """[rad] The standard deviation of a compass at first, and in how many directions it is proven."""
-_SAMPLED_S, _SAMPLED_GAIN = 0.01, 0.05
+_SAMPLED_S, _SAMPLED_GAIN, _SLOWEST_NS = 0.01, 0.05, 350_000_000
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
 _YAW = ROTATION.start + 2
@@ -192,9 +194,10 @@ class Steps(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Rejections of a source in a row, since ``start``."""
+    """Rejections of a source in a row: from ``start`` to ``stamp``, ``length`` in number."""
 
     start: int
+    stamp: int
     length: int
 
 
@@ -349,7 +352,7 @@ class Fusion:
         start, size, gyro, accel, was_still = estimate.rest
         rest = Rest(start, size + 1, gyro + sample.gyro, accel + sample.accel, was_still)
         sampled_s = estimate.sampled_s
-        if before.imu is not None and not estimate.is_coasting:
+        if before.imu is not None and sample.stamp - before.imu.stamp < _SLOWEST_NS:
             sampled_s += _SAMPLED_GAIN * ((sample.stamp - before.imu.stamp) * 1e-9 - sampled_s)
         estimate = estimate._replace(
             imu=sample,
@@ -506,7 +509,9 @@ class Fusion:
             return before
         last = before.stamp if before.imu is None else before.imu.stamp
         until = stamp if following is None else following.stamp
-        if until - last > SILENCE_NS or (before.imu is None and following is None):
+        if until - last > max(SILENCE_NS, 3e9 * before.sampled_s) or (
+            before.imu is None and following is None
+        ):
             return self._coasted(before, stamp)
         white = white_noise(self.noise) if before.vibration is None else before.vibration.white
         if following is not None and before.vibration is not None:
@@ -816,14 +821,19 @@ def _without_shock(before: Estimate, sample: Inertia) -> Inertia:
 
 
 def _moved(estimate: Estimate, state: FilterState) -> Estimate:
-    """The estimate corrected to ``state``, while the continuous pose stays, but for a tilt.
+    """The estimate corrected to ``state``, while the continuous pose stays but for what its velocity explains.
 
-    ``place`` is that of the IMU. Tilt, and poses that are measured, are followed slowly.
+    ``place`` is that of the IMU. It moves by one standard deviation of the velocity since the last correction at
+    most. Tilt, and poses that are measured, are followed slowly.
     """
     before, offset = estimate.state, estimate.offset
     place = offset.rotation.dot(before.position) + offset.shift
     rotation = offset.rotation.dot(before.rotation).dot(state.rotation.T)
     elapsed_s = (estimate.stamp - offset.stamp) * 1e-9
+    if elapsed_s < _SHORT_S:
+        step = offset.rotation.dot(state.position - before.position)
+        fastest = math.sqrt(max(before.covariance[3, 3], before.covariance[4, 4], before.covariance[5, 5]))
+        place = place + step * min(1.0, fastest * elapsed_s / max(math.sqrt(step @ step), 1e-12))
     # The offset turns the vertical into the first two numbers; turning it back levels the pose.
     x, y = float(rotation[0, 2]), float(rotation[1, 2])
     angle = math.hypot(x, y)
@@ -881,8 +891,10 @@ def _gated(
         if source in estimate.runs:
             estimate = _with_run(estimate, source, None)
         return _moved(estimate, corrected(state, measurement, found)), Outcome("accepted", nis, dimension)
-    run = estimate.runs.get(source) or Run(estimate.stamp, 0)
-    run = Run(run.start, run.length + 1)
+    if source == STANDSTILL:  # the base may be turned or carried while its wheels stand
+        return estimate, Outcome("rejected", nis, dimension)
+    run = estimate.runs.get(source) or Run(estimate.stamp, 0, 0)
+    run = Run(run.start, estimate.stamp, run.length + 1)
     if run.length < _REACQUIRE_COUNT or estimate.stamp - run.start < _REACQUIRE_NS:
         return _with_run(estimate, source, run), Outcome("rejected", nis, dimension)
     forget = _without_place if is_position else _without_velocity
