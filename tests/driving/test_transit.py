@@ -121,6 +121,25 @@ def test_without_an_echo_a_slow_clock_is_followed_and_one_that_is_set_back_is_no
     assert ages.excess(1, set_back, START + 3600 * S) > 3 * S
 
 
+@pytest.mark.parametrize("idle_s", [250, 3600, 86_400])
+def test_without_an_echo_a_command_after_a_pause_counts_for_at_most_one_ttl_longer(idle_s: int):
+    for late in (0, TTL // 2, 2 * TTL, 3600 * MS):
+        ages = CommandAges(HOST, TTL)
+        assert ages.excess(1, 0, START) == 0
+        sent = idle_s * S
+        # A burst that has waited for equally long is equally old.
+        for number in range(10):
+            arrived = START + sent + late + number * MS
+            assert ages.excess(1, sent + number * MS, arrived) > late - TTL - MS
+
+
+@pytest.mark.parametrize("drift", [0.0, 50e-6, -50e-6])
+def test_without_an_echo_a_clock_without_ntp_is_followed_over_an_hour_without_commands(drift: float):
+    ages = CommandAges(HOST, TTL)
+    assert ages.excess(1, 0, START) == 0
+    assert ages.excess(1, round(3600 * S * (1 - drift)), START + 3600 * S) == 0
+
+
 class Queue:
     """A link that carries ``per_s`` commands, one after the other, in simulated time."""
 
