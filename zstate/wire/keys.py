@@ -69,19 +69,19 @@ Stream = Literal[
 CLOCK_KEY = "zstate/clock"
 ANY = "*"
 
-NAMED_STREAMS: frozenset[Stream] = frozenset(
-    {
-        *("tf_static", "transforms", "partial_joint_states", "odometry", "map"),
-        *("scan", "imu", "velocity", "pose", "stop", "relax"),
-    }
-)
-"""The streams with one key for each of the writer names of a robot."""
-
 EDGE_STREAMS: tuple[Stream, ...] = ("transforms", "odometry")
 """The streams of moving edges under the names of their writers."""
 
 SENSOR_STREAMS: tuple[Stream, ...] = ("scan", "imu", "velocity", "pose")
 """The streams of sensors under their names."""
+
+STOP_STREAMS: tuple[Stream, ...] = ("stop", "relax")
+"""The streams of stops. Access control lets every identity write the first, which never drops a load."""
+
+NAMED_STREAMS: frozenset[Stream] = frozenset(
+    {*EDGE_STREAMS, *SENSOR_STREAMS, *STOP_STREAMS, "tf_static", "partial_joint_states", "map"}
+)
+"""The streams with one key for each of the writer names of a robot."""
 
 LATCHED_STREAMS: frozenset[Stream] = frozenset({"robot_description", "tf_static", "map"})
 """The streams of one current value, which late joiners receive as well."""
@@ -97,9 +97,6 @@ VERBATIM_CHUNKS = ("@writer", "@clock", "@edge", "@reader")
 
 MOTION_CHUNK = "@motion"
 """The chunk of requests for motions. It is verbatim, too: access control lets viewers query ``zstate/**``."""
-
-STOP_STREAMS: tuple[Stream, ...] = ("stop", "relax")
-"""The streams of stops. Access control lets every identity write the first, which never drops a load."""
 
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""

@@ -48,12 +48,9 @@ from zstate.wire.registry import get_wire
 _MIN_WINDOW_S = 1.2  # writers publish their status once a second
 _READERS_WITHIN_S = 0.3
 _REPLY_WITHIN_S = 0.4
-_MEASURED: tuple[Stream, ...] = ("imu", "velocity", "pose", "odometry")
-_NATIVE_STREAMS: tuple[Stream, ...] = (
-    *("joint_states", "partial_joint_states", "transforms", "scan"),
-    *_MEASURED,
-)
-_ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "scan", *_MEASURED)
+_MEASURED: tuple[Stream, ...] = (*SENSOR_STREAMS, "odometry")
+_NATIVE_STREAMS: tuple[Stream, ...] = (*sorted(JOINT_STREAMS), "transforms", *_MEASURED)
+_ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", *_MEASURED)
 
 
 class WriterSamples:
@@ -300,8 +297,8 @@ class RobotProbe:
 
     @property
     def measured(self) -> dict[Stream, StreamSamples]:
-        """Those of other sensors, and of odometry."""
-        return {stream: self._of(stream) for stream in _MEASURED}
+        """Those of other sensors than laser scanners, and of odometry."""
+        return {stream: self._of(stream) for stream in _MEASURED if stream != "scan"}
 
     @property
     def nodes(self) -> dict[Stream, StreamSamples]:
