@@ -33,6 +33,8 @@ COMMAND_BYTES = 180
 """At least what a command of one joint takes on the link."""
 
 _CUT_S = 1.5
+"""The link is cut for as many commands as take this time."""
+
 _QUIET_S = 1.5
 """A link that has carried nothing for so long has no old commands left."""
 
@@ -92,7 +94,7 @@ class _Arm(SimulatedDriver):
 
 
 def trial(bytes_per_s: float, command_hz: float, fault: Fault, drive_s: float) -> Result:
-    """Commands the robot for ``drive_s`` [s], ends its commander, and waits until nothing is under way."""
+    """Sends commands for ``drive_s`` [s], ends their commander, and waits until nothing is under way."""
     port, driver = find_free_port(), _Arm()
     with (
         tempfile.NamedTemporaryFile() as file,
@@ -110,21 +112,27 @@ def trial(bytes_per_s: float, command_hz: float, fault: Fault, drive_s: float) -
     ):
         file.write(bytes(16))
         file.flush()
+        shared = mmap.mmap(file.fileno(), 16)
+
+        def sent() -> tuple[int, int]:
+            """The stamp of the commander's last command, and the number of all."""
+            return struct.unpack("<qq", shared[:])
+
         thread = threading.Thread(target=host.run)
         thread.start()
         commander = Child(COMMANDER, relay.endpoint, str(command_hz), file.name)
         try:
             commander.line(40.0)
             began = time.time_ns()
-            time.sleep(drive_s)
+            until(lambda: sent()[1] >= drive_s * command_hz, _MOST_S)
             failed_at = time.monotonic()
             if fault == "cut":
                 relay.is_cut = True
             else:
                 commander.process.send_signal(signal.SIGKILL if fault == "killed" else signal.SIGSTOP)
-            last, number = struct.unpack("<qq", mmap.mmap(file.fileno(), 16)[:])
+            last, number = sent()
             if fault == "cut":
-                time.sleep(_CUT_S)
+                until(lambda: sent()[1] >= number + _CUT_S * command_hz, _MOST_S)
                 commander.kill()
                 relay.is_cut = False
                 healed_at = time.monotonic()
@@ -140,7 +148,7 @@ def trial(bytes_per_s: float, command_hz: float, fault: Fault, drive_s: float) -
             thread.join()
         report = host.report()
     period_s = 1.0 / RATE_HZ
-    active = sum(began <= stamp <= last for stamp in driver.moved) * period_s / drive_s
+    active = sum(began <= stamp <= last for stamp in driver.moved) * period_s / ((last - began) * 1e-9)
     moved_s = (driver.moved[-1] - last) * 1e-9 if driver.moved else 0.0
     tick_s = report.lateness_us.max * 1e-6 + period_s
     return Result(moved_s, tick_s, active, waited_s, number, dict(report.refused))

@@ -340,6 +340,7 @@ def test_lookup_of_a_robot_that_is_not_announced_names_it_and_the_one_that_is(se
         with pytest.raises(UnknownFrame, match="robot 'myrm' is not announced \\(announced: no robot\\)"):
             listener.buffer.lookup("world", "tool")
         with StatePublisher(writer, RRBOT, "myarm", streams=["joint_states"]):
+            until(lambda: discover(reader))
             with pytest.raises(UnknownFrame) as raised:
                 listener.buffer.lookup("world", "tool")
             hint = "robot 'myrm' is not announced; did you mean 'myarm'? (announced: myarm)"

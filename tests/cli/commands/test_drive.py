@@ -67,7 +67,8 @@ class Leaving(Arm):
 class SlowToStop(Arm):
     def stop(self, how):
         self.log.write_text(self.log.read_text() + "stopping ")
-        time.sleep(0.7)
+        while self.log.with_suffix(".held").exists():
+            time.sleep(0.002)
         super().stop(how)
         self.log.write_text(self.log.read_text() + "stopped ")
 
@@ -126,10 +127,13 @@ def test_a_second_signal_does_not_skip_the_stop_of_the_driver(spawn: Spawn, arm:
         commander.wait_for_driver(DEADLINE_S)
         until(lambda: _is_moved(commander))
         log.write_text("")
+        held = log.with_suffix(".held")
+        held.touch()
         child.process.send_signal(signal.SIGINT)
         until(lambda: "stopping" in log.read_text())
         child.process.send_signal(signal.SIGINT)
         child.process.send_signal(signal.SIGTERM)
+        held.unlink()
         assert child.process.wait(DEADLINE_S) == 130
     assert log.read_text().startswith("stopping stopped ")
     assert log.read_text().endswith("closed")

@@ -9,7 +9,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -215,6 +215,19 @@ def keys_moving(robot: str) -> Generator[tuple[int, subprocess.Popen[str]]]:
         os.close(terminal)
 
 
+def rates_of(joints: JointStateListener) -> Callable[[], np.ndarray]:
+    """The newest velocities of two joints; zero before the first."""
+    rates = np.zeros(2)
+
+    def measured() -> np.ndarray:
+        reading = joints.read(0)
+        if reading is not None and reading.velocities is not None:
+            rates[:] = reading.velocities
+        return rates
+
+    return measured
+
+
 def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: Spawn):
     assert spawn(ROVER).line() == "ready"
     with (
@@ -222,14 +235,7 @@ def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: 
         JointStateListener(session, "rover") as joints,
         keys_moving("rover") as (keyboard, move),
     ):
-        rates = np.zeros(2)
-
-        def measured() -> np.ndarray:
-            reading = joints.read(0)
-            if reading is not None and reading.velocities is not None:
-                rates[:] = reading.velocities
-            return rates
-
+        measured = rates_of(joints)
         assert move.stderr is not None
         assert "driving left_wheel_joint and right_wheel_joint of 'rover': hold" in move.stderr.readline()
         with repeated(lambda: os.write(keyboard, b"w")):
@@ -247,14 +253,7 @@ def test_wheels_stop_at_once_when_the_program_of_the_keys_ends(spawn: Spawn, end
     # By its ttl the driver would turn the wheels for longer than this test waits.
     line_with(started(spawn, "drive", "sim", "diffbot", "--ttl", f"{4 * DEADLINE_S}"), "ready")
     with connect() as session, JointStateListener(session, "diffbot") as joints:
-        rates = np.zeros(2)
-
-        def measured() -> np.ndarray:
-            reading = joints.read(0)
-            if reading is not None and reading.velocities is not None:
-                rates[:] = reading.velocities
-            return rates
-
+        measured = rates_of(joints)
         with keys_moving("diffbot") as (keyboard, move):
             with repeated(lambda: os.write(keyboard, b"w")):
                 until(lambda: np.allclose(measured(), [4.0, 4.0], atol=0.1))
