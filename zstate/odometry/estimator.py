@@ -371,7 +371,7 @@ class BaseEstimator:
         if compass is not None and compass.deviation > 0.0:
             degrees = math.degrees(math.sqrt(compass.deviation))
             found.append(
-                f"off by about {degrees:.2g} degrees against the gyro as the base moves, and weighted so"
+                f"off by about {degrees:.2g} degrees as the base moves, against the gyro, and weighted so"
             )
         return "; ".join(found)
 

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -84,12 +84,15 @@ _VIBRATION_S = 1.0
 _SHOCK = np.repeat((10.0, 50.0), 3)
 """[rad/s], [m/s^2]: no sample of an IMU differs from the one before by more, but in a shock or by a fault."""
 
-_WHEEL_TURN, _WHEEL_SLIP, _WHEEL_TURN_S = 0.02, 1.0, 1.0
-"""The yaw rate by wheels is wrong by 0.02 rad/s, and by as much as they turn, independently each second."""
+_WHEEL_TURN = 0.03
+"""[rad/s] The yaw rates of wheels and gyro are on a line but for so much, or the wheels slip."""
 _STRAIGHT = 0.005
-"""[rad/s] And by so much for ever: radii differ. Wheels do not make the bias of the gyro surer than that."""
-_APART, _APART_S = 3.0, 5.0
+"""[rad/s] And by so much for ever: radii differ."""
+_APART, _APART_S = 3.0, 8.0
 """So many standard deviations apart, in the mean of so many seconds, the gyro is not what it was taken for."""
+_FROZEN, _FROZEN_RATE = 10, 0.03
+"""So many samples that repeat the one before, while wheels turn otherwise [rad/s], are of an IMU that is frozen.
+Samples of a simulation without noise repeat as well, but turn as the wheels do."""
 
 _LEAST_SPEED_BOUND = 2.0
 """[m/s] The velocity of a base that nothing measures is so unsure, or twice the fastest that was measured."""
@@ -206,7 +209,8 @@ class Compass(NamedTuple):
 
     ``start`` is the stamp of its first reading, ``offset`` its yaw minus ours then, and ``offset_variance``
     that of our yaw then. ``deviation`` is the variance by which its errors exceed the stated one, and
-    ``excess`` their present mean. ``sectors`` are the directions in which it was read.
+    ``excess`` their present mean. ``sectors`` has for each direction the stamp of its last
+    reading there and what it differed from the yaw by the gyro then [rad].
     """
 
     start: int
@@ -215,14 +219,14 @@ class Compass(NamedTuple):
     offset_variance: float
     excess: float
     deviation: float
-    sectors: frozenset[int]
+    sectors: dict[int, tuple[int, float]]
 
 
 class Vibration(NamedTuple):
     """The noise of the samples of the IMU: ``variance`` of gyro and accelerometer in each axis, (6,).
 
     ``values`` are the last sample as it was received, (6,), and ``change`` its difference to the one before;
-    ``count`` are those in the mean. ``white`` is the squared density of the noise to predict with, (6,).
+    ``count`` are those in the mean, and ``repeated`` those in a row that repeat the last one. ``white`` is the squared density of the noise to predict with, (6,).
     """
 
     values: Floats
@@ -230,23 +234,21 @@ class Vibration(NamedTuple):
     variance: Floats
     count: int
     white: Floats
+    repeated: int = 0
 
 
 class Turning(NamedTuple):
     """The yaw rates by wheels and by the gyro less its bias, in motion: means of the last 20 s.
 
-    They are those of their squares and product. ``apart`` is that of their difference while the wheels roll
-    straight [rad/s], ``rolled`` that of the absolute rate by wheels then. ``time_s`` is how long there was
-    motion, ``straight_s`` how much of it was straight, up to 20 s.
+    They are those of both, of their squares, and of their product. ``time_s`` is how long there was motion.
     """
 
     time_s: float = 0.0
     wheels: float = 0.0
     gyro: float = 0.0
-    both: float = 0.0
-    straight_s: float = 0.0
-    apart: float = 0.0
-    rolled: float = 0.0
+    wheels_square: float = 0.0
+    gyro_square: float = 0.0
+    product: float = 0.0
 
 
 class Offset(NamedTuple):
@@ -317,10 +319,13 @@ class Estimate(NamedTuple):
     wheels_at: int | None = None
     moved_at: int = 0
     angular: Floats | None = None
+    upright: Floats | None = None
     touching: frozenset[str] | None = None
     vibration: Vibration | None = None
     turning: Turning = Turning()
     turn_at_rest: float = 0.0
+    was_at_rest: bool = False
+    is_frozen: bool = False
     biased_at: int | None = None
     fastest: float = 0.0
     anchor: Estimate | None = None
@@ -348,6 +353,9 @@ class Fusion:
         """The estimate at a sample of the IMU; with an outcome if the base was found to stand."""
         estimate = self.predicted(before, sample.stamp, sample)
         vibration = self._vibration(before, sample)
+        is_frozen = _is_frozen(estimate._replace(vibration=vibration))
+        if is_frozen:
+            return estimate._replace(vibration=vibration, is_frozen=True), None
         sample = _without_shock(before, sample)
         start, size, gyro, accel, was_still = estimate.rest
         rest = Rest(start, size + 1, gyro + sample.gyro, accel + sample.accel, was_still)
@@ -359,6 +367,7 @@ class Fusion:
             rate=sample.gyro,
             force=sample.accel,
             is_coasting=False,
+            is_frozen=False,
             rest=rest,
             sampled_s=sampled_s,
             vibration=vibration,
@@ -377,6 +386,7 @@ class Fusion:
                 wheels_at=reading.stamp,
                 moved_at=estimate.moved_at if reading.is_still else reading.stamp,
                 angular=reading.angular,
+                upright=reading.upright,
                 fastest=max(estimate.fastest, reading.speed),
             )
         if reading.scale > estimate.drift.scale:
@@ -436,16 +446,21 @@ class Fusion:
         row = measurement.jacobian[0]
         settled = self.settled(estimate)
         variance = float(row @ settled.state.covariance @ row)
+        # The yaw of the continuous pose is that of the gyro alone, which this source has not pulled.
+        turned = estimate.offset.rotation
+        against_gyro = residual - math.atan2(float(turned[1, 0]), float(turned[0, 0]))
         if compass is None:
-            sectors = frozenset((_sector(reading.yaw),))
+            sectors = {_sector(reading.yaw): (reading.stamp, against_gyro)}
             first = Compass(reading.stamp, reading.stamp, residual, variance, 0.0, 0.0, sectors)
             return _with_compass(estimate, source, first), Outcome("accepted", 1.0, 1)
         # The first reading has an error as well, and that of our yaw then is part of the present one.
         expected = variance + 2.0 * reading.variance
         share = 1.0 - math.exp(-(reading.stamp - compass.stamp) * 1e-9 / _DEVIATION_S)
         excess = compass.excess + share * (residual * residual - expected - compass.excess)
-        deviation = max(compass.deviation, excess)
-        sectors = compass.sectors | {_sector(reading.yaw)}
+        sectors = {**compass.sectors, _sector(reading.yaw): (reading.stamp, against_gyro)}
+        bias_variance = float(np.diag(estimate.state.covariance)[GYRO_BIAS].max())
+        spread = _spread(sectors, reading.stamp, against_gyro, bias_variance) - 2.0 * reading.variance
+        deviation = max(compass.deviation, excess, spread)
         compass = compass._replace(stamp=reading.stamp, excess=excess, deviation=deviation, sectors=sectors)
         estimate = _with_compass(estimate, source, compass)
         deviation = max(deviation, (_UNPROVEN * (1.0 - len(sectors) / _SECTORS)) ** 2)
@@ -569,7 +584,7 @@ class Fusion:
             rate=rate,
             force=force,
             is_coasting=True,
-            vibration=None,
+            vibration=before.vibration if before.is_frozen else None,
             rest=_new_rest(stamp),
         )
         return estimate if end == stamp else self._paused(estimate, stamp)
@@ -617,43 +632,42 @@ class Fusion:
             bend = change - last.change
             variance = variance + min(share, 1.0) * (bend * bend / 6.0 - variance)
         white = np.maximum(white_noise(self.noise), variance * before.sampled_s)
-        return Vibration(values, change, variance, count, white)
+        repeated = 0 if change.any() else last.repeated + 1
+        return Vibration(values, change, variance, count, white, repeated)
 
     def _with_turn(self, estimate: Estimate, reading: Reading) -> Estimate:
-        """The estimate after the yaw rate of wheels, which measures the bias of the gyro if they roll straight.
+        """The estimate after the yaw rate of wheels, which is compared with that of the gyro.
 
-        Slip and unequal radii last: readings within a second count as one.
+        If they differ by a constant, the bias of the gyro is unsure by it. One that was not measured at rest is
+        corrected; another is not, because the radii of wheels may differ.
         """
         axis, angular, wheels_at = reading.upright, reading.angular, estimate.wheels_at
-        if axis is None or angular is None or wheels_at is None or estimate.is_coasting:
+        if axis is None or angular is None or wheels_at is None or reading.is_still:
             return estimate
         state, vibration = estimate.state, estimate.vibration
-        dt_s = min((reading.stamp - wheels_at) * 1e-9, _WHEEL_TURN_S)
-        if dt_s <= 0.0 or reading.is_still:
+        dt_s = min((reading.stamp - wheels_at) * 1e-9, _LONGEST_STEP_S)
+        if dt_s <= 0.0 or vibration is None:
             return estimate
         rate = float(axis @ angular)
-        measurement = yaw_rate(state, rate, 0.0, axis, estimate.rate)
-        row = measurement.jacobian[0]
-        gyro = rate - float(measurement.residual[0])
-        noise = 0.0 if vibration is None else float((axis * axis) @ vibration.variance[:3])
-        estimate = estimate._replace(turning=_after_turn(estimate.turning, rate, gyro, noise, dt_s))
-        variance = float(row @ state.covariance @ row)
-        turning = estimate.turning
-        bound = _APART * math.hypot(_STRAIGHT, math.sqrt(variance), _WHEEL_SLIP * turning.rolled)
-        if turning.straight_s > _APART_S and abs(turning.apart) > bound:
-            # It was zeroed while it turned, or its bias is larger than that of a usual gyro.
-            covariance = state.covariance.copy()
-            covariance[GYRO_BIAS, GYRO_BIAS] += np.outer(axis, axis) * turning.apart**2
-            state = state._replace(covariance=covariance)
-            estimate = estimate._replace(state=state, turning=Turning(), biased_at=estimate.stamp)
-            variance += turning.apart**2
-        spread = math.hypot(_WHEEL_TURN, _WHEEL_SLIP * rate)
-        error = spread * spread * _WHEEL_TURN_S / dt_s + noise
-        floor = _STRAIGHT * _STRAIGHT
-        if variance <= floor or (rate - gyro) ** 2 > gate(1) * (variance + spread * spread + noise):
+        gyro = float(axis @ (estimate.rate - state.gyro_bias))
+        turning = _after_turn(estimate.turning, rate, gyro, float((axis * axis) @ vibration.variance[:3]), dt_s)
+        estimate = estimate._replace(turning=turning)
+        if turning.time_s < _APART_S:
             return estimate
-        error = max(error, variance * floor / (variance - floor))
-        return _moved(estimate, updated(state, measurement._replace(covariance=np.array([[error]]))))
+        apart, sigma = _apart(turning)
+        variance = float(axis @ state.covariance[GYRO_BIAS, GYRO_BIAS] @ axis)
+        if abs(apart) < _APART * math.sqrt(variance + sigma * sigma):
+            return estimate
+        wrong_s = min(turning.time_s, _COMPARED_S)
+        covariance = state.covariance.copy()
+        covariance[GYRO_BIAS, GYRO_BIAS] += np.outer(axis, axis) * apart**2
+        covariance[_YAW, _YAW] += (apart * wrong_s) ** 2
+        state = state._replace(covariance=covariance)
+        estimate = estimate._replace(state=state, turning=Turning(), biased_at=estimate.stamp)
+        if estimate.was_at_rest:
+            return estimate
+        measurement = yaw_rate(state, gyro + apart, sigma * sigma, axis, estimate.rate)
+        return _moved(estimate, updated(state, measurement))
 
     def _at_end_of_rest(self, estimate: Estimate) -> tuple[Estimate, Outcome | None]:
         """The estimate with a zero velocity, if the base stood in this interval and in the one before."""
@@ -684,7 +698,8 @@ class Fusion:
         )
         if not (is_still and rest.was_still):
             return self._within_bounds(estimate), None
-        return _gated(estimate, STANDSTILL, zero_velocity(state, gyro, _REST_SPEED, sigma))
+        found, outcome = _gated(estimate, STANDSTILL, zero_velocity(state, gyro, _REST_SPEED, sigma))
+        return found._replace(was_at_rest=estimate.was_at_rest or outcome.fate == "accepted"), outcome
 
     def _within_bounds(self, estimate: Estimate) -> Estimate:
         """The estimate with a velocity that is plausible, if nothing measures it any more."""
@@ -732,7 +747,12 @@ def imu_remarks(estimate: Estimate) -> list[str]:
             f"bias is larger than {MOST_BIAS:g} rad/s and is found on a straight drive"
         )
     if _is_recent(estimate, estimate.biased_at):
-        found.append("its bias was wrong, as wheels that roll straight show; it is measured anew")
+        found.append(
+            "the yaw rates of gyro and wheels differ by a constant: the bias of the gyro has changed, or the radii "
+            "of the wheels differ"
+        )
+    if estimate.is_frozen:
+        found.append("it repeats its last numbers while the wheels turn the base: it counts as silent")
     if _is_recent(estimate, estimate.lost_at):
         found.append(
             "the estimate was lost and follows the sources that it had rejected; its place is unsure"
@@ -750,16 +770,14 @@ def _is_recent(estimate: Estimate, stamp: int | None) -> bool:
 
 def disagreement(turning: Turning) -> str:
     """A sentence on the yaw rates of wheels and gyro if they contradict each other; else empty."""
-    wheels, gyro = math.sqrt(turning.wheels), math.sqrt(max(0.0, turning.gyro))
+    wheels, gyro = math.sqrt(turning.wheels_square), math.sqrt(max(0.0, turning.gyro_square))
     if turning.time_s < _APART_S or max(wheels, gyro) < _COMPARED_RATE:
         return ""
-    alike = turning.both / max(wheels * gyro, _COMPARED_RATE**2)
+    alike = turning.product / max(wheels * gyro, _COMPARED_RATE**2)
     if alike < -0.5:
         cause = "in opposite directions: the mount of the IMU is mirrored, or left and right are swapped"
     elif gyro < 0.2 * wheels:
-        cause = (
-            "so the gyro does not turn with the base (frozen, or mounted about another axis), or wheels slip"
-        )
+        cause = "so the gyro does not turn with the base (frozen, or mounted about another axis), or wheels slip"
     elif alike < 0.5:
         cause = "at different times: one of them is wrong"
     elif not 1.0 / _COMPARED_SCALE < wheels / gyro < _COMPARED_SCALE:
@@ -769,21 +787,39 @@ def disagreement(turning: Turning) -> str:
     return f"the wheels turn the base by {wheels:.2g} rad/s and the gyro by {gyro:.2g} (rms of 20 s), {cause}"
 
 
+def _apart(turning: Turning) -> tuple[float, float]:
+    """By what constant the yaw rate of wheels exceeds that of the gyro, with its standard deviation [rad/s].
+
+    That is the regression of one on the other, with a scale if they turn enough to show it. Rates that do not
+    follow a line, as those of wheels that slip, or that have another scale, say nothing.
+    """
+    spread = turning.gyro_square - turning.gyro**2
+    both = turning.product - turning.gyro * turning.wheels
+    scale = both / spread if spread > _WHEEL_TURN**2 else 1.0
+    rest = turning.wheels_square - turning.wheels**2 - scale * (2.0 * both - scale * spread)
+    if not 1.0 / _COMPARED_SCALE < scale < _COMPARED_SCALE or rest > _WHEEL_TURN**2:
+        return 0.0, _STRAIGHT
+    lever = turning.gyro**2 / spread if spread > _WHEEL_TURN**2 else 0.0
+    variance = max(0.0, rest) * (1.0 + lever) / min(turning.time_s, _COMPARED_S)
+    return turning.wheels - scale * turning.gyro, math.sqrt(variance + _STRAIGHT**2)
+
+
 def _after_turn(before: Turning, rate: float, gyro: float, noise: float, dt_s: float) -> Turning:
     time_s = before.time_s + dt_s
     share = dt_s / min(time_s, _COMPARED_S)
-    weighted_s = dt_s / (1.0 + (rate / _WHEEL_TURN) ** 2)
-    straight_s = min(before.straight_s + weighted_s, _COMPARED_S)
-    part = weighted_s / straight_s
-    return Turning(
-        time_s,
-        before.wheels + share * (rate * rate - before.wheels),
-        before.gyro + share * (gyro * gyro - noise - before.gyro),
-        before.both + share * (rate * gyro - before.both),
-        straight_s,
-        before.apart + part * (rate - gyro - before.apart),
-        before.rolled + part * (abs(rate) - before.rolled),
-    )
+    now = (rate, gyro, rate * rate, gyro * gyro - noise, rate * gyro)
+    return Turning(time_s, *(old + share * (new - old) for old, new in zip(before[1:], now, strict=True)))
+
+
+def _is_frozen(estimate: Estimate) -> bool:
+    """Whether the IMU repeats its numbers while the wheels turn the base otherwise."""
+    vibration, angular, upright = estimate.vibration, estimate.angular, estimate.upright
+    if vibration is None or vibration.repeated < _FROZEN or angular is None or upright is None:
+        return False
+    if estimate.is_frozen:
+        return True
+    wheels, gyro = float(upright @ angular), float(upright @ (estimate.rate - estimate.state.gyro_bias))
+    return abs(wheels - gyro) > _FROZEN_RATE + 0.1 * abs(wheels)
 
 
 def _speed_bound(estimate: Estimate) -> float:
@@ -848,6 +884,20 @@ def _moved(estimate: Estimate, state: FilterState) -> Estimate:
         place = place + gap * min(1.0, _PLACE_RATE * elapsed_s / max(math.sqrt(gap @ gap), 1e-12))
     offset = Offset(rotation, place - rotation.dot(state.position), estimate.stamp, offset.is_followed)
     return estimate._replace(state=state, offset=offset)
+
+
+def _spread(
+    sectors: Mapping[int, tuple[int, float]], stamp: int, against_gyro: float, bias_variance: float
+) -> float:
+    """The variance of a compass whose difference to the gyro turns with its direction: half the range, squared.
+
+    What the gyro may have drifted since is no error of the compass.
+    """
+    found = 0.0
+    for then, other in sectors.values():
+        apart, elapsed_s = math.remainder(against_gyro - other, math.tau), (stamp - then) * 1e-9
+        found = max(found, 0.25 * apart * apart - bias_variance * elapsed_s * elapsed_s)
+    return found
 
 
 def _sector(yaw: float) -> int:
