@@ -30,7 +30,7 @@ def health(
     for number in range(count):
         record.stamps.append(20_000_000 * number)
         record.keep(Outcome(fate, nis, 3))
-    return record.health("wheels", 20_000_000 * count, [], "", 1.0)
+    return record.health("wheels", 20_000_000 * count, [], "", history_s=1.0)
 
 
 def test_sigmas_that_are_right_need_no_sentence():

@@ -34,6 +34,11 @@ _BLOCK_S = 0.1
 _REST_RATE, _REST_FORCE = 0.1, 0.4
 """[rad/s] and [m/s^2]: means of 0.1 s at rest are no larger: biases, and what is left of the noise."""
 
+_NO_FORCE = 0.1
+"""[m/s^2] What an accelerometer reads without any signal is less."""
+_FORCE_PART = 0.5
+"""Of gravity: the mean of a robot that drives differs by less."""
+
 # Standard deviations of the first state, in the order of the filter: rad, m/s, m, rad/s, m/s^2.
 _YAW, _POSITION = 1e-4, 1e-4
 _TILT, _COARSE_TILT = 0.02, 0.2
@@ -61,6 +66,10 @@ def align(
     """
     if not samples:
         return "no samples of the IMU yet, which give roll and pitch"
+    # Accelerometers that warm up read zeros, which show no direction.
+    samples = [sample for sample in samples if sample.accel @ sample.accel > _NO_FORCE**2]
+    if not samples:
+        return "the accelerometer reads 0; at rest it measures 9.8 m/s^2 upwards"
     chosen, is_at_rest = _chosen(samples)
     if not chosen:
         span = (samples[-1].stamp - samples[0].stamp) * 1e-9
@@ -69,6 +78,12 @@ def align(
             f"{ALIGNMENT_S:g} s at rest, or {COARSE_S:g} s in motion"
         )
     gyro, accel = _mean(chosen)
+    force = math.sqrt(accel @ accel)
+    if abs(force + GRAVITY[2]) > _FORCE_PART * -GRAVITY[2]:
+        return (
+            f"the accelerometer reads {force:.3g} m/s^2 in the mean of {len(chosen)} samples, and gravity is "
+            "9.8 m/s^2: check its unit, which is not g, and that gravity is not subtracted"
+        )
     rotation = _level(accel, imu_from_base)
     tilt = _TILT if is_at_rest else _COARSE_TILT
     gyro_bias, bias_sigma = np.zeros(3), _UNKNOWN_GYRO_BIAS

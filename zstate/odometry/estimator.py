@@ -3,27 +3,30 @@
 All events are kept for ``history_s`` in the order of their stamps, each with the estimate after it, which is
 immutable. A late event is sorted in, and the events after it are fused again when a state is next read. So
 the order of arrival does not matter, and a replay of the same calls gives the same states, bit for bit. No
-clock is read.
+clock is read; jumps of time are found by the stamps (``zstate.odometry.stamp_order``).
+
+No event stops it. One that cannot be fused is rejected, with a reason in ``health``. If the estimate itself
+is not finite any more, it starts again from its last finite pose.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from zstate import se3
-from zstate._util.format import did_you_mean
+from zstate._util.format import did_you_mean, format_duration
 from zstate.buffer.buffer import TransformBuffer, check_duration
 from zstate.clock import check_stamp
 from zstate.errors import InFuture, InPast, InvalidInput, NoData
-from zstate.odometry.alignment import Alignment, align, start_at
+from zstate.odometry.alignment import COARSE_S, Alignment, align, start_at
 from zstate.odometry.fusion import (
     COASTING_RATE_DENSITY,
     LOST_NS,
@@ -45,6 +48,8 @@ from zstate.odometry.health import Outcome, SourceHealth, SourceRecord
 from zstate.odometry.invariant_filter import FilterState, Floats, ImuNoise, Measurement
 from zstate.odometry.legs import Legs
 from zstate.odometry.measurements import (
+    MAX_SIGMA,
+    MIN_SIGMA,
     body_velocity,
     checked_noise,
     checked_vector,
@@ -53,8 +58,11 @@ from zstate.odometry.measurements import (
     pose,
     yaw_curvature,
 )
+from zstate.odometry.placement import Placement, is_finite, last_pose, placed
+from zstate.odometry.stamp_order import Held, StampOrder
 from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions, displacement
 from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
+from zstate.wire.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_RATE, MAX_SPEED
 
 IMU, WHEELS, FEET, CONTACTS = "imu", "wheels", "feet", "contacts"
 """The names of these sources in ``BaseEstimator.health``."""
@@ -64,6 +72,19 @@ COAST_NS = 500_000_000
 
 _MOST_UNFUSED = 2000
 _PRUNED_AT_ONCE = 64
+
+_MOST_SOURCES = 64
+_MOST_PER_S = 10_000
+"""Events of all sources in a second of history. More are refused."""
+
+_UNALIGNED_NS = round(2.0 * COARSE_S * 1e9)
+"""Before the alignment, events are kept for so long, or for the history."""
+
+_RESTART_TOLD_NS = 60_000_000_000
+"""How long ``health`` reports a new start."""
+
+_LARGEST_YAW = 1e6
+"""[rad] Of a heading that counts its turns on. Doubles then still resolve 1e-10 rad."""
 
 
 class BaseTwist(NamedTuple):
@@ -100,7 +121,7 @@ class BaseState:
     is_coasting: bool
 
 
-_Input: TypeAlias = Inertia | Reading | Displacement | Heading | Contacts | Steps
+_Input: TypeAlias = Inertia | Reading | Displacement | Heading | Contacts | Steps | Placement
 
 
 class _Event:
@@ -109,7 +130,7 @@ class _Event:
     __slots__ = ("estimate", "key", "outcome", "reading", "source")
 
     def __init__(self, source: str, reading: _Input, numbers: Sequence[float] = ()) -> None:
-        kind = 0 if isinstance(reading, Inertia) else 1
+        kind = 0 if isinstance(reading, Inertia) else 2 if isinstance(reading, Placement) else 1
         self.key = (reading.stamp, kind, source, *numbers)
         self.source = source
         self.reading = reading
@@ -130,8 +151,14 @@ class BaseEstimator:
     IMU. Events older than ``history_s`` before the newest one are refused and counted. ``wheels`` are those
     that ``joints`` reads.
 
-    Events may arrive in any order. Not safe for several threads at once. Raises InvalidInput for a sensor
-    that moves on the base, UnknownFrame with near misses, and other errors of lookups.
+    Events may arrive in any order; an event that comes twice counts once. A reading more than ``history_s``,
+    and more than a second, after the newest one is used once a second one confirms it. If time goes back by
+    as much for half a second of readings, as in a recording in a loop, it starts anew, and ``epoch``, the
+    number of such starts and of calls of ``reset``, grows (``zstate.odometry.stamp_order``).
+
+    Not safe for several threads at once. Raises InvalidInput for a sensor that moves on the base,
+    UnknownFrame with near misses, and other errors of lookups. Its methods for events raise InvalidInput for
+    more than 64 sources and for more than 10,000 events in a second of stamps.
     """
 
     def __init__(
@@ -151,6 +178,8 @@ class BaseEstimator:
         self.imu_frame = imu
         self.history_s = check_duration("history_s", history_s)
         self._history_ns = round(history_s * 1e9)
+        self._unaligned_ns = max(self._history_ns, _UNALIGNED_NS)
+        self._most_events = _MOST_UNFUSED + round(_MOST_PER_S * self._unaligned_ns * 1e-9)
         self._buffer = buffer
         self._mounts: dict[str, Floats] = {}
         self._imu_from_base = self._mount(base)
@@ -161,6 +190,12 @@ class BaseEstimator:
         if wheels is not None and wheels.frame is not None:
             self._mount(wheels.frame)
         self._initial_pose = initial_pose
+        self.epoch = 0
+        """How often it has started anew: by ``reset``, or because time went back."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget all events and what came of them."""
         self._log: list[_Event] = []
         self._start: Estimate | None = None
         self._is_settled = False
@@ -170,18 +205,60 @@ class BaseEstimator:
         self._fused = 0
         """Events up to here have the estimate after them."""
         self._missing = "no samples of the IMU yet, which give roll and pitch"
-        self._newest: int | None = None
+        self._order = StampOrder(self._history_ns, IMU)
         self._rotations: list[tuple[int, dict[str, float]]] = []
         """Readings of the wheels, by stamp."""
-        self._sources: defaultdict[str, SourceRecord] = defaultdict(SourceRecord)
+        self._sources: dict[str, SourceRecord] = {}
+        self._restarts: dict[str, tuple[int, str]] = {}
+        """By source, when and why it made the estimate start anew."""
+        self._placements = 0
+
+    def reset(self, odom_from_base: Transform | None = None) -> None:
+        """Start anew: forget all events, biases and the pose, and align again, at rest.
+
+        The base is then at the origin of ``odom``, or at ``odom_from_base`` from the next event on, as with
+        ``initial_pose``, whose place it takes. It is no correction: in the terms of REP 105 the pose in
+        ``odom`` is continuous, and this breaks it as a restart of the robot does. A pose in a map belongs
+        to map -> odom (``MapCorrection``).
+        """
+        if odom_from_base is not None:
+            self._check_placement(odom_from_base)
+            self._initial_pose = odom_from_base
+        self._begin()
+        self.epoch += 1
+
+    def set_pose(self, odom_from_base: Transform) -> None:
+        """Place the base now: x, y, z and yaw of ``odom_from_base``, as of the newest event.
+
+        Velocity in the axes of the base, roll and pitch, which gravity shows, and biases stay. The position
+        and the yaw are then as uncertain as the covariance of the transform says, or certain. Late events
+        from before do not change the place. By REP 105 a jump of ``odom`` is the user's alone, and readers
+        that take differences of poses see it as a motion. Raises NoData before the alignment, and
+        InvalidInput for other frames.
+        """
+        self._check_placement(odom_from_base)
+        stamp = self.state().stamp
+        self._placements += 1
+        reading = Placement(stamp, odom_from_base.matrix, odom_from_base.covariance)
+        self._insert(_Event("", reading, (self._placements,)))
+
+    def _check_placement(self, odom_from_base: Transform) -> None:
+        if (odom_from_base.target, odom_from_base.source) != (self.odom, self.base):
+            raise InvalidInput(
+                f"the base is placed by {self.odom!r} from {self.base!r}; got {odom_from_base.target!r} from "
+                f"{odom_from_base.source!r}"
+            )
+        checked_vector(odom_from_base.translation, "set_pose", "position", MAX_DISTANCE)
 
     def imu(self, stamp: int, gyro: ArrayLike, accel: ArrayLike) -> None:
         """A sample of the IMU at ``stamp`` [ns]: rate [rad/s] and specific force [m/s^2] in its axes, (3,).
 
-        Raises InvalidInput for other shapes, NaN and infinity.
+        Raises InvalidInput for other shapes, NaN and infinity, and for numbers that no IMU measures, above
+        1e3 rad/s or 1e5 m/s^2.
         """
-        rate, force = checked_vector(gyro, IMU, "gyro"), checked_vector(accel, IMU, "accel")
-        self._insert(_Event(IMU, Inertia(check_stamp(stamp), rate, force), (*rate.tolist(), *force.tolist())))
+        rate = checked_vector(gyro, IMU, "gyro", MAX_RATE)
+        force = checked_vector(accel, IMU, "accel", MAX_ACCELERATION)
+        self._offer(_Event(IMU, Inertia(check_stamp(stamp), rate, force), (*rate.tolist(), *force.tolist())))
 
     def velocity(
         self,
@@ -200,18 +277,23 @@ class BaseEstimator:
         Its noise is given by ``sigma``, standard deviations (3,), or by ``covariance``, (3, 3). ``frame`` is
         the base by default. ``angular`` [rad/s] (3,) is used while the IMU is silent, and to know standstill.
         ``scale`` is the standard deviation of a constant relative error, as of a radius of wheels.
-        Raises InvalidInput, which names the source, for NaN and for what is no covariance; UnknownFrame for
-        the frame.
+        Raises InvalidInput, which names the source, for NaN, for what is no covariance, for more than
+        1e4 m/s or 1e3 rad/s, and for standard deviations outside of 1e-9 to 1e9; UnknownFrame for the frame.
         """
-        vector = checked_vector(linear, source, "velocity")
-        rate = None if angular is None else checked_vector(angular, source, "angular velocity")
+        vector = checked_vector(linear, source, "velocity", MAX_SPEED)
+        rate = None if angular is None else checked_vector(angular, source, "angular velocity", MAX_RATE)
         noise = checked_noise(sigma, covariance, 3, source)
         measured = WheelVelocity(vector, np.zeros(3) if rate is None else rate, noise)
-        if not 0.0 <= scale < math.inf:
+        if not 0.0 <= scale <= MAX_SIGMA:
             raise InvalidInput(
-                f"the scale of source {source!r} is a standard deviation of 0 or more; got {scale!r}"
+                f"the scale of source {source!r} is a standard deviation of 0 to {MAX_SIGMA:g}; got {scale!r}"
             )
-        self._insert_velocity(check_stamp(stamp), measured, frame, source, scale, has_rate=rate is not None)
+        stamp = check_stamp(stamp)
+        self._mount(frame or self.base)  # raises here, where the mistake is made
+        insert = partial(
+            self._insert_velocity, stamp, measured, frame, source, scale, has_rate=rate is not None
+        )
+        self._offer_reading(source, stamp, insert)
 
     def joints(
         self,
@@ -235,7 +317,8 @@ class BaseEstimator:
             )
         stamp = check_stamp(stamp)
         if self._wheels is not None:
-            self._insert_rotations(self._wheels, stamp, check_wheel_positions(self._wheels, positions))
+            found = check_wheel_positions(self._wheels, positions)
+            self._offer_reading(WHEELS, stamp, partial(self._insert_rotations, self._wheels, stamp, found))
         if self._legs is not None:
             numbers = [float(positions.get(name, math.nan)) for name in self._legs.joint_names]
             steps = Steps(stamp, self._legs.feet(positions), velocities, efforts)
@@ -243,8 +326,8 @@ class BaseEstimator:
                 raise InvalidInput(f"positions of legs must be finite; got {dict(positions)}")
             if not self._has_contacts:
                 self._legs.check_detection(velocities, efforts)
-            self._sources[FEET].has_bounds = True
-            self._insert(_Event(FEET, steps, numbers))
+            self._record(FEET).has_bounds = True
+            self._offer(_Event(FEET, steps, numbers))
 
     def contacts(self, stamp: int, touching: Mapping[str, bool]) -> None:
         """Which feet are on the ground from ``stamp`` on, by name; those left out are not.
@@ -262,19 +345,20 @@ class BaseEstimator:
         self._has_contacts = True
         down = frozenset(name for name, is_down in touching.items() if is_down)
         flags = [float(name in down) for name in names]
-        self._insert(_Event(CONTACTS, Contacts(check_stamp(stamp), down), flags))
+        self._offer(_Event(CONTACTS, Contacts(check_stamp(stamp), down), flags))
 
     def pose(self, stamp: int, odom_from_base: Transform, covariance: ArrayLike, *, source: str) -> None:
         """The pose of a frame on the robot in ``odom`` at ``stamp``, as of motion capture.
 
         ``covariance`` (6, 6) has the order and axes of ``Transform.covariance``. Raises InvalidInput, which
-        names the source, for another target than ``odom``, NaN and what is no covariance; UnknownFrame for
-        the frame.
+        names the source, for another target than ``odom``, NaN, what is no covariance, more than 1e8 m, and
+        standard deviations outside of 1e-9 to 1e9; UnknownFrame for the frame.
         """
         if odom_from_base.target != self.odom:
             raise InvalidInput(
                 f"poses of source {source!r} are in {odom_from_base.target!r}; they must be in {self.odom!r}"
             )
+        checked_vector(odom_from_base.translation, source, "position", MAX_DISTANCE)
         mount = self._mount(odom_from_base.source)
         noise = checked_noise(None, covariance, 6, source)
         matrix = odom_from_base.matrix
@@ -283,24 +367,25 @@ class BaseEstimator:
             return pose(state, matrix, noise, mount)
 
         reading = Reading(check_stamp(stamp), measure, is_position=True)
-        self._insert(_Event(source, reading, odom_from_base.pose7.tolist()))
+        self._offer(_Event(source, reading, (*odom_from_base.pose7.tolist(), *noise.diagonal().tolist())))
 
     def heading(self, stamp: int, yaw: float, sigma: float, *, source: str, frame: str | None = None) -> None:
         """The yaw of ``frame``, by default the base, at ``stamp`` [rad], with a standard deviation.
 
         It is relative to the first one of this source, because the odometry frame has no north. ``sigma`` is
         that of errors that do not average out: the yaw will not be known better by it. See
-        ``zstate.odometry.fusion``. Raises InvalidInput, which names the source, for NaN and a sigma that is
-        not above zero.
+        ``zstate.odometry.fusion``. A heading while the axis is within 6 degrees of the vertical, where it has
+        none, is rejected. Raises InvalidInput, which names the source, for NaN and a sigma outside of 1e-9 to
+        1e9.
         """
         mount = self._mount(frame or self.base)
-        if not (math.isfinite(yaw) and 0.0 < sigma < math.inf):
+        if not (abs(yaw) <= _LARGEST_YAW and MIN_SIGMA <= sigma <= MAX_SIGMA):
             raise InvalidInput(
-                f"a heading of source {source!r} is finite, with a sigma above zero [rad]; got "
-                f"yaw={yaw!r}, sigma={sigma!r}"
+                f"a heading of source {source!r} is at most {_LARGEST_YAW:g} rad, with a sigma of "
+                f"{MIN_SIGMA:g} to {MAX_SIGMA:g} rad; got yaw={yaw!r}, sigma={sigma!r}"
             )
         reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, mount)
-        self._insert(_Event(source, reading, (yaw, sigma)))
+        self._offer(_Event(source, reading, (yaw, sigma)))
 
     def state(self, at: int | None = None) -> BaseState:
         """The state at the stamp ``at`` [ns]; by default at the newest event.
@@ -331,13 +416,12 @@ class BaseEstimator:
                 newest=newest,
             )
         place = bisect_right(self._log, stamp, key=lambda event: event.key[0])
-        before = self._estimate_before(place)
-        return self._state_of(self._fusion.predicted(before, stamp, self._following(place)))
+        return self._state_of(self._predicted(self._estimate_before(place), stamp, self._following(place))[0])
 
     def health(self) -> tuple[SourceHealth, ...]:
         """The health of each source, by name; standstill is one as soon as it is found."""
         self._fuse()
-        newest = self._newest or 0
+        newest = self._order.newest or 0
         recent: dict[str, list[Outcome]] = {name: [] for name in self._sources}
         for event in self._log[: self._fused]:
             if event.outcome is not None:
@@ -345,10 +429,21 @@ class BaseEstimator:
         last = self._estimate_before(self._fused) if self._start is not None else None
         return tuple(
             record.health(
-                name, newest, recent[name], self._remark(name, record, last, newest), self.history_s
+                name,
+                newest,
+                recent[name],
+                self._remarks(name, last, newest),
+                history_s=self.history_s,
+                leader=self._order.leader,
             )
             for name, record in sorted(self._sources.items())
         )
+
+    def _remarks(self, name: str, last: Estimate | None, newest: int) -> str:
+        at, restart = self._restarts.get(name, (0, ""))
+        told = restart if newest - at < _RESTART_TOLD_NS else ""
+        remark = self._remark(name, self._sources[name], last, newest)
+        return "; ".join(text for text in (told, remark) if text)
 
     def _remark(self, name: str, record: SourceRecord, last: Estimate | None, newest: int) -> str:
         """What the fusion has to say of a source."""
@@ -387,17 +482,54 @@ class BaseEstimator:
             self._mounts[frame] = transform.matrix
         return self._mounts[frame]
 
-    def _is_too_late(self, source: str, stamp: int) -> bool:
-        """Whether an event is older than what is kept, in which case it is counted."""
-        if self._newest is None or stamp >= self._newest - self._history_ns:
-            return False
-        self._sources[source].too_late += 1
-        return True
+    def _record(self, source: str) -> SourceRecord:
+        if source not in self._sources:
+            if len(self._sources) >= _MOST_SOURCES:
+                raise InvalidInput(
+                    f"an estimator takes {_MOST_SOURCES} sources; {source!r} is one more. Give the readings "
+                    "of one sensor one name"
+                )
+            self._sources[source] = SourceRecord()
+        return self._sources[source]
+
+    def _offer(self, event: _Event) -> None:
+        self._offer_reading(event.source, event.reading.stamp, partial(self._insert, event))
+
+    def _offer_reading(self, source: str, stamp: int, insert: Callable[[], None]) -> None:
+        """Insert a reading, unless it is of another time than the present."""
+        record, newest = self._record(source), self._order.newest
+        place = self._order.place(source, stamp)
+        if place == "present" or newest is None:
+            insert()
+            return
+        if place == "late":
+            record.too_late += 1
+            record.late_ns = newest - stamp
+        else:
+            record.ahead += 1
+            record.ahead_ns = stamp - newest
+        jump = self._order.hold(Held(source, stamp, insert), place)
+        if jump is None:
+            return
+        if jump.is_back:
+            self._begin_epoch(source, jump.size_ns)
+        for held in jump.held:
+            one = self._record(held.source)
+            one.ahead = 0
+            if self._order.place(held.source, held.stamp) == "present":
+                held.insert()
+
+    def _begin_epoch(self, source: str, size_ns: int) -> None:
+        order = self._order
+        self._begin()
+        self._order = order
+        self.epoch += 1
+        text = f"time went back by {format_duration(size_ns)}; the odometry started anew"
+        self._record(source)
+        self._restarts = {source: (order.newest or 0, text)}
 
     def _insert_rotations(self, wheels: Wheels, stamp: int, found: dict[str, float]) -> None:
         """Insert the displacements from the reading before and to that after, instead of that between."""
-        if self._is_too_late(WHEELS, stamp):
-            return
         place = bisect_left(self._rotations, stamp, key=lambda entry: entry[0])
         if place < len(self._rotations) and self._rotations[place][0] == stamp:
             return  # the same reading again, as after a reconnection
@@ -405,26 +537,26 @@ class BaseEstimator:
         after = self._rotations[place] if place < len(self._rotations) else None
         self._rotations.insert(place, (stamp, found))
         if before and after:
-            self._remove(WHEELS, (before[0] + after[0]) // 2)
+            self._remove(WHEELS, _displacement_stamp(before[0], after[0]))
         for first, second in ((before, (stamp, found)), ((stamp, found), after)):
             if first and second:
                 self._insert_displacement(wheels, first, second)
-        self._sources[WHEELS].has_bounds = True
+        self._record(WHEELS).has_bounds = True
 
     def _insert_displacement(
         self, wheels: Wheels, first: tuple[int, dict[str, float]], second: tuple[int, dict[str, float]]
     ) -> None:
-        seconds = (second[0] - first[0]) * 1e-9
+        stamp, seconds = _displacement_stamp(first[0], second[0]), (second[0] - first[0]) * 1e-9
+        if self._order.is_late(stamp):
+            return
         measured = wheels.velocity(first[1], second[1], seconds)
-        self._newest = max(self._newest or second[0], second[0])
-        if second[0] - first[0] > COAST_NS:
+        if stamp == second[0]:
             mount = self._mount(wheels.frame or self.base)
             way, turn = displacement(measured, seconds)
-            self._insert(_Event(WHEELS, Displacement(second[0], first[0], way, turn, mount), way.tolist()))
-            return
-        self._insert_velocity(
-            (first[0] + second[0]) // 2, measured, wheels.frame, WHEELS, wheels.noise.scale, has_rate=True
-        )
+            reading = Displacement(stamp, first[0], way, turn, mount)
+            self._insert(_Event(WHEELS, reading, (*way.tolist(), turn)))
+        else:
+            self._insert_velocity(stamp, measured, wheels.frame, WHEELS, wheels.noise.scale, has_rate=True)
 
     def _insert_velocity(
         self,
@@ -452,21 +584,25 @@ class BaseEstimator:
             upright=mount[:3, 2],
             speed=math.sqrt(linear @ linear),
         )
-        self._insert(_Event(source, reading, linear.tolist()))
+        numbers = (*linear.tolist(), *angular.tolist(), *noise.diagonal().tolist())
+        self._insert(_Event(source, reading, numbers))
 
     def _insert(self, event: _Event) -> None:
-        stamp = event.reading.stamp
-        if self._is_too_late(event.source, stamp):
-            return
-        self._sources[event.source].stamps.append(stamp)
-        if self._newest is None or stamp > self._newest:
-            self._newest = stamp
-        if not self._log or event.key >= self._log[-1].key:
+        """Insert an event of the present, unless the same one is there."""
+        if not self._log or event.key > self._log[-1].key:
             place = len(self._log)
-            self._log.append(event)
         else:
-            place = bisect_right(self._log, event.key, key=_key)
-            self._log.insert(place, event)
+            place = bisect_left(self._log, event.key, key=_key)
+            if self._log[place].key == event.key:
+                return  # the same event again, as after a reconnection
+        if len(self._log) >= self._most_events:
+            raise InvalidInput(
+                f"{len(self._log)} events in the {self.history_s:g} s of history_s are too many; "
+                f"source {event.source!r} has one more"
+            )
+        self._log.insert(place, event)
+        if event.source:
+            self._record(event.source).stamps.append(event.reading.stamp)
         if isinstance(event.reading, Inertia):
             place = self._first_between_samples(place)
         self._rewind(place)
@@ -505,26 +641,61 @@ class BaseEstimator:
         if self._start is None:
             return
         estimate = self._estimate_before(self._fused)
-        for place in range(self._fused, len(self._log)):
-            event = self._log[place]
-            estimate, event.outcome = self._after(estimate, event, place)
-            event.estimate = estimate
+        with np.errstate(all="ignore"):  # what is not finite is found below
+            for place in range(self._fused, len(self._log)):
+                event = self._log[place]
+                estimate, event.outcome = self._after(estimate, event, place)
+                event.estimate = estimate
         self._fused = len(self._log)
         self._prune()
 
     def _after(self, estimate: Estimate, event: _Event, place: int) -> tuple[Estimate, Outcome | None]:
-        reading = event.reading
-        if reading.stamp < estimate.stamp:  # before the first estimate
+        """The estimate after an event, and its outcome: rejected if it cannot be used."""
+        if event.reading.stamp < estimate.stamp:  # before the first estimate
             return estimate, None
+        try:
+            after, outcome = self._fused_with(estimate, event, self._following(place))
+        except InvalidInput as error:
+            failure = str(error)
+        except Exception as error:  # one event must not stop the odometry, whatever it is
+            failure = f"{type(error).__name__}: {error}"
+        else:
+            if is_finite(after.state):
+                return after, outcome
+            failure = "the estimate would not be finite with it"
+        kept, is_restarted = self._predicted(estimate, event.reading.stamp, self._following(place))
+        if is_restarted:
+            failure = "the estimate was not finite any more; it started again from its last pose"
+        return kept if is_restarted else estimate, Outcome("rejected", math.nan, 0, failure)
+
+    def _predicted(self, before: Estimate, stamp: int, following: Inertia | None) -> tuple[Estimate, bool]:
+        """The estimate at ``stamp``; if it is not finite, one that starts from the last pose, and True."""
+        try:
+            with np.errstate(all="ignore"):
+                estimate = self._fusion.predicted(before, stamp, following)
+        except (ArithmeticError, ValueError):
+            pass
+        else:
+            if is_finite(estimate.state):
+                return estimate, False
+        last = last_pose(before.state, self._imu_from_base, self.odom, self.base)
+        return start_at(stamp, last, self._imu_from_base), True
+
+    def _fused_with(
+        self, estimate: Estimate, event: _Event, following: Inertia | None
+    ) -> tuple[Estimate, Outcome | None]:
+        reading = event.reading
         if isinstance(reading, Inertia):
             after, outcome = self._fusion.after_inertia(estimate, reading)
             if outcome is not None:
                 self._count_standstill(reading.stamp)
             return after, outcome
-        following = self._following(place)
         if isinstance(reading, Contacts):
             after = self._fusion.predicted(estimate, reading.stamp, following)
             return after._replace(touching=reading.touching), None
+        if isinstance(reading, Placement):
+            after = self._fusion.settled(self._fusion.predicted(estimate, reading.stamp, following))
+            return placed(after, reading, self._imu_from_base), None
         if isinstance(reading, Steps):
             assert self._legs is not None
             return self._fusion.after_steps(self._legs, estimate, reading, following)
@@ -535,7 +706,7 @@ class BaseEstimator:
         return self._fusion.after_reading(estimate, event.source, reading, following)
 
     def _count_standstill(self, stamp: int) -> None:
-        record = self._sources[STANDSTILL]
+        record = self._sources.setdefault(STANDSTILL, SourceRecord())
         record.has_bounds = True
         if not record.stamps or stamp > record.stamps[-1]:  # else it is replayed
             record.stamps.append(stamp)
@@ -546,8 +717,6 @@ class BaseEstimator:
             self._alignment_end = 1
             return
         samples = [event.reading for event in self._log if isinstance(event.reading, Inertia)]
-        if not samples:
-            self._forget(self._too_old())
         readings = [event.reading for event in self._log if isinstance(event.reading, Reading)]
         turns = [(one.stamp, one.angular) for one in readings if one.angular is not None]
         outcome = align(samples, turns, self._imu_from_base)
@@ -556,10 +725,12 @@ class BaseEstimator:
             self._alignment_end = bisect_right(self._log, outcome.end, key=lambda event: event.reading.stamp)
         else:
             self._missing = outcome
+            # Wheels and poses are of no use before; of the IMU, the last seconds are.
+            self._forget(self._older_than(self._history_ns if not samples else self._unaligned_ns))
 
     def _prune(self) -> None:
         """Forget events that are too old, but for the estimate after the last of them."""
-        count = self._too_old()
+        count = self._older_than(self._history_ns)
         if count < _PRUNED_AT_ONCE:
             return
         self._start = self._estimate_before(count)
@@ -569,15 +740,15 @@ class BaseEstimator:
                 self._sources[_outcome_source(event)].keep(event.outcome)
         self._forget(count)
 
-    def _too_old(self) -> int:
-        """How many events of the log are too old to be changed by later ones."""
-        oldest = (self._newest or 0) - self._history_ns
+    def _older_than(self, age_ns: int) -> int:
+        """How many events of the log are older than the newest one by more than ``age_ns``."""
+        oldest = (self._order.newest or 0) - age_ns
         return bisect_left(self._log, oldest, key=lambda event: event.reading.stamp)
 
     def _forget(self, count: int) -> None:
         del self._log[:count]
         self._fused = max(0, self._fused - count)
-        oldest = (self._newest or 0) - self._history_ns
+        oldest = (self._order.newest or 0) - self._history_ns
         # A displacement starts at the reading before.
         first = bisect_left(self._rotations, oldest, key=lambda entry: entry[0]) - 1
         del self._rotations[: max(0, first)]
@@ -622,5 +793,12 @@ class BaseEstimator:
         )
 
 
+def _displacement_stamp(first: int, second: int) -> int:
+    """That of a displacement between two readings: a mean velocity is that of the middle, unless it is a pause."""
+    return (first + second) // 2 if second - first <= COAST_NS else second
+
+
 def _outcome_source(event: _Event) -> str:
-    return STANDSTILL if isinstance(event.reading, Inertia) else event.source
+    """The source of an outcome. A sample of the IMU has none of its own, unless it could not be used."""
+    is_standstill = isinstance(event.reading, Inertia) and event.outcome and not event.outcome.failure
+    return STANDSTILL if is_standstill else event.source

@@ -86,7 +86,7 @@ _SHOCK = np.repeat((10.0, 50.0), 3)
 
 _WHEEL_TURN = 0.03
 """[rad/s] The yaw rates of wheels and gyro are on a line but for so much, or the wheels slip."""
-_STRAIGHT = 0.005
+_STRAIGHT = 0.004
 """[rad/s] And by so much for ever: radii differ."""
 _APART, _APART_S = 3.0, 8.0
 """So many standard deviations apart, in the mean of so many seconds, the gyro is not what it was taken for."""
@@ -650,7 +650,9 @@ class Fusion:
             return estimate
         rate = float(axis @ angular)
         gyro = float(axis @ (estimate.rate - state.gyro_bias))
-        turning = _after_turn(estimate.turning, rate, gyro, float((axis * axis) @ vibration.variance[:3]), dt_s)
+        turning = _after_turn(
+            estimate.turning, rate, gyro, float((axis * axis) @ vibration.variance[:3]), dt_s
+        )
         estimate = estimate._replace(turning=turning)
         if turning.time_s < _APART_S:
             return estimate
@@ -777,7 +779,9 @@ def disagreement(turning: Turning) -> str:
     if alike < -0.5:
         cause = "in opposite directions: the mount of the IMU is mirrored, or left and right are swapped"
     elif gyro < 0.2 * wheels:
-        cause = "so the gyro does not turn with the base (frozen, or mounted about another axis), or wheels slip"
+        cause = (
+            "so the gyro does not turn with the base (frozen, or mounted about another axis), or wheels slip"
+        )
     elif alike < 0.5:
         cause = "at different times: one of them is wrong"
     elif not 1.0 / _COMPARED_SCALE < wheels / gyro < _COMPARED_SCALE:

@@ -31,15 +31,22 @@ readings is often outside its band."""
 
 _REJECTED_PART = 0.1
 
+_LONGEST_HISTORY_NS = 10_000_000_000
+"""Readings that are later than that are of another clock: a longer history is no remedy."""
+
 Fate = Literal["accepted", "rejected", "reacquired"]
 
 
 class Outcome(NamedTuple):
-    """What the filter did with a reading of ``dimension`` numbers, and its NIS."""
+    """What the filter did with a reading of ``dimension`` numbers, and its NIS.
+
+    ``failure`` is why a rejected reading could not be used at all; its NIS is NaN then.
+    """
 
     fate: Fate
     nis: float
     dimension: int
+    failure: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +85,11 @@ class SourceRecord:
     fates: Counter[Fate] = field(default_factory=Counter[Fate])
     """Of the same readings, all of them."""
     too_late: int = 0
+    late_ns: int = 0
+    """How much too old the newest of these was, against the newest reading of all sources."""
+    ahead: int = 0
+    ahead_ns: int = 0
+    """Readings that were refused because they are of the future, and by how much the newest of them was."""
 
     def keep(self, outcome: Outcome) -> None:
         """Count an outcome that is final."""
@@ -85,15 +97,25 @@ class SourceRecord:
         self.fates[outcome.fate] += 1
 
     def health(
-        self, name: str, newest: int, recent: Iterable[Outcome], remark: str, history_s: float
+        self,
+        name: str,
+        newest: int,
+        recent: Iterable[Outcome],
+        remark: str,
+        *,
+        history_s: float,
+        leader: str = "",
     ) -> SourceHealth:
         """The health with the outcomes of ``recent`` readings, which may still be replayed.
 
-        ``newest`` is the newest stamp of all sources [ns], ``remark`` a sentence that the fusion has of it.
+        ``newest`` is the newest stamp of all sources [ns], and ``leader`` the source that has it. ``remark``
+        is a sentence that the fusion has of it.
         """
         recent = list(recent)
         fates = self.fates + Counter(outcome.fate for outcome in recent)
-        window = [*self.outcomes, *recent][-WINDOW:]
+        newest_outcomes = [*self.outcomes, *recent][-WINDOW:]
+        failures = [outcome.failure for outcome in newest_outcomes if outcome.failure]
+        window = [outcome for outcome in newest_outcomes if not outcome.failure]
         dimension = window[-1].dimension if window else 0
         window = [outcome for outcome in window if outcome.dimension == dimension]
         mean = sum(outcome.nis for outcome in window) / len(window) if window else math.nan
@@ -101,9 +123,11 @@ class SourceRecord:
         age_s = (newest - max(self.stamps)) * 1e-9 if self.stamps else math.inf
         sentences = [
             remark,
+            _failure_text(failures, len(newest_outcomes)),
             _rejection_text(window),
             self._nis_text(mean, dimension, window),
-            self._late_text(history_s),
+            self._late_text(history_s, leader),
+            self._ahead_text(),
         ]
         found = [text for text in sentences if text]
         return SourceHealth(
@@ -138,11 +162,32 @@ class SourceRecord:
             return f"{fact}: its sigmas are {size} times too large"
         return ""
 
-    def _late_text(self, history_s: float) -> str:
+    def _late_text(self, history_s: float, leader: str) -> str:
         if not self.too_late:
             return ""
-        age = format_duration(round(history_s * 1e9))
-        return f"{self.too_late} readings came too late, more than {age} after the newest: raise history_s"
+        count = f"{self.too_late} reading{'s' * (self.too_late != 1)}"
+        if self.late_ns <= _LONGEST_HISTORY_NS:
+            age = format_duration(round(history_s * 1e9))
+            return f"{count} came too late, more than {age} after the newest: raise history_s"
+        return (
+            f"{count} came too late, the last one stamped {format_duration(self.late_ns)} before the newest "
+            f"of {leader!r}: one of the two clocks is wrong, or it was sent again"
+        )
+
+    def _ahead_text(self) -> str:
+        if not self.ahead:
+            return ""
+        return (
+            f"{self.ahead} reading{'s' * (self.ahead != 1)} of the future refused, the last one stamped "
+            f"{format_duration(self.ahead_ns)} after the newest of the others: its clock is ahead; "
+            "synchronise the clocks (NTP, PTP), or stamp all on one machine"
+        )
+
+
+def _failure_text(failures: list[str], count: int) -> str:
+    if not failures:
+        return ""
+    return f"{len(failures)} of its last {count} readings could not be used: {failures[-1]}"
 
 
 def _rejection_text(window: list[Outcome]) -> str:

@@ -27,6 +27,9 @@ from zstate.odometry.invariant_filter import (
 )
 from zstate.odometry.rotations import IDENTITY, skew
 
+MIN_SIGMA, MAX_SIGMA = 1e-9, 1e9
+"""The bounds of standard deviations, in any unit. What is worse measures nothing; squares stay in range."""
+
 _LEVEL = 0.1
 """The shortest level part of a unit vector that has a heading: 84 degrees of pitch."""
 
@@ -174,29 +177,38 @@ def frame_twist(
     return twist, covariance
 
 
-def checked_vector(values: ArrayLike, source: str, what: str) -> Floats:
-    """A copy of ``values``, (3,). Raises InvalidInput, which names the source, for other shapes and NaN."""
+def checked_vector(values: ArrayLike, source: str, what: str, limit: float) -> Floats:
+    """A copy of ``values``, (3,).
+
+    Raises InvalidInput, which names the source, for other shapes, NaN, and sizes above ``limit``.
+    """
     vector = real_numbers(values, f"the {what} of source {source!r}")
     if vector.shape != (3,):
         raise InvalidInput(f"the {what} of source {source!r} has shape (3,); got {vector.shape}")
     if not math.isfinite(sum(vector.tolist())):
         raise InvalidInput(f"the {what} of source {source!r} must be finite; got {vector.tolist()}")
+    if float(np.abs(vector).max()) > limit:
+        raise InvalidInput(
+            f"the {what} of source {source!r} is at most {limit:g}, more than any sensor measures; got "
+            f"{vector.tolist()}"
+        )
     return vector.copy()
 
 
 def checked_noise(sigma: ArrayLike | None, covariance: ArrayLike | None, size: int, source: str) -> Floats:
     """The covariance, (size, size), that is given as such or by standard deviations.
 
-    Raises InvalidInput, which names the source, unless it is finite, symmetric and positive definite.
+    Raises InvalidInput, which names the source, unless it is finite, symmetric and positive definite, with
+    standard deviations from ``MIN_SIGMA`` to ``MAX_SIGMA``.
     """
     if (sigma is None) == (covariance is None):
         raise InvalidInput(f"the noise of source {source!r} is given by sigma or by covariance, one of both")
     if sigma is not None:
         sigmas = real_numbers(sigma, f"the sigma of source {source!r}")
-        if sigmas.shape != (size,) or not (np.isfinite(sigmas) & (sigmas > 0.0)).all():
+        if sigmas.shape != (size,) or not ((sigmas >= MIN_SIGMA) & (sigmas <= MAX_SIGMA)).all():
             raise InvalidInput(
-                f"the sigma of source {source!r} is {size} standard deviations above zero; got "
-                f"{sigmas.tolist()}"
+                f"the sigma of source {source!r} is {size} standard deviations above zero, of {MIN_SIGMA:g} "
+                f"to {MAX_SIGMA:g}; got {sigmas.tolist()}"
             )
         return np.diag(sigmas * sigmas)
     assert covariance is not None
@@ -214,6 +226,11 @@ def checked_noise(sigma: ArrayLike | None, covariance: ArrayLike | None, size: i
         raise InvalidInput(
             f"the covariance of source {source!r} has no eigenvalue of zero or less; got {smallest:g}. A "
             "variance of 0 is no exact measurement but an unknown noise: state what the sensor has"
+        )
+    if smallest < MIN_SIGMA**2 or matrix.diagonal().max() > MAX_SIGMA**2:
+        raise InvalidInput(
+            f"the covariance of source {source!r} has standard deviations of {MIN_SIGMA:g} to {MAX_SIGMA:g}; "
+            f"got variances {matrix.diagonal().tolist()}"
         )
     return 0.5 * (matrix + matrix.T)
 

@@ -26,6 +26,7 @@ from zstate.errors import InvalidInput
 Floats = NDArray[np.float64]
 
 _TURN_LIMIT = math.pi * (1.0 + 1e-9)
+_MOST_TURNED = 1e9
 _STANDING = 1e-9
 """[m/s] and [rad/s]: rounding."""
 
@@ -265,14 +266,19 @@ class Mecanum:
 
 
 def check_wheel_positions(wheels: Wheels, positions: Mapping[str, float]) -> dict[str, float]:
-    """The positions of the joints of ``wheels``. Raises InvalidInput for missing ones, NaN and infinity."""
+    """The positions of the joints of ``wheels``.
+
+    Raises InvalidInput for missing ones, for NaN and above 1e9 rad, where doubles resolve 1e-7 rad.
+    """
     missing = [name for name in wheels.joint_names if name not in positions]
     if missing:
         near = did_you_mean(missing[0], positions)
         raise InvalidInput(f"joint positions lack {', '.join(map(repr, missing))} of the wheels{near}")
     found = {name: float(positions[name]) for name in wheels.joint_names}
-    if bad := [f"{name!r} ({value})" for name, value in found.items() if not math.isfinite(value)]:
-        raise InvalidInput(f"positions of wheels must be finite; not so: {', '.join(bad)}")
+    if bad := [f"{name!r} ({value})" for name, value in found.items() if not abs(value) <= _MOST_TURNED]:
+        raise InvalidInput(
+            f"positions of wheels must be finite, at most {_MOST_TURNED:g} rad; not so: {', '.join(bad)}"
+        )
     return found
 
 

@@ -544,6 +544,13 @@ class LaserScan(StampedMessage, frozen=True, array_like=True, gc=False):
             )
 
 
+MAX_RATE, MAX_ACCELERATION = 1e3, 1e5
+"""[rad/s] and [m/s^2]: more in any axis is no reading of a sensor, but a fault of memory or of units."""
+
+MAX_SPEED, MAX_DISTANCE = 1e4, 1e8
+"""[m/s] and [m], likewise: above the speed of satellites, and twice the circumference of the Earth."""
+
+
 class Imu(StampedMessage, frozen=True, array_like=True, gc=False):
     """One reading of an inertial measurement unit, in the axes of ``frame``, which is named as in edges.
 
@@ -563,8 +570,8 @@ class Imu(StampedMessage, frozen=True, array_like=True, gc=False):
 
     def __post_init__(self) -> None:
         _check_frame(self.frame)
-        _finite_numbers("angular velocities", self.gyro, 3)
-        _finite_numbers("accelerations", self.accel, 3)
+        _check_limit("angular velocities", _finite_numbers("angular velocities", self.gyro, 3), MAX_RATE)
+        _check_limit("accelerations", _finite_numbers("accelerations", self.accel, 3), MAX_ACCELERATION)
         _check_covariance("angular velocities", self.gyro_covariance, 3)
         _check_covariance("accelerations", self.accel_covariance, 3)
         _check_covariance("an orientation", self.orientation_covariance, 3)
@@ -589,9 +596,11 @@ class Velocity(StampedMessage, frozen=True, array_like=True, gc=False):
 
     def __post_init__(self) -> None:
         _check_frame(self.frame)
-        _finite_numbers("velocities", self.linear, 3)
+        _check_limit("velocities", _finite_numbers("velocities", self.linear, 3), MAX_SPEED)
         if self.angular is not None:
-            _finite_numbers("angular velocities", self.angular, 3)
+            _check_limit(
+                "angular velocities", _finite_numbers("angular velocities", self.angular, 3), MAX_RATE
+            )
         _check_covariance("velocities", self.covariance, 3 if self.angular is None else 6)
 
 
@@ -612,7 +621,9 @@ class Pose(StampedMessage, frozen=True, array_like=True, gc=False):
         _check_frame(self.parent)
         if self.child:
             _check_frame(self.child)
-        _check_quaternion(_finite_numbers("a pose", self.pose, 7)[3:])
+        numbers = _finite_numbers("a pose", self.pose, 7)
+        _check_limit("positions", numbers[:3], MAX_DISTANCE)
+        _check_quaternion(numbers[3:])
         _check_covariance("a pose", self.covariance, 6)
 
 
@@ -759,6 +770,11 @@ def _finite_numbers(what: str, block: bytes, count: int) -> tuple[float, ...]:
     numbers = struct.unpack(f"<{count}d", block)
     _check_finite(what, *numbers)
     return numbers
+
+
+def _check_limit(what: str, numbers: Sequence[float], limit: float) -> None:
+    if max(map(abs, numbers)) > limit:
+        raise InvalidInput(f"{what} of sensors are at most {limit:g}; got {', '.join(map(str, numbers))}")
 
 
 def _check_quaternion(quaternion: Sequence[float]) -> None:
