@@ -15,7 +15,7 @@ from helpers.processes import DEADLINE_S, until
 from helpers.robots import STAMP
 
 from zstate import SecondWriter, StatePublisher, TransformBuffer, TransformListener, connect, load_model
-from zstate.clock import SystemClock
+from zstate.clock import ManualClock, SystemClock
 from zstate.errors import InvalidInput
 from zstate.model.kinematics import Kinematics
 from zstate.net.session import Session
@@ -275,3 +275,72 @@ def test_message_that_a_callback_refuses_is_counted(sessions):
     with SensorListener(reader, "r1", on_imu=refuse) as listener, ImuPublisher(writer, "r1") as imu:
         until(lambda: imu.publish([0, 0, 0], [0, 0, 9.81]) or listener.refused)
         assert set(listener.refused) == {"refused"}
+
+
+@contextmanager
+def imu_to_node(
+    sessions: tuple[Session, Session], **options: object
+) -> Generator[tuple[ImuPublisher, OdometryNode]]:
+    """A publisher of an IMU, and the node of an estimator that starts at a pose, with a manual clock."""
+    robot, estimating = sessions
+    mounts = TransformBuffer()
+    mounts.insert_static(Transform(BASE, IMU, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+    start = Transform(ODOM, BASE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    base = BaseEstimator(odom=ODOM, base=BASE, imu=IMU, buffer=mounts, imu_noise=NOISE, initial_pose=start)
+    with (
+        OdometryNode(estimating, "r1", base, **options) as node,  # pyright: ignore[reportArgumentType]
+        ImuPublisher(robot, "r1", "imu", frame="imu_link") as imu,
+    ):
+        yield imu, node
+
+
+def test_stamps_of_the_future_are_refused_and_the_odometry_goes_on(sessions):
+    clock = ManualClock(STAMP)
+    with imu_to_node(sessions, clock=clock) as (imu, node):
+        ticks = iter(range(STAMP, STAMP + 400_000_000, 10_000))
+
+        def publish(extra: int = 0) -> None:
+            imu.publish([0, 0, 0], [0, 0, 9.80665], next(ticks) + extra)
+
+        until(lambda: publish() or node.published)
+        until(lambda: publish(3_600_000_000_000) or node.refused)
+        assert set(node.refused) == {"refused"}
+        published = node.published
+        until(lambda: publish() or node.published > published + 3)
+        assert node.state().stamp < STAMP + 500_000_000
+
+
+def test_time_that_goes_back_is_published_from_there_on(sessions):
+    with imu_to_node(sessions, clock=ManualClock(STAMP)) as (imu, node):
+        for _ in range(2):
+            ticks = iter(range(STAMP - 10**11, STAMP, 10_000_000))
+            published = node.published
+
+            def publish() -> None:
+                imu.publish([0, 0, 0], [0, 0, 9.80665], next(ticks))  # noqa: B023
+
+            until(lambda: publish() or node.published > published + 300)  # noqa: B023
+        assert node.base.epoch == 1
+        assert node.state().stamp < STAMP - 10**11 + 99 * 10**9
+
+
+def test_exceptions_of_a_callback_are_counted_and_the_next_messages_arrive(sessions):
+    writer, reader = sessions
+    calls: list[int] = []
+
+    def fail(sensor: str, message: Imu) -> None:
+        calls.append(message.stamp)
+        raise ZeroDivisionError(sensor)
+
+    with SensorListener(reader, "r1", on_imu=fail) as listener, ImuPublisher(writer, "r1") as imu:
+        until(lambda: imu.publish([0, 0, 0], [0, 0, 9.81]) or len(calls) > 2)
+        until(lambda: listener.refused.get("failed with ZeroDivisionError", 0) > 2)
+
+
+def test_absurd_numbers_of_an_imu_are_not_published(sessions):
+    writer, _ = sessions
+    with ImuPublisher(writer, "r1") as imu:
+        with pytest.raises(InvalidInput, match="angular velocities"):
+            imu.publish([1e154, 0, 0], [0, 0, 9.81])
+        with pytest.raises(InvalidInput, match="accelerations"):
+            imu.publish([0, 0, 0], [0, 0, 1e308])

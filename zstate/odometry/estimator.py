@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from zstate import se3
 from zstate._util.format import did_you_mean, format_duration
 from zstate.buffer.buffer import TransformBuffer, check_duration
-from zstate.clock import check_stamp
+from zstate.clock import Clock, check_stamp
 from zstate.errors import InFuture, InPast, InvalidInput, NoData
 from zstate.odometry.alignment import COARSE_S, Alignment, align, start_at
 from zstate.odometry.fusion import (
@@ -386,6 +386,16 @@ class BaseEstimator:
             )
         reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, mount)
         self._offer(_Event(source, reading, (yaw, sigma)))
+
+    @property
+    def clock(self) -> Clock:
+        """The clock of the buffer of the mounts. The estimator does not read it."""
+        return self._buffer.clock
+
+    @property
+    def newest(self) -> int:
+        """The newest stamp of all events [ns]; readings of another time are not among them. 0 without any."""
+        return self._order.newest or 0
 
     def state(self, at: int | None = None) -> BaseState:
         """The state at the stamp ``at`` [ns]; by default at the newest event.

@@ -6,6 +6,7 @@ The functions that pass a message to an estimator also serve recordings.
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -13,7 +14,9 @@ from typing import Any
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
+from zstate._util.format import format_duration
 from zstate._util.refusals import Refusals
+from zstate.clock import SYSTEM, Clock
 from zstate.errors import Closed, InPast, InvalidInput, NoData, SecondWriter
 from zstate.model.robot import POSITION_COUNTS, RobotModel
 from zstate.net.presence import announce_reader
@@ -31,6 +34,11 @@ from zstate.wire.registry import get_wire
 
 _SILENT_NS = 100_000_000
 """After this time without its IMU, a node publishes at the stamps of other sources."""
+
+_AHEAD_NS = 500_000_000
+"""Clocks of one robot differ by less, and the way of a reading takes more than none."""
+
+_LONG_AGO = -(2**63)
 
 _HEALTH_NS = 500_000_000
 """The interval at which the health of the sources is assessed, by stamps."""
@@ -92,8 +100,9 @@ class SensorListener(Closeable):
     The frames of a message have their full names; the child of a pose is empty for the base of the robot.
     Each callback has a thread of its own, and gets the messages in the order of their arrival; a stream
     without a callback is not subscribed. If a callback is slow, the oldest messages are lost. ``refused``
-    counts, by reason, messages that cannot be used and those that a callback refuses by raising InvalidInput;
-    the first of each reason is also logged. A context manager.
+    counts, by reason, messages that cannot be used, those that a callback refuses by raising InvalidInput,
+    and its other exceptions, which do not end the thread; the first of each reason is also logged. A context
+    manager.
     """
 
     def __init__(
@@ -138,10 +147,18 @@ class SensorListener(Closeable):
                 callback(self._wire.edge_writer_name(key) or "", with_full_names(message, robot))
             except InvalidInput as error:
                 self._refusals.count("refused", f"{shortened(key)}: {error}")
+            except Exception as error:  # the next message may be good
+                self._refusals.count(*_failure(error, shortened(key)))
 
     def close(self) -> None:
         """Stop listening. A second call does nothing."""
         self._opened.close()
+
+
+def _failure(error: Exception, place: str) -> tuple[str, str]:
+    """The reason and the text of an exception that no message should cause."""
+    kind = type(error).__name__
+    return f"failed with {kind}", f"{place}: {kind}: {error}"
 
 
 class OdometryNode(Closeable):
@@ -152,6 +169,10 @@ class OdometryNode(Closeable):
     publishes the state at its stamp, at most ``rate_hz`` of them a second. If the IMU is silent for 0.1 s,
     readings of the other sources do; if all are silent, nothing is published. The sentences of
     ``base.health()`` are the warning in the status of the writer.
+
+    Readings that are stamped more than 0.5 s after the time of ``clock`` are refused; without ``clock``, the
+    clock of this host, or none if that of the buffer of ``base`` is simulated. If time goes back, the node
+    publishes from there on, which is a new epoch for listeners.
 
     Raises SecondWriter as ``OdometryPublisher``. While it runs, that becomes its ``failure``, and
     ``has_failed`` is set. A context manager.
@@ -170,15 +191,17 @@ class OdometryNode(Closeable):
         writer: str = "odometry",
         rate_hz: float | None = None,
         program: str = "",
+        clock: Clock | None = None,
     ) -> None:
         self.base = base
+        self._clock = base.clock if clock is None else clock
         self.failure: Exception | None = None
         self.has_failed = fork_safe(threading.Event())
         self._refusals = Refusals("joint states")
         self._imu, self._velocities, self._poses = imu, frozenset(velocities), frozenset(poses)
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
-        self._imu_stamp = self._due = self._newest = self._assessed = 0
+        self._restart()
         self._joints: JointStateListener | None = None
         with ExitStack() as opening:
             self._publisher = opening.enter_context(
@@ -198,13 +221,18 @@ class OdometryNode(Closeable):
             )
             self._opened = opening.pop_all()
 
+    def _restart(self) -> None:
+        """Publish from the next stamp on, whatever it is; the estimator has started anew."""
+        self._imu_stamp = self._due = self._newest = self._assessed = _LONG_AGO
+        self._epoch = self.base.epoch
+
     def __repr__(self) -> str:
         return f"<OdometryNode of {self._publisher.robot!r}: {self.published} samples>"
 
     @property
     def refused(self) -> dict[str, int]:
         """Counts of messages that could not be used, by reason; the first of each is also logged."""
-        return {**self._sensors.refused, **self._refusals.counts}
+        return dict(Counter(self._sensors.refused) + self._refusals.counts)
 
     @property
     def published(self) -> int:
@@ -231,20 +259,26 @@ class OdometryNode(Closeable):
         if sensor != self._imu:
             return
         with self._lock:
+            self._check_stamp(message.stamp)
             add_imu(self.base, message)
-            self._imu_stamp = max(self._imu_stamp, message.stamp)
-            # Not the newest of all data: wheels may be ahead, and what the IMU did since is not known.
-            self._publish(message.stamp, at=self._imu_stamp)
+            self._check_epoch()
+            is_present = message.stamp <= self.base.newest
+            if is_present:
+                self._imu_stamp = max(self._imu_stamp, message.stamp)
+                # Not the newest of all data: wheels may be ahead, and what the IMU did since is not known.
+                self._publish(message.stamp, at=self._imu_stamp)
 
     def _on_velocity(self, sensor: str, message: Velocity) -> None:
         if sensor in self._velocities:
             with self._lock:
+                self._check_stamp(message.stamp)
                 add_velocity(self.base, sensor, message)
                 self._publish_without_imu(message.stamp)
 
     def _on_pose(self, sensor: str, message: Pose) -> None:
         if sensor in self._poses:
             with self._lock:
+                self._check_stamp(message.stamp)
                 add_pose(self.base, sensor, message)
                 self._publish_without_imu(message.stamp)
 
@@ -253,16 +287,34 @@ class OdometryNode(Closeable):
             return
         assert self._joints.model is not None
         assert reading.stamp is not None
-        with self._lock:
-            try:
+        try:
+            with self._lock:
+                self._check_stamp(reading.stamp)
                 add_joints(self.base, self._joints.model, reading)
-            except InvalidInput as error:
-                self._refusals.count("refused joints", error)
-            else:
                 self._publish_without_imu(reading.stamp)
+        except InvalidInput as error:
+            self._refusals.count("refused joints", error)
+        except Exception as error:  # the next reading may be good
+            self._refusals.count(*_failure(error, "joints"))
+
+    def _check_stamp(self, stamp: int) -> None:
+        """Raises InvalidInput for a stamp of the future."""
+        if self._clock.domain != SYSTEM:
+            return
+        ahead_ns = stamp - self._clock.now()
+        if ahead_ns > _AHEAD_NS:
+            raise InvalidInput(
+                f"it is stamped {format_duration(ahead_ns)} after the time of this host: one of the two "
+                "clocks is wrong; synchronise them (NTP, PTP)"
+            )
+
+    def _check_epoch(self) -> None:
+        if self.base.epoch != self._epoch:
+            self._restart()
 
     def _publish_without_imu(self, stamp: int) -> None:
-        if stamp - self._imu_stamp > _SILENT_NS:
+        self._check_epoch()
+        if stamp <= self.base.newest and stamp - self._imu_stamp > _SILENT_NS:
             self._publish(stamp)
 
     def _publish(self, stamp: int, at: int | None = None) -> None:
