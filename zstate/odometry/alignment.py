@@ -43,7 +43,7 @@ _FORCE_PART = 0.5
 _YAW, _POSITION = 1e-4, 1e-4
 _TILT, _COARSE_TILT = 0.02, 0.2
 _SPEED = 2.0
-_GYRO_BIAS, _UNKNOWN_GYRO_BIAS, _ACCEL_BIAS = 0.01, 0.002, 0.05
+_GYRO_BIAS, _UNKNOWN_GYRO_BIAS, _ACCEL_BIAS = 0.01, 0.02, 0.05
 _TURN = 0.3
 """Of a turn by wheels, as a part of it: they may slip, or skid."""
 

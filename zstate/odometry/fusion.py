@@ -42,6 +42,7 @@ from zstate.odometry.invariant_filter import (
     FilterState,
     Floats,
     ImuNoise,
+    Innovation,
     Measurement,
     corrected,
     forgotten,
@@ -90,6 +91,10 @@ _STRAIGHT = 0.004
 """[rad/s] And by so much for ever: radii differ."""
 _APART, _APART_S = 3.0, 8.0
 """So many standard deviations apart, in the mean of so many seconds, the gyro is not what it was taken for."""
+_UNKNOWN_BIAS = 0.008
+"""[rad/s] A bias with a larger standard deviation was never measured."""
+_USUAL_BIAS = 0.002
+"""[rad/s] The standard deviation of the biases of gyros that are calibrated."""
 _FROZEN, _FROZEN_RATE = 10, 0.03
 """So many samples that repeat the one before, while wheels turn otherwise [rad/s], are of an IMU that is frozen.
 Samples of a simulation without noise repeat as well, but turn as the wheels do."""
@@ -106,7 +111,7 @@ _SHORT_S = 0.2
 """Corrections of the place that follow one another within this time are of the velocity between them."""
 _TILT_RATE = 0.05
 """[rad/s] The tilt of the continuous pose follows that of the estimate so fast."""
-_PLACE_RATE, _YAW_RATE = 0.2, 0.1
+_PLACE_RATE, _YAW_RATE = 0.2, 0.05
 """[m/s], [rad/s] It follows measured poses so fast."""
 
 MOST_BIAS = 0.03
@@ -117,6 +122,8 @@ _COMPARED_S, _COMPARED_RATE, _COMPARED_SCALE = 20.0, 0.05, 1.6
 _DEVIATION_S = 20.0
 _UNPROVEN, _SECTORS = 0.5, 12
 """[rad] The standard deviation of a compass at first, and in how many directions it is proven."""
+_PROVEN, _SECTORS_PROVEN = 0.1, 8
+"""[rad] One that is wrong by less in so many directions measures the bias of the gyro, and turns the pose."""
 _SAMPLED_S, _SAMPLED_GAIN, _SLOWEST_NS = 0.01, 0.05, 350_000_000
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
@@ -254,13 +261,15 @@ class Turning(NamedTuple):
 class Offset(NamedTuple):
     """From the estimate to the continuous pose of the IMU: ``rotation @ place + shift``. ``rotation`` (3, 3).
 
-    It was last changed at ``stamp``. ``is_followed``: it fades, as poses are measured in the odometry frame.
+    It was last changed at ``stamp``. ``is_followed``: it fades, as poses are measured in the odometry frame;
+    ``is_turned``: its yaw fades, as a compass is right.
     """
 
     rotation: Floats
     shift: Floats
     stamp: int
     is_followed: bool = False
+    is_turned: bool = False
 
 
 class Pause(NamedTuple):
@@ -394,9 +403,8 @@ class Fusion:
         if reading.is_position:
             estimate = self.settled(estimate)
             estimate = estimate._replace(offset=estimate.offset._replace(is_followed=True))
-        return _gated(
-            estimate, source, reading.measure(estimate.state, estimate.rate), is_position=reading.is_position
-        )
+        measurement = reading.measure(estimate.state, estimate.rate)
+        return _gated(estimate, source, measurement, is_position=reading.is_position, axis=reading.upright)
 
     def after_pause(
         self, before: Estimate, reading: Displacement, following: Inertia | None
@@ -471,7 +479,14 @@ class Fusion:
         if variance > floor:
             # Such a noise lowers the variance to the floor: 1 / variance + 1 / noise = 1 / floor.
             noise = np.array([[variance * floor / (variance - floor)]])
-            estimate = _moved(estimate, updated(estimate.state, measurement._replace(covariance=noise)))
+            measurement = measurement._replace(covariance=noise)
+            found = innovation(estimate.state, measurement)
+            is_proven = len(sectors) >= _SECTORS_PROVEN and deviation < _PROVEN * _PROVEN
+            if is_proven:
+                estimate = estimate._replace(offset=estimate.offset._replace(is_turned=True))
+            else:
+                found = _without_yaw_bias(found, estimate.state.rotation[2])
+            estimate = _moved(estimate, corrected(estimate.state, measurement, found))
         return estimate, Outcome("accepted", nis, 1)
 
     def after_steps(
@@ -656,8 +671,21 @@ class Fusion:
         estimate = estimate._replace(turning=turning)
         if turning.time_s < _APART_S:
             return estimate
-        apart, sigma = _apart(turning)
+        compared = _apart(turning)
+        if compared is None:
+            return estimate
+        apart, sigma = compared
         variance = float(axis @ state.covariance[GYRO_BIAS, GYRO_BIAS] @ axis)
+        if not estimate.was_at_rest and variance > _UNKNOWN_BIAS * _UNKNOWN_BIAS:
+            if abs(apart) < _APART * math.hypot(sigma, _USUAL_BIAS):
+                # A gyro that is calibrated: less than the wheels say about it is its bias. It stays as it is.
+                usual = _USUAL_BIAS**2 + max(0.0, apart * apart - sigma * sigma)
+                noise = 1.0 / (1.0 / min(usual, 0.9 * variance) - 1.0 / variance)
+                measurement = yaw_rate(state, gyro, noise, axis, estimate.rate)
+            else:
+                measurement = yaw_rate(state, gyro + apart, sigma * sigma, axis, estimate.rate)
+                estimate = estimate._replace(biased_at=estimate.stamp)
+            return _moved(estimate._replace(turning=Turning()), updated(state, measurement))
         if abs(apart) < _APART * math.sqrt(variance + sigma * sigma):
             return estimate
         wrong_s = min(turning.time_s, _COMPARED_S)
@@ -791,18 +819,18 @@ def disagreement(turning: Turning) -> str:
     return f"the wheels turn the base by {wheels:.2g} rad/s and the gyro by {gyro:.2g} (rms of 20 s), {cause}"
 
 
-def _apart(turning: Turning) -> tuple[float, float]:
+def _apart(turning: Turning) -> tuple[float, float] | None:
     """By what constant the yaw rate of wheels exceeds that of the gyro, with its standard deviation [rad/s].
 
     That is the regression of one on the other, with a scale if they turn enough to show it. Rates that do not
-    follow a line, as those of wheels that slip, or that have another scale, say nothing.
+    follow a line, as those of wheels that slip, or that have another scale, say nothing: None.
     """
     spread = turning.gyro_square - turning.gyro**2
     both = turning.product - turning.gyro * turning.wheels
     scale = both / spread if spread > _WHEEL_TURN**2 else 1.0
     rest = turning.wheels_square - turning.wheels**2 - scale * (2.0 * both - scale * spread)
     if not 1.0 / _COMPARED_SCALE < scale < _COMPARED_SCALE or rest > _WHEEL_TURN**2:
-        return 0.0, _STRAIGHT
+        return None
     lever = turning.gyro**2 / spread if spread > _WHEEL_TURN**2 else 0.0
     variance = max(0.0, rest) * (1.0 + lever) / min(turning.time_s, _COMPARED_S)
     return turning.wheels - scale * turning.gyro, math.sqrt(variance + _STRAIGHT**2)
@@ -880,13 +908,16 @@ def _moved(estimate: Estimate, state: FilterState) -> Estimate:
     if angle > 1e-12:
         part = min(1.0, _TILT_RATE * elapsed_s / angle)
         rotation = rotation_exp(np.array((y * part, -x * part, 0.0))).dot(rotation)
-    if offset.is_followed:
+    if offset.is_followed or offset.is_turned:
         yaw = math.atan2(rotation[1, 0], rotation[0, 0])
         most = _YAW_RATE * elapsed_s
         rotation = rotation_exp(np.array((0.0, 0.0, -max(-most, min(yaw, most))))).dot(rotation)
+    if offset.is_followed:
         gap = state.position - place
         place = place + gap * min(1.0, _PLACE_RATE * elapsed_s / max(math.sqrt(gap @ gap), 1e-12))
-    offset = Offset(rotation, place - rotation.dot(state.position), estimate.stamp, offset.is_followed)
+    offset = offset._replace(
+        rotation=rotation, shift=place - rotation.dot(state.position), stamp=estimate.stamp
+    )
     return estimate._replace(state=state, offset=offset)
 
 
@@ -936,14 +967,22 @@ def _interpolated(last: Inertia | None, following: Inertia | None, stamp: int) -
 
 
 def _gated(
-    estimate: Estimate, source: str, measurement: Measurement, *, is_position: bool = False
+    estimate: Estimate,
+    source: str,
+    measurement: Measurement,
+    *,
+    is_position: bool = False,
+    axis: Floats | None = None,
 ) -> tuple[Estimate, Outcome]:
+    """The estimate after a measurement, if it passes the gate. ``axis``: see ``_without_yaw_bias``."""
     state, dimension = estimate.state, len(measurement.residual)
     found = innovation(state, measurement)
     nis = found.nis
     if nis <= gate(dimension):
         if source in estimate.runs:
             estimate = _with_run(estimate, source, None)
+        if axis is not None:
+            found = _without_yaw_bias(found, axis)
         return _moved(estimate, corrected(state, measurement, found)), Outcome("accepted", nis, dimension)
     if source == STANDSTILL:  # the base may be turned or carried while its wheels stand
         return estimate, Outcome("rejected", nis, dimension)
@@ -952,9 +991,22 @@ def _gated(
     if run.length < _REACQUIRE_COUNT or estimate.stamp - run.start < _REACQUIRE_NS:
         return _with_run(estimate, source, run), Outcome("rejected", nis, dimension)
     forget = _without_place if is_position else _without_velocity
-    state = updated(forget(state, measurement.residual, (estimate.stamp - run.start) * 1e-9), measurement)
+    state = forget(state, measurement.residual, (estimate.stamp - run.start) * 1e-9)
+    found = innovation(state, measurement)
+    state = corrected(state, measurement, found if axis is None else _without_yaw_bias(found, axis))
     estimate = _moved(_with_run(estimate, source, None), state)._replace(lost_at=estimate.stamp)
     return estimate, Outcome("reacquired", nis, dimension)
+
+
+def _without_yaw_bias(found: Innovation, axis: Floats) -> Innovation:
+    """The innovation with a gain that leaves the bias of the gyro about ``axis``, (3,), as it is.
+
+    A velocity shows it only by the force across the base in turns, which tilt, slip and play are part of: what
+    it seemed to show led away on real drives (Schmidt's consider filter; the covariance is that of this gain).
+    """
+    gain = found.gain.copy()
+    gain[GYRO_BIAS] -= np.outer(axis, axis.dot(gain[GYRO_BIAS]))
+    return found._replace(gain=gain)
 
 
 def _without_velocity(state: FilterState, residual: Floats, seconds: float) -> FilterState:
