@@ -16,7 +16,7 @@ from helpers.robots import STAMP
 
 from zstate import SecondWriter, StatePublisher, TransformBuffer, TransformListener, connect, load_model
 from zstate.clock import ManualClock, SystemClock
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, Unreachable
 from zstate.model.kinematics import Kinematics
 from zstate.net.session import Session
 from zstate.net.status import StatusMonitor
@@ -31,6 +31,7 @@ from zstate.odometry import (
     SensorListener,
     VelocityPublisher,
 )
+from zstate.odometry.requests import request_odometry
 from zstate.odometry.simulated_rover import SimulatedRover
 from zstate.rate import Rate
 from zstate.sources.square_drive import WheelPair
@@ -344,3 +345,21 @@ def test_absurd_numbers_of_an_imu_are_not_published(sessions):
             imu.publish([1e154, 0, 0], [0, 0, 9.81])
         with pytest.raises(InvalidInput, match="accelerations"):
             imu.publish([0, 0, 0], [0, 0, 1e308])
+
+
+def test_a_request_places_the_base_or_starts_anew_and_what_is_refused_has_its_reason(sessions):
+    with imu_to_node(sessions, clock=ManualClock(STAMP)) as (imu, node):
+        robot, _ = sessions
+        place = Transform(ODOM, BASE, (3.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        with pytest.raises(InvalidInput, match="not aligned"):
+            request_odometry(robot, "r1", "set_pose", place, timeout_s=DEADLINE_S)
+        with pytest.raises(InvalidInput, match="with a pose"):
+            request_odometry(robot, "r1", "set_pose", timeout_s=DEADLINE_S)
+        ticks = iter(range(STAMP - 10**11, STAMP, 10_000_000))
+        until(lambda: imu.publish([0, 0, 0], [0, 0, 9.80665], next(ticks)) or node.published)
+        request_odometry(robot, "r1", "set_pose", place, timeout_s=DEADLINE_S)
+        assert node.state().odom_from_base.translation.tolist() == pytest.approx([3.0, 1.0, 0.0], abs=0.1)
+        request_odometry(robot, "r1", "reset", timeout_s=DEADLINE_S)
+        assert node.base.epoch == 1
+        with pytest.raises(Unreachable, match="is `zstate odometry r1` running"):
+            request_odometry(robot, "r1", "reset", writer="other", timeout_s=0.2)

@@ -7,6 +7,7 @@ from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThreshold
 from zstate.odometry.map_correction import MapCorrection
 from zstate.odometry.node import OdometryNode, SensorListener
 from zstate.odometry.publishers import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+from zstate.odometry.requests import request_odometry
 from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
 from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
@@ -36,4 +37,5 @@ __all__ = [
     "WheelNoise",
     "WheelVelocity",
     "Wheels",
+    "request_odometry",
 ]

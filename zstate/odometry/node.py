@@ -20,15 +20,17 @@ from zstate.clock import SYSTEM, Clock
 from zstate.errors import Closed, InPast, InvalidInput, NoData, SecondWriter
 from zstate.model.robot import POSITION_COUNTS, RobotModel
 from zstate.net.presence import announce_reader
+from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
 from zstate.odometry.invariant_filter import Floats
 from zstate.odometry.publishers import OdometryPublisher
+from zstate.odometry.requests import apply_request
 from zstate.sources import JointReading, JointStateListener
 from zstate.transform import Transform
-from zstate.wire.keys import Stream, check_robot, shortened
+from zstate.wire.keys import Stream, check_robot, odometry_request_key, shortened
 from zstate.wire.messages import Imu, Pose, Velocity, covariance_matrix, from_block, with_full_names
 from zstate.wire.registry import get_wire
 
@@ -172,7 +174,7 @@ class OdometryNode(Closeable):
 
     Readings that are stamped more than 0.5 s after the time of ``clock`` are refused; without ``clock``, the
     clock of this host, or none if that of the buffer of ``base`` is simulated. If time goes back, the node
-    publishes from there on, which is a new epoch for listeners.
+    publishes from there on, which is a new epoch for listeners. It also obeys ``request_odometry``.
 
     Raises SecondWriter as ``OdometryPublisher``. While it runs, that becomes its ``failure``, and
     ``has_failed`` is set. A context manager.
@@ -207,6 +209,8 @@ class OdometryNode(Closeable):
             self._publisher = opening.enter_context(
                 OdometryPublisher(session, robot, writer, program=program)
             )
+            request_key = odometry_request_key(robot, self._publisher.writer)
+            opening.enter_context(Queryable(session, request_key, self._on_request))
             if has_joints:
                 joints = JointStateListener(session, robot, on_reading=self._on_joints)
                 self._joints = opening.enter_context(joints)
@@ -248,6 +252,16 @@ class OdometryNode(Closeable):
         """The newest state. Raises NoData before the first alignment."""
         with self._lock:
             return self.base.state()
+
+    def reset(self, odom_from_base: Transform | None = None) -> None:
+        """Start anew, as ``BaseEstimator.reset``."""
+        with self._lock:
+            self.base.reset(odom_from_base)
+
+    def set_pose(self, odom_from_base: Transform) -> None:
+        """Place the base, as ``BaseEstimator.set_pose``."""
+        with self._lock:
+            self.base.set_pose(odom_from_base)
 
     def close(self) -> None:
         """Stop. A second call does nothing."""
@@ -296,6 +310,14 @@ class OdometryNode(Closeable):
             self._refusals.count("refused joints", error)
         except Exception as error:  # the next reading may be good
             self._refusals.count(*_failure(error, "joints"))
+
+    def _on_request(self, parameters: Mapping[str, str]) -> Reply:
+        try:
+            with self._lock:
+                apply_request(self.base, parameters)
+        except (InvalidInput, NoData) as error:
+            return Reply(str(error).encode(), "text/plain", is_error=True)
+        return Reply(b"", "text/plain")
 
     def _check_stamp(self, stamp: int) -> None:
         """Raises InvalidInput for a stamp of the future."""

@@ -98,6 +98,9 @@ VERBATIM_CHUNKS = ("@writer", "@clock", "@edge", "@reader")
 MOTION_CHUNK = "@motion"
 """The chunk of requests for motions. It is verbatim, too: access control lets viewers query ``zstate/**``."""
 
+ODOMETRY_CHUNK = "@odometry"
+"""The chunk of requests to the writer of an odometry, likewise verbatim."""
+
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""
 
@@ -258,6 +261,11 @@ def parse_release_key(key: str) -> tuple[str, str]:
 def motion_key(robot: str) -> str:
     """The key of the queryable of a driver that takes requests for motions."""
     return f"zstate/{check_robot(robot)}/{MOTION_CHUNK}"
+
+
+def odometry_request_key(robot: str, writer: str) -> str:
+    """The key of the queryable of an odometry node that starts anew, or sets its pose, on request."""
+    return f"zstate/{check_robot(robot)}/{ODOMETRY_CHUNK}/{check_writer(writer)}"
 
 
 def writer_key(robot: str, streams: Stream | Collection[Stream], identity: str) -> str:

@@ -5,7 +5,8 @@ the message, so a robot cannot write to other robots by a wildcard either.
 
 Native wire: ``**`` does not match chunks that begin with ``@``, so each needs a key expression: history
 queries of late joiners (``@adv``), liveliness tokens (``@writer``, ``@reader``), static edges (``@edge``)
-and clocks (``@clock``). Requests for motions (``@motion``) are verbatim so that viewers cannot send them.
+and clocks (``@clock``). Requests for motions (``@motion``) and to an odometry (``@odometry``) are verbatim so
+that viewers cannot send them.
 
 ROS 2 (rmw_zenoh_cpp): topics and services are below ``<domain>/``, history queries under ``@adv`` below
 them, and the tokens of the ROS graph under ``@ros2_lv/<domain>/``, with node and topic names in which ``%``
@@ -24,7 +25,14 @@ from typing import Any
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import user_config
 from zstate.net.security.credentials import check_identity
-from zstate.wire.keys import CLOCK_KEY, MOTION_CHUNK, VERBATIM_CHUNKS, check_robot, check_writer
+from zstate.wire.keys import (
+    CLOCK_KEY,
+    MOTION_CHUNK,
+    ODOMETRY_CHUNK,
+    VERBATIM_CHUNKS,
+    check_robot,
+    check_writer,
+)
 from zstate.wire.registry import ros_options
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.types import FLOAT64_MULTI_ARRAY, JOINT_TRAJECTORY, OCCUPANCY_GRID
@@ -47,12 +55,13 @@ class AclRoles:
     A robot writes and reads its own keys; of other robots it reads their names, their static edges,
     which it must not contradict, their maps, as those of places, and the states of their drivers; and it
     reads the simulated time. A viewer reads everything and writes nothing but stops of drivers, which every
-    identity may send: the joints hold. A commander also commands joints, releases stops, and may switch the
-    torque off; an operator does, too, and calls services of ROS; a timekeeper also
-    writes the simulated time. A placer writes only static edges under its own name, and reads those of the
-    robots: it places their roots, as in ``fleet/map -> r1/odom``; readers with ``placers=`` accept such edges
-    from these only. A name may have several roles. ``namespace`` is that of the sessions behind the router,
-    if they have one. ``wires``: "native", and "ros2" with its options, see ``_Ros2Rules``.
+    identity may send: the joints hold. A commander also commands joints, releases stops, resets and places an
+    odometry, and may switch the torque off; an operator does, too, and calls services of ROS; a timekeeper
+    also writes the simulated time. A placer writes only static edges under its own name, and reads those
+    of the robots: it places their roots, as in ``fleet/map -> r1/odom``; readers with ``placers=`` accept
+    such edges from these only. A name may have several roles. ``namespace`` is that of the sessions
+    behind the router, if they have one. ``wires``: "native", and "ros2" with its options, see
+    ``_Ros2Rules``.
     Raises InvalidInput for names that cannot be names of identities.
     """
 
@@ -122,10 +131,10 @@ def _native_rules(roles: AclRoles) -> Grants:
     # A program that may stop a driver reads whether that has stopped.
     drivers = tuple(f"{root}/*/driver{end}" for end in ("", "/@adv/**"))
     shared = (*latched, *drivers, f"{root}/*/{_EDGE}/**", f"{root}/*/{_WRITER}/**", clock)
-    motions = f"{root}/*/{MOTION_CHUNK}"
+    requests = (f"{root}/*/{MOTION_CHUNK}", f"{root}/*/{ODOMETRY_CHUNK}/*")
     for robot in dict.fromkeys(roles.robots):
         prefix = f"{root}/{check_robot(robot)}"
-        keys = (*_below(prefix), f"{prefix}/{MOTION_CHUNK}")
+        keys = (*_below(prefix), f"{prefix}/{MOTION_CHUNK}", f"{prefix}/{ODOMETRY_CHUNK}/*")
         yield (robot,), _ingress(f"{robot} writes", PUBLISH, keys)
         yield (robot,), _ingress(f"{robot} reads", SUBSCRIBE, keys)
         yield (robot,), _egress(f"{robot} is given", PUBLISH, keys)
@@ -139,7 +148,7 @@ def _native_rules(roles: AclRoles) -> Grants:
     yield robots, _ingress("robots read", SUBSCRIBE, shared)
     yield robots, _egress("robots are given", PUBLISH, shared)
     # A query for all robots goes to each of them; a reply has the robot's own data only.
-    yield robots, _egress("robots are asked", SUBSCRIBE, (*everything, motions))
+    yield robots, _egress("robots are asked", SUBSCRIBE, (*everything, *requests))
     yield roles.readers, _ingress("viewers read", SUBSCRIBE, everything)
     yield roles.readers, _egress("viewers are given", PUBLISH, everything)
     yield roles.identities, _ingress("readers are known", ("liveliness_token",), (f"{root}/{_READER}/**",))
@@ -149,8 +158,8 @@ def _native_rules(roles: AclRoles) -> Grants:
     yield commanders, _ingress("commanders command", ("put", "liveliness_token"), commands)
     # A publisher sends nothing before its session knows of a subscriber.
     yield commanders, _egress("commanders are asked", SUBSCRIBE, commands)
-    yield commanders, _ingress("commanders move", ("query",), (motions,))
-    yield commanders, _egress("commanders are answered", PUBLISH, (motions,))
+    yield commanders, _ingress("commanders move", ("query",), requests)
+    yield commanders, _egress("commanders are answered", PUBLISH, requests)
     relaxing = (f"{root}/*/relax/*", f"{root}/*/relax/*/@adv/**")
     yield commanders, _ingress("commanders relax", PUBLISH, relaxing)
     yield commanders, _egress("commanders are asked for that", SUBSCRIBE, relaxing)
