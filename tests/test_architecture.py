@@ -81,6 +81,7 @@ EVERYWHERE = {"numpy"}
 GUESTS = {
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
     ("cli/snapshot_file.py", "msgspec"),
+    ("cli/odometry_file.py", "msgspec"),
     ("cli/up/cell.py", "msgspec"),
     ("cli/commands/drive.py", "msgspec"),  # so is --param, into the types that a driver annotates
     ("scans/map_files.py", "PIL"),

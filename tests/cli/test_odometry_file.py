@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
 
+from zstate import Transform, TransformBuffer
 from zstate.cli.odometry_file import (
     LegSettings,
     OdometrySettings,
     parse_diff_drive,
     parse_feet,
+    parse_pose,
+    parse_velocity,
     read_settings,
 )
 from zstate.errors import ConfigError, InvalidInput
@@ -18,14 +22,16 @@ from zstate.odometry import (
     ForceThresholds,
     ImuNoise,
     LegNoise,
+    PoseNoise,
     SpeedThresholds,
+    VelocityNoise,
     WheelNoise,
 )
 
 ROVER = """
 imu = "body"
-velocities = ["flow"]
 history_s = 2.0
+initial_pose = [2.0, 1, 90.0]
 
 [imu_noise]
 gyro = 2e-3
@@ -39,6 +45,15 @@ right = ["r1", "r2"]
 radius = 0.1
 track = 0.5
 noise = { slip = 0.1 }
+
+[velocity.flow]
+[velocity.radar]
+sigma = [0.1, 0.2, 0.3]
+scale = 0.01
+
+[pose.mocap]
+sigma = 0.01
+sigma_deg = 1
 """
 
 
@@ -52,10 +67,12 @@ def test_file_has_the_settings_of_one_robot(tmp_path: Path):
     settings = read_settings(written(tmp_path, ROVER))
     assert settings == OdometrySettings(
         imu="body",
-        velocities=("flow",),
+        velocity={"flow": VelocityNoise(), "radar": VelocityNoise(sigma=(0.1, 0.2, 0.3), scale=0.01)},
+        pose={"mocap": PoseNoise(sigma=0.01, sigma_deg=1.0)},
+        initial_pose=(2.0, 1.0, 90.0),
         history_s=2.0,
         imu_noise=ImuNoise(gyro=2e-3, accel=1e-2, gyro_bias=1e-5, accel_bias=1e-4),
-        wheels=DiffDrive("l", ["r1", "r2"], 0.1, 0.5, noise=WheelNoise(slip=0.1)),
+        diff_drive=DiffDrive("l", ["r1", "r2"], 0.1, 0.5, noise=WheelNoise(slip=0.1)),
     )
 
 
@@ -107,15 +124,22 @@ def test_feet_of_a_command_line_are_links():
     ("before", "after", "error"),
     [
         ("radius", "radus", r"rover.toml:15: diff_drive.radus: unknown key; did you mean 'radius'\?"),
-        ("radius = 0.1", "", "rover.toml:12: diff_drive: radius missing"),
+        ("radius = 0.1", "", "rover.toml:12: diff_drive: Object missing required field `radius`"),
         ("slip", "slop", r"unknown key; did you mean 'slip'\?"),
         ("0.5", "-0.5", "rover.toml:12: diff_drive: the track of wheels is a length"),
-        ("history_s", "history", "rover.toml:4: history: unknown key"),
+        ("history_s", "history", "rover.toml:3: history: unknown key"),
         (
             "gyro = 2e-3",
             "gyro = 0",
             "rover.toml:6: imu_noise: the noise 'gyro' of an IMU is a finite density",
         ),
+        ('imu = "body"', "imu = 3", "rover.toml:2: imu: Expected `str`, got `int`"),
+        ("[2.0, 1, 90.0]", "[2.0, 1]", "rover.toml:4: initial_pose: Expected `array` of length 3, got 2"),
+        ("[0.1, 0.2, 0.3]", "true", r"rover.toml:21: velocity.radar.sigma: Expected `float \| array"),
+        ("[0.1, 0.2, 0.3]", "-0.1", "rover.toml:20: velocity.radar: sigma is a standard deviation above"),
+        ("scale = 0.01", "scal = 0.01", r"rover.toml:22: velocity.radar.scal: unknown key; did you mean"),
+        ("sigma_deg = 1", "", r"rover.toml:24: pose.mocap: a pose has both, sigma \[m\] and sigma_deg"),
+        ("[velocity.flow]", "[velocity]\nflow = 1", "rover.toml:20: velocity.flow: Expected `object`, got"),
     ],
 )
 def test_each_mistake_has_its_line(tmp_path: Path, before: str, after: str, error: str):
@@ -125,8 +149,46 @@ def test_each_mistake_has_its_line(tmp_path: Path, before: str, after: str, erro
 
 def test_robot_has_wheels_of_one_kind(tmp_path: Path):
     text = ROVER + '[mecanum]\nfront_left="a"\nfront_right="b"\nrear_left="c"\nrear_right="d"\n'
-    with pytest.raises(ConfigError, match="mecanum: a robot has wheels of one kind"):
+    with pytest.raises(ConfigError, match="a robot has wheels of one kind, not of diff_drive and mecanum"):
         read_settings(written(tmp_path, text + "radius=0.1\ntrack=0.5\nwheelbase=0.5\n"))
+
+
+def test_noise_of_a_source_is_stated_on_the_command_line():
+    assert parse_velocity("wheels") == ("wheels", VelocityNoise())
+    assert parse_velocity("wheels:sigma=0.05, scale=0") == ("wheels", VelocityNoise(sigma=0.05, scale=0.0))
+    assert parse_pose("mocap:sigma=0.01,sigma_deg=1")[1].sigmas == pytest.approx(
+        (0.01,) * 3 + (0.0174533,) * 3
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        (
+            "wheels:sgma=1",
+            r"'sgma=1' is not part of SENSOR:sigma=NUMBER,scale=NUMBER; did you mean 'sigma'\?",
+        ),
+        ("wheels:sigma=1,sigma=2", "'sigma=2' is not part of"),
+        ("wheels:sigma=a", "sigma is a number, not 'a'"),
+        ("wheels:sigma=nan", "sigma is a standard deviation above zero, or three"),
+        ("wheels:scale=-1", "the scale of a velocity is a part of it, 0 or more"),
+        ("wheels:", "'' is not part of"),
+        ("a/b", "contains '/'"),
+    ],
+)
+def test_unusable_noise_of_a_source_is_refused(text: str, error: str):
+    with pytest.raises(InvalidInput, match=error):
+        parse_velocity(text)
+
+
+def test_initial_pose_is_where_the_base_starts():
+    mounts = TransformBuffer()
+    mounts.insert_static(Transform("r1/base", "r1/imu", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
+    settings = OdometrySettings(initial_pose=(2.0, 1.0, 90.0))
+    base = settings.estimator("r1", "base", "imu", mounts, None)
+    base.imu(0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.80665])
+    pose = base.state().odom_from_base
+    assert [*pose.translation, pose.rpy[2]] == pytest.approx([2.0, 1.0, 0.0, math.pi / 2])
 
 
 def test_wheels_of_a_command_line_may_be_several_on_a_side():

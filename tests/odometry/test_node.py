@@ -27,16 +27,19 @@ from zstate.odometry import (
     ImuNoise,
     ImuPublisher,
     OdometryNode,
+    PoseNoise,
     PosePublisher,
     SensorListener,
+    VelocityNoise,
     VelocityPublisher,
 )
+from zstate.odometry.node import pose_covariance, velocity_covariance
 from zstate.odometry.requests import request_odometry
 from zstate.odometry.simulated_rover import SimulatedRover
 from zstate.rate import Rate
 from zstate.sources.square_drive import WheelPair
 from zstate.transform import Transform
-from zstate.wire.messages import Imu, Odometry, Pose, Velocity
+from zstate.wire.messages import Imu, Odometry, Pose, Velocity, to_block
 from zstate.wire.registry import get_wire
 
 MODEL = load_model("diffbot")
@@ -179,7 +182,7 @@ def test_rate_limits_the_samples_of_a_faster_imu():
 
 def test_sentences_on_the_sources_are_in_the_status_of_the_writer():
     with (
-        rover_with_odometry(velocities=("flow",)) as (_, _, _, session),
+        rover_with_odometry(velocities={"flow": VelocityNoise()}) as (_, _, _, session),
         StatusMonitor(session, "r1") as statuses,
         VelocityPublisher(session, "r1", "flow", frame="base_footprint") as flow,
     ):
@@ -194,7 +197,7 @@ def test_sentences_on_the_sources_are_in_the_status_of_the_writer():
 
 def test_velocities_without_covariance_are_refused_and_counted():
     with (
-        rover_with_odometry(velocities=("flow",)) as (_, node, _, session),
+        rover_with_odometry(velocities={"flow": VelocityNoise()}) as (_, node, _, session),
         VelocityPublisher(session, "r1", "flow", frame="base_footprint") as flow,
     ):
 
@@ -205,9 +208,32 @@ def test_velocities_without_covariance_are_refused_and_counted():
         until(refused)
 
 
+@pytest.mark.parametrize("covariance", [None, np.zeros((3, 3)), np.diag([0.01, 0.0, 0.0])])
+def test_noise_that_is_stated_is_in_place_of_that_of_messages(covariance: np.ndarray | None):
+    triangle = None if covariance is None else to_block(covariance[np.triu_indices(3)])
+    message = Velocity(1, 0, 1, "base", to_block([1.0, 0.0, 0.0]), None, triangle)
+    stated = velocity_covariance("flow", message, VelocityNoise(sigma=(0.1, 0.2, 0.3)))
+    assert np.diag(stated) == pytest.approx([0.01, 0.04, 0.09])
+    why = r"velocities of 'flow' have .*: state their noise by `--velocity flow:sigma=0.05`, or sigma = 0.05"
+    with pytest.raises(InvalidInput, match=why):
+        velocity_covariance("flow", message, VelocityNoise())
+
+
+def test_poses_have_the_noise_of_their_messages_or_the_stated_one():
+    placed = to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    known = Pose(1, 0, 1, "odom", "", placed, to_block(np.eye(6)[np.triu_indices(6)]))
+    assert np.array_equal(pose_covariance("mocap", known, PoseNoise()), np.eye(6))
+    stated = PoseNoise(sigma=0.1, sigma_deg=(1.0, 1.0, 2.0))
+    assert np.sqrt(np.diag(pose_covariance("mocap", known, stated))) == pytest.approx(
+        [0.1, 0.1, 0.1, math.radians(1.0), math.radians(1.0), math.radians(2.0)]
+    )
+    with pytest.raises(InvalidInput, match=r"poses of 'mocap' have no covariance: .* in \[pose.mocap\]"):
+        pose_covariance("mocap", Pose(1, 0, 1, "odom", "", placed), PoseNoise())
+
+
 def test_measured_poses_place_the_base():
     with (
-        rover_with_odometry(poses=("mocap",)) as (_, node, listener, session),
+        rover_with_odometry(poses={"mocap": PoseNoise()}) as (_, node, listener, session),
         PosePublisher(session, "r1", "mocap") as mocap,
     ):
         measured = Transform(ODOM, BASE, [0.02, 0.0, 0.0], [0, 0, 0, 1]).with_covariance(1e-6 * np.eye(6))

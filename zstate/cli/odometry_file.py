@@ -1,16 +1,18 @@
 """What the odometry of one robot is computed from, and the TOML file that holds it: one setting for all runs.
 
-Its keys are those of OdometrySettings, with the keywords of ImuNoise in ``[imu_noise]``, of DiffDrive,
-Ackermann or Mecanum in ``[diff_drive]``, ``[ackermann]`` or ``[mecanum]``, of WheelNoise in their ``noise``,
-and of LegSettings in ``[legs]``. models/rover.toml is an example.
+Its keys are the fields of OdometrySettings and, in tables, of the classes of their values. models/rover.toml
+is an example.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
+
+import msgspec
 
 from zstate._util.format import did_you_mean
 from zstate.buffer.buffer import TransformBuffer
@@ -26,10 +28,12 @@ from zstate.odometry import (
     LegNoise,
     Legs,
     Mecanum,
+    PoseNoise,
     SpeedThresholds,
-    WheelNoise,
+    VelocityNoise,
     Wheels,
 )
+from zstate.transform import Transform
 from zstate.wire.keys import check_writer, full_name
 
 MEMS_NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)
@@ -39,6 +43,9 @@ DEFAULT_SPEEDS = SpeedThresholds(touchdown=0.1, liftoff=0.2)
 """Those of the feet of walking robots without another setting."""
 
 T = TypeVar("T")
+Noise = TypeVar("Noise", VelocityNoise, PoseNoise)
+PlanarPose = tuple[float, float, float]
+"""x, y [m] and yaw [degrees] in the frame of the odometry."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,36 +70,39 @@ class LegSettings:
         return Legs(model, self.feet, imu=imu, noise=self.noise, detection=detection)
 
 
-_PARTS: Mapping[str, type[Any]] = {
-    "imu_noise": ImuNoise,
-    "diff_drive": DiffDrive,
-    "ackermann": Ackermann,
-    "mecanum": Mecanum,
-    "legs": LegSettings,
-}
-_WHEELS = ("diff_drive", "ackermann", "mecanum")
-
-
 @dataclass(frozen=True, kw_only=True)
 class OdometrySettings:
-    """The sensors, frames and noise of one robot; ``base`` None is the root of its model.
+    """The sensors, frames and noise of one robot.
 
-    Raises InvalidInput for names that no sensor can have, and for wheels of several kinds.
+    ``velocity`` and ``pose`` are further sensors by name, with what is stated of their noise. ``base`` None
+    is the root of the model. Without an ``initial_pose`` the base starts at the origin, once it is aligned at
+    rest. Raises InvalidInput for names that no sensor can have, and for wheels of several kinds.
     """
 
     imu: str = "imu"
-    velocities: tuple[str, ...] = ()
-    poses: tuple[str, ...] = ()
+    velocity: dict[str, VelocityNoise] = field(default_factory=dict[str, VelocityNoise])
+    pose: dict[str, PoseNoise] = field(default_factory=dict[str, PoseNoise])
     odom: str = "odom"
     base: str | None = None
+    initial_pose: PlanarPose | None = None
     history_s: float = 1.0
     imu_noise: ImuNoise = MEMS_NOISE
-    wheels: Wheels | None = None
+    diff_drive: DiffDrive | None = None
+    ackermann: Ackermann | None = None
+    mecanum: Mecanum | None = None
     legs: LegSettings | None = None
 
     def __post_init__(self) -> None:
-        for sensor in (self.imu, *self.velocities, *self.poses):
+        for sensor in (self.imu, *self.velocity, *self.pose):
             check_writer(sensor)
+        kinds = [kind for kind in ("diff_drive", "ackermann", "mecanum") if getattr(self, kind) is not None]
+        if len(kinds) > 1:
+            raise InvalidInput(f"a robot has wheels of one kind, not of {' and '.join(kinds)}")
+
+    @property
+    def wheels(self) -> Wheels | None:
+        """Those of the robot, of whichever kind."""
+        return self.diff_drive or self.ackermann or self.mecanum
 
     @property
     def has_joints(self) -> bool:
@@ -111,63 +121,64 @@ class OdometrySettings:
             if model is None:
                 raise InvalidInput(f"legs need the model of {robot!r}, and there is none")
             legs = self.legs.legs(model, imu_frame.removeprefix(f"{robot}/"))
+        odom, base = full_name(robot, self.odom), full_name(robot, base)
+        start = None
+        if self.initial_pose is not None:
+            x, y, yaw_deg = self.initial_pose
+            start = Transform.from_rpy(odom, base, (x, y, 0.0), (0.0, 0.0, math.radians(yaw_deg)))
         return BaseEstimator(
-            odom=full_name(robot, self.odom),
-            base=full_name(robot, base),
+            odom=odom,
+            base=base,
             imu=full_name(robot, imu_frame),
             buffer=buffer,
             imu_noise=self.imu_noise,
             history_s=self.history_s,
             wheels=self.wheels,
             legs=legs,
+            initial_pose=start,
         )
 
 
 def read_settings(path: str) -> OdometrySettings:
     """The settings in a TOML file. Raises ConfigError, with the line, for unknown and unusable keys."""
     file = TomlFile(Path(path))
-    values: dict[str, Any] = {}
-    for key, value in file.tables.items():
-        if key in _PARTS:
-            part = _built(_PARTS[key], value, file, key)
-            kind = "wheels" if key in _WHEELS else key
-            if kind in values:
-                raise file.error(key, "a robot has wheels of one kind")
-            values[kind] = part
-        else:
-            values[key] = value
-    return _built(OdometrySettings, values, file, "")
+    for kind, noise in (("velocity", VelocityNoise), ("pose", PoseNoise)):
+        for sensor, table in _table(file.tables.get(kind)).items():
+            _converted(table, noise, file, f"{kind}.{sensor}")  # msgspec does not name keys of mappings
+    return _converted(file.tables, OdometrySettings, file, "")
 
 
-def _built(kind: type[T], table: object, file: TomlFile, place: str) -> T:
-    """``kind(**table)``, with errors at ``place``."""
-    if not isinstance(table, dict):
-        raise file.error(place, f"a table of keys and values is needed, not {table!r}")
-    lists = cast("dict[str, Any]", table)
-    values: dict[str, Any] = {
-        key: tuple(cast("list[Any]", value)) if isinstance(value, list) else value
-        for key, value in lists.items()
-    }
-    known = {one.name: one for one in fields(cast("Any", kind))}
-    for key in values:
-        if key not in known:
-            raise file.error(f"{place}.{key}" if place else key, f"unknown key{did_you_mean(key, known)}")
-    required = [
-        name for name, one in known.items() if one.default is MISSING and one.default_factory is MISSING
-    ]
-    if missing := [name for name in required if name not in values]:
-        raise file.error(place, f"{', '.join(missing)} missing")
-    inner: dict[str, type[Any]] = {
-        "noise": LegNoise if kind is LegSettings else WheelNoise,
-        "force": ForceThresholds,
-        "speed": SpeedThresholds,
-    }
-    for key in inner.keys() & values.keys():
-        values[key] = _built(inner[key], values[key], file, f"{place}.{key}")
+def _converted(values: object, kind: type[T], file: TomlFile, place: str) -> T:
+    """``kind(**values)``, with errors at ``place`` or below it."""
+    _check_keys(values, msgspec.inspect.type_info(kind), file, place)
     try:
-        return kind(**values)
-    except (InvalidInput, TypeError) as error:
-        raise file.error(place, str(error)) from None
+        return msgspec.convert(values, kind)
+    except msgspec.ValidationError as error:
+        text, _, below = str(error).partition(" - at `$")
+        raise file.error((place + below.strip("`")).removeprefix("."), text) from None
+
+
+def _check_keys(values: object, kind: msgspec.inspect.Type, file: TomlFile, place: str) -> None:
+    """Raise ConfigError for the first unknown key, which msgspec ignores in what becomes a dataclass."""
+    if isinstance(kind, msgspec.inspect.UnionType):
+        for one in kind.types:
+            _check_keys(values, one, file, place)
+    elif isinstance(kind, msgspec.inspect.DataclassType):
+        known = {one.name: one.type for one in kind.fields}
+        for key, value in _table(values).items():
+            at = f"{place}.{key}" if place else key
+            if key not in known:
+                raise file.error(at, f"unknown key{did_you_mean(key, known)}")
+            _check_keys(value, known[key], file, at)
+
+
+def _table(values: object) -> Mapping[str, Any]:
+    return cast("Mapping[str, Any]", values) if isinstance(values, dict) else {}
+
+
+def others_text(sensor: str, known: Collection[str]) -> str:
+    """The sensors that there are in place of ``sensor``, near misses first; empty if there are none."""
+    return f"; there is {', '.join(map(repr, sorted(known)))}{did_you_mean(sensor, known)}" if known else ""
 
 
 def parse_feet(text: str) -> LegSettings:
@@ -176,6 +187,40 @@ def parse_feet(text: str) -> LegSettings:
     if not all(feet):
         raise InvalidInput(f"feet are names of links with commas between them, not {text!r}")
     return LegSettings(feet=feet)
+
+
+def parse_velocity(text: str) -> tuple[str, VelocityNoise]:
+    """``SENSOR[:sigma=M/S,scale=PART]``: the sensor, and what is stated of its noise. Raises InvalidInput."""
+    return _parse_source(text, VelocityNoise)
+
+
+def parse_pose(text: str) -> tuple[str, PoseNoise]:
+    """``SENSOR[:sigma=M,sigma_deg=DEG]``, likewise."""
+    return _parse_source(text, PoseNoise)
+
+
+def _parse_source(text: str, kind: Callable[..., Noise]) -> tuple[str, Noise]:
+    sensor, colon, stated = text.partition(":")
+    known = msgspec.inspect.type_info(kind)
+    assert isinstance(known, msgspec.inspect.DataclassType)
+    names = [one.name for one in known.fields]
+    values: dict[str, float] = {}
+    for part in stated.split(",") if colon else ():
+        key, _, value = part.strip().partition("=")
+        if key not in names or key in values:
+            raise InvalidInput(
+                f"{part!r} is not part of SENSOR:{','.join(f'{name}=NUMBER' for name in names)}"
+                f"{did_you_mean(key, names)}"
+            )
+        values[key] = _number(key, value)
+    return check_writer(sensor), kind(**values)
+
+
+def _number(key: str, value: str, unit: str = "") -> float:
+    try:
+        return float(value)
+    except ValueError:
+        raise InvalidInput(f"{key} is a number{unit}, not {value!r}") from None
 
 
 def parse_diff_drive(text: str) -> DiffDrive:
@@ -190,10 +235,7 @@ def parse_diff_drive(text: str) -> DiffDrive:
         if sign and value and key in joints:
             joints[key].append(value)
         elif sign and key in ("radius", "track") and key not in lengths:
-            try:
-                lengths[key] = float(value)
-            except ValueError:
-                raise InvalidInput(f"{key} is a number [m], not {value!r}") from None
+            lengths[key] = _number(key, value, " [m]")
         else:
             raise InvalidInput(f"{part!r} is not part of left=JOINT,right=JOINT,radius=M,track=M")
     if missing := [

@@ -1,4 +1,4 @@
-"""Odometry from a recording: the path with its covariances, the NIS of each source, and their plot."""
+"""Odometry from a recording: a table of its sources, the path with its covariances, and their plot."""
 
 # pyright: reportUnknownMemberType=false
 # Matplotlib's annotations leave keyword arguments out
@@ -6,36 +6,65 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.cli.commands.plot import new_figure
-from zstate.cli.odometry_file import OdometrySettings
-from zstate.errors import InvalidInput, NoData
+from zstate.cli.odometry_delay import Delay, Motions
+from zstate.cli.odometry_file import OdometrySettings, others_text
+from zstate.cli.odometry_reference import Comparison, Path, ReferenceName, compared, reference_path
+from zstate.cli.output.text_layout import Table
+from zstate.errors import InvalidInput, NoData, UnknownFrame
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, SourceHealth
+from zstate.odometry.estimator import WHEELS
 from zstate.odometry.fusion import STANDSTILL
 from zstate.odometry.health import WINDOW
-from zstate.odometry.node import add_imu, add_pose, add_velocity
+from zstate.odometry.node import (
+    add_imu,
+    add_pose,
+    add_velocity,
+    pose_covariance,
+    velocity_covariance,
+)
+from zstate.recording.info import recorded_robots
 from zstate.recording.recording import HISTORY_S, Recording
-from zstate.wire.messages import RobotDescription
+from zstate.wire.keys import full_name
+from zstate.wire.messages import (
+    Imu,
+    Odometry,
+    Pose,
+    RobotDescription,
+    Velocity,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
+Stamped = TypeVar("Stamped", Imu, Velocity, Pose, Odometry)
 
 _HEALTH_NS = 500_000_000
 """Interval of the points of the NIS."""
+
+_WIDTH = 80
+"""Of the table [letters]."""
+_LEGEND = (
+    "NIS: mean square of what a number contradicts, in its sigmas; 1 is right. sigma: what the sigmas of the "
+    "source are to be multiplied by for that. delay: so much later are its stamps than those of the IMU, if "
+    "the motion shows it."
+)
+_NEAR = 1.5
+"""Factors of sigmas between this and its inverse are right: real noise is not white."""
 
 _ELLIPSES = 40
 _RADIUS_95 = math.sqrt(-2.0 * math.log(0.05))
@@ -58,7 +87,9 @@ class ReplayedOdometry:
     """The odometry of a recording: states after each reading of the IMU, and the health of the sources.
 
     ``health`` is the last one, ``nis`` by source the points of those in between: seconds since the first
-    state, mean NIS, and its band from low to high.
+    state, mean NIS, and its band from low to high. ``delays`` are those of sources whose stamps the motion
+    determines, ``sigmas`` the medians of the standard deviations of velocities and poses: x y z [m/s], or x y
+    z [m] and the rotation [rad].
     """
 
     base: str
@@ -67,6 +98,9 @@ class ReplayedOdometry:
     nis: dict[str, list[tuple[float, float, float, float]]] = field(
         default_factory=dict[str, list[tuple[float, float, float, float]]]
     )
+    delays: dict[str, Delay] = field(default_factory=dict[str, Delay])
+    sigmas: dict[str, Floats] = field(default_factory=dict[str, Floats])
+    reference: Comparison | None = None
 
     @property
     def positions(self) -> Floats:
@@ -85,41 +119,130 @@ class ReplayedOdometry:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
 
-def replay(path: str, robot: str, settings: OdometrySettings) -> ReplayedOdometry:
+def replay(
+    path: str, robot: str, settings: OdometrySettings, reference: ReferenceName | None = None
+) -> ReplayedOdometry:
     """The odometry of ``robot`` in a recording, from all data in the order of its stamps.
 
-    Raises RecordingError, LookupFailed for unknown mounts, and InvalidInput without readings of the IMU.
+    Without a state, ``ReplayedOdometry.states`` is empty. Raises RecordingError, LookupFailed for unknown
+    mounts, and InvalidInput for a sensor or reference without messages, and without noise.
     """
     mounts, model = TransformBuffer(HISTORY_S), None
+    if reference is not None and reference.stream == "pose" and reference.sensor in settings.pose:
+        raise InvalidInput(f"{reference} is a source: it would judge itself; leave out one of both")
     with Recording(path, robot) as recording:
         for _, message, _ in recording.fill(mounts):
             if isinstance(message, RobotDescription) and model is None:
                 model = parse_urdf(message.urdf, f"the URDF of {robot!r}")
-        readings = list(recording.imu(robot, settings.imu))
-        events: list[Event] = [(one.stamp, True, partial(add_imu, message=one)) for one in readings]
-        for sensor in settings.velocities:
-            events += [
-                (one.stamp, False, partial(add_velocity, sensor=sensor, message=one))
-                for one in recording.velocities(robot, sensor)
-            ]
-        for sensor in settings.poses:
-            events += [
-                (one.stamp, False, partial(add_pose, sensor=sensor, message=one))
-                for one in recording.poses(robot, sensor)
-            ]
+        sensors = _RecordedSensors(recording, robot)
+        readings = sensors.imu(settings.imu)
+        velocities = {name: sensors.velocities(name) for name in settings.velocity}
+        poses = {name: sensors.poses(name) for name in settings.pose}
         joints = recording.joint_states(robot) if settings.has_joints else None
-    if not readings:
+        truth = None if reference is None else sensors.reference(reference)
+    base = settings.base or ("" if model is None else model.root)
+    try:
+        estimator = settings.estimator(robot, base, readings[0].frame, mounts, model)
+    except UnknownFrame as unknown:
+        if unknown.frame_count:
+            raise
         raise InvalidInput(
-            f"{path} has no reading of the IMU {settings.imu!r} of {robot!r}; `zstate info` shows its streams"
-        )
+            f"{path} has no mounts of the sensors of {robot!r}: no model and no static transforms; record "
+            "robot_description or tf_static with them (`zstate info` shows what it has)"
+        ) from None
+    events: list[Event] = [(one.stamp, True, partial(add_imu, message=one)) for one in readings]
+    motions = Motions(mounts, full_name(robot, base), readings)
+    sigmas: dict[str, Floats] = {}
+    delays: dict[str, Delay | None] = {}
+    for name, noise in settings.velocity.items():
+        known = velocities[name]
+        add = partial(add_velocity, sensor=name, noise=noise)
+        events += [(one.stamp, False, partial(add, message=one)) for one in known]
+        sigmas[name] = _median_sigmas(velocity_covariance(name, one, noise) for one in known)
+        delays[name] = motions.delay(*motions.of_velocities(known))
+    for name, noise in settings.pose.items():
+        known = poses[name]
+        add = partial(add_pose, sensor=name, noise=noise)
+        events += [(one.stamp, False, partial(add, message=one)) for one in known]
+        sigmas[name] = _median_sigmas(pose_covariance(name, one, noise) for one in known)
+        delays[name] = motions.delay(motions.of_poses(known), None)
     if joints is not None:
         events += [
             (stamp, False, partial(_add_joints, joints=joints, row=row))
             for row, stamp in enumerate(joints.stamps.tolist())
         ]
-    base = settings.base or ("" if model is None else model.root)
-    estimator = settings.estimator(robot, base, readings[0].frame, mounts, model)
-    return _run(estimator, base, sorted(events, key=itemgetter(0)))
+        if settings.wheels is not None:
+            delays[WHEELS] = motions.delay(*motions.of_wheels(settings.wheels, joints))
+    replayed = _run(estimator, base, sorted(events, key=itemgetter(0)))
+    replayed.sigmas = sigmas
+    replayed.delays = {name: delay for name, delay in delays.items() if delay is not None}
+    if reference is not None and truth is not None and replayed.states:
+        replayed.reference = _against(reference, truth, replayed, mounts)
+    return replayed
+
+
+def _stamp(message: Imu | Velocity | Pose | Odometry) -> int:
+    return message.stamp
+
+
+class _RecordedSensors:
+    """The messages of one robot by sensor, by their stamps.
+
+    Raises InvalidInput, with near misses, for a sensor without any.
+    """
+
+    def __init__(self, recording: Recording, robot: str) -> None:
+        self._recording, self._robot = recording, robot
+
+    def imu(self, sensor: str) -> list[Imu]:
+        return self._some("imu", sensor, self._recording.imu(self._robot, sensor))
+
+    def velocities(self, sensor: str) -> list[Velocity]:
+        return self._some("velocity", sensor, self._recording.velocities(self._robot, sensor))
+
+    def poses(self, sensor: str) -> list[Pose]:
+        return self._some("pose", sensor, self._recording.poses(self._robot, sensor))
+
+    def reference(self, name: ReferenceName) -> Sequence[Pose | Odometry]:
+        if name.stream == "pose":
+            return self.poses(name.sensor)
+        return self._some("odometry", name.sensor, self._recording.odometry(self._robot, name.sensor))
+
+    def _some(self, stream: str, sensor: str, messages: Iterator[Stamped]) -> list[Stamped]:
+        found = sorted(messages, key=_stamp)
+        if found:
+            return found
+        recorded = recorded_robots(self._recording.info)
+        streams = [one for robot in recorded if robot.name == self._robot for one in robot.streams]
+        known = {one.writer for one in streams if one.stream == stream and one.count}
+        raise InvalidInput(
+            f"{self._recording.info.path} has no message on {stream}/{sensor} of {self._robot!r}"
+            f"{others_text(sensor, known)}"
+        )
+
+
+def _median_sigmas(covariances: Iterable[Floats]) -> Floats:
+    return np.median([np.sqrt(np.diag(one)) for one in covariances], axis=0)
+
+
+def _against(
+    name: ReferenceName,
+    messages: Sequence[Pose | Odometry],
+    replayed: ReplayedOdometry,
+    mounts: TransformBuffer,
+) -> Comparison:
+    """The comparison with a reference, at the frame that it measures."""
+    states, first = replayed.states, messages[0]
+    point = np.zeros(3)
+    if isinstance(first, Pose) and first.child:
+        point = mounts.lookup(states[0].odom_from_base.source, first.child).translation
+    poses = [one.odom_from_base for one in states]
+    odometry = Path(
+        np.array([one.stamp for one in states], dtype=np.int64),
+        np.array([(pose.matrix[:3, :3] @ point + pose.translation)[:2] for pose in poses]),
+        np.array([one.covariance.pose[:2, :2] for one in states]),
+    )
+    return compared(str(name), odometry, reference_path(name, messages))
 
 
 def _add_joints(base: BaseEstimator, joints: JointTrajectory, row: int) -> None:
@@ -160,7 +283,13 @@ def _run(base: BaseEstimator, frame: str, events: Sequence[Event]) -> ReplayedOd
 
 
 def report_lines(replayed: ReplayedOdometry) -> Iterator[str]:
-    """The path, its end with one standard deviation, and each source."""
+    """The table of the sources, what to change of them, the path, its end, and the reference."""
+    yield from source_table(replayed).lines(_WIDTH)
+    yield _LEGEND
+    yield from _sigma_lines(replayed)
+    yield from (one.sentence for one in replayed.health if one.sentence)
+    if sentence := _rest_text(replayed):
+        yield sentence
     last = replayed.states[-1]
     x, y, z = last.odom_from_base.translation.tolist()
     sigmas = np.sqrt(np.diag(last.covariance.pose))
@@ -169,10 +298,78 @@ def report_lines(replayed: ReplayedOdometry) -> Iterator[str]:
         f"x {x:.3f} m (sigma {sigmas[0]:.3f}), y {y:.3f} m ({sigmas[1]:.3f}), z {z:.3f} m ({sigmas[2]:.3f}), "
         f"yaw {math.degrees(last.odom_from_base.rpy[2]):.1f} deg ({math.degrees(sigmas[5]):.1f})"
     )
-    if sentence := _rest_text(replayed):
-        yield sentence
+    drift = float(np.hypot(sigmas[0], sigmas[1]))
+    yield f"drift by its own claim: {drift:.3f} m{_part_text(drift, replayed.way_m)}"
+    if replayed.reference is not None:
+        yield from _reference_lines(replayed.reference, replayed.way_m)
+
+
+def source_table(replayed: ReplayedOdometry) -> Table:
+    """A row for each source."""
+    rows = [
+        (
+            one.name,
+            f"{one.rate_hz:.1f}",
+            str(one.accepted) if one.dimension else "-",
+            str(one.rejected) if one.dimension else "-",
+            str(one.too_late),
+            "-" if factor is None else f"{factor**2:.2f}",
+            "-" if factor is None else f"x {factor:.2f}",
+            _delay_text(replayed.delays.get(one.name)),
+        )
+        for one in replayed.health
+        for factor in (sigma_factor(replayed, one),)
+    ]
+    headings = ("source", "rate [Hz]", "used", "rejected", "too late", "NIS", "sigma", "delay [ms]")
+    return Table(headings, rows, optional=("too late", "rate [Hz]"))
+
+
+def sigma_factor(replayed: ReplayedOdometry, health: SourceHealth) -> float | None:
+    """By what the sigmas of a source have to be multiplied for a NIS of 1 a number; None without a NIS.
+
+    It is that of the median of the means, so that a fault for a part of the run does not count.
+    """
+    means = [mean for _, mean, _, _ in replayed.nis.get(health.name, ())]
+    if not means or not health.dimension:
+        return None
+    return math.sqrt(float(np.median(means)) / health.dimension)
+
+
+def _delay_text(delay: Delay | None) -> str:
+    return "-" if delay is None else f"{1e3 * delay.delay_s:.0f} +- {max(1.0, 1e3 * delay.sigma_s):.0f}"
+
+
+def _sigma_lines(replayed: ReplayedOdometry) -> Iterator[str]:
+    """The sigmas to state for sources of velocities and poses whose NIS is far from right."""
     for one in replayed.health:
-        yield health_text(one)
+        factor, sigmas = sigma_factor(replayed, one), replayed.sigmas.get(one.name)
+        if factor is None or sigmas is None or 1.0 / _NEAR < factor < _NEAR:
+            continue
+        fitting = factor * sigmas
+        metres = ", ".join(f"{value:.2g}" for value in fitting[:3])
+        if len(fitting) == 3:
+            yield f"would fit: [velocity.{one.name}] sigma = [{metres}]"
+        else:
+            degrees = ", ".join(f"{math.degrees(value):.2g}" for value in fitting[3:])
+            yield f"would fit: [pose.{one.name}] sigma = [{metres}], sigma_deg = [{degrees}]"
+
+
+def _part_text(error_m: float, way_m: float) -> str:
+    return f", {100.0 * error_m / way_m:.1f} % of the way" if way_m > 0.0 else ""
+
+
+def _reference_lines(found: Comparison, way_m: float) -> Iterator[str]:
+    yield (
+        f"against {found.count} readings of {found.name}: ATE {found.ate_m:.3f} m, error at the end "
+        f"{found.end_m:.3f} m{_part_text(found.end_m, way_m)}"
+    )
+    if found.nees is None or found.end_sigmas is None:
+        yield f"errors in sigmas need the noise of the reference: --reference {found.name}:sigma=METRES"
+        return
+    yield (
+        f"error at the end {found.end_sigmas:.1f} sigma (95 % are below 2.4); NEES of x y {found.nees:.2f} "
+        "(2 is right; above it, the odometry claims too much)"
+    )
 
 
 def _rest_text(replayed: ReplayedOdometry) -> str:
@@ -189,7 +386,7 @@ def _rest_text(replayed: ReplayedOdometry) -> str:
 
 
 def health_text(health: SourceHealth) -> str:
-    """One source on one line."""
+    """One source on one line, as at the end of live odometry."""
     text = f"{health.name}: {health.rate_hz:.1f} Hz"
     if health.dimension:
         low, high = health.nis_band
@@ -255,6 +452,9 @@ def _draw_path(panel: Axes, replayed: ReplayedOdometry) -> None:
         panel.plot(
             x[number] + ellipse[0], y[number] + ellipse[1], color="tab:blue", linewidth=0.6, label=label
         )
+    if replayed.reference is not None:
+        found = replayed.reference
+        panel.plot(*found.positions.T, ".", color="tab:orange", markersize=3.0, label=found.name)
     panel.plot(x[:1], y[:1], "o", color="tab:green", label="first")
     panel.plot(x[-1:], y[-1:], "s", color="tab:red", label="last")
     panel.set(xlabel="x [m]", ylabel="y [m]")

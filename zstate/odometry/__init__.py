@@ -9,6 +9,7 @@ from zstate.odometry.node import OdometryNode, SensorListener
 from zstate.odometry.publishers import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
 from zstate.odometry.requests import request_odometry
 from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
+from zstate.odometry.source_noise import PoseNoise, VelocityNoise
 from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
 __all__ = [
@@ -27,12 +28,14 @@ __all__ = [
     "Mecanum",
     "OdometryNode",
     "OdometryPublisher",
+    "PoseNoise",
     "PosePublisher",
     "SensorListener",
     "SimulatedRover",
     "SimulatedWheels",
     "SourceHealth",
     "SpeedThresholds",
+    "VelocityNoise",
     "VelocityPublisher",
     "WheelNoise",
     "WheelVelocity",

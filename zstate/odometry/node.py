@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
+from types import MappingProxyType
 from typing import Any
+
+import numpy as np
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
@@ -28,6 +31,7 @@ from zstate.odometry.health import SourceHealth
 from zstate.odometry.invariant_filter import Floats
 from zstate.odometry.publishers import OdometryPublisher
 from zstate.odometry.requests import apply_request
+from zstate.odometry.source_noise import PoseNoise, VelocityNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.transform import Transform
 from zstate.wire.keys import Stream, check_robot, odometry_request_key, shortened
@@ -51,26 +55,60 @@ def add_imu(base: BaseEstimator, message: Imu) -> None:
     base.imu(message.stamp, from_block(message.gyro), from_block(message.accel))
 
 
-def add_velocity(base: BaseEstimator, sensor: str, message: Velocity) -> None:
-    """Pass one measurement of ``sensor`` to ``base``. Raises InvalidInput for one without covariance."""
-    if message.covariance is None:
-        raise InvalidInput(f"velocities of {sensor!r} have no covariance: publish them with one")
+def velocity_covariance(sensor: str, message: Velocity, noise: VelocityNoise) -> Floats:
+    """That of the linear velocity [m^2/s^2], (3, 3): by ``noise``, else of the message.
+
+    Raises InvalidInput if neither states it: variances of zero are those of a driver that does not know them.
+    """
+    if noise.sigmas is not None:
+        return np.diag(np.square(noise.sigmas))
+    covariance = None if message.covariance is None else covariance_matrix(message.covariance)[:3, :3]
+    if covariance is None or not np.diag(covariance).all():
+        raise InvalidInput(
+            f"velocities of {sensor!r} have {_unknown(covariance)}: state their noise by `--velocity "
+            f"{sensor}:sigma=0.05`, or sigma = 0.05 [m/s] in [velocity.{sensor}] of the settings"
+        )
+    return covariance
+
+
+def pose_covariance(sensor: str, message: Pose, noise: PoseNoise) -> Floats:
+    """That of a pose, (6, 6), as of ``Transform.covariance``: by ``noise``, else of the message.
+
+    Raises InvalidInput as ``velocity_covariance``.
+    """
+    if noise.sigmas is not None:
+        return np.diag(np.square(noise.sigmas))
+    covariance = None if message.covariance is None else covariance_matrix(message.covariance)
+    if covariance is None or not np.diag(covariance).all():
+        raise InvalidInput(
+            f"poses of {sensor!r} have {_unknown(covariance)}: state their noise by `--pose "
+            f"{sensor}:sigma=0.02,sigma_deg=1`, or sigma = 0.02 [m] and sigma_deg = 1.0 [degrees] in "
+            f"[pose.{sensor}] of the settings"
+        )
+    return covariance
+
+
+def _unknown(covariance: Floats | None) -> str:
+    return "no covariance" if covariance is None else "a covariance with variances of zero"
+
+
+def add_velocity(base: BaseEstimator, sensor: str, noise: VelocityNoise, message: Velocity) -> None:
+    """Pass one measurement of ``sensor`` to ``base``. Raises InvalidInput if its noise is not known."""
     base.velocity(
         message.stamp,
         from_block(message.linear),
-        covariance=covariance_matrix(message.covariance)[:3, :3],
+        covariance=velocity_covariance(sensor, message, noise),
         angular=None if message.angular is None else from_block(message.angular),
         frame=message.frame,
+        scale=noise.scale,
         source=sensor,
     )
 
 
-def add_pose(base: BaseEstimator, sensor: str, message: Pose) -> None:
-    """Pass one measured pose of ``sensor`` to ``base``. Raises InvalidInput for one without covariance."""
-    if message.covariance is None:
-        raise InvalidInput(f"poses of {sensor!r} have no covariance: publish them with one")
+def add_pose(base: BaseEstimator, sensor: str, noise: PoseNoise, message: Pose) -> None:
+    """Pass one measured pose of ``sensor`` to ``base``. Raises InvalidInput if its noise is not known."""
     measured = Transform.from_pose7(message.parent, message.child or base.base, from_block(message.pose))
-    base.pose(message.stamp, measured, covariance_matrix(message.covariance), source=sensor)
+    base.pose(message.stamp, measured, pose_covariance(sensor, message, noise), source=sensor)
 
 
 def add_joints(base: BaseEstimator, model: RobotModel, reading: JointReading) -> None:
@@ -166,11 +204,11 @@ def _failure(error: Exception, place: str) -> tuple[str, str]:
 class OdometryNode(Closeable):
     """Feeds ``base`` with the sensors of ``robot``, and publishes its odometry as ``writer``.
 
-    ``base`` gets the readings of the IMU ``imu``, of the sensors ``velocities`` and ``poses``, and with
-    ``has_joints`` the joint states, from the threads of their subscriptions. Each reading of the IMU
-    publishes the state at its stamp, at most ``rate_hz`` of them a second. If the IMU is silent for 0.1 s,
-    readings of the other sources do; if all are silent, nothing is published. The sentences of
-    ``base.health()`` are the warning in the status of the writer.
+    ``base`` gets the readings of the IMU ``imu``, of the sensors ``velocities`` and ``poses``, each with what
+    is stated of its noise, and with ``has_joints`` the joint states, from the threads of their subscriptions.
+    Each reading of the IMU publishes the state at its stamp, at most ``rate_hz`` of them a second. If the IMU
+    is silent for 0.1 s, readings of the other sources do; if all are silent, nothing is published. The
+    sentences of ``base.health()`` are the warning in the status of the writer.
 
     Readings that are stamped more than 0.5 s after the time of ``clock`` are refused; without ``clock``, the
     clock of this host, or none if that of the buffer of ``base`` is simulated. If time goes back, the node
@@ -187,8 +225,8 @@ class OdometryNode(Closeable):
         base: BaseEstimator,
         *,
         imu: str = "imu",
-        velocities: Collection[str] = (),
-        poses: Collection[str] = (),
+        velocities: Mapping[str, VelocityNoise] = MappingProxyType({}),
+        poses: Mapping[str, PoseNoise] = MappingProxyType({}),
         has_joints: bool = False,
         writer: str = "odometry",
         rate_hz: float | None = None,
@@ -200,7 +238,7 @@ class OdometryNode(Closeable):
         self.failure: Exception | None = None
         self.has_failed = fork_safe(threading.Event())
         self._refusals = Refusals("joint states")
-        self._imu, self._velocities, self._poses = imu, frozenset(velocities), frozenset(poses)
+        self._imu, self._velocities, self._poses = imu, dict(velocities), dict(poses)
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._restart()
@@ -286,14 +324,14 @@ class OdometryNode(Closeable):
         if sensor in self._velocities:
             with self._lock:
                 self._check_stamp(message.stamp)
-                add_velocity(self.base, sensor, message)
+                add_velocity(self.base, sensor, self._velocities[sensor], message)
                 self._publish_without_imu(message.stamp)
 
     def _on_pose(self, sensor: str, message: Pose) -> None:
         if sensor in self._poses:
             with self._lock:
                 self._check_stamp(message.stamp)
-                add_pose(self.base, sensor, message)
+                add_pose(self.base, sensor, self._poses[sensor], message)
                 self._publish_without_imu(message.stamp)
 
     def _on_joints(self, reading: JointReading) -> None:

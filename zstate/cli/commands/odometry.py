@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import click
 
@@ -18,11 +19,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from zstate.cli.odometry_file import LegSettings, OdometrySettings
+    from zstate.cli.odometry_reference import ReferenceName
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
-    from zstate.odometry import DiffDrive, OdometryNode
-    from zstate.wire.messages import Imu
+    from zstate.odometry import DiffDrive, OdometryNode, PoseNoise, VelocityNoise
+    from zstate.wire.messages import Imu, Pose, Velocity
+
+    SensorMessage = Imu | Velocity | Pose
 
 
 def _parse_diff_drive(text: str) -> DiffDrive:
@@ -37,6 +41,24 @@ def _parse_feet(text: str) -> LegSettings:
     return parse_feet(text)
 
 
+def _parse_velocity(text: str) -> tuple[str, VelocityNoise]:
+    from zstate.cli.odometry_file import parse_velocity
+
+    return parse_velocity(text)
+
+
+def _parse_pose(text: str) -> tuple[str, PoseNoise]:
+    from zstate.cli.odometry_file import parse_pose
+
+    return parse_pose(text)
+
+
+def _parse_reference(text: str) -> ReferenceName:
+    from zstate.cli.odometry_reference import parse_reference
+
+    return parse_reference(text)
+
+
 def _parse_plot(file: str) -> Path:
     from zstate.cli.commands.plot import plot_file
 
@@ -49,16 +71,18 @@ def _parse_plot(file: str) -> Path:
 @click.option(
     "--velocity",
     "velocities",
+    type=options.Checked("SENSOR[:sigma=M/S,scale=PART]", _parse_velocity),
     multiple=True,
-    metavar="SENSOR",
-    help="A further stream of measured velocities. Repeatable.",
+    help="A further stream of measured velocities. Its noise is that of its messages, or the standard "
+    "deviation sigma; scale is that of a constant relative error. Repeatable.",
 )
 @click.option(
     "--pose",
     "poses",
+    type=options.Checked("SENSOR[:sigma=M,sigma_deg=DEG]", _parse_pose),
     multiple=True,
-    metavar="SENSOR",
-    help="A further stream of measured poses in the frame of the odometry. Repeatable.",
+    help="A further stream of measured poses in the frame of the odometry. Its noise is that of its "
+    "messages, or sigma and sigma_deg. Repeatable.",
 )
 @click.option(
     "--diff-drive",
@@ -81,6 +105,13 @@ def _parse_plot(file: str) -> Path:
     "--base", metavar="FRAME", help="The frame that is placed in it; default: the root of the model."
 )
 @click.option(
+    "--initial-pose",
+    type=float,
+    nargs=3,
+    metavar="X Y YAW",
+    help="Where the base starts [m, degrees]; default: at the origin, after a second at rest.",
+)
+@click.option(
     "--rate", type=options.RATE, help="Publish so often at most; default: with each reading of the IMU."
 )
 @click.option(
@@ -89,7 +120,13 @@ def _parse_plot(file: str) -> Path:
 @click.option(
     "--replay",
     metavar="RECORDING",
-    help="Compute from a recording instead, and publish nothing: a report of each source.",
+    help="Compute from a recording instead, and publish nothing: a table of its sources.",
+)
+@click.option(
+    "--reference",
+    type=options.Checked("pose/SENSOR[:sigma=M]", _parse_reference),
+    help="Of --replay: compare with poses in the recording, or with odometry/WRITER: ATE, the error at the "
+    "end, NEES. Its noise is that of its messages, or sigma.",
 )
 @click.option(
     "--plot",
@@ -102,16 +139,18 @@ def odometry_command(
     *,
     robot: str,
     imu: str | None,
-    velocities: tuple[str, ...],
-    poses: tuple[str, ...],
+    velocities: tuple[tuple[str, VelocityNoise], ...],
+    poses: tuple[tuple[str, PoseNoise], ...],
     diff_drive: DiffDrive | None,
     feet: LegSettings | None,
     file: str | None,
     odom: str | None,
     base: str | None,
+    initial_pose: tuple[float, float, float] | None,
     rate: float | None,
     writer: str,
     replay: str | None,
+    reference: ReferenceName | None,
     plot: Path | None,
     seconds: float | None,
     network: SessionOptions,
@@ -131,29 +170,34 @@ def odometry_command(
     zstate odometry r1 --imu imu --diff-drive left=lw,right=rw,radius=0.08,track=0.32
     zstate odometry go2 --feet FL_foot,FR_foot,RL_foot,RR_foot
     zstate odometry r1 --file r1.toml
+    zstate odometry r1 --velocity wheels:sigma=0.05                # [m/s]; messages without covariance
     zstate odometry r1 --file r1.toml --replay run.mcap --plot run.png
+    zstate odometry r1 --file r1.toml --replay run.mcap --reference pose/mocap
     """
     from zstate.cli.odometry_file import OdometrySettings, read_settings
 
-    if plot is not None and replay is None:
-        raise click.UsageError("--plot needs --replay RECORDING")
+    for option, value in (("--plot", plot), ("--reference", reference)):
+        if value is not None and replay is None:
+            raise click.UsageError(f"{option} needs --replay RECORDING")
     settings = OdometrySettings() if file is None else read_settings(file)
     given = {
         "imu": imu,
-        "velocities": velocities or None,
-        "poses": poses or None,
+        "velocity": dict(velocities) or None,
+        "pose": dict(poses) or None,
         "odom": odom,
         "base": base,
-        "wheels": diff_drive,
+        "initial_pose": initial_pose,
         "legs": feet,
     }
     settings = replace(settings, **{key: value for key, value in given.items() if value is not None})
-    if not (settings.has_joints or settings.velocities or settings.poses):
+    if diff_drive is not None:
+        settings = replace(settings, diff_drive=diff_drive, ackermann=None, mecanum=None)
+    if not (settings.has_joints or settings.velocity or settings.pose):
         raise click.UsageError(
             "an IMU alone drifts by metres in seconds; add --diff-drive, --feet, --velocity, --pose or --file"
         )
     if replay is not None:
-        _replay(replay, robot, settings, plot)
+        _replay(replay, robot, settings, reference, plot)
         return
     with open_session(network) as session:
         _publish(session, robot, settings, writer=writer, rate_hz=rate, seconds=seconds)
@@ -182,8 +226,8 @@ def _publish(
                 robot,
                 settings.estimator(robot, base, imu_frame, listener.buffer, model),
                 imu=settings.imu,
-                velocities=settings.velocities,
-                poses=settings.poses,
+                velocities=settings.velocity,
+                poses=settings.pose,
                 has_joints=settings.has_joints,
                 writer=writer,
                 rate_hz=rate_hz,
@@ -204,25 +248,31 @@ def _publish(
 def _wait_for_sensors(
     session: Session, robot: str, settings: OdometrySettings, listener: TransformListener
 ) -> tuple[str, str, RobotModel | None]:
-    """The frames of the base and of the IMU, and the model, once the mount is known.
+    """The frames of the base and of the IMU, and the model, once each sensor has sent and the mount is known.
 
-    What is missing is printed. There may be no model with ``settings.base`` and without legs.
+    What is missing is printed. There may be no model with ``settings.base`` and without legs. Raises
+    InvalidInput for a sensor whose noise is not known.
     """
+    from zstate.cli.odometry_file import others_text
     from zstate.cli.waiting import ConditionWaiter
     from zstate.odometry import SensorListener
+    from zstate.odometry.node import pose_covariance, velocity_covariance
     from zstate.sources.joint_state_listener import DescriptionSubscriber
     from zstate.wire.keys import full_name
+    from zstate.wire.messages import Imu
 
     waiter = ConditionWaiter()
     models: dict[str, RobotModel] = {}
-    frames: dict[str, str] = {}
+    heard: dict[str, dict[str, SensorMessage]] = {"imu": {}, "velocity": {}, "pose": {}}
+    """The first message of each sensor, by stream."""
+    needed = {"imu": (settings.imu,), "velocity": (*settings.velocity,), "pose": (*settings.pose,)}
 
     def base() -> str:
         return settings.base or models[robot].root
 
-    def on_imu(sensor: str, message: Imu) -> None:
-        if sensor not in frames:
-            frames[sensor] = message.frame
+    def on_message(stream: str, sensor: str, message: SensorMessage) -> None:
+        if sensor not in heard[stream]:
+            heard[stream][sensor] = message
             waiter.notify()
 
     def on_description(name: str, model: RobotModel) -> None:
@@ -230,33 +280,51 @@ def _wait_for_sensors(
         waiter.notify()
 
     def reason() -> str:
-        if settings.imu not in frames:
-            others = f"; there is {', '.join(sorted(frames))}" if frames else ""
-            return f"{robot!r} has no reading of the IMU {settings.imu!r}{others}"
+        for stream, sensors in needed.items():
+            for sensor in sensors:
+                if sensor not in heard[stream]:
+                    return (
+                        f"{robot!r} has no message on {stream}/{sensor}{others_text(sensor, heard[stream])}"
+                    )
         if robot not in models and settings.legs is not None:
             return f"the model of {robot!r}, which feet need, has no publisher; start it"
         if robot not in models and settings.base is None:
             return f"the model of {robot!r} has no publisher; start it, or give --base"
         try:
-            listener.buffer.lookup(full_name(robot, base()), frames[settings.imu])
+            listener.buffer.lookup(full_name(robot, base()), imu_frame())
         except LookupFailed as missing:
             return str(missing)
         return ""
 
+    def imu_frame() -> str:
+        message = heard["imu"][settings.imu]
+        assert isinstance(message, Imu)
+        return message.frame
+
     listener.add_observer(waiter.notify)
     with (
-        SensorListener(session, robot, on_imu=on_imu),
+        SensorListener(
+            session,
+            robot,
+            on_imu=partial(on_message, "imu"),
+            on_velocity=partial(on_message, "velocity") if settings.velocity else None,
+            on_pose=partial(on_message, "pose") if settings.pose else None,
+        ),
         DescriptionSubscriber(session, robot, on_description),
     ):
         waiter.wait_for(lambda: not reason(), None, reason)
-    return base(), frames[settings.imu], models.get(robot)
+    for sensor, noise in settings.velocity.items():
+        velocity_covariance(sensor, cast("Velocity", heard["velocity"][sensor]), noise)
+    for sensor, noise in settings.pose.items():
+        pose_covariance(sensor, cast("Pose", heard["pose"][sensor]), noise)
+    return base(), imu_frame(), models.get(robot)
 
 
 def _sources_text(settings: OdometrySettings) -> str:
     wheels = ["its wheels"] if settings.wheels is not None else []
     feet = ["its feet"] if settings.legs is not None else []
     return ", ".join(
-        [f"its IMU {settings.imu!r}", *wheels, *feet, *map(repr, (*settings.velocities, *settings.poses))]
+        [f"its IMU {settings.imu!r}", *wheels, *feet, *map(repr, (*settings.velocity, *settings.pose))]
     )
 
 
@@ -268,14 +336,16 @@ def _end_lines(node: OdometryNode) -> Iterator[str]:
         yield health_text(one)
 
 
-def _replay(path: str, robot: str, settings: OdometrySettings, plot: Path | None) -> None:
+def _replay(
+    path: str, robot: str, settings: OdometrySettings, reference: ReferenceName | None, plot: Path | None
+) -> None:
     """Print the report of a recording, and draw it. Ends the command if nothing can be estimated."""
     from zstate.cli.commands.plot import new_figure, save_figure
     from zstate.cli.odometry_replay import odometry_figure, replay, report_lines
 
     if plot is not None:
         new_figure("", 1.0)  # reports a missing Matplotlib before it reads the recording
-    replayed = replay(path, robot, settings)
+    replayed = replay(path, robot, settings, reference)
     if not replayed.states:
         fail(f"{path} has no odometry of {robot!r}: it needs a second of rest, or of readings of the IMU")
     for line in report_lines(replayed):

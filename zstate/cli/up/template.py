@@ -23,8 +23,8 @@ _TABLES = (*LISTS, *SINGLE, "parameters", "include")
 LOOPS = ("robot", "program")
 LOOP_KEYS = ("names", "count", "when")
 
-_PLACE = re.compile(r"(?P<table>\w+)(?:\[(?P<number>\d+)\])?(?:\.(?P<key>[\w-]+))?")
-_HEADER = re.compile(r"\s*\[\[?\s*([\w-]+)")
+_PLACE = re.compile(r"(?P<table>\w+)(?:\[(?P<number>\d+)\])?(?:\.(?P<key>[\w-]+))?(?:\.(?P<inner>[\w-]+))?")
+_HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)")
 _REFERENCE = re.compile(r"\$?\$\{(?P<name>[^{}:]*)(?::-(?P<default>[^{}]*))?\}")
 _TRUE = ("true", "yes", "on", "1")
 _FALSE = ("false", "no", "off", "0", "")
@@ -68,9 +68,12 @@ class TomlFile:
             return None
         lines = self._text.splitlines()
         headers = [_HEADER.match(line) for line in lines]
-        tables = [at for at, one in enumerate(headers, 1) if one and one[1] == match["table"]]
+        table, key = match["table"], match["key"]
+        if any(one and one[1] == f"{table}.{key}" for one in headers):  # [velocity.wheels]
+            table, key = f"{table}.{key}", match["inner"]
+        tables = [at for at, one in enumerate(headers, 1) if one and one[1] == table]
         begin = next(iter(tables[int(match["number"] or 0) :]), None)
-        key = match["table"] if begin is None else match["key"]
+        key = table if begin is None else key
         for number in range(begin or 0, len(lines)):
             if headers[number]:
                 break

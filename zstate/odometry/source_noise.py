@@ -1,0 +1,74 @@
+"""What a user states of the noise of a source of velocities or poses; it takes precedence over messages."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from zstate.errors import InvalidInput
+
+Sigma: TypeAlias = float | tuple[float, float, float]
+"""Standard deviations of x, y and z; one number is that of each."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VelocityNoise:
+    """The noise of measured velocities; one setting for a sensor.
+
+    ``sigma`` [m/s] are standard deviations in the axes of the measured frame; None if messages have them, as
+    covariances. ``scale`` is the standard deviation of a constant relative error, as of a radius of wheels.
+    Raises InvalidInput unless all are finite, and sigmas above zero.
+    """
+
+    sigma: Sigma | None = None
+    scale: float = 0.02
+
+    def __post_init__(self) -> None:
+        _check_sigma("sigma", self.sigma)
+        if not 0.0 <= self.scale < math.inf:
+            raise InvalidInput(f"the scale of a velocity is a part of it, 0 or more; got {self.scale!r}")
+
+    @property
+    def sigmas(self) -> tuple[float, ...] | None:
+        """x y z [m/s]; None if messages have them."""
+        return None if self.sigma is None else _three(self.sigma)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseNoise:
+    """The noise of measured poses; one setting for a sensor.
+
+    ``sigma`` [m] are standard deviations of the position, ``sigma_deg`` [degrees] of the rotation about the
+    axes of the frame in which poses are measured; both are None if messages have them, as covariances. Raises
+    InvalidInput for one without the other, and unless all are finite and above zero.
+    """
+
+    sigma: Sigma | None = None
+    sigma_deg: Sigma | None = None
+
+    def __post_init__(self) -> None:
+        _check_sigma("sigma", self.sigma)
+        _check_sigma("sigma_deg", self.sigma_deg)
+        if (self.sigma is None) != (self.sigma_deg is None):
+            raise InvalidInput(
+                "a pose has both, sigma [m] and sigma_deg [degrees]; give the other one as well"
+            )
+
+    @property
+    def sigmas(self) -> tuple[float, ...] | None:
+        """x y z [m] and the rotation about them [rad]; None if messages have them."""
+        if self.sigma is None or self.sigma_deg is None:
+            return None
+        return (*_three(self.sigma), *map(math.radians, _three(self.sigma_deg)))
+
+
+def _three(sigma: Sigma) -> tuple[float, float, float]:
+    return sigma if isinstance(sigma, tuple) else (sigma, sigma, sigma)
+
+
+def _check_sigma(name: str, sigma: Sigma | None) -> None:
+    if sigma is not None and not all(0.0 < value < math.inf for value in _three(sigma)):
+        raise InvalidInput(
+            f"{name} is a standard deviation above zero, or three for x, y and z; got {sigma!r}"
+        )
