@@ -1,12 +1,229 @@
-"""The report and the figure of replayed odometry; commands/test_odometry.py replays recordings."""
+"""Replayed odometry of a simulated rover's recording: its table, its reference, its report and its figure."""
 
 from __future__ import annotations
 
-import pytest
+import math
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from random import Random
+from typing import NamedTuple
 
-from zstate import Transform, TransformBuffer
-from zstate.cli.odometry_replay import ReplayedOdometry, odometry_figure, report_lines
-from zstate.odometry import BaseEstimator, ImuNoise
+import numpy as np
+import pytest
+from helpers.recording_builder import MS, START, RecordingBuilder
+
+from zstate import Transform, TransformBuffer, load_model
+from zstate.cli.odometry_file import OdometrySettings
+from zstate.cli.odometry_reference import ReferenceName
+from zstate.cli.odometry_replay import (
+    ReplayedOdometry,
+    odometry_figure,
+    replay,
+    report_lines,
+    sigma_factor,
+)
+from zstate.errors import InvalidInput
+from zstate.model.kinematics import Kinematics
+from zstate.odometry import BaseEstimator, DiffDrive, ImuNoise, PoseNoise, SimulatedRover, VelocityNoise
+from zstate.odometry.simulated_rover import ImuReading
+from zstate.sources.square_drive import WheelPair
+from zstate.wire.messages import Imu, Odometry, Pose, Velocity, order_digest, to_block
+
+MODEL = load_model("diffbot")
+NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)
+SETTINGS = OdometrySettings(
+    base="base_footprint",
+    imu_noise=NOISE,
+    diff_drive=DiffDrive("left_wheel_joint", "right_wheel_joint", radius=0.08, track=0.32),
+)
+SECONDS = 40
+FLOW_SIGMA, MOCAP_SIGMA = 0.04, 0.02
+FLOW_DELAY_MS, JOINT_DELAY_MS = 60, 0
+MAP_FROM_ODOM = 3.0, -2.0, 2.0
+"""x y [m] and yaw [rad]."""
+
+
+class Drive(NamedTuple):
+    """What the sensors of a rover measured: joints, velocities along x and poses at their stamps [ns]."""
+
+    imu: list[ImuReading]
+    joints: list[tuple[int, list[float]]]
+    flow: list[tuple[int, float]]
+    poses: list[tuple[int, tuple[float, float, float]]]
+
+
+@cache
+def drive() -> Drive:
+    """A rest of 3 s, then a new speed and turn each second."""
+    kinematics = Kinematics(MODEL).link_poses(MODEL.neutral)
+    mount = Transform.from_pose7("base_footprint", "imu_link", kinematics[MODEL.links.index("imu_link")])
+    wheels = WheelPair(0.08, 0.32)
+    rover = SimulatedRover(wheels, mount, NOISE, slip=0.02, gyro_bias=(0.002, -0.001, 0.003), seed=1)
+    random, found = Random(1), Drive([], [], [], [])
+    rover.advance(START)
+    for n in range(1, 50 * SECONDS + 1):
+        stamp = START + n * 20 * MS
+        if n >= 150 and not n % 50:
+            rover.drive(wheels.roll(random.uniform(0.1, 0.8), random.uniform(-1.0, 1.0)))
+        before = rover.pose
+        found.joints.append((stamp, rover.joints(stamp).positions.tolist()))
+        found.imu.extend(rover.imu(stamp))
+        x, y, yaw = rover.pose
+        along = (x - before.x) * math.cos(yaw) + (y - before.y) * math.sin(yaw)
+        found.flow.append((stamp - 10 * MS, along / 0.02 + random.gauss(0.0, FLOW_SIGMA)))
+        found.poses.append((stamp, (x, y, yaw)))
+    return found
+
+
+def in_map(x: float, y: float, yaw: float) -> tuple[float, float, float]:
+    at_x, at_y, turn = MAP_FROM_ODOM
+    cosine, sine = math.cos(turn), math.sin(turn)
+    return at_x + cosine * x - sine * y, at_y + sine * x + cosine * y, yaw + turn
+
+
+def recorded(
+    path: Path, *, has_mounts: bool = True, covariance: float = 0.0, noise_m: float = MOCAP_SIGMA
+) -> Path:
+    """The drive with the flow sensor late; both have that variance in their messages."""
+    random = Random(2)
+    with RecordingBuilder(path) as builder:
+        write = builder.encoder.write_message
+        if has_mounts:
+            builder.describe("r1", MODEL)
+        for one in drive().imu:
+            message = Imu(one.stamp, 0, 2, "imu_link", to_block(one.gyro), to_block(one.accel))
+            write("r1", message, one.stamp, "imu")
+        for stamp, positions in drive().joints if has_mounts else ():
+            builder.joints("r1", stamp + JOINT_DELAY_MS * MS, positions, model=MODEL)
+        upper = to_block(covariance * np.eye(3)[np.triu_indices(3)])
+        for stamp, speed in drive().flow:
+            late = stamp + FLOW_DELAY_MS * MS
+            flow = Velocity(late, 0, 3, "base_footprint", to_block([speed, 0.0, 0.0]), None, upper)
+            write("r1", flow, late, "flow")
+        upper = to_block(covariance * np.eye(6)[np.triu_indices(6)])
+        for stamp, (x, y, yaw) in drive().poses[::5]:
+            map_x, map_y, turn = in_map(x + random.gauss(0.0, noise_m), y + random.gauss(0.0, noise_m), yaw)
+            placed = to_block([map_x, map_y, 0.0, 0.0, 0.0, math.sin(0.5 * turn), math.cos(0.5 * turn)])
+            write("r1", Pose(stamp, 0, 4, "map", "", placed, upper), stamp, "mocap")
+            edges = (("map", "base_footprint"),)
+            twist = to_block([0.0] * 6)
+            other = Odometry(stamp, 0, 5, order_digest(edges), placed, edges, None, twist)
+            write("r1", other, stamp, "laser")
+    return path
+
+
+def test_table_has_used_rejected_nis_sigma_and_delay_of_each_source(tmp_path: Path):
+    settings = replace(SETTINGS, velocity={"flow": VelocityNoise(sigma=0.5 * FLOW_SIGMA, scale=0.0)})
+    replayed = replay(str(recorded(tmp_path / "r.mcap")), "r1", settings)
+    lines = list(report_lines(replayed))
+    assert lines[0].split("  ")[0] == "source"
+    assert max(map(len, lines[: 1 + len(replayed.health)])) <= 80
+    rows = {line.split()[0]: line for line in lines[1 : 1 + len(replayed.health)]}
+    assert {"flow", "wheels", "imu"} <= rows.keys()
+    assert "delay [ms]" in lines[0]
+    # The stamps of the sensor are 60 ms late, those of the joints are not.
+    for source, delay_ms in (("flow", FLOW_DELAY_MS), ("wheels", JOINT_DELAY_MS)):
+        found = replayed.delays[source]
+        assert found.delay_s * 1e3 == pytest.approx(delay_ms, abs=5.0)
+        assert abs(found.delay_s - delay_ms * 1e-3) < 4.0 * max(found.sigma_s, 1e-3)
+        assert re.search(r"-?\d+ \+- \d+$", rows[source])
+    assert rows["imu"].endswith("-")
+
+
+def test_sigma_that_would_fit_is_that_of_the_sensor(tmp_path: Path):
+    """A sensor of x alone, in time: its y and z are exact, so that the mean of three numbers is 1/3 of x."""
+    settings = replace(
+        SETTINGS, velocity={"flow": VelocityNoise(sigma=(0.2 * FLOW_SIGMA, 1.0, 1.0), scale=0.0)}
+    )
+    replayed = replay(str(recorded(tmp_path / "r.mcap")), "r1", settings)
+    flow = next(one for one in replayed.health if one.name == "flow")
+    factor = sigma_factor(replayed, flow)
+    assert factor is not None
+    assert factor > 1.5
+    (line,) = [line for line in report_lines(replayed) if line.startswith("would fit: [velocity.flow]")]
+    fitting = [float(number) for number in re.findall(r"[\d.]+", line.split("=")[1])]
+    assert fitting == pytest.approx([factor * 0.2 * FLOW_SIGMA, factor, factor], rel=0.05)
+
+
+@pytest.mark.parametrize("stream", ["pose/mocap", "odometry/laser"])
+def test_reference_gives_ate_error_at_the_end_and_nees(tmp_path: Path, stream: str):
+    path = str(recorded(tmp_path / "r.mcap"))
+    name = ReferenceName(*stream.split("/"), sigma=MOCAP_SIGMA)
+    found = replay(path, "r1", SETTINGS, name).reference
+    assert found is not None
+    assert found.count == pytest.approx(len(drive().poses) / 5, abs=10)
+    # Moved back into the frame of the odometry, it is where the rover was.
+    x, y, _ = drive().poses[-5][1]
+    assert found.positions[-1] == pytest.approx([x, y], abs=0.2)
+    assert 0.7 * MOCAP_SIGMA < found.ate_m < 0.3
+    assert found.nees is not None
+    assert found.end_sigmas is not None
+    assert found.nees < 4.0
+    assert found.end_sigmas < 4.0
+    text = "\n".join(report_lines(replay(path, "r1", SETTINGS, name)))
+    assert re.search(
+        rf"against \d+ readings of {stream}: ATE 0.\d+ m, error at the end 0.\d+ m, .* % of", text
+    )
+    assert re.search(r"error at the end \d.\d sigma .*; NEES of x y \d.\d\d \(2 is right", text)
+
+
+def test_reference_without_noise_has_no_errors_in_sigmas(tmp_path: Path):
+    path = str(recorded(tmp_path / "r.mcap"))
+    replayed = replay(path, "r1", SETTINGS, ReferenceName("pose", "mocap"))
+    assert replayed.reference is not None
+    assert replayed.reference.nees is None
+    assert any("--reference pose/mocap:sigma=METRES" in line for line in report_lines(replayed))
+    stated = replay(
+        str(recorded(tmp_path / "s.mcap", covariance=MOCAP_SIGMA**2)),
+        "r1",
+        SETTINGS,
+        ReferenceName("pose", "mocap"),
+    )
+    assert stated.reference is not None
+    assert stated.reference.nees is not None
+
+
+@pytest.mark.parametrize(
+    ("settings", "reference", "error"),
+    [
+        (
+            replace(SETTINGS, imu="imi"),
+            None,
+            r"no message on imu/imi of 'r1'; there is 'imu'; did you mean 'imu'\?",
+        ),
+        (
+            replace(SETTINGS, velocity={"flwo": VelocityNoise()}),
+            None,
+            r"no message on velocity/flwo of 'r1'; there is 'flow'; did you mean 'flow'\?",
+        ),
+        (SETTINGS, ReferenceName("pose", "gps"), r"no message on pose/gps of 'r1'; there is 'mocap'"),
+        (
+            replace(SETTINGS, velocity={"flow": VelocityNoise()}),
+            None,
+            r"velocities of 'flow' have no covariance: .* \[velocity.flow\]",
+        ),
+    ],
+)
+def test_sensor_without_messages_or_noise_is_refused(
+    tmp_path: Path, settings: OdometrySettings, reference: ReferenceName | None, error: str
+):
+    with pytest.raises(InvalidInput, match=error):
+        replay(str(recorded(tmp_path / "r.mcap")), "r1", settings, reference)
+
+
+def test_source_does_not_judge_itself(tmp_path: Path):
+    settings = replace(SETTINGS, pose={"mocap": PoseNoise(sigma=0.02, sigma_deg=1.0)})
+    with pytest.raises(InvalidInput, match="pose/mocap is a source: it would judge itself"):
+        replay(str(tmp_path / "r.mcap"), "r1", settings, ReferenceName("pose", "mocap"))
+
+
+def test_recording_without_mounts_says_what_it_lacks(tmp_path: Path):
+    settings = replace(SETTINGS, diff_drive=None, velocity={"flow": VelocityNoise(sigma=0.1)})
+    with pytest.raises(InvalidInput, match="no model and no static transforms; record robot_description or"):
+        replay(str(recorded(tmp_path / "r.mcap", has_mounts=False)), "r1", settings)
+
 
 Points = list[tuple[float, float, float, float]]
 BAND = 2.67, 3.35
@@ -35,7 +252,7 @@ def replayed(nis: dict[str, Points]) -> ReplayedOdometry:
     ],
 )
 def test_report_explains_a_large_sigma_of_the_yaw(standstill: dict[str, Points], found: str | None):
-    _, *explanations = report_lines(replayed(standstill))
+    explanations = [text for text in report_lines(replayed(standstill)) if text.startswith("no rest")]
     assert [text.partition(", so ")[0] for text in explanations] == ([] if found is None else [found])
     assert all("begin a recording with 3 s at rest" in text for text in explanations)
 

@@ -59,12 +59,15 @@ _HEALTH_NS = 500_000_000
 _WIDTH = 80
 """Of the table [letters]."""
 _LEGEND = (
-    "NIS: mean square of what a number contradicts, in its sigmas; 1 is right. sigma: what the sigmas of the "
-    "source are to be multiplied by for that. delay: so much later are its stamps than those of the IMU, if "
-    "the motion shows it."
+    "NIS: mean square of the innovations in sigmas, by number; 1 is right. sigma: the factor on the sigmas of "
+    "the source that would make it so. delay: how much later its stamps are than those of the IMU, where the "
+    "motion shows it."
 )
 _NEAR = 1.5
 """Factors of sigmas between this and its inverse are right: real noise is not white."""
+
+_MOST_REJECTED = 0.2
+"""Sigmas that are half of what they should be reject a tenth."""
 
 _ELLIPSES = 40
 _RADIUS_95 = math.sqrt(-2.0 * math.log(0.05))
@@ -336,14 +339,21 @@ def sigma_factor(replayed: ReplayedOdometry, health: SourceHealth) -> float | No
 
 
 def _delay_text(delay: Delay | None) -> str:
-    return "-" if delay is None else f"{1e3 * delay.delay_s:.0f} +- {max(1.0, 1e3 * delay.sigma_s):.0f}"
+    if delay is None:
+        return "-"
+    return f"{round(1e3 * delay.delay_s)} +- {max(1, round(1e3 * delay.sigma_s))}"
 
 
 def _sigma_lines(replayed: ReplayedOdometry) -> Iterator[str]:
-    """The sigmas to state for sources of velocities and poses whose NIS is far from right."""
+    """The sigmas to state for sources of velocities and poses whose NIS is far from right.
+
+    None if much was rejected: what contradicts for a while, such as slip or a lost estimate, is no noise.
+    """
     for one in replayed.health:
         factor, sigmas = sigma_factor(replayed, one), replayed.sigmas.get(one.name)
         if factor is None or sigmas is None or 1.0 / _NEAR < factor < _NEAR:
+            continue
+        if one.rejected > _MOST_REJECTED * (one.accepted + one.rejected):
             continue
         fitting = factor * sigmas
         metres = ", ".join(f"{value:.2g}" for value in fitting[:3])
