@@ -59,15 +59,15 @@ _HEALTH_NS = 500_000_000
 _WIDTH = 80
 """Of the table [letters]."""
 _LEGEND = (
-    "NIS: mean square of the innovations in sigmas, by number; 1 is right. sigma: the factor on the sigmas of "
-    "the source that would make it so. delay: how much later its stamps are than those of the IMU, where the "
-    "motion shows it."
+    "NIS: mean square of the innovations in sigmas, by number; 1 is right. sigma: the factor on the "
+    "sigmas of the source that would make it so. delay: how much later its stamps are than those of the IMU, "
+    "where the motion shows it."
 )
 _NEAR = 1.5
 """Factors of sigmas between this and its inverse are right: real noise is not white."""
 
-_MOST_REJECTED = 0.2
-"""Sigmas that are half of what they should be reject a tenth."""
+_UNSTEADY = 10.0
+"""The 90 % quantile of the NIS over its median, if it was not noise that was wrong but a part of the run."""
 
 _ELLIPSES = 40
 _RADIUS_95 = math.sqrt(-2.0 * math.log(0.05))
@@ -347,13 +347,14 @@ def _delay_text(delay: Delay | None) -> str:
 def _sigma_lines(replayed: ReplayedOdometry) -> Iterator[str]:
     """The sigmas to state for sources of velocities and poses whose NIS is far from right.
 
-    None if much was rejected: what contradicts for a while, such as slip or a lost estimate, is no noise.
+    None if the NIS is not steady: what contradicts for a part of the run, as a lost estimate, is no noise.
     """
     for one in replayed.health:
         factor, sigmas = sigma_factor(replayed, one), replayed.sigmas.get(one.name)
         if factor is None or sigmas is None or 1.0 / _NEAR < factor < _NEAR:
             continue
-        if one.rejected > _MOST_REJECTED * (one.accepted + one.rejected):
+        means = [mean for _, mean, _, _ in replayed.nis[one.name]]
+        if np.quantile(means, 0.9) > _UNSTEADY * np.median(means):
             continue
         fitting = factor * sigmas
         metres = ", ".join(f"{value:.2g}" for value in fitting[:3])
