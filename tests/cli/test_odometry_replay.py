@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers.recording_builder import MS, START, RecordingBuilder
+from helpers.recording_builder import MS, START, RecordingBuilder, pose
 
 from zstate import Transform, TransformBuffer, load_model
 from zstate.cli.odometry_file import OdometrySettings
@@ -83,19 +83,16 @@ def in_map(x: float, y: float, yaw: float) -> tuple[float, float, float]:
     return at_x + cosine * x - sine * y, at_y + sine * x + cosine * y, yaw + turn
 
 
-def recorded(
-    path: Path, *, has_mounts: bool = True, covariance: float = 0.0, noise_m: float = MOCAP_SIGMA
-) -> Path:
+def recorded(path: Path, *, covariance: float = 0.0) -> Path:
     """The drive with the flow sensor late; both have that variance in their messages."""
     random = Random(2)
     with RecordingBuilder(path) as builder:
         write = builder.encoder.write_message
-        if has_mounts:
-            builder.describe("r1", MODEL)
+        builder.describe("r1", MODEL)
         for one in drive().imu:
             message = Imu(one.stamp, 0, 2, "imu_link", to_block(one.gyro), to_block(one.accel))
             write("r1", message, one.stamp, "imu")
-        for stamp, positions in drive().joints if has_mounts else ():
+        for stamp, positions in drive().joints:
             builder.joints("r1", stamp + JOINT_DELAY_MS * MS, positions, model=MODEL)
         upper = to_block(covariance * np.eye(3)[np.triu_indices(3)])
         for stamp, speed in drive().flow:
@@ -104,7 +101,9 @@ def recorded(
             write("r1", flow, late, "flow")
         upper = to_block(covariance * np.eye(6)[np.triu_indices(6)])
         for stamp, (x, y, yaw) in drive().poses[::5]:
-            map_x, map_y, turn = in_map(x + random.gauss(0.0, noise_m), y + random.gauss(0.0, noise_m), yaw)
+            map_x, map_y, turn = in_map(
+                x + random.gauss(0.0, MOCAP_SIGMA), y + random.gauss(0.0, MOCAP_SIGMA), yaw
+            )
             placed = to_block([map_x, map_y, 0.0, 0.0, 0.0, math.sin(0.5 * turn), math.cos(0.5 * turn)])
             write("r1", Pose(stamp, 0, 4, "map", "", placed, upper), stamp, "mocap")
             edges = (("map", "base_footprint"),)
@@ -219,10 +218,32 @@ def test_source_does_not_judge_itself(tmp_path: Path):
         replay(str(tmp_path / "r.mcap"), "r1", settings, ReferenceName("pose", "mocap"))
 
 
-def test_recording_without_mounts_says_what_it_lacks(tmp_path: Path):
-    settings = replace(SETTINGS, diff_drive=None, velocity={"flow": VelocityNoise(sigma=0.1)})
-    with pytest.raises(InvalidInput, match="no model and no static transforms; record robot_description or"):
-        replay(str(recorded(tmp_path / "r.mcap", has_mounts=False)), "r1", settings)
+@pytest.mark.parametrize(
+    ("has_edges", "base", "error"),
+    [
+        (
+            False,
+            "base_link",
+            "it has no model and no static transforms; record robot_description or tf_static",
+        ),
+        (True, "base_link", "'r1/imu_link' is unknown among .*; record robot_description or tf_static"),
+        (True, None, "has no model of 'r1', whose root would be the base; give --base"),
+    ],
+)
+def test_recording_without_mounts_says_what_it_lacks(
+    tmp_path: Path, has_edges: bool, base: str | None, error: str
+):
+    path = tmp_path / "r.mcap"
+    with RecordingBuilder(path) as builder:
+        at_rest = to_block([0.0, 0.0, 0.0]), to_block([0.0, 0.0, 9.81])
+        builder.encoder.write_message("r1", Imu(START, 0, 2, "imu_link", *at_rest), START, "imu")
+        upper = to_block(np.eye(3)[np.triu_indices(3)])
+        flow = Velocity(START, 0, 3, "base_link", to_block([0.0, 0.0, 0.0]), None, upper)
+        builder.encoder.write_message("r1", flow, START, "flow")
+        if has_edges:
+            builder.edges("r1", START, {("odom", "base_link"): pose()}, writer="other")
+    with pytest.raises(InvalidInput, match=error):
+        replay(str(path), "r1", OdometrySettings(base=base, velocity={"flow": VelocityNoise()}))
 
 
 Points = list[tuple[float, float, float, float]]

@@ -21,7 +21,7 @@ from zstate.cli.odometry_delay import Delay, Motions
 from zstate.cli.odometry_file import OdometrySettings, others_text
 from zstate.cli.odometry_reference import Comparison, Path, ReferenceName, compared, reference_path
 from zstate.cli.output.text_layout import Table
-from zstate.errors import InvalidInput, NoData, UnknownFrame
+from zstate.errors import InvalidInput, LookupFailed, NoData, UnknownFrame
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, SourceHealth
@@ -127,8 +127,8 @@ def replay(
 ) -> ReplayedOdometry:
     """The odometry of ``robot`` in a recording, from all data in the order of its stamps.
 
-    Without a state, ``ReplayedOdometry.states`` is empty. Raises RecordingError, LookupFailed for unknown
-    mounts, and InvalidInput for a sensor or reference without messages, and without noise.
+    Without a state, ``ReplayedOdometry.states`` is empty. Raises RecordingError, and InvalidInput for unknown
+    mounts, for a sensor or reference without messages, and for one without noise.
     """
     mounts, model = TransformBuffer(HISTORY_S), None
     if reference is not None and reference.stream == "pose" and reference.sensor in settings.pose:
@@ -143,14 +143,16 @@ def replay(
         poses = {name: sensors.poses(name) for name in settings.pose}
         joints = recording.joint_states(robot) if settings.has_joints else None
         truth = None if reference is None else sensors.reference(reference)
-    base = settings.base or ("" if model is None else model.root)
+    base = settings.base or (None if model is None else model.root)
+    if base is None:
+        raise InvalidInput(f"{path} has no model of {robot!r}, whose root would be the base; give --base")
     try:
         estimator = settings.estimator(robot, base, readings[0].frame, mounts, model)
-    except UnknownFrame as unknown:
-        if unknown.frame_count:
-            raise
+    except LookupFailed as failure:
+        is_empty = isinstance(failure, UnknownFrame) and not failure.frame_count
         raise InvalidInput(
-            f"{path} has no mounts of the sensors of {robot!r}: no model and no static transforms; record "
+            f"{path} does not have the mounts of the sensors of {robot!r}: "
+            f"{'it has no model and no static transforms' if is_empty else failure}; record "
             "robot_description or tf_static with them (`zstate info` shows what it has)"
         ) from None
     events: list[Event] = [(one.stamp, True, partial(add_imu, message=one)) for one in readings]
