@@ -71,7 +71,8 @@ def _parse_plot(file: str) -> Path:
 @click.option(
     "--velocity",
     "velocities",
-    type=options.Checked("SENSOR[:sigma=M/S,scale=PART]", _parse_velocity),
+    metavar="SENSOR[:sigma=M/S,scale=PART]",
+    type=options.Checked("SENSOR", _parse_velocity),
     multiple=True,
     help="A further stream of measured velocities. Its noise is that of its messages, or the standard "
     "deviation sigma; scale is that of a constant relative error. Repeatable.",
@@ -79,7 +80,8 @@ def _parse_plot(file: str) -> Path:
 @click.option(
     "--pose",
     "poses",
-    type=options.Checked("SENSOR[:sigma=M,sigma_deg=DEG]", _parse_pose),
+    metavar="SENSOR[:sigma=M,sigma_deg=DEG]",
+    type=options.Checked("SENSOR", _parse_pose),
     multiple=True,
     help="A further stream of measured poses in the frame of the odometry. Its noise is that of its "
     "messages, or sigma and sigma_deg. Repeatable.",
@@ -124,7 +126,8 @@ def _parse_plot(file: str) -> Path:
 )
 @click.option(
     "--reference",
-    type=options.Checked("pose/SENSOR[:sigma=M]", _parse_reference),
+    metavar="pose/SENSOR[:sigma=M]",
+    type=options.Checked("REFERENCE", _parse_reference),
     help="Of --replay: compare with poses in the recording, or with odometry/WRITER: ATE, the error at the "
     "end, NEES. Its noise is that of its messages, or sigma.",
 )
