@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers.recording_builder import MS, START, RecordingBuilder, pose
+from helpers.recording_builder import MS, START, STORE, Bag, RecordingBuilder, S, pose
 
 from zstate import Transform, TransformBuffer, load_model
 from zstate.cli.odometry_file import OdometrySettings
@@ -54,13 +54,16 @@ class Drive(NamedTuple):
     poses: list[tuple[int, tuple[float, float, float]]]
 
 
+def drive_mount() -> Transform:
+    poses = Kinematics(MODEL).link_poses(MODEL.neutral)
+    return Transform.from_pose7("base_footprint", "imu_link", poses[MODEL.links.index("imu_link")])
+
+
 @cache
 def drive() -> Drive:
     """A rest of 3 s, then a new speed and turn each second."""
-    kinematics = Kinematics(MODEL).link_poses(MODEL.neutral)
-    mount = Transform.from_pose7("base_footprint", "imu_link", kinematics[MODEL.links.index("imu_link")])
     wheels = WheelPair(0.08, 0.32)
-    rover = SimulatedRover(wheels, mount, NOISE, slip=0.02, gyro_bias=(0.002, -0.001, 0.003), seed=1)
+    rover = SimulatedRover(wheels, drive_mount(), NOISE, slip=0.02, gyro_bias=(0.002, -0.001, 0.003), seed=1)
     random, found = Random(1), Drive([], [], [], [])
     rover.advance(START)
     for n in range(1, 50 * SECONDS + 1):
@@ -168,6 +171,47 @@ def test_reference_gives_ate_error_at_the_end_and_nees(tmp_path: Path, stream: s
     assert re.search(r"error at the end \d.\d sigma .*; NEES of x y \d.\d\d \(2 is right", text)
 
 
+def test_bag_of_ros_has_sources_and_references_by_the_names_of_their_topics(tmp_path: Path):
+    """/imu/data, /wheels/twist without covariance, and nav_msgs/Odometry of a reference."""
+    types = STORE.types
+
+    def vector(x: float, y: float, z: float) -> object:
+        return types["geometry_msgs/msg/Vector3"](float(x), float(y), float(z))
+
+    def twist(x: float) -> object:
+        moving = types["geometry_msgs/msg/Twist"](vector(x, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+        return types["geometry_msgs/msg/TwistWithCovariance"](moving, np.zeros(36))
+
+    def header(stamp: int, frame: str) -> object:
+        return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(stamp, S)), frame)
+
+    mount = Transform.from_pose7("base_link", "imu_link", drive_mount().pose7)
+    with Bag(tmp_path / "bag") as bag:
+        bag.tf(START, [mount], "/tf_static")
+        level, unknown = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0), np.zeros(9)
+        for one in drive().imu:
+            kind = "sensor_msgs/msg/Imu"
+            parts = (level, unknown, vector(*one.gyro), unknown, vector(*one.accel), unknown)
+            bag.write("/imu/data", one.stamp, types[kind](header(one.stamp, "imu_link"), *parts), kind)
+        for stamp, speed in drive().flow:
+            kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
+            message = types[kind](header(stamp, "base_link"), twist(speed))
+            bag.write("/wheels/twist", stamp, message, kind)
+        for stamp, (x, y, yaw) in drive().poses[::5]:
+            kind = "nav_msgs/msg/Odometry"
+            turned = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
+            placed = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](x, y, 0.0), turned)
+            posed = types["geometry_msgs/msg/PoseWithCovariance"](placed, np.zeros(36))
+            message = types[kind](header(stamp, "world"), "truth_link", posed, twist(0.0))
+            bag.write("/truth/odom", stamp, message, kind)
+    stated = {"wheels_twist": VelocityNoise(sigma=FLOW_SIGMA)}
+    settings = OdometrySettings(imu="imu_data", base="base_link", imu_noise=NOISE, velocity=stated)
+    replayed = replay(str(tmp_path / "bag"), "ros", settings, ReferenceName("odometry", "truth_odom"))
+    assert replayed.reference is not None
+    assert replayed.reference.ate_m < 0.5
+    assert replayed.delays["wheels_twist"].delay_s == pytest.approx(0.0, abs=0.01)
+
+
 def test_reference_without_noise_has_no_errors_in_sigmas(tmp_path: Path):
     path = str(recorded(tmp_path / "r.mcap"))
     replayed = replay(path, "r1", SETTINGS, ReferenceName("pose", "mocap"))
@@ -196,6 +240,13 @@ def test_reference_without_noise_has_no_errors_in_sigmas(tmp_path: Path):
             replace(SETTINGS, velocity={"flwo": VelocityNoise()}),
             None,
             r"no message on velocity/flwo of 'r1'; there is 'flow'; did you mean 'flow'\?",
+        ),
+        (
+            replace(
+                SETTINGS, diff_drive=DiffDrive("left_wheel", "right_wheel_joint", radius=0.08, track=0.32)
+            ),
+            None,
+            r"joint positions lack 'left_wheel' of the wheels; did you mean 'left_wheel_joint'\?",
         ),
         (SETTINGS, ReferenceName("pose", "gps"), r"no message on pose/gps of 'r1'; there is 'mocap'"),
         (

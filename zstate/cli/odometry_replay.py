@@ -176,9 +176,9 @@ def replay(
             (stamp, False, partial(_add_joints, joints=joints, row=row))
             for row, stamp in enumerate(joints.stamps.tolist())
         ]
-        if settings.wheels is not None:
-            delays[WHEELS] = motions.delay(*motions.of_wheels(settings.wheels, joints))
-    replayed = _run(estimator, base, sorted(events, key=itemgetter(0)))
+    replayed = _run(estimator, base, sorted(events, key=itemgetter(0)))  # checks the joints of the wheels
+    if joints is not None and settings.wheels is not None:
+        delays[WHEELS] = motions.delay(*motions.of_wheels(settings.wheels, joints))
     replayed.sigmas = sigmas
     replayed.delays = {name: delay for name, delay in delays.items() if delay is not None}
     if reference is not None and truth is not None and replayed.states:

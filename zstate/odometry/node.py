@@ -58,12 +58,12 @@ def add_imu(base: BaseEstimator, message: Imu) -> None:
 def velocity_covariance(sensor: str, message: Velocity, noise: VelocityNoise) -> Floats:
     """That of the linear velocity [m^2/s^2], (3, 3): by ``noise``, else of the message.
 
-    Raises InvalidInput if neither states it: variances of zero are those of a driver that does not know them.
+    Raises InvalidInput if neither states it: a driver that does not know variances sends zero or -1.
     """
     if noise.sigmas is not None:
         return np.diag(np.square(noise.sigmas))
     covariance = None if message.covariance is None else covariance_matrix(message.covariance)[:3, :3]
-    if covariance is None or not np.diag(covariance).all():
+    if covariance is None or not (np.diag(covariance) > 0.0).all():
         raise InvalidInput(
             f"velocities of {sensor!r} have {_unknown(covariance)}: state their noise by `--velocity "
             f"{sensor}:sigma=0.05`, or sigma = 0.05 [m/s] in [velocity.{sensor}] of the settings"
@@ -79,7 +79,7 @@ def pose_covariance(sensor: str, message: Pose, noise: PoseNoise) -> Floats:
     if noise.sigmas is not None:
         return np.diag(np.square(noise.sigmas))
     covariance = None if message.covariance is None else covariance_matrix(message.covariance)
-    if covariance is None or not np.diag(covariance).all():
+    if covariance is None or not (np.diag(covariance) > 0.0).all():
         raise InvalidInput(
             f"poses of {sensor!r} have {_unknown(covariance)}: state their noise by `--pose "
             f"{sensor}:sigma=0.02,sigma_deg=1`, or sigma = 0.02 [m] and sigma_deg = 1.0 [degrees] in "
@@ -89,7 +89,7 @@ def pose_covariance(sensor: str, message: Pose, noise: PoseNoise) -> Floats:
 
 
 def _unknown(covariance: Floats | None) -> str:
-    return "no covariance" if covariance is None else "a covariance with variances of zero"
+    return "no covariance" if covariance is None else "a covariance with variances that are not above zero"
 
 
 def add_velocity(base: BaseEstimator, sensor: str, noise: VelocityNoise, message: Velocity) -> None:
