@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from helpers.base_motion import mounted, stamp_at, tilted_mount
 
-from zstate import InvalidInput, NoData, Transform
+from zstate import InFuture, InPast, InvalidInput, NoData, Transform
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, ImuNoise, LegNoise, Legs, WheelNoise, Wheels
 from zstate.odometry.invariant_filter import GRAVITY, Floats
@@ -412,7 +412,7 @@ def run(
     def read(t: float) -> None:
         try:
             errors.append(errors_of(drive, base.state(stamp_at(t)), first_t))
-        except NoData:
+        except (NoData, InFuture, InPast):
             missing.append(t)
         for source in base.health():
             if source.sentence:
