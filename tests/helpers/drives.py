@@ -318,7 +318,7 @@ def compass_calls(
     calls: list[Call] = []
     for t in np.arange(0.004, drive.seconds, 1.0 / hertz).tolist():
         yaw = float(drive.at(drive.yaw, t))
-        measured = yaw + 1.0 + hard_iron * math.sin(yaw + 0.5) + random.normal(0.0, 0.2 * sigma)
+        measured = yaw + 1.0 + hard_iron * math.sin(yaw + 0.5) + random.normal(0.0, sigma)
         calls.append(Call(t, "heading", (math.remainder(measured, math.tau), sigma), {"source": "compass"}))
     return calls
 

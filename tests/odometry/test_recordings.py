@@ -1,0 +1,184 @@
+"""BaseEstimator on recordings of wheeled robots, with the settings of `zstate odometry`, none of them tuned.
+
+The errors of one drive are one sample: bounds are dead reckoning by wheels and gyro, and the estimator's own claims.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers import recordings
+from helpers.drives import Call
+from helpers.recordings import HUSKY_REST_S, WHEELS, Recording, Score, Track, calls_of, played, score
+
+from zstate import Transform
+
+THREE_SIGMA = 3.5
+NO_WORSE = 1.1
+"""A drive with GPS errors of 0.8 to 1.7 m tells errors of 3 m apart by no more than a tenth."""
+
+
+@cache
+def husky() -> Recording:
+    return recordings.load("husky")
+
+
+@cache
+def jackal() -> Recording:
+    return recordings.load("jackal")
+
+
+@cache
+def track_of(*, as_joints: bool = False, has_compass: bool = False, start: float = 0.0) -> Track:
+    calls = calls_of(husky(), as_joints=as_joints, has_compass=has_compass, start=start)
+    return played(husky(), calls, wheels=WHEELS if as_joints else None)
+
+
+def dead_reckoning(start: float = 0.0) -> float:
+    t, path = recordings.dead_reckoned(husky(), start=start)
+    return recordings.error_of(husky(), t, path)
+
+
+def changed_score(calls: list[Call], mount: Transform | None = None) -> tuple[Score, Track]:
+    track = played(husky(), calls, mount=mount)
+    return score(husky(), track), track
+
+
+def without(kind: str, begin: float, end: float) -> list[Call]:
+    return [call for call in calls_of(husky()) if call.kind != kind or not begin <= call.t < end]
+
+
+def imu_in_base(rate_factor: float, rate_offset: float) -> list[Call]:
+    """The calls with another yaw rate of the IMU."""
+    turn, calls = husky().mount.matrix[:3, :3], calls_of(husky())
+    for row, call in enumerate(calls):
+        if call.kind == "imu":
+            rate = turn @ call.values[0]
+            rate[2] = rate[2] * rate_factor + rate_offset
+            calls[row] = call._replace(values=(turn.T @ rate, call.values[1]))
+    return calls
+
+
+def frozen(begin: float, end: float) -> list[Call]:
+    """The calls with an IMU that repeats its last sample."""
+    calls, last = calls_of(husky()), None
+    for row, call in enumerate(calls):
+        if call.kind == "imu":
+            if last is not None and begin <= call.t < end:
+                calls[row] = call._replace(values=last)
+            else:
+                last = call.values
+    return calls
+
+
+def test_wheels_and_gyro_alone_are_three_metres_off_after_359_metres():
+    """The baseline of the others, by an integration that has nothing of the estimator."""
+    assert dead_reckoning() == pytest.approx(3.06, abs=0.01)
+
+
+@pytest.mark.parametrize("start", [0.0, HUSKY_REST_S], ids=["in motion", "at rest"])
+@pytest.mark.parametrize("has_compass", [False, True], ids=["no compass", "bad compass"])
+@pytest.mark.parametrize("as_joints", [False, True], ids=["velocity", "joints"])
+def test_a_husky_is_found_as_well_as_by_dead_reckoning_and_inside_its_claim(
+    as_joints: bool, has_compass: bool, start: float
+):
+    track = track_of(as_joints=as_joints, has_compass=has_compass, start=start)
+    found = score(husky(), track)
+    assert found.error <= NO_WORSE * dead_reckoning(start)
+    assert found.end_sigmas < THREE_SIGMA
+    assert found.nees < 4.0  # 2 is expected, of errors that are one sample
+    assert track.way == pytest.approx(359.0 if start == 0.0 else 130.0, rel=0.03)
+
+
+@pytest.mark.parametrize("as_joints", [False, True], ids=["velocity", "joints"])
+def test_a_pose_in_odom_is_continuous(as_joints: bool):
+    """REP-105: no state is further from the last one than its velocity explains, at 10 Hz."""
+    assert track_of(as_joints=as_joints, has_compass=True).longest_jump < 0.1
+    assert track_of(as_joints=as_joints).longest_jump < 0.1
+
+
+@pytest.mark.parametrize("wheel_step", [1, 3])
+@pytest.mark.parametrize("as_joints", [False, True], ids=["velocity", "joints"])
+def test_slow_sensors_cost_accuracy_and_no_more(as_joints: bool, wheel_step: int):
+    """The IMU at 10 Hz, and the wheels at 10 or 3.3 Hz."""
+    calls = calls_of(husky(), as_joints=as_joints, imu_step=3, wheel_step=wheel_step)
+    track = played(husky(), calls, wheels=WHEELS if as_joints else None)
+    found = score(husky(), track)
+    assert found.error < 2.0 * dead_reckoning()
+    assert found.end_sigmas < THREE_SIGMA
+
+
+def test_wheels_five_percent_too_fast_are_inside_the_claim():
+    calls = [
+        call._replace(values=(tuple(1.05 * part for part in call.values[0]),)) if call.kind == "velocity" else call
+        for call in calls_of(husky())
+    ]
+    found, _ = changed_score(calls)
+    assert found.error < 2.0 * dead_reckoning()  # 359 m times 5 % in a round
+    assert found.end_sigmas < THREE_SIGMA
+
+
+def test_a_gyro_whose_bias_is_far_off_is_inside_the_claim():
+    """0.02 rad/s, two sigmas of a start in motion: a quarter of a turn in each 80 s."""
+    found, _ = changed_score(imu_in_base(1.0, 0.02))
+    assert found.error < 15.0
+    assert found.end_sigmas < THREE_SIGMA
+
+
+def test_a_mount_that_is_wrong_by_five_degrees_costs_little_and_the_height_is_inside_its_claim():
+    angle = math.radians(5.0)
+    wrong = Transform.from_rpy("base_link", "base_link_wrong", (0.0, 0.0, 0.0), (angle, angle, 0.0)).matrix
+    turned = wrong @ husky().mount.matrix
+    turned[:3, 3] = husky().mount.translation
+    found, track = changed_score(calls_of(husky()), Transform.from_matrix("base_link", "imu_link", turned))
+    assert found.error < 2.0 * dead_reckoning()
+    assert found.end_sigmas < THREE_SIGMA
+    heights, sigmas = track.poses[:, 2], np.sqrt(track.covariances[:, 2, 2])
+    assert (np.abs(heights) < THREE_SIGMA * sigmas).all() or track.sentences
+
+
+@pytest.mark.parametrize("kind", ["velocity", "imu"])
+def test_thirty_seconds_without_a_source_are_inside_the_claim(kind: str):
+    found, track = changed_score(without(kind, 150.0, 180.0))
+    assert found.error < 5.0 * dead_reckoning()
+    assert found.end_sigmas < THREE_SIGMA
+    assert any("silent" in sentence for sentence in track.sentences.values())
+
+
+@pytest.mark.parametrize(
+    "calls",
+    [pytest.param(lambda: imu_in_base(-1.0, 0.0), id="mirrored"), pytest.param(lambda: frozen(150.0, 1e9), id="frozen")],
+)  # fmt: skip
+def test_a_gyro_that_contradicts_the_wheels_is_named_and_the_base_does_not_fly_off(calls: object):
+    assert callable(calls)
+    _, track = changed_score(calls())
+    assert any("gyro" in sentence or "imu" in sentence for sentence in track.sentences.values())
+    assert np.linalg.norm(track.live[:, 4:], axis=1).max() < 3.0  # it drives 1 m/s
+
+
+def test_late_and_shuffled_data_of_a_recording_change_nothing():
+    random = np.random.default_rng(0)
+    calls = calls_of(husky())[:6000]
+    arrivals = [call.t + random.uniform(0.0, 0.3) for call in calls]
+    shuffled = [calls[row] for row in np.argsort(arrivals, kind="stable")]
+    first, second = (played(husky(), one) for one in (calls, shuffled))
+    np.testing.assert_allclose(first.poses[:-2], second.poses[: len(first.poses) - 2], atol=1e-9)
+
+
+@pytest.mark.parametrize("as_joints", [False, True], ids=["velocity", "joints"])
+@pytest.mark.parametrize("has_compass", [False, True], ids=["no compass", "true compass"])
+def test_a_jackal_that_turns_before_it_drives_keeps_its_yaw(has_compass: bool, as_joints: bool):
+    """The raw gyro drifts 1.5 degrees in this minute."""
+    calls = calls_of(jackal(), as_joints=as_joints, has_compass=has_compass)
+    track = played(jackal(), calls, wheels=WHEELS if as_joints else None)
+    truth = np.unwrap(jackal().compass[:, 1])
+    at = np.interp(track.t, jackal().compass[:, 0], truth)
+    errors = np.unwrap(track.poses[:, 3]) - at
+    errors -= errors[0]
+    sigmas = np.sqrt(track.covariances[:, 5, 5])
+    late = track.t > 1.0
+    assert np.abs(errors[-1]) < math.radians(6.0)
+    assert (np.abs(errors) < THREE_SIGMA * sigmas)[late].all()
