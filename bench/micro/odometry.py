@@ -7,7 +7,8 @@ The mean NEES of position, attitude and velocity at the end stands with the band
 if errors are as large as their covariances; then once more with the velocities up to 0.3 s late and out of
 order. The cost is CPU seconds of this process per simulated second. A rewind is
 a velocity that is 100 samples of the IMU late. The recordings of a mower in the gtsam wheel, Plaza1 and
-Plaza2, have their error beside that of dead reckoning, and their mean NEES of x and y, expected 2.
+Plaza2, and of a Husky in tests/odometry/data have their error beside that of dead reckoning, and their mean
+NEES of x and y, expected 2.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from __future__ import annotations
 import platform
 import sys
 import time
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
-from helpers import plaza
+from helpers import plaza, recordings
 from helpers.base_motion import IMU_HZ, stamp_at, tilted_mount
 from odometry.test_estimator import SIGMA, calls_of, estimator, feed, late, squared_errors
 from odometry.test_plaza import dead_reckoned, estimated, mean_nees
@@ -84,8 +86,8 @@ def cost(seconds: float) -> None:
     print(f"rewind of 100 samples: median {np.median(times):.2f} ms, p90 {np.percentile(times, 90):.2f} ms")
 
 
-def recordings() -> None:
-    """Print the errors on the recordings, if gtsam is there."""
+def mower() -> None:
+    """Print the errors on the recordings of a mower, if gtsam is there."""
     folder = plaza.folder()
     for name in ("Plaza1", "Plaza2") if folder else ():
         assert folder is not None
@@ -98,6 +100,22 @@ def recordings() -> None:
         print(f"{name} {error:.2f} m rms, dead reckoning {by_increments:.2f} m, mean NEES {nees:.2f}")
 
 
+def husky() -> None:
+    """Print the errors on the recording of a Husky, with wheels as velocities and as joints, and their cost."""
+    data = recordings.load("husky")
+    reckoned = recordings.error_of(data, *recordings.dead_reckoned(data))
+    for as_joints, has_compass in product((False, True), repeat=2):
+        calls = recordings.calls_of(data, as_joints=as_joints, has_compass=has_compass)
+        start = time.process_time()
+        track = recordings.played(data, calls, wheels=recordings.WHEELS if as_joints else None)
+        share = 100.0 * (time.process_time() - start) / float(data.imu[-1, 0])
+        found = recordings.score(data, track)
+        name = f"husky, {'joints' if as_joints else 'velocity'}{', bad compass' if has_compass else ''}"
+        print(f"{name:<30} {found.error:.2f} m rms, dead reckoning {reckoned:.2f} m, ", end="")
+        print(f"mean NEES {found.nees:.2f}, end {found.end_sigmas:.1f} sigma, ", end="")
+        print(f"longest jump {track.longest_jump:.2f} m, {share:.2f} % of a core")
+
+
 def main() -> None:
     """Measure, and print."""
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else RUNS
@@ -105,7 +123,8 @@ def main() -> None:
     print(f"zstate {zstate.__version__}, Python {platform.python_version()}, {platform.machine()}")
     cost(seconds)
     consistency(runs, seconds)
-    recordings()
+    mower()
+    husky()
 
 
 if __name__ == "__main__":

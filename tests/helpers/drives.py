@@ -108,9 +108,7 @@ def wandering(
     def profile(levels: Floats) -> Profile:
         return legs_of(list(zip(ends.tolist(), levels.tolist(), strict=True)))
 
-    return Drive(
-        seconds, profile(speed), profile(rate), profile(aside if sideways else np.zeros(count))
-    )  # fmt: skip
+    return Drive(seconds, profile(speed), profile(rate), profile(aside if sideways else np.zeros(count)))
 
 
 @dataclass(frozen=True)
@@ -163,13 +161,13 @@ def imu_calls(
         (rate, added[0], noise.gyro, noise.gyro_bias, biases[0]),
         (force, added[1], noise.accel, noise.accel_bias, biases[1]),
     ):
-        bias = random.normal(0.0, first, 3) + np.cumsum(random.normal(0.0, walk / math.sqrt(IMU_HZ), ideal.shape), 0)
+        bias = random.normal(0.0, first, 3) + np.cumsum(
+            random.normal(0.0, walk / math.sqrt(IMU_HZ), ideal.shape), 0
+        )
         spread = random.normal(0.0, white * math.sqrt(IMU_HZ), ideal.shape)
         measured.append(ideal @ turn + extra + bias + spread)
     measured[0] += moves[:, None] * shift
-    return [
-        Call(at, "imu", (gyro, accel)) for at, gyro, accel in zip(t.tolist(), *measured, strict=True)
-    ]  # fmt: skip
+    return [Call(at, "imu", (gyro, accel)) for at, gyro, accel in zip(t.tolist(), *measured, strict=True)]
 
 
 def measured_motion(
@@ -288,7 +286,9 @@ def foot_calls(drive: Drive, legs: Legs, random: np.random.Generator, *, hertz: 
     points, calls, before = np.zeros((4, 3)), list[Call](), -1
     for t in times.tolist():
         yaw = float(drive.at(drive.yaw, t))
-        turn = np.array(((math.cos(yaw), -math.sin(yaw), 0.0), (math.sin(yaw), math.cos(yaw), 0.0), (0.0, 0.0, 1.0)))
+        turn = np.array(
+            ((math.cos(yaw), -math.sin(yaw), 0.0), (math.sin(yaw), math.cos(yaw), 0.0), (0.0, 0.0, 1.0))
+        )
         place = np.array((float(drive.at(drive.x, t)), float(drive.at(drive.y, t)), 0.0))
         step = math.floor(t / _SWING_S)
         swinging = slice(0, 2) if step % 2 else slice(2, 4)
@@ -312,7 +312,12 @@ def foot_calls(drive: Drive, legs: Legs, random: np.random.Generator, *, hertz: 
 
 
 def compass_calls(
-    drive: Drive, random: np.random.Generator, *, hard_iron: float = 0.0, sigma: float = 0.035, hertz: float = 10
+    drive: Drive,
+    random: np.random.Generator,
+    *,
+    hard_iron: float = 0.0,
+    sigma: float = 0.035,
+    hertz: float = 10,
 ) -> list[Call]:
     """Headings from a north that odom has not; ``hard_iron`` [rad] is the amplitude of their error."""
     calls: list[Call] = []
@@ -355,7 +360,9 @@ def errors_of(drive: Drive, state: BaseState, first_t: float = 0.0) -> Errors:
     yaw = float(drive.at(drive.yaw, t)) - first
     velocity = np.array((float(drive.at(drive.vx, t)), float(drive.at(drive.vy, t)), 0.0))
     position = np.array(state.odom_from_base.translation) - place
-    truth = np.array(((math.cos(yaw), -math.sin(yaw), 0.0), (math.sin(yaw), math.cos(yaw), 0.0), (0.0, 0.0, 1.0)))
+    truth = np.array(
+        ((math.cos(yaw), -math.sin(yaw), 0.0), (math.sin(yaw), math.cos(yaw), 0.0), (0.0, 0.0, 1.0))
+    )
     turn = state.odom_from_base.matrix[:3, :3] @ truth.T
     angle = np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])) / 2.0
     yaw_error = math.remainder(state.odom_from_base.rpy[2] - yaw, math.tau)
@@ -370,9 +377,7 @@ def errors_of(drive: Drive, state: BaseState, first_t: float = 0.0) -> Errors:
     mahalanobis = math.sqrt(float(level @ np.linalg.solve(pose[:2, :2], level)))
     claim = math.sqrt(float(np.linalg.eigvalsh(pose[:2, :2]).max()))
     sigmas = max(mahalanobis, math.sqrt(squares[3]))
-    return Errors(
-        t, float(np.hypot(*level)), yaw_error, claim, math.sqrt(float(pose[5, 5])), sigmas, squares
-    )  # fmt: skip
+    return Errors(t, float(np.hypot(*level)), yaw_error, claim, math.sqrt(float(pose[5, 5])), sigmas, squares)
 
 
 class Run(NamedTuple):

@@ -1,4 +1,4 @@
-"""Recordings of wheeled robots in tests/odometry/data, as calls of an estimator, and scores against the truth.
+"""Recordings of wheeled robots in tests/odometry/data, as calls of an estimator, and their scores.
 
 Frames and times are those of the recordings: t = 0 is the first sample of the IMU.
 """
@@ -36,8 +36,8 @@ Change = Callable[[list[Call]], list[Call]]
 class Recording:
     """Samples in their order; ``imu`` has t, rate (3,) and force (3,), ``wheels`` t, speed, yaw rate.
 
-    ``arrivals`` are delays of arrival [s] of both. ``compass`` are t and yaw. ``gps`` has t, x, y [m] and the
-    variance [m^2], none for a simulator.
+    ``compass`` has t and yaw. ``gps`` has t, x, y [m] and the variance [m^2]; none for a
+    simulator.
     """
 
     name: str
@@ -99,7 +99,7 @@ def calls_of(
 
 
 def dead_reckoned(recording: Recording, *, start: float = 0.0) -> tuple[Floats, Floats]:
-    """Times [s] and x, y, yaw by the speed of the wheels and the rate of the gyro, as they are: (T,), (T, 3)."""
+    """Times [s], (T,), and x, y, yaw by the speed of the wheels and the gyro as they are, (T, 3)."""
     imu = recording.imu[recording.imu[:, 0] >= start]
     t, rate = imu[:, 0], (imu[:, 1:4] @ recording.mount.matrix[:3, :3].T)[:, 2]
     dt = np.diff(t)
@@ -114,7 +114,8 @@ class Track(NamedTuple):
     """What an estimator made of a recording.
 
     Rows are instants of the GPS, or 0.2 s apart: ``t`` [s], ``poses`` x, y, z, yaw, with the covariances of
-    the pose, (N, 6, 6). ``live`` are states read as readings of the wheels arrived: t, x, y, z, and the velocity in odom.
+    the pose, (N, 6, 6). ``live`` are states read as readings of the wheels arrived: t, x, y, z, and the
+    velocity in odom.
     """
 
     t: Floats
@@ -138,7 +139,11 @@ class Track(NamedTuple):
 
 
 def played(
-    recording: Recording, calls: Sequence[Call], *, mount: Transform | None = None, wheels: DiffDrive | None = None
+    recording: Recording,
+    calls: Sequence[Call],
+    *,
+    mount: Transform | None = None,
+    wheels: DiffDrive | None = None,
 ) -> Track:
     """Feed ``calls`` in their order; states of instants are read 0.4 s after them."""
     base = new_estimator(mount or recording.mount, wheels=wheels)

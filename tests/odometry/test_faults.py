@@ -40,7 +40,9 @@ SENTENCE_S = 5.0
 """A fault is named at most so late."""
 
 ROUND = legs_of([(5.0, 0.0), (20.0, 0.5), (25.0, 0.3), (40.0, 0.5), (44.0, 0.0), (57.0, 0.4)])
-ROUND_TURNS = legs_of([(8.0, 0.0), (14.0, 0.4), (20.0, 0.0), (25.0, -0.5), (40.0, 0.2), (44.0, 0.0), (57.0, -0.3)])
+ROUND_TURNS = legs_of(
+    [(8.0, 0.0), (14.0, 0.4), (20.0, 0.0), (25.0, -0.5), (40.0, 0.2), (44.0, 0.0), (57.0, -0.3)]
+)
 STRAIGHT = legs_of([(5.0, 0.0), (57.0, 0.5)])
 NO_TURNS = legs_of([])
 AT_REST = legs_of([])
@@ -204,7 +206,9 @@ FAULTS: dict[str, Fault] = {
     "three samples of 16 g, which swing back": Fault(
         bound=1.0, change=imu_where(between(20.0, 20.025), add(force=(0, 0, 160.0)))
     ),
-    "one gyro sample of 35 rad/s about x": Fault(bound=1.0, change=imu_where(once(20.0), add(rate=(35.0, 0, 0)))),
+    "one gyro sample of 35 rad/s about x": Fault(
+        bound=1.0, change=imu_where(once(20.0), add(rate=(35.0, 0, 0)))
+    ),
     "one gyro z sample of 100 rad/s, straight": Fault(
         bound=5.0, along=STRAIGHT, turning=NO_TURNS, change=imu_where(once(20.0), add(rate=(0, 0, 100.0)))
     ),
@@ -214,7 +218,9 @@ FAULTS: dict[str, Fault] = {
     "accelerometer reads zeros for the first 3 s": Fault(
         bound=1.5, change=imu_where(between(-1.0, 3.0), set_to(force=0.0))
     ),
-    "accelerometer reads zeros": Fault(bound=math.inf, change=imu_where(between(-1.0, 1e3), set_to(force=0.0)), named=True),
+    "accelerometer reads zeros": Fault(
+        bound=math.inf, change=imu_where(between(-1.0, 1e3), set_to(force=0.0)), named=True
+    ),
     # stamps
     "one IMU stamp an hour ahead": Fault(bound=1.0, stamp_of=shifted(first_of("imu", 20.0), 3600.0)),
     "one joints stamp an hour ahead": Fault(bound=1.0, stamp_of=shifted(first_of("joints", 20.0), 3600.0)),
@@ -223,7 +229,9 @@ FAULTS: dict[str, Fault] = {
         bound=3.0, stamp_of=shifted(lambda call: call.kind == "joints", 1.1), named=True
     ),
     # gyro
-    "mirrored gyro": Fault(bound=math.inf, change=imu_where(between(-1, 1e3), lambda w, f: (w * (1, 1, -1), f)), named=True),
+    "mirrored gyro": Fault(
+        bound=math.inf, change=imu_where(between(-1, 1e3), lambda w, f: (w * (1, 1, -1), f)), named=True
+    ),
     "frozen IMU from 20 s on": Fault(bound=10.0, change=held("imu", 20.0, 1e3), named=True),
     "frozen IMU for 5 s": Fault(bound=3.0, change=held("imu", 20.0, 25.0), named=True),
     "gyro jumps by 0.02 rad/s": Fault(
@@ -240,13 +248,23 @@ FAULTS: dict[str, Fault] = {
     ),
     # wheels
     "wheels spin for 5 s while driving": Fault(bound=4.0, distort=spinning(27.0, 32.0, 0.7), named=True),
-    "wheels spin for 5 s at rest": Fault(bound=4.0, distort=spinning(46.0, 51.0, 0.7), along=legs_of([(5.0, 0.0), (40.0, 0.5)]), turning=legs_of([(8.0, 0.0), (38.0, 0.2)]), named=True),
+    "wheels spin for 5 s at rest": Fault(
+        bound=4.0,
+        distort=spinning(46.0, 51.0, 0.7),
+        along=legs_of([(5.0, 0.0), (40.0, 0.5)]),
+        turning=legs_of([(8.0, 0.0), (38.0, 0.2)]),
+        named=True,
+    ),
     "wheels blocked for 5 s": Fault(bound=4.0, distort=blocked(27.0, 32.0), named=True),
     "encoders frozen from 30 s on": Fault(bound=math.inf, change=held("joints", 30.0, 1e3), named=True),
     "wheels silent for 5 s": Fault(bound=3.0, change=without(["joints"], 20.0, 25.0)),
     # sigmas that are wider than the speed
-    "0.3 m/s with sigma 0.5": Fault(bound=2.5, along=legs_of([(5.0, 0.0), (35.0, 0.3)]), velocity=(0.002, 0.5)),
-    "0.15 m/s with sigma 0.2": Fault(bound=1.5, along=legs_of([(5.0, 0.0), (35.0, 0.15)]), velocity=(0.002, 0.2)),
+    "0.3 m/s with sigma 0.5": Fault(
+        bound=2.5, along=legs_of([(5.0, 0.0), (35.0, 0.3)]), velocity=(0.002, 0.5)
+    ),
+    "0.15 m/s with sigma 0.2": Fault(
+        bound=1.5, along=legs_of([(5.0, 0.0), (35.0, 0.15)]), velocity=(0.002, 0.2)
+    ),
     "0.03 m/s with sigma 0.032": Fault(
         bound=0.5, along=legs_of([(5.0, 0.0), (55.0, 0.03)]), turning=NO_TURNS, velocity=(0.001, 0.032)
     ),
@@ -258,30 +276,47 @@ FAULTS: dict[str, Fault] = {
         bound=8.0, along=LATE_START, turning=CREEP_FROM_START, distort=wheels_stand(8.0), gyro_bias=0.0
     ),
     "the same with a compass": Fault(
-        bound=4.0, along=LATE_START, turning=CREEP_FROM_START, distort=wheels_stand(8.0), gyro_bias=0.0, compass=0.0
+        bound=4.0,
+        along=LATE_START,
+        turning=CREEP_FROM_START,
+        distort=wheels_stand(8.0),
+        gyro_bias=0.0,
+        compass=0.0,
     ),
     # compass
     "compass with a hard iron of 42 degrees, straight, then turns": Fault(
-        bound=1.5, along=legs_of([(5.0, 0.0), (117.0, 0.5)]), turning=legs_of([(80.0, 0.0), (100.0, 0.3), (115.0, -0.3)]),
-        seconds=120.0, compass=math.radians(42.0), named=True,
+        bound=1.5,
+        along=legs_of([(5.0, 0.0), (117.0, 0.5)]),
+        turning=legs_of([(80.0, 0.0), (100.0, 0.3), (115.0, -0.3)]),
+        seconds=120.0,
+        compass=math.radians(42.0),
+        named=True,
     ),
     "compass with a hard iron of 42 degrees": Fault(bound=1.5, compass=math.radians(42.0), named=True),
     # pauses of all sources
-    "pause of 13 s at rest": Fault(bound=1.0, along=SHORT_PAUSE, turning=SHORT_TURNS, change=without(ALL, 20.0, 33.0)),
+    "pause of 13 s at rest": Fault(
+        bound=1.0, along=SHORT_PAUSE, turning=SHORT_TURNS, change=without(ALL, 20.0, 33.0)
+    ),
     "pause of 100 s at rest": Fault(
         bound=1.0, along=PAUSE_AT_REST, turning=PAUSE_TURNS, seconds=150.0, change=without(ALL, 20.0, 120.0)
     ),
-    "pause of 5 s while driving": Fault(bound=4.0, along=STRAIGHT, turning=ROUND_TURNS, change=without(ALL, 26.0, 31.0)),
-    "pause of 5 s while driving straight": Fault(bound=4.0, along=STRAIGHT, turning=NO_TURNS, change=without(ALL, 26.0, 31.0)),
+    "pause of 5 s while driving": Fault(
+        bound=4.0, along=STRAIGHT, turning=ROUND_TURNS, change=without(ALL, 26.0, 31.0)
+    ),
+    "pause of 5 s while driving straight": Fault(
+        bound=4.0, along=STRAIGHT, turning=NO_TURNS, change=without(ALL, 26.0, 31.0)
+    ),
     "pause of 13 s in which the base was moved": Fault(
         bound=4.0, along=MOVED_SHORT, turning=SHORT_TURNS, change=without(ALL, 20.0, 33.0)
     ),
     "pause of 100 s in which the base was moved": Fault(
         bound=4.0, along=MOVED_LONG, turning=PAUSE_TURNS, seconds=150.0, change=without(ALL, 20.0, 120.0)
     ),
-}  # fmt: skip
+}
 
-UNSEEN = {"radius 20 % wrong": Fault(bound=math.inf, wheels=DiffDrive("left", "right", radius=0.12, track=0.4))}
+UNSEEN = {
+    "radius 20 % wrong": Fault(bound=math.inf, wheels=DiffDrive("left", "right", radius=0.12, track=0.4))
+}
 """What no other sensor contradicts: for the table of a benchmark, not for a claim."""
 
 
@@ -326,7 +361,9 @@ def findings(fault: Fault, found: Run) -> list[str]:
     ]
     if silent:
         worst = max(silent, key=lambda one: one.sigmas)
-        wrong.append(f"{worst.sigmas:.1f} sigmas off at {worst.t:.0f} s without a sentence ({worst.plane:.2f} m)")
+        wrong.append(
+            f"{worst.sigmas:.1f} sigmas off at {worst.t:.0f} s without a sentence ({worst.plane:.2f} m)"
+        )
     if not found.end.plane <= fault.bound:
         wrong.append(f"{found.end.plane:.2f} m off at the end; of use are {fault.bound:g} m")
     if not math.isinf(fault.bound) and found.errors[-1].t < fault.seconds - 2.0:
@@ -348,7 +385,9 @@ def test_a_base_without_faults_has_no_sentence():
 
 def test_headings_of_an_axis_that_passes_the_vertical_leave_the_estimator_alive():
     """At rest for 3 s; then its x axis goes up to the vertical and comes back, with a compass all along."""
-    base = new_estimator(MOUNT, )
+    base = new_estimator(
+        MOUNT,
+    )
     turn = MOUNT.matrix[:3, :3]
     for step in range(1500):
         t = 0.01 * step

@@ -1,6 +1,7 @@
 """BaseEstimator on recordings of wheeled robots, with the settings of `zstate odometry`, none of them tuned.
 
-The errors of one drive are one sample: bounds are dead reckoning by wheels and gyro, and the estimator's own claims.
+The errors of one drive are one sample: bounds are dead reckoning by wheels and gyro, and the claims of the
+estimator.
 """
 
 from __future__ import annotations
@@ -113,7 +114,9 @@ def test_slow_sensors_cost_accuracy_and_no_more(as_joints: bool, wheel_step: int
 
 def test_wheels_five_percent_too_fast_are_inside_the_claim():
     calls = [
-        call._replace(values=(tuple(1.05 * part for part in call.values[0]),)) if call.kind == "velocity" else call
+        call._replace(values=(tuple(1.05 * part for part in call.values[0]),))
+        if call.kind == "velocity"
+        else call
         for call in calls_of(husky())
     ]
     found, _ = changed_score(calls)
@@ -150,8 +153,11 @@ def test_thirty_seconds_without_a_source_are_inside_the_claim(kind: str):
 
 @pytest.mark.parametrize(
     "calls",
-    [pytest.param(lambda: imu_in_base(-1.0, 0.0), id="mirrored"), pytest.param(lambda: frozen(150.0, 1e9), id="frozen")],
-)  # fmt: skip
+    [
+        pytest.param(lambda: imu_in_base(-1.0, 0.0), id="mirrored"),
+        pytest.param(lambda: frozen(150.0, 1e9), id="frozen"),
+    ],
+)
 def test_a_gyro_that_contradicts_the_wheels_is_named_and_the_base_does_not_fly_off(calls: object):
     assert callable(calls)
     _, track = changed_score(calls())
