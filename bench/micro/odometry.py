@@ -101,7 +101,7 @@ def mower() -> None:
 
 
 def husky() -> None:
-    """Print the errors on the recording of a Husky, with wheels as velocities and as joints, and their cost."""
+    """Print the errors and the cost on the recording of a Husky, with velocities and with joints."""
     data = recordings.load("husky")
     reckoned = recordings.error_of(data, *recordings.dead_reckoned(data))
     for as_joints, has_compass in product((False, True), repeat=2):

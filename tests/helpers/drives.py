@@ -263,8 +263,8 @@ def sliding_legs(noise: LegNoise | None = None) -> Legs:
         for axis, parent, child, vector in zip("xyz", ends[:-1], ends[1:], np.eye(3), strict=True):
             direction = " ".join(f"{part:g}" for part in vector)
             parts.append(
-                f'<link name="{child}"/><joint name="{foot}_{axis}" type="prismatic"><parent link="{parent}"/>'
-                f'<child link="{child}"/><axis xyz="{direction}"/>'
+                f'<link name="{child}"/><joint name="{foot}_{axis}" type="prismatic">'
+                f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{direction}"/>'
                 '<limit lower="-2" upper="2" velocity="9" effort="9"/></joint>'
             )
     model = parse_urdf(f'<robot name="slider">{"".join(parts)}</robot>', "slider.urdf")
