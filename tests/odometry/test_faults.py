@@ -226,7 +226,7 @@ FAULTS: dict[str, Fault] = {
     "one joints stamp an hour ahead": Fault(bound=1.0, stamp_of=shifted(first_of("joints", 20.0), 3600.0)),
     "one joints stamp 3 s ahead": Fault(bound=1.0, stamp_of=shifted(first_of("joints", 20.0), 3.0)),
     "clock of the wheels 1.1 s ahead": Fault(
-        bound=3.0, stamp_of=shifted(lambda call: call.kind == "joints", 1.1), named=True
+        bound=math.inf, stamp_of=shifted(lambda call: call.kind == "joints", 1.1), named=True
     ),
     # gyro
     "mirrored gyro": Fault(

@@ -67,6 +67,9 @@ from zstate.wire.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_RATE, MAX_S
 IMU, WHEELS, FEET, CONTACTS = "imu", "wheels", "feet", "contacts"
 """The names of these sources in ``BaseEstimator.health``."""
 
+_ALIGNED_NS = 3_000_000_000
+"""After this time without an alignment, the health of the IMU says why."""
+
 COAST_NS = 500_000_000
 """No state is later than the newest event by more than this."""
 
@@ -463,6 +466,8 @@ class BaseEstimator:
                 "silent; the base is predicted from its last velocity and its wheels, with large noise"
             )
         if last is None:
+            if name == IMU and self._log and newest - self._log[0].reading.stamp > _ALIGNED_NS:
+                found.append(f"the base is not aligned: {self._missing}")
             return "; ".join(found)
         if name == IMU:
             found += imu_remarks(last)
@@ -688,7 +693,7 @@ class BaseEstimator:
         else:
             if is_finite(estimate.state):
                 return estimate, False
-        last = last_pose(before.state, self._imu_from_base, self.odom, self.base)
+        last = last_pose(before, self._imu_from_base, self.odom, self.base)
         return start_at(stamp, last, self._imu_from_base), True
 
     def _fused_with(

@@ -82,6 +82,8 @@ _REST_FORCE = 0.5
 
 _VIBRATION_S = 1.0
 """The noise of the samples of the IMU is averaged for so long."""
+_NOISIER = 1.5
+"""Variances that are larger than stated by less are those of the mean of few samples."""
 _SHOCK = np.repeat((10.0, 50.0), 3)
 """[rad/s], [m/s^2]: no sample of an IMU differs from the one before by more, but in a shock or by a fault."""
 
@@ -89,7 +91,7 @@ _WHEEL_TURN = 0.03
 """[rad/s] The yaw rates of wheels and gyro are on a line but for so much, or the wheels slip."""
 _STRAIGHT = 0.004
 """[rad/s] And by so much for ever: radii differ."""
-_APART, _APART_S = 3.0, 8.0
+_APART, _APART_S = 3.0, 5.0
 """So many standard deviations apart, in the mean of so many seconds, the gyro is not what it was taken for."""
 _UNKNOWN_BIAS = 0.008
 """[rad/s] A bias with a larger standard deviation was never measured."""
@@ -107,8 +109,6 @@ _PAUSE_NS = 500_000_000
 _PAUSE_SLIP, _PAUSE_PLACE, _PAUSE_YAW, _PAUSE_TILT = 0.3, 0.02, 0.02, 0.02
 """Of a displacement by wheels over a pause: a part of it, [m], [rad] and [rad]."""
 
-_SHORT_S = 0.2
-"""Corrections of the place that follow one another within this time are of the velocity between them."""
 _TILT_RATE = 0.05
 """[rad/s] The tilt of the continuous pose follows that of the estimate so fast."""
 _PLACE_RATE, _YAW_RATE = 0.2, 0.05
@@ -116,7 +116,9 @@ _PLACE_RATE, _YAW_RATE = 0.2, 0.05
 
 MOST_BIAS = 0.03
 """[rad/s] A gyro that measures more while wheels stand is turned: it may be carried, or on a turntable."""
-_COMPARED_S, _COMPARED_RATE, _COMPARED_SCALE = 20.0, 0.05, 1.6
+_TILTED, _TILT_SHARE = math.radians(4.0), 0.01
+"""[rad] A base that is tilted by more in all directions is not; the mean of so many readings is taken."""
+_COMPARED_S, _COMPARED_RATE, _COMPARED_SCALE = 10.0, 0.08, 1.6
 """The yaw rates of wheels and gyro are compared for so long, if above it [rad/s], up to this factor."""
 
 _DEVIATION_S = 20.0
@@ -245,7 +247,7 @@ class Vibration(NamedTuple):
 
 
 class Turning(NamedTuple):
-    """The yaw rates by wheels and by the gyro less its bias, in motion: means of the last 20 s.
+    """The yaw rates by wheels and by the gyro less its bias, in motion: means of the last 10 s.
 
     They are those of both, of their squares, and of their product. ``time_s`` is how long there was motion.
     """
@@ -310,7 +312,8 @@ class Estimate(NamedTuple):
     ``moved_at`` is the stamp of the last velocity that was not zero, ``angular`` the rate by wheels in the
     IMU's axes [rad/s], ``wheels_at`` their stamp. ``touching`` are the feet on the ground, if measured.
     ``sampled_s`` is the mean time between samples of the IMU, over which the noise of a rate is averaged.
-    ``fastest`` is the greatest speed that was measured [m/s]. ``anchor`` is the estimate at the last reading
+    ``tilts`` has for each direction the vertical less that of the base, in
+    the IMU's axes, (3,). ``fastest`` is the greatest speed that was measured [m/s]. ``anchor`` is the estimate at the last reading
     before the wheels and the IMU fell silent. ``lost_at`` is when the estimate last followed a source that it
     had rejected. ``turn_at_rest`` is the rate of the gyro while wheels stand, if too large for a bias [rad/s].
     """
@@ -337,6 +340,7 @@ class Estimate(NamedTuple):
     is_frozen: bool = False
     biased_at: int | None = None
     fastest: float = 0.0
+    tilts: dict[int, Floats] = {}  # noqa: RUF012 - replaced, never written to
     anchor: Estimate | None = None
     pause: Pause | None = None
     lost_at: int | None = None
@@ -396,6 +400,7 @@ class Fusion:
                 moved_at=estimate.moved_at if reading.is_still else reading.stamp,
                 angular=reading.angular,
                 upright=reading.upright,
+                tilts=_with_tilt(estimate, reading),
                 fastest=max(estimate.fastest, reading.speed),
             )
         if reading.scale > estimate.drift.scale:
@@ -505,7 +510,7 @@ class Fusion:
                 efforts=reading.efforts,
             )
         state, squares = updated_by_feet(estimate.state, reading.feet, touching, gate(3))
-        estimate = _moved(estimate, state)
+        estimate = _moved(estimate, state, is_step=True)
         if not squares:
             return estimate, None
         fate = "accepted" if max(squares.values()) <= gate(3) else "rejected"
@@ -646,7 +651,8 @@ class Fusion:
             share = max((sample.stamp - before.imu.stamp) * 1e-9 / _VIBRATION_S, 1.0 / count)
             bend = change - last.change
             variance = variance + min(share, 1.0) * (bend * bend / 6.0 - variance)
-        white = np.maximum(white_noise(self.noise), variance * before.sampled_s)
+        stated, seen = white_noise(self.noise), variance * before.sampled_s
+        white = np.where(seen > _NOISIER * stated, seen, stated)
         repeated = 0 if change.any() else last.repeated + 1
         return Vibration(values, change, variance, count, white, repeated)
 
@@ -754,6 +760,11 @@ def is_still(linear: Floats, angular: Floats | None) -> bool:
     return float(linear @ linear) <= _STILL_SPEED**2
 
 
+def at_its_estimate(estimate: Estimate) -> Estimate:
+    """The estimate whose continuous pose is the estimated one, as at its start."""
+    return estimate._replace(offset=Offset(np.eye(3), np.zeros(3), estimate.stamp))
+
+
 def odom_pose(estimate: Estimate, imu_from_frame: Floats) -> tuple[Floats, Floats]:
     """The continuous pose of a frame, (4, 4), and by how much the estimate differs from it.
 
@@ -771,6 +782,13 @@ def odom_pose(estimate: Estimate, imu_from_frame: Floats) -> tuple[Floats, Float
 def imu_remarks(estimate: Estimate) -> list[str]:
     """What the IMU, and the prediction from it, have come to, in sentences."""
     found = [disagreement(estimate.turning)]
+    if len(estimate.tilts) >= _SECTORS_PROVEN:
+        tilt = np.mean(list(estimate.tilts.values()), axis=0)
+        if float(tilt @ tilt) > _TILTED * _TILTED:
+            found.append(
+                f"the base is tilted by {math.degrees(math.sqrt(tilt @ tilt)):.2g} degrees whichever way it heads: "
+                "the mount of the IMU is off by that"
+            )
     if estimate.turn_at_rest:
         found.append(
             f"the gyro reads {estimate.turn_at_rest:.2g} rad/s while the wheels stand: the base is turned, or the "
@@ -792,6 +810,17 @@ def imu_remarks(estimate: Estimate) -> list[str]:
         how = "wheels measured the way" if pause.is_bridged else "the base may have driven anywhere meanwhile"
         found.append(f"all data paused for {pause.seconds:.1f} s: {how}")
     return [text for text in found if text]
+
+
+def _with_tilt(estimate: Estimate, reading: Reading) -> dict[int, Floats]:
+    """The tilt of the base in each direction, with one reading more, by a slow mean."""
+    if reading.upright is None or reading.is_still:
+        return estimate.tilts
+    rotation = estimate.state.rotation
+    sector = _sector(math.atan2(rotation[1, 0], rotation[0, 0]))
+    tilt = rotation[2] - reading.upright
+    before = estimate.tilts.get(sector, tilt)
+    return {**estimate.tilts, sector: before + _TILT_SHARE * (tilt - before)}
 
 
 def _is_recent(estimate: Estimate, stamp: int | None) -> bool:
@@ -816,7 +845,7 @@ def disagreement(turning: Turning) -> str:
         cause = f"so the track is about {wheels / gyro:.2g} times as wide, or the wheels slip"
     else:
         return ""
-    return f"the wheels turn the base by {wheels:.2g} rad/s and the gyro by {gyro:.2g} (rms of 20 s), {cause}"
+    return f"the wheels turn the base by {wheels:.2g} rad/s and the gyro by {gyro:.2g} (rms of 10 s), {cause}"
 
 
 def _apart(turning: Turning) -> tuple[float, float] | None:
@@ -888,20 +917,21 @@ def _without_shock(before: Estimate, sample: Inertia) -> Inertia:
     return Inertia(sample.stamp, gyro, np.where(shock[3:] > 0.0, before.imu.accel, accel))
 
 
-def _moved(estimate: Estimate, state: FilterState) -> Estimate:
-    """The estimate corrected to ``state``, while the continuous pose stays but for what its velocity explains.
+def _moved(estimate: Estimate, state: FilterState, *, is_step: bool = False) -> Estimate:
+    """The estimate corrected to ``state``, while the continuous pose stays.
 
-    ``place`` is that of the IMU. It moves by one standard deviation of the velocity since the last correction at
-    most. Tilt, and poses that are measured, are followed slowly.
+    ``place`` is that of the IMU. Tilt, and poses that are measured, are followed slowly. ``is_step``: feet
+    measure displacements, so that the place moves, by one standard deviation of the velocity at most.
     """
     before, offset = estimate.state, estimate.offset
     place = offset.rotation.dot(before.position) + offset.shift
     rotation = offset.rotation.dot(before.rotation).dot(state.rotation.T)
     elapsed_s = (estimate.stamp - offset.stamp) * 1e-9
-    if elapsed_s < _SHORT_S:
+    if is_step:
         step = offset.rotation.dot(state.position - before.position)
-        fastest = math.sqrt(max(before.covariance[3, 3], before.covariance[4, 4], before.covariance[5, 5]))
-        place = place + step * min(1.0, fastest * elapsed_s / max(math.sqrt(step @ step), 1e-12))
+        sigma = math.sqrt(max(before.covariance[3, 3], before.covariance[4, 4], before.covariance[5, 5]))
+        most = sigma * min(elapsed_s, _LONGEST_STEP_S)
+        place = place + step * min(1.0, most / max(math.sqrt(step @ step), 1e-12))
     # The offset turns the vertical into the first two numbers; turning it back levels the pose.
     x, y = float(rotation[0, 2]), float(rotation[1, 2])
     angle = math.hypot(x, y)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zstate import se3
-from zstate.odometry.fusion import Drift, Estimate
+from zstate.odometry.fusion import Drift, Estimate, at_its_estimate, odom_pose
 from zstate.odometry.invariant_filter import POSITION, ROTATION, VELOCITY, FilterState, Floats
 from zstate.odometry.measurements import frame_pose
 from zstate.odometry.rotations import skew
@@ -53,7 +53,7 @@ def placed(estimate: Estimate, placement: Placement, imu_from_base: Floats) -> E
         name: compass._replace(offset=compass.offset - turn) for name, compass in estimate.compasses.items()
     }
     drift = Drift(state.position, estimate.drift.scale)
-    return estimate._replace(state=state, drift=drift, runs={}, compasses=compasses)
+    return at_its_estimate(estimate._replace(state=state, drift=drift, runs={}, compasses=compasses))
 
 
 def is_finite(state: FilterState) -> bool:
@@ -65,9 +65,11 @@ def is_finite(state: FilterState) -> bool:
     return math.isfinite(total) and 0.0 <= variances <= _LARGEST
 
 
-def last_pose(state: FilterState, imu_from_base: Floats, odom: str, base: str) -> Transform:
-    """The pose of the base in a finite state, with variances that a filter can start from, (6, 6)."""
-    matrix, covariance = frame_pose(state, imu_from_base)
+def last_pose(estimate: Estimate, imu_from_base: Floats, odom: str, base: str) -> Transform:
+    """The continuous pose of the base in a finite estimate, with variances that a filter can start from."""
+    _, covariance = frame_pose(estimate.state, imu_from_base)
+    matrix, corrected = odom_pose(estimate, imu_from_base)
+    covariance += np.outer(corrected, corrected)
     largest = np.repeat((_LAST_POSITION, _LAST_ANGLE), 3) ** 2
     variances = np.diag(np.clip(covariance.diagonal(), _CERTAIN**2, largest))
     rotation = se3.quaternion_from_matrix(matrix[:3, :3])
