@@ -13,8 +13,21 @@ from helpers.recordings import calls_of, played, score
 from odometry import test_faults as faults
 from odometry.test_vibration import END_SIGMAS, VIBRATIONS, end_of
 
-CHOSEN: list[tuple[str, str]] = []
+_FUSION = "zstate.odometry.fusion"
+CHOSEN = [
+    (_FUSION, "_VIBRATION_S"),
+    ("zstate.odometry.turning", "_STRAIGHT"),
+    (_FUSION, "_USUAL_BIAS"),
+    ("zstate.odometry.turning", "COMPARED_S"),
+    (_FUSION, "_STILL_SPEED"),
+    (_FUSION, "_LEAST_SPEED_BOUND"),
+    (_FUSION, "_PAUSE_SLIP"),
+    (_FUSION, "_UNPROVEN"),
+    ("zstate.odometry.alignment", "_UNKNOWN_GYRO_BIAS"),
+]
 """The module that uses a constant, and its name; each module that imports a name has a row of its own."""
+
+pytestmark = pytest.mark.soak  # some minutes
 
 THREE_SIGMA = 3.5
 FAULTS = (

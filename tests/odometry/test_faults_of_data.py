@@ -307,7 +307,8 @@ def test_memory_is_bounded_when_the_imu_never_comes_or_comes_once():
         assert len(base._rotations) < 5000  # pyright: ignore[reportPrivateUsage]
 
 
-def test_a_flood_of_one_instant_is_refused_in_the_end():
+def test_a_flood_of_one_instant_is_refused_in_the_end(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("zstate.odometry.estimator._MOST_PER_S", 100)
     base = estimator(history_s=0.1)
     with pytest.raises(InvalidInput, match="too many"):
         for number in range(100_000):

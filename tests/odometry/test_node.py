@@ -180,7 +180,7 @@ def test_rate_limits_the_samples_of_a_faster_imu():
         assert (newest - began) * 1e-9 == pytest.approx(1.0, abs=0.3)
 
 
-def test_sentences_on_the_sources_are_in_the_status_of_the_writer():
+def test_sentences_on_the_sources_are_in_the_status_of_the_writer_and_logged_once(caplog):
     with (
         rover_with_odometry(velocities={"flow": VelocityNoise()}) as (_, _, _, session),
         StatusMonitor(session, "r1") as statuses,
@@ -193,6 +193,7 @@ def test_sentences_on_the_sources_are_in_the_status_of_the_writer():
             return any("flow: " in text for text in texts)
 
         until(warned)
+    assert [record.message.startswith("odometry of 'r1': flow: ") for record in caplog.records].count(True) == 1
 
 
 def test_velocities_without_covariance_are_refused_and_counted():

@@ -474,8 +474,8 @@ class BaseEstimator:
         run = last.runs.get(name)
         if run is not None and run.stamp - run.start > LOST_NS and newest - run.stamp < LOST_NS:
             found.append(
-                f"rejected for {(run.stamp - run.start) * 1e-9:.1f} s in a row: the estimate is lost, unless another "
-                "source confirms it"
+                f"rejected for {(run.stamp - run.start) * 1e-9:.1f} s in a row: the estimate is lost, unless "
+                "another source confirms it"
             )
         compass = last.compasses.get(name)
         if compass is not None and compass.deviation > 0.0:
@@ -699,26 +699,28 @@ class BaseEstimator:
     def _fused_with(
         self, estimate: Estimate, event: _Event, following: Inertia | None
     ) -> tuple[Estimate, Outcome | None]:
-        reading = event.reading
-        if isinstance(reading, Inertia):
-            after, outcome = self._fusion.after_inertia(estimate, reading)
-            if outcome is not None:
-                self._count_standstill(reading.stamp)
-            return after, outcome
-        if isinstance(reading, Contacts):
-            after = self._fusion.predicted(estimate, reading.stamp, following)
-            return after._replace(touching=reading.touching), None
-        if isinstance(reading, Placement):
-            after = self._fusion.settled(self._fusion.predicted(estimate, reading.stamp, following))
-            return placed(after, reading, self._imu_from_base), None
-        if isinstance(reading, Steps):
-            assert self._legs is not None
-            return self._fusion.after_steps(self._legs, estimate, reading, following)
-        if isinstance(reading, Displacement):
-            return self._fusion.after_pause(estimate, reading, following)
-        if isinstance(reading, Heading):
-            return self._fusion.after_heading(estimate, event.source, reading, following)
-        return self._fusion.after_reading(estimate, event.source, reading, following)
+        reading, fusion, outcome = event.reading, self._fusion, None
+        match reading:
+            case Inertia():
+                after, outcome = fusion.after_inertia(estimate, reading)
+                if outcome is not None:
+                    self._count_standstill(reading.stamp)
+            case Contacts():
+                after = fusion.predicted(estimate, reading.stamp, following)
+                after = after._replace(touching=reading.touching)
+            case Placement():
+                after = fusion.settled(fusion.predicted(estimate, reading.stamp, following))
+                after = placed(after, reading, self._imu_from_base)
+            case Steps():
+                assert self._legs is not None
+                after, outcome = fusion.after_steps(self._legs, estimate, reading, following)
+            case Displacement():
+                after, outcome = fusion.after_pause(estimate, reading, following)
+            case Heading():
+                after, outcome = fusion.after_heading(estimate, event.source, reading, following)
+            case Reading():
+                after, outcome = fusion.after_reading(estimate, event.source, reading, following)
+        return after, outcome
 
     def _count_standstill(self, stamp: int) -> None:
         record = self._sources.setdefault(STANDSTILL, SourceRecord())
@@ -809,7 +811,7 @@ class BaseEstimator:
 
 
 def _displacement_stamp(first: int, second: int) -> int:
-    """That of a displacement between two readings: a mean velocity is that of the middle, unless it is a pause."""
+    """That of a displacement between two readings: their middle, as of a mean velocity, but for a pause."""
     return (first + second) // 2 if second - first <= COAST_NS else second
 
 

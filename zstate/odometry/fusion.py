@@ -11,8 +11,8 @@ kept.
   constant 0.5 rad/s. The displacement of the wheels over such a pause replaces all of that.
 - A reading whose NIS exceeds the 99.9 % gate is rejected. After two seconds of rejections in a row, the
   estimate follows: it forgets its velocity, or place, and keeps biases and tilt.
-- If wheels and gyro agree for 0.1 s that the base stands, its velocity is zero, and the gyro measures its own
-  bias. Wheels that roll nearly straight measure it as well, but never better than they are straight.
+- If wheels, or all feet, and the gyro agree for 0.1 s that the base stands, its velocity is zero, and the
+  gyro measures its own bias. The yaw rate of wheels shows a bias that was never measured so (``turning.py``).
 - A heading is relative to the first one of its source: the odometry frame has no north. The error of a
   compass turns with the robot and its place and does not average out. So the variance of the yaw is never
   lowered below that of the source, which is the stated one or, if larger, the mean square that its
@@ -54,9 +54,10 @@ from zstate.odometry.invariant_filter import (
     white_noise,
     with_plain_covariance,
 )
-from zstate.odometry.legs import Foot, Legs, updated_by_feet
+from zstate.odometry.legs import Foot, Legs, Stance, stance_after, updated_by_feet
 from zstate.odometry.measurements import heading, yaw_rate, zero_velocity
 from zstate.odometry.rotations import rotation_exp, skew
+from zstate.odometry.turning import COMPARED_S, Turning, constant_difference, disagreement, turned
 
 SILENCE_NS = 100_000_000
 """Without samples of the IMU for longer, the base coasts."""
@@ -87,19 +88,15 @@ _NOISIER = 1.5
 _SHOCK = np.repeat((10.0, 50.0), 3)
 """[rad/s], [m/s^2]: no sample of an IMU differs from the one before by more, but in a shock or by a fault."""
 
-_WHEEL_TURN = 0.03
-"""[rad/s] The yaw rates of wheels and gyro are on a line but for so much, or the wheels slip."""
-_STRAIGHT = 0.004
-"""[rad/s] And by so much for ever: radii differ."""
-_APART, _APART_S = 3.0, 5.0
-"""So many standard deviations apart, in the mean of so many seconds, the gyro is not what it was taken for."""
+_APART = 3.0
+"""The gyro and wheels that are so many standard deviations apart contradict each other."""
 _UNKNOWN_BIAS = 0.008
 """[rad/s] A bias with a larger standard deviation was never measured."""
 _USUAL_BIAS = 0.002
 """[rad/s] The standard deviation of the biases of gyros that are calibrated."""
 _FROZEN, _FROZEN_RATE = 10, 0.03
-"""So many samples that repeat the one before, while wheels turn otherwise [rad/s], are of an IMU that is frozen.
-Samples of a simulation without noise repeat as well, but turn as the wheels do."""
+"""So many samples that repeat the one before, while wheels turn otherwise [rad/s], are of a frozen IMU. Those
+of a simulation without noise repeat as well, but turn as the wheels do."""
 
 _LEAST_SPEED_BOUND = 2.0
 """[m/s] The velocity of a base that nothing measures is so unsure, or twice the fastest that was measured."""
@@ -118,8 +115,6 @@ MOST_BIAS = 0.03
 """[rad/s] A gyro that measures more while wheels stand is turned: it may be carried, or on a turntable."""
 _TILTED, _TILT_SHARE = math.radians(4.0), 0.01
 """[rad] A base that is tilted by more in all directions is not; the mean of so many readings is taken."""
-_COMPARED_S, _COMPARED_RATE, _COMPARED_SCALE = 10.0, 0.08, 1.6
-"""The yaw rates of wheels and gyro are compared for so long, if above it [rad/s], up to this factor."""
 
 _DEVIATION_S = 20.0
 _UNPROVEN, _SECTORS = 0.5, 12
@@ -234,30 +229,17 @@ class Compass(NamedTuple):
 class Vibration(NamedTuple):
     """The noise of the samples of the IMU: ``variance`` of gyro and accelerometer in each axis, (6,).
 
-    ``values`` are the last sample as it was received, (6,), and ``change`` its difference to the one before;
-    ``count`` are those in the mean, and ``repeated`` those in a row that repeat the last one. ``white`` is the squared density of the noise to predict with, (6,).
+    ``values`` are the last sample as it was received, (6,), and ``change`` its difference to the one before.
+    ``averaged`` are those in the mean, ``repeated`` those in a row that repeat the last one. ``white`` is the
+    squared density of the noise to predict with, (6,).
     """
 
     values: Floats
     change: Floats | None
     variance: Floats
-    count: int
+    averaged: int
     white: Floats
     repeated: int = 0
-
-
-class Turning(NamedTuple):
-    """The yaw rates by wheels and by the gyro less its bias, in motion: means of the last 10 s.
-
-    They are those of both, of their squares, and of their product. ``time_s`` is how long there was motion.
-    """
-
-    time_s: float = 0.0
-    wheels: float = 0.0
-    gyro: float = 0.0
-    wheels_square: float = 0.0
-    gyro_square: float = 0.0
-    product: float = 0.0
 
 
 class Offset(NamedTuple):
@@ -312,10 +294,11 @@ class Estimate(NamedTuple):
     ``moved_at`` is the stamp of the last velocity that was not zero, ``angular`` the rate by wheels in the
     IMU's axes [rad/s], ``wheels_at`` their stamp. ``touching`` are the feet on the ground, if measured.
     ``sampled_s`` is the mean time between samples of the IMU, over which the noise of a rate is averaged.
-    ``tilts`` has for each direction the vertical less that of the base, in
-    the IMU's axes, (3,). ``fastest`` is the greatest speed that was measured [m/s]. ``anchor`` is the estimate at the last reading
-    before the wheels and the IMU fell silent. ``lost_at`` is when the estimate last followed a source that it
-    had rejected. ``turn_at_rest`` is the rate of the gyro while wheels stand, if too large for a bias [rad/s].
+    ``tilts`` has for each direction the vertical less that of the base, in the IMU's axes, (3,). ``fastest``
+    is the greatest speed that was measured [m/s]. ``anchor`` is the estimate at the last reading before
+    wheels and IMU fell silent. ``lost_at`` is when the estimate last followed a source that it had rejected,
+    and ``biased_at`` when the wheels last contradicted the bias of the gyro. ``turn_at_rest`` is the rate of
+    the gyro while wheels stand, if too large for a bias [rad/s]; ``was_at_rest``: the bias was measured then.
     """
 
     stamp: int
@@ -333,6 +316,7 @@ class Estimate(NamedTuple):
     angular: Floats | None = None
     upright: Floats | None = None
     touching: frozenset[str] | None = None
+    stance: Stance | None = None
     vibration: Vibration | None = None
     turning: Turning = Turning()
     turn_at_rest: float = 0.0
@@ -509,6 +493,12 @@ class Fusion:
                 velocities=reading.velocities,
                 efforts=reading.efforts,
             )
+        stance = stance_after(
+            estimate.stance, reading.stamp, reading.feet, is_whole=touching == frozenset(legs.names)
+        )
+        is_standing = stance is not None and stance.is_still
+        moved_at = estimate.moved_at if is_standing else reading.stamp
+        estimate = estimate._replace(stance=stance, wheels_at=reading.stamp, moved_at=moved_at)
         state, squares = updated_by_feet(estimate.state, reading.feet, touching, gate(3))
         estimate = _moved(estimate, state, is_step=True)
         if not squares:
@@ -645,7 +635,7 @@ class Fusion:
         last = before.vibration
         if last is None or before.imu is None or sample.stamp <= before.imu.stamp:
             return Vibration(values, None, np.zeros(6), 0, white_noise(self.noise))
-        change, variance, count = values - last.values, last.variance, last.count
+        change, variance, count = values - last.values, last.variance, last.averaged
         if last.change is not None and not (np.abs(change) > _SHOCK).any():
             count += 1
             share = max((sample.stamp - before.imu.stamp) * 1e-9 / _VIBRATION_S, 1.0 / count)
@@ -657,53 +647,21 @@ class Fusion:
         return Vibration(values, change, variance, count, white, repeated)
 
     def _with_turn(self, estimate: Estimate, reading: Reading) -> Estimate:
-        """The estimate after the yaw rate of wheels, which is compared with that of the gyro.
-
-        If they differ by a constant, the bias of the gyro is unsure by it. One that was not measured at rest is
-        corrected; another is not, because the radii of wheels may differ.
-        """
+        """The estimate after the yaw rate of wheels, which is compared with that of the gyro."""
         axis, angular, wheels_at = reading.upright, reading.angular, estimate.wheels_at
-        if axis is None or angular is None or wheels_at is None or reading.is_still:
+        vibration = estimate.vibration
+        if axis is None or angular is None or wheels_at is None or vibration is None or reading.is_still:
             return estimate
-        state, vibration = estimate.state, estimate.vibration
         dt_s = min((reading.stamp - wheels_at) * 1e-9, _LONGEST_STEP_S)
-        if dt_s <= 0.0 or vibration is None:
+        if dt_s <= 0.0:
             return estimate
-        rate = float(axis @ angular)
-        gyro = float(axis @ (estimate.rate - state.gyro_bias))
-        turning = _after_turn(
-            estimate.turning, rate, gyro, float((axis * axis) @ vibration.variance[:3]), dt_s
+        gyro = float(axis @ (estimate.rate - estimate.state.gyro_bias))
+        noise = float((axis * axis) @ vibration.variance[:3])
+        estimate = estimate._replace(
+            turning=turned(estimate.turning, float(axis @ angular), gyro, noise, dt_s)
         )
-        estimate = estimate._replace(turning=turning)
-        if turning.time_s < _APART_S:
-            return estimate
-        compared = _apart(turning)
-        if compared is None:
-            return estimate
-        apart, sigma = compared
-        variance = float(axis @ state.covariance[GYRO_BIAS, GYRO_BIAS] @ axis)
-        if not estimate.was_at_rest and variance > _UNKNOWN_BIAS * _UNKNOWN_BIAS:
-            if abs(apart) < _APART * math.hypot(sigma, _USUAL_BIAS):
-                # A gyro that is calibrated: less than the wheels say about it is its bias. It stays as it is.
-                usual = _USUAL_BIAS**2 + max(0.0, apart * apart - sigma * sigma)
-                noise = 1.0 / (1.0 / min(usual, 0.9 * variance) - 1.0 / variance)
-                measurement = yaw_rate(state, gyro, noise, axis, estimate.rate)
-            else:
-                measurement = yaw_rate(state, gyro + apart, sigma * sigma, axis, estimate.rate)
-                estimate = estimate._replace(biased_at=estimate.stamp)
-            return _moved(estimate._replace(turning=Turning()), updated(state, measurement))
-        if abs(apart) < _APART * math.sqrt(variance + sigma * sigma):
-            return estimate
-        wrong_s = min(turning.time_s, _COMPARED_S)
-        covariance = state.covariance.copy()
-        covariance[GYRO_BIAS, GYRO_BIAS] += np.outer(axis, axis) * apart**2
-        covariance[_YAW, _YAW] += (apart * wrong_s) ** 2
-        state = state._replace(covariance=covariance)
-        estimate = estimate._replace(state=state, turning=Turning(), biased_at=estimate.stamp)
-        if estimate.was_at_rest:
-            return estimate
-        measurement = yaw_rate(state, gyro + apart, sigma * sigma, axis, estimate.rate)
-        return _moved(estimate, updated(state, measurement))
+        compared = constant_difference(estimate.turning)
+        return estimate if compared is None else _with_bias_by_wheels(estimate, axis, gyro, *compared)
 
     def _at_end_of_rest(self, estimate: Estimate) -> tuple[Estimate, Outcome | None]:
         """The estimate with a zero velocity, if the base stood in this interval and in the one before."""
@@ -748,9 +706,8 @@ class Fusion:
         if largest <= bound * bound:
             return estimate
         slow = zero_velocity(state, state.gyro_bias, bound, 1.0)
-        return _moved(
-            estimate, updated(state, Measurement(*(part[:3] for part in slow[:2]), np.eye(3) * bound**2))
-        )
+        slow = Measurement(slow.residual[:3], slow.jacobian[:3], slow.covariance[:3, :3])
+        return _moved(estimate, updated(state, slow))
 
 
 def is_still(linear: Floats, angular: Floats | None) -> bool:
@@ -786,18 +743,18 @@ def imu_remarks(estimate: Estimate) -> list[str]:
         tilt = np.mean(list(estimate.tilts.values()), axis=0)
         if float(tilt @ tilt) > _TILTED * _TILTED:
             found.append(
-                f"the base is tilted by {math.degrees(math.sqrt(tilt @ tilt)):.2g} degrees whichever way it heads: "
-                "the mount of the IMU is off by that"
+                f"the base is tilted by {math.degrees(math.sqrt(tilt @ tilt)):.2g} degrees whichever way it "
+                "heads: the mount of the IMU is off by that"
             )
     if estimate.turn_at_rest:
         found.append(
-            f"the gyro reads {estimate.turn_at_rest:.2g} rad/s while the wheels stand: the base is turned, or the "
-            f"bias is larger than {MOST_BIAS:g} rad/s and is found on a straight drive"
+            f"the gyro reads {estimate.turn_at_rest:.2g} rad/s while the wheels stand: the base is turned, "
+            f"or the bias is larger than {MOST_BIAS:g} rad/s and is found on a straight drive"
         )
     if _is_recent(estimate, estimate.biased_at):
         found.append(
-            "the yaw rates of gyro and wheels differ by a constant: the bias of the gyro has changed, or the radii "
-            "of the wheels differ"
+            "the yaw rates of gyro and wheels differ by a constant: the bias of the gyro has changed, or the "
+            "radii of the wheels differ"
         )
     if estimate.is_frozen:
         found.append("it repeats its last numbers while the wheels turn the base: it counts as silent")
@@ -827,49 +784,35 @@ def _is_recent(estimate: Estimate, stamp: int | None) -> bool:
     return stamp is not None and estimate.stamp - stamp < _REMEMBERED_NS
 
 
-def disagreement(turning: Turning) -> str:
-    """A sentence on the yaw rates of wheels and gyro if they contradict each other; else empty."""
-    wheels, gyro = math.sqrt(turning.wheels_square), math.sqrt(max(0.0, turning.gyro_square))
-    if turning.time_s < _APART_S or max(wheels, gyro) < _COMPARED_RATE:
-        return ""
-    alike = turning.product / max(wheels * gyro, _COMPARED_RATE**2)
-    if alike < -0.5:
-        cause = "in opposite directions: the mount of the IMU is mirrored, or left and right are swapped"
-    elif gyro < 0.2 * wheels:
-        cause = (
-            "so the gyro does not turn with the base (frozen, or mounted about another axis), or wheels slip"
-        )
-    elif alike < 0.5:
-        cause = "at different times: one of them is wrong"
-    elif not 1.0 / _COMPARED_SCALE < wheels / gyro < _COMPARED_SCALE:
-        cause = f"so the track is about {wheels / gyro:.2g} times as wide, or the wheels slip"
-    else:
-        return ""
-    return f"the wheels turn the base by {wheels:.2g} rad/s and the gyro by {gyro:.2g} (rms of 10 s), {cause}"
+def _with_bias_by_wheels(
+    estimate: Estimate, axis: Floats, gyro: float, apart: float, sigma: float
+) -> Estimate:
+    """The estimate after a comparison: wheels turn by ``apart`` more than the gyro about ``axis`` [rad/s].
 
-
-def _apart(turning: Turning) -> tuple[float, float] | None:
-    """By what constant the yaw rate of wheels exceeds that of the gyro, with its standard deviation [rad/s].
-
-    That is the regression of one on the other, with a scale if they turn enough to show it. Rates that do not
-    follow a line, as those of wheels that slip, or that have another scale, say nothing: None.
+    ``sigma`` is the standard deviation of that, ``gyro`` the rate that the gyro reads less its bias. A bias
+    that was not measured at rest is corrected, if it is larger than that of a calibrated gyro. One that was
+    measured is not, because the radii of wheels may differ: it is as unsure as the difference.
     """
-    spread = turning.gyro_square - turning.gyro**2
-    both = turning.product - turning.gyro * turning.wheels
-    scale = both / spread if spread > _WHEEL_TURN**2 else 1.0
-    rest = turning.wheels_square - turning.wheels**2 - scale * (2.0 * both - scale * spread)
-    if not 1.0 / _COMPARED_SCALE < scale < _COMPARED_SCALE or rest > _WHEEL_TURN**2:
-        return None
-    lever = turning.gyro**2 / spread if spread > _WHEEL_TURN**2 else 0.0
-    variance = max(0.0, rest) * (1.0 + lever) / min(turning.time_s, _COMPARED_S)
-    return turning.wheels - scale * turning.gyro, math.sqrt(variance + _STRAIGHT**2)
-
-
-def _after_turn(before: Turning, rate: float, gyro: float, noise: float, dt_s: float) -> Turning:
-    time_s = before.time_s + dt_s
-    share = dt_s / min(time_s, _COMPARED_S)
-    now = (rate, gyro, rate * rate, gyro * gyro - noise, rate * gyro)
-    return Turning(time_s, *(old + share * (new - old) for old, new in zip(before[1:], now, strict=True)))
+    state, turning = estimate.state, estimate.turning
+    variance = float(axis @ state.covariance[GYRO_BIAS, GYRO_BIAS] @ axis)
+    corrected_by_wheels = yaw_rate(state, gyro + apart, sigma * sigma, axis, estimate.rate)
+    if not estimate.was_at_rest and variance > _UNKNOWN_BIAS * _UNKNOWN_BIAS:
+        if abs(apart) < _APART * math.hypot(sigma, _USUAL_BIAS):
+            usual = min(_USUAL_BIAS**2 + max(0.0, apart * apart - sigma * sigma), 0.9 * variance)
+            # A measurement of what is known already, with the noise that leads to this variance.
+            noise = 1.0 / (1.0 / usual - 1.0 / variance)
+            measurement = yaw_rate(state, gyro, noise, axis, estimate.rate)
+            return _moved(estimate._replace(turning=Turning()), updated(state, measurement))
+        estimate = estimate._replace(turning=Turning(), biased_at=estimate.stamp)
+        return _moved(estimate, updated(state, corrected_by_wheels))
+    if abs(apart) < _APART * math.sqrt(variance + sigma * sigma):
+        return estimate
+    covariance = state.covariance.copy()
+    covariance[GYRO_BIAS, GYRO_BIAS] += np.outer(axis, axis) * apart**2
+    covariance[_YAW, _YAW] += (apart * min(turning.time_s, COMPARED_S)) ** 2
+    state = state._replace(covariance=covariance)
+    estimate = estimate._replace(state=state, turning=Turning(), biased_at=estimate.stamp)
+    return estimate if estimate.was_at_rest else _moved(estimate, updated(state, corrected_by_wheels))
 
 
 def _is_frozen(estimate: Estimate) -> bool:
@@ -921,7 +864,7 @@ def _moved(estimate: Estimate, state: FilterState, *, is_step: bool = False) -> 
     """The estimate corrected to ``state``, while the continuous pose stays.
 
     ``place`` is that of the IMU. Tilt, and poses that are measured, are followed slowly. ``is_step``: feet
-    measure displacements, so that the place moves, by one standard deviation of the velocity at most.
+    measure displacements, which the place follows, slowly as well.
     """
     before, offset = estimate.state, estimate.offset
     place = offset.rotation.dot(before.position) + offset.shift
@@ -929,8 +872,7 @@ def _moved(estimate: Estimate, state: FilterState, *, is_step: bool = False) -> 
     elapsed_s = (estimate.stamp - offset.stamp) * 1e-9
     if is_step:
         step = offset.rotation.dot(state.position - before.position)
-        sigma = math.sqrt(max(before.covariance[3, 3], before.covariance[4, 4], before.covariance[5, 5]))
-        most = sigma * min(elapsed_s, _LONGEST_STEP_S)
+        most = _PLACE_RATE * min(elapsed_s, _LONGEST_STEP_S)
         place = place + step * min(1.0, most / max(math.sqrt(step @ step), 1e-12))
     # The offset turns the vertical into the first two numbers; turning it back levels the pose.
     x, y = float(rotation[0, 2]), float(rotation[1, 2])
@@ -954,7 +896,7 @@ def _moved(estimate: Estimate, state: FilterState, *, is_step: bool = False) -> 
 def _spread(
     sectors: Mapping[int, tuple[int, float]], stamp: int, against_gyro: float, bias_variance: float
 ) -> float:
-    """The variance of a compass whose difference to the gyro turns with its direction: half the range, squared.
+    """The variance of a compass whose difference to the gyro turns with its direction: (range / 2)^2.
 
     What the gyro may have drifted since is no error of the compass.
     """
@@ -1031,8 +973,9 @@ def _gated(
 def _without_yaw_bias(found: Innovation, axis: Floats) -> Innovation:
     """The innovation with a gain that leaves the bias of the gyro about ``axis``, (3,), as it is.
 
-    A velocity shows it only by the force across the base in turns, which tilt, slip and play are part of: what
-    it seemed to show led away on real drives (Schmidt's consider filter; the covariance is that of this gain).
+    A velocity shows it only by the force across the base in turns, which tilt, slip and play are part of.
+    What it seems to show leads away on real drives. This is a consider filter (S. F. Schmidt, "Application of
+    state-space methods to navigation problems", 1966); the covariance is that of this gain.
     """
     gain = found.gain.copy()
     gain[GYRO_BIAS] -= np.outer(axis, axis.dot(gain[GYRO_BIAS]))

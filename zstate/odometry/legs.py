@@ -29,6 +29,9 @@ from zstate.odometry.invariant_filter import (
 from zstate.odometry.measurements import contact
 from zstate.odometry.rotations import Floats
 
+_STANCE_NS, _STANCE_MOTION = 500_000_000, 0.003
+"""The means of so long of where feet are differ by less [m] while a robot stands on all of them."""
+
 _SINGLE = ("revolute", "continuous", "prismatic")
 
 
@@ -109,6 +112,22 @@ class Foot(NamedTuple):
     offset: Floats
     covariance: Floats
     jacobian: Floats
+
+
+class Stance(NamedTuple):
+    """Where feet that are all on the ground are from the IMU, (k, 3): sums of them and of their squares.
+
+    They are those since ``start``. ``before`` is the mean of the interval before, and ``spread`` how far
+    single readings were from it. ``is_still``: the means of the last two intervals were the same.
+    """
+
+    start: int
+    size: int
+    total: Floats
+    squares: Floats
+    before: Floats | None = None
+    spread: float = 0.0
+    is_still: bool = False
 
 
 class Legs:
@@ -214,6 +233,26 @@ class Legs:
                 f"no {what} of {', '.join(map(repr, missing))}, which moves a foot{suggestion_text(near)}"
             )
         return np.array([values[name] for name in self.joint_names], dtype=np.float64)
+
+
+def stance_after(before: Stance | None, stamp: int, feet: Sequence[Foot], *, is_whole: bool) -> Stance | None:
+    """The stance with one more reading; None if not all feet are on the ground."""
+    if not is_whole:
+        return None
+    offsets = np.array([foot.offset for foot in feet])
+    first = Stance(stamp, 1, offsets, offsets * offsets)
+    if before is None:
+        return first
+    if before.before is not None and float(np.abs(offsets - before.before).max()) > before.spread:
+        return first
+    if stamp - before.start < _STANCE_NS:
+        total, squares = before.total + offsets, before.squares + offsets * offsets
+        return before._replace(size=before.size + 1, total=total, squares=squares)
+    mean = before.total / before.size
+    variance = float((before.squares / before.size - mean * mean).max())
+    is_still = before.before is not None and float(np.abs(mean - before.before).max()) < _STANCE_MOTION
+    spread = _STANCE_MOTION + 4.0 * math.sqrt(max(0.0, variance))
+    return first._replace(before=mean, spread=spread, is_still=is_still)
 
 
 def updated_by_feet(

@@ -5,6 +5,7 @@ The functions that pass a message to an estimator also serve recordings.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -45,6 +46,11 @@ _AHEAD_NS = 500_000_000
 """Clocks of one robot differ by less, and the way of a reading takes more than none."""
 
 _LONG_AGO = -(2**63)
+
+_LOG = logging.getLogger("zstate")
+
+_LOGGED_NS = 60_000_000_000
+"""A sentence of each source is logged once in this time."""
 
 _HEALTH_NS = 500_000_000
 """The interval at which the health of the sources is assessed, by stamps."""
@@ -267,6 +273,7 @@ class OdometryNode(Closeable):
         """Publish from the next stamp on, whatever it is; the estimator has started anew."""
         self._imu_stamp = self._due = self._newest = self._assessed = _LONG_AGO
         self._epoch = self.base.epoch
+        self._logged: dict[str, int] = {}
 
     def __repr__(self) -> str:
         return f"<OdometryNode of {self._publisher.robot!r}: {self.published} samples>"
@@ -406,5 +413,9 @@ class OdometryNode(Closeable):
     def _assess(self, stamp: int) -> None:
         if stamp - self._assessed >= _HEALTH_NS:
             self._assessed = stamp
-            sentences = [one.sentence for one in self.base.health() if one.sentence]
-            self._publisher.warning = "; ".join(sentences)
+            sentences = {one.name: one.sentence for one in self.base.health() if one.sentence}
+            self._publisher.warning = "; ".join(sentences.values())
+            for name, sentence in sentences.items():
+                if stamp - self._logged.get(name, _LONG_AGO) > _LOGGED_NS:
+                    self._logged[name] = stamp
+                    _LOG.warning("odometry of %r: %s", self._publisher.robot, sentence)
