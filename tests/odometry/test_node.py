@@ -193,7 +193,8 @@ def test_sentences_on_the_sources_are_in_the_status_of_the_writer_and_logged_onc
             return any("flow: " in text for text in texts)
 
         until(warned)
-    assert [record.message.startswith("odometry of 'r1': flow: ") for record in caplog.records].count(True) == 1
+    logged = [record.message for record in caplog.records]
+    assert sum(text.startswith("odometry of 'r1': flow: ") for text in logged) == 1
 
 
 def test_velocities_without_covariance_are_refused_and_counted():
