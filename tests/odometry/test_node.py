@@ -387,6 +387,9 @@ def test_a_request_places_the_base_or_starts_anew_and_what_is_refused_has_its_re
         until(lambda: imu.publish([0, 0, 0], [0, 0, 9.80665], next(ticks)) or node.published)
         request_odometry(robot, "r1", "set_pose", place, timeout_s=DEADLINE_S)
         assert node.state().odom_from_base.translation.tolist() == pytest.approx([3.0, 1.0, 0.0], abs=0.1)
+        every = [*robot.zenoh.get("zstate/*/@odometry/*?do=reset", timeout=DEADLINE_S)]
+        assert [reply.err and "is for one key" in reply.err.payload.to_string() for reply in every] == [True]
+        assert node.base.epoch == 0
         request_odometry(robot, "r1", "reset", timeout_s=DEADLINE_S)
         assert node.base.epoch == 1
         with pytest.raises(Unreachable, match="is `zstate odometry r1` running"):

@@ -254,7 +254,7 @@ class OdometryNode(Closeable):
                 OdometryPublisher(session, robot, writer, program=program)
             )
             request_key = odometry_request_key(robot, self._publisher.writer)
-            opening.enter_context(Queryable(session, request_key, self._on_request))
+            opening.enter_context(Queryable(session, request_key, self._on_request, is_exact=True))
             if has_joints:
                 joints = JointStateListener(session, robot, on_reading=self._on_joints)
                 self._joints = opening.enter_context(joints)
