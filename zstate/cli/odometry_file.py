@@ -122,10 +122,7 @@ class OdometrySettings:
                 raise InvalidInput(f"legs need the model of {robot!r}, and there is none")
             legs = self.legs.legs(model, imu_frame.removeprefix(f"{robot}/"))
         odom, base = full_name(robot, self.odom), full_name(robot, base)
-        start = None
-        if self.initial_pose is not None:
-            x, y, yaw_deg = self.initial_pose
-            start = Transform.from_rpy(odom, base, (x, y, 0.0), (0.0, 0.0, math.radians(yaw_deg)))
+        start = None if self.initial_pose is None else planar_transform(odom, base, self.initial_pose)
         return BaseEstimator(
             odom=odom,
             base=base,
@@ -137,6 +134,12 @@ class OdometrySettings:
             legs=legs,
             initial_pose=start,
         )
+
+
+def planar_transform(odom: str, base: str, pose: PlanarPose) -> Transform:
+    """The pose of ``base`` in ``odom``, on the floor and upright."""
+    x, y, yaw_deg = pose
+    return Transform.from_rpy(odom, base, (x, y, 0.0), (0.0, 0.0, math.radians(yaw_deg)))
 
 
 def read_settings(path: str) -> OdometrySettings:

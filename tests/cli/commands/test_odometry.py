@@ -159,6 +159,34 @@ def test_stated_noise_and_initial_pose_place_the_base_where_it_starts(spawn: Spa
     interrupted(live)
 
 
+def test_requests_place_the_base_of_a_running_odometry_and_start_it_anew(spawn: Spawn):
+    live = started(spawn, "odometry", "walker", "--feet", "foot1,foot2", "--writer", "legs")
+    request = ("odometry", "walker", "--writer", "legs")
+    with connect() as session, TransformListener(session, "walker") as listener, walker(session):
+        assert "as 'legs'" in live.line()
+        listener.buffer.wait("odom", "base", timeout_s=DEADLINE_S)
+
+        def place() -> list[float]:
+            pose = listener.buffer.lookup("odom", "base")
+            return [*pose.translation[:2], pose.rpy[2]]
+
+        for options, done, expected in (
+            (("--set-pose", "2", "1", "90"), "placed the base at x 2 m, y 1 m, yaw 90 deg", (2, 1, 1.5708)),
+            (
+                ("--reset", "--set-pose", "-3", "0.5", "0"),
+                "started anew and placed the base at",
+                (-3, 0.5, 0),
+            ),
+        ):
+            ended = zstate(*request, *options)
+            assert ended.stdout.decode().startswith(f"the odometry 'legs' of 'walker' {done}"), ended.stderr
+            until(lambda: place() == pytest.approx(expected, abs=0.05))  # noqa: B023
+        assert zstate(*request, "--reset").stdout.decode() == "the odometry 'legs' of 'walker' started anew\n"
+        refused = failure("odometry", "walker", "--reset")
+        assert "no reply at 'zstate/walker/@odometry/odometry' within 2 s" in refused
+    interrupted(live)
+
+
 def test_unusable_options_are_explained(tmp_path: Path):
     wheels = "left=l,right=r,radius=0.1,track=0.5"
     for arguments, error in (
@@ -168,6 +196,8 @@ def test_unusable_options_are_explained(tmp_path: Path):
         (("--diff-drive", wheels, "--reference", "pose/gps"), "--reference needs --replay RECORDING"),
         (("--reference", "poses/gps"), "a reference is pose/SENSOR or odometry/WRITER, not 'poses/gps'"),
         (("--reference", "pose/gps:sgma=1"), "'sgma=1' is not sigma=METRES; write pose/gps:sigma=0.02"),
+        (("--reset", "--initial-pose", "1", "2", "3"), "--initial-pose is not for it"),
+        (("--set-pose", "1", "2", "3", "--replay", "a.mcap"), "--replay is not for it"),
         (("--velocity", "flow:sigma=0"), "sigma is a standard deviation above zero"),
     ):
         assert error in failure("odometry", "rover", *arguments, code=2)

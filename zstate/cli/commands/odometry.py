@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import click
+from click.core import ParameterSource
 
 from zstate.cli import options
 from zstate.cli.output.console import count_text, fail, print_wrapped
@@ -18,7 +19,7 @@ from zstate.errors import LookupFailed
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from zstate.cli.odometry_file import LegSettings, OdometrySettings
+    from zstate.cli.odometry_file import LegSettings, OdometrySettings, PlanarPose
     from zstate.cli.odometry_reference import ReferenceName
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
@@ -63,6 +64,13 @@ def _parse_plot(file: str) -> Path:
     from zstate.cli.commands.plot import plot_file
 
     return plot_file(file)
+
+
+_OF_ESTIMATES = (
+    *("imu", "velocities", "poses", "diff_drive", "feet", "file", "odom", "base", "initial_pose"),
+    *("rate", "replay", "reference", "plot", "seconds"),
+)
+"""Parameters of the command that a request to a running odometry has no use for."""
 
 
 @click.command("odometry")
@@ -120,6 +128,18 @@ def _parse_plot(file: str) -> Path:
     "--writer", default="odometry", show_default=True, metavar="NAME", help="The name to publish under."
 )
 @click.option(
+    "--reset",
+    is_flag=True,
+    help="Have the odometry that runs as --writer start anew: pose, biases and alignment, at rest.",
+)
+@click.option(
+    "--set-pose",
+    type=float,
+    nargs=3,
+    metavar="X Y YAW",
+    help="Have it place the base there [m, degrees], at z = 0; with --reset it starts anew there.",
+)
+@click.option(
     "--replay",
     metavar="RECORDING",
     help="Compute from a recording instead, and publish nothing: a table of its sources.",
@@ -149,9 +169,11 @@ def odometry_command(
     file: str | None,
     odom: str | None,
     base: str | None,
-    initial_pose: tuple[float, float, float] | None,
+    initial_pose: PlanarPose | None,
     rate: float | None,
     writer: str,
+    reset: bool,
+    set_pose: PlanarPose | None,
     replay: str | None,
     reference: ReferenceName | None,
     plot: Path | None,
@@ -176,7 +198,13 @@ def odometry_command(
     zstate odometry r1 --velocity wheels:sigma=0.05                # [m/s]; messages without covariance
     zstate odometry r1 --file r1.toml --replay run.mcap --plot run.png
     zstate odometry r1 --file r1.toml --replay run.mcap --reference pose/mocap
+    zstate odometry r1 --set-pose 2 1 90                           # the base of the one that runs
     """
+    if reset or set_pose is not None:
+        _check_request(click.get_current_context())
+        with open_session(network) as session:
+            _request(session, robot, writer, reset=reset, place=set_pose)
+        return
     from zstate.cli.odometry_file import OdometrySettings, read_settings
 
     for option, value in (("--plot", plot), ("--reference", reference)):
@@ -204,6 +232,29 @@ def odometry_command(
         return
     with open_session(network) as session:
         _publish(session, robot, settings, writer=writer, rate_hz=rate, seconds=seconds)
+
+
+def _check_request(context: click.Context) -> None:
+    """Refuse options of the odometry itself next to a request to one that runs."""
+    for one in context.command.params:
+        name = one.name or ""
+        if name in _OF_ESTIMATES and context.get_parameter_source(name) == ParameterSource.COMMANDLINE:
+            raise click.UsageError(
+                f"--reset and --set-pose go to an odometry that runs; {one.opts[0]} is not for it"
+            )
+
+
+def _request(session: Session, robot: str, writer: str, *, reset: bool, place: PlanarPose | None) -> None:
+    """Send a request to the odometry that runs, and print what it did."""
+    from zstate.cli.odometry_file import planar_transform
+    from zstate.odometry import request_odometry
+
+    pose = None if place is None else planar_transform("odom", "base", place)
+    request_odometry(session, robot, "reset" if reset else "set_pose", pose, writer=writer)
+    done = ["started anew"] if reset else []
+    if place is not None:
+        done.append("placed the base at x {:g} m, y {:g} m, yaw {:g} deg".format(*place))
+    print_wrapped(f"the odometry {writer!r} of {robot!r} {' and '.join(done)}")
 
 
 def _publish(
