@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -53,3 +54,20 @@ def test_terminals_print_what_the_guide_shows(
     for name, content in files(text).items():
         (folder / name).write_text(content)
     check_page(TutorialPage(text), folder)
+
+
+def test_sentences_in_the_guide_of_odometry_are_those_of_the_code() -> None:
+    """Numbers differ: the words between them are in a literal of the package."""
+    written = [
+        node.value
+        for path in sorted((ROOT / "zstate" / "odometry").glob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    table = GUIDES["odometry"].partition("| sentence |")[2].partition("\n\n")[0]
+    quoted = re.findall(r"`([^`]*)`", "".join(f"{row.split(' | ')[0]}\n" for row in table.splitlines()[2:]))
+    assert len(quoted) > 20
+    for sentence in quoted:
+        split = re.split(r"\d[\d.]*(?: s\b| readings?)?|'\w+'|\.\.\.|[,;:]", sentence)
+        words = [part.strip(" .,:'") for part in split]
+        assert [part for part in words if part and not any(part in text for text in written)] == [], sentence
