@@ -394,7 +394,7 @@ def _rest_text(replayed: ReplayedOdometry) -> str:
     found = f"it was first found to stand after {first_s:.1f} s" if stood else "it was never found to stand"
     return (
         f"no rest at the start: {found}, so the bias of its gyro is not known, and the sigma of "
-        "the yaw grows; begin a recording with 3 s at rest, which wheels or velocities show, and feet do not"
+        "the yaw grows; begin a recording with 3 s at rest"
     )
 
 

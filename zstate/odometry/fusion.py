@@ -962,8 +962,10 @@ def _gated(
     run = Run(run.start, estimate.stamp, run.length + 1)
     if run.length < _REACQUIRE_COUNT or estimate.stamp - run.start < _REACQUIRE_NS:
         return _with_run(estimate, source, run), Outcome("rejected", nis, dimension)
-    forget = _without_place if is_position else _without_velocity
-    state = forget(state, measurement.residual, (estimate.stamp - run.start) * 1e-9)
+    if is_position:
+        state = _without_place(state, measurement.residual)
+    else:
+        state = _without_velocity(state, measurement.residual, (estimate.stamp - run.start) * 1e-9)
     found = innovation(state, measurement)
     state = corrected(state, measurement, found if axis is None else _without_yaw_bias(found, axis))
     estimate = _moved(_with_run(estimate, source, None), state)._replace(lost_at=estimate.stamp)
@@ -990,9 +992,8 @@ def _without_velocity(state: FilterState, residual: Floats, seconds: float) -> F
     return state._replace(covariance=covariance)
 
 
-def _without_place(state: FilterState, residual: Floats, seconds: float) -> FilterState:
+def _without_place(state: FilterState, residual: Floats) -> FilterState:
     """The state with an unknown position and yaw: they are wrong by the residual."""
-    del seconds
     covariance = forgotten(plain_covariance(state), POSITION, float(residual[:3] @ residual[:3]))
     if len(residual) == 6:
         forgotten(covariance, slice(_YAW, _YAW + 1), float(residual[5] ** 2))

@@ -184,8 +184,8 @@ def odometry_command(
 
     The estimate has a pose, a velocity and the covariances of both, and corrects the biases of the IMU. The
     mounts of the sensors are those of the robot's model. Data may be late and out of order. The robot should
-    stand still for a few seconds at first: gravity aligns the IMU, and its gyro is zeroed. Later rests zero
-    it if the robot has wheels or velocities; feet alone do not show that it rests.
+    stand still for a few seconds at first: gravity aligns the IMU, and its gyro is zeroed. Later rests,
+    on wheels or on all feet, zero it again.
 
     Each source has a NIS, the mean square of what it contradicts in units of its sigmas. `zstate monitor` and
     `zstate doctor` show the sentences about sources whose sigmas are wrong. The settings of a robot with the
