@@ -260,6 +260,45 @@ def test_other_writers_may_place_the_root_in_their_frames_and_in_unowned_ones():
         assert network.refused == {}
 
 
+def test_root_is_placed_before_the_fixed_edges_of_its_model_arrive_and_after_they_left():
+    moving = RobotDescription(1, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, MOVING)
+
+    def sample(network: Network) -> None:
+        network.ingest("r1").describe(moving)
+        network.sample("r1")
+
+    steps = (
+        sample,
+        set_statics("r1", MODEL_WRITER, *FIXED),
+        set_statics("cell", "site", ("map", "r1/world")),
+    )
+    for network in in_every_order(*steps, follow=TransformIngest):
+        assert network.edges == OWN | {("cell/map", "r1/world")}
+        network.writer("r1", MODEL_WRITER).withdraw()
+        assert ("cell/map", "r1/world") in network.edges
+        assert (network.refused, network.conflicts) == ({}, [])
+
+
+def test_other_frames_than_the_root_are_refused_once_the_model_is_complete():
+    root, stray = (
+        set_statics("cell", "site", ("map", "r1/base")),
+        set_statics("cell", "thief", ("map", "r1/x")),
+    )
+    moving = RobotDescription(1, "", "", (), MOVING)
+    for fixed in ((), FIXED):
+        network = Network(TransformIngest)
+        network.ingest("r1").describe(moving)
+        network.sample("r1")
+        stray(network)
+        assert ("cell/map", "r1/x") in network.edges
+        assert network.refused == {}
+        network.statics("r1", MODEL_WRITER, *fixed)
+        assert ("cell/map", "r1/x") not in network.edges
+        assert network.refused == {"foreign frame": 1}
+        root(network)
+        assert (("cell/map", "r1/base") in network.edges) == (not fixed)
+
+
 @pytest.mark.parametrize("parent", ["r1/base", "r3/base"])
 def test_other_writers_cannot_place_frames_of_a_robot_in_a_third_robots_frames(parent: str):
     steps = (

@@ -30,6 +30,7 @@ class Writers:
 
     def __init__(self, seed: int, *, is_shared: bool) -> None:
         self.choose = random.Random(seed)
+        self.is_shared = is_shared
         placers = self.choose.choice([None, ["r1"]])
         self.ownership = FrameOwnership(TransformBuffer(), Counters(), is_shared=is_shared, placers=placers)
         self.buffer = self.ownership.buffer
@@ -45,9 +46,10 @@ class Writers:
         return [(self.choose.choice(FRAMES), self.choose.choice(FRAMES)) for _ in range(number)]
 
     def step(self) -> None:
-        action = self.choose.choice(
-            [self.set_statics] * 3 + [self.move] * 3 + [self.join, self.leave, self.release, self.model]
-        )
+        actions = [self.set_statics] * 3 + [self.move] * 3 + [self.join, self.leave, self.release, self.model]
+        if not self.is_shared:  # in ROS nothing is withdrawn, and no frame belongs to a robot
+            actions += [self.withdraw, self.describe]
+        action = self.choose.choice(actions)
         action()
 
     def set_statics(self) -> None:
@@ -87,6 +89,12 @@ class Writers:
 
     def release(self) -> None:
         self.ownership.release(self.choose.choice(self.statics + self.moving))
+
+    def withdraw(self) -> None:
+        self.ownership.withdraw_statics(self.choose.choice(self.statics))
+
+    def describe(self) -> None:
+        self.ownership.add_description(self.choose.choice(ROBOTS))
 
     def model(self) -> None:
         robot = self.choose.choice(ROBOTS)

@@ -151,6 +151,9 @@ class FrameOwnership:
         # The frames of a robot that its own edges name, those of its model, and those of model edges.
         self._own_frames: dict[str, Counter[str]] = {}
         self._links: dict[str, frozenset[str]] = {}
+        # The robots with a model of published edges, and those whose fixed ones, maybe none, are known.
+        self._described: set[str] = set()
+        self._with_fixed_edges: set[str] = set()
         self._model_parents: Counter[str] = Counter()
         self._model_children: Counter[str] = Counter()
         self._refused: dict[EdgeClaim, None] = {}
@@ -168,6 +171,13 @@ class FrameOwnership:
             return
         with self._lock:
             self._robots.add(robot)
+            self._compare_outside(robot)
+            self._resolve_marked()
+
+    def add_description(self, robot: str) -> None:
+        """Add a robot whose model's edges are published: the moving ones, and the fixed ones apart."""
+        with self._lock:
+            self._described.add(robot)
             self._compare_outside(robot)
             self._resolve_marked()
 
@@ -264,6 +274,9 @@ class FrameOwnership:
     ) -> None:
         """Replace the static edges of ``source``; with ``adds``, as in ROS, only of the same children."""
         with self._lock:
+            if source.is_model and source.robot not in self._with_fixed_edges:
+                self._with_fixed_edges.add(source.robot)
+                self._compare_outside(source.robot)
             edges = {self._named(names): pose for names, pose in edges.items()}
             children = {child for _, child in edges}
             for names, claim in list(source.claims.items()):
@@ -371,6 +384,14 @@ class FrameOwnership:
             )
             raise InsertRefused(text, reason="too many frames", edge=next(iter(edges)))
         moved |= new
+
+    def withdraw_statics(self, source: EdgeSource) -> None:
+        """Remove the static edges of ``source``."""
+        with self._lock:
+            if source.is_model:
+                self._with_fixed_edges.discard(source.robot)
+                self._compare_outside(source.robot)
+            self.release(source)
 
     def release(self, source: EdgeSource) -> None:
         """Remove all edges of ``source``."""
@@ -670,10 +691,16 @@ class FrameOwnership:
         return InsertRefused(text, reason="second parent", edge=names)
 
     def _is_stray(self, frame: str) -> bool:
-        """Whether its robot places frames, but neither this one nor any on this one."""
+        """Whether its robot places frames, but neither this one nor any on this one.
+
+        False until the fixed edges of a described model arrive: they may place others on the frame.
+        """
         robot = frame_owner(frame)
         links, own = self._links.get(robot, ()), self._own_frames.get(robot, ())
-        return bool(links or own) and frame not in links and frame not in own
+        if frame in links or frame in own:
+            return False
+        is_complete = robot not in self._described or robot in self._with_fixed_edges
+        return bool(links or own) and is_complete
 
     def _prevails(self, claim: EdgeClaim, there: _AcceptedEdge | None) -> bool:
         """Whether it is the claim that is inserted, of all claims of the same edge."""

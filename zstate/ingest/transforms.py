@@ -71,6 +71,7 @@ class TransformIngest(StreamIngest):
                 return
             self._release(self._described)
             self._edges, self._order = edges, order
+            self._ownership.add_description(self.robot)
             self._buffer.domain.place(self.robot, (child for _, child in edges))
             self._insert_early()
 
@@ -252,7 +253,7 @@ class StaticTransformIngest:
     def withdraw(self) -> None:
         """Withdraw all of this writer's edges."""
         self.children = frozenset()
-        self._ownership.release(self._source)
+        self._ownership.withdraw_statics(self._source)
 
     def _edges(self, statics: StaticTransforms) -> dict[EdgeNames, Transform]:
         edges: dict[EdgeNames, Transform] = {}
