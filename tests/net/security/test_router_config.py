@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import zenoh
 from helpers.processes import find_free_port, until
-from helpers.robots import RRBOT, SampleCollector
+from helpers.robots import RRBOT, SampleCollector, wait_for_reader
 
 from zstate import StatePublisher, connect
 from zstate.errors import ConfigError, InvalidInput
@@ -18,6 +18,7 @@ from zstate.net.security.credentials import Credentials
 from zstate.net.security.router_config import Downsampling, RouterConfig, access_text
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
+from zstate.wire.keys import MODEL_WRITER
 
 FILES = Credentials(ca="/certs/ca.pem", certificate="/certs/r1.pem", key="/certs/r1.key")
 CONFIGURATIONS = {
@@ -112,6 +113,8 @@ def test_each_robot_is_downsampled_separately_and_latched_values_never():
     ):
         taps = [SampleCollector(reader, f"zstate/{robot}/joint_states") for robot in ("r1", "r2")]
         statics = SampleCollector(reader, "zstate/*/tf_static/*")
+        for robot in ("r1", "r2"):  # static edges are sent once, as the publisher opens
+            wait_for_reader(writer, f"zstate/{robot}/tf_static/{MODEL_WRITER}")
         with (
             StatePublisher(writer, RRBOT, "r1") as one,
             StatePublisher(writer, RRBOT, "r2") as other,
