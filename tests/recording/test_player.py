@@ -377,8 +377,14 @@ def test_robot_is_played_back_to_ros(sessions, arm: Path):
     writer, reader = sessions
     with TransformListener(reader, wire=wire, history_s=100.0) as listener:
         wait_for_reader(writer, RmwKeys(Ros2Options(domain=3, namespace="*")).key("arm", "joint_states"))
-        with Player(writer, arm, wires=("native", wire), rate=math.inf) as replayer:
-            assert not replayer.run().refused
+        replayer = Player(writer, arm, wires=("native", wire), rate=math.inf)
+        replayer.pause()
+        with replaying(replayer) as reports:
+            # Until it has the model or all tokens, a listener also receives, and counts, /tf.
+            until(lambda: [one.kind for one in listener.buffer.frames(("arm/upper",))] == ["joint"])
+            replayer.resume()
+            until(lambda: reports)
+        assert not reports[0].refused
         until(lambda: listener.stats.received == COUNT)
         until(lambda: listener.buffer.can_lookup("tool", "lens"))
         stamps = np.arange(START, START + 900 * MS, 7 * MS)
