@@ -147,6 +147,7 @@ def test_second_driver_of_a_joint_is_refused_with_both_names(sessions):
 def test_all_joints_and_some_joints_exclude_each_other(sessions):
     first, second = sessions
     with PartialStatePublisher(first, RRBOT, [ELBOW], "r1", program="gripper.py"):
+        until(lambda: any("partial_joint_states" in dict(info.writers) for info in discover(second)))
         with pytest.raises(SecondWriter, match=r"gripper\.py"):
             StatePublisher(second, RRBOT, "r1")
         with StatePublisher(second, RRBOT, "r1", streams=("robot_description", "tf_static")):

@@ -820,6 +820,7 @@ def test_states_motions_and_stops_of_a_driver_are_recorded_and_not_replayed(sess
         loop = threading.Thread(target=host.run)
         loop.start()
         arm.wait_for_driver(SOON_S)
+        until(lambda: count(recorder, "arm", "joint_states"))  # the driver knows its joints
         assert arm.move({"elbow": [0.05]}, [0.2], stretch=True).wait(SOON_S).name == "reached"
         stop(sessions[1], "arm", "door open", timeout_s=SOON_S)
         until(lambda: count(recorder, "arm", "stop"))
