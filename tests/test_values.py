@@ -33,8 +33,10 @@ from zstate.odometry import (
     ImuNoise,
     LegNoise,
     Mecanum,
+    PoseNoise,
     SourceHealth,
     SpeedThresholds,
+    VelocityNoise,
     WheelNoise,
     WheelVelocity,
 )
@@ -98,6 +100,8 @@ def examples() -> list[Any]:
         ImuNoise(gyro=1e-3, accel=1e-2, gyro_bias=1e-5, accel_bias=1e-4),
         LegNoise(),
         WheelNoise(),
+        VelocityNoise(),
+        PoseNoise(),
         ForceThresholds(20.0, 10.0),
         SpeedThresholds(0.1, 0.2),
     ]

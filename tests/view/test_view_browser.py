@@ -100,13 +100,18 @@ def test_robot_meshes_are_drawn_at_the_poses_of_their_links(robot: str, open_tab
         until(lambda: robot in shown.source.models)
         view_tab = open_tab(shown.page.url)
         until_fitted(shown)
-        # The page has the fitted camera when a click has come through it.
-        field(view_tab, "Visuals").click()
-        until(lambda: not shown.view.scene.visuals)
-        bare = picture(view_tab)
-        field(view_tab, "Visuals").click()
-        until(lambda: shown.view.scene.visuals)
-        full = picture(view_tab)
+
+        def toggled(shows: bool):
+            field(view_tab, "Visuals").click()
+            until(lambda: shown.view.scene.visuals == shows)
+            return picture(view_tab)
+
+        # The camera is the fitted one once it does not move between two pictures without meshes.
+        bare, full, again = toggled(False), toggled(True), toggled(False)
+        deadline = time.monotonic() + DEADLINE_S
+        while changed(bare, again).any() and time.monotonic() < deadline:
+            bare, full, again = again, toggled(True), toggled(False)
+        toggled(True)
         view_tab.save_screenshot(f"{robot}")
         surface = changed(full, bare)
 
