@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import repeated, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
@@ -51,11 +51,11 @@ def test_publish_uses_the_simulated_time_for_stamps_and_rate():
             return max((frame.newest or start for frame in joint_frames()), default=start) + SECOND // 2
 
         with simulation(start, limit=limit):
-            done = zstate(
+            done = run_cli(
                 "publish", RRBOT, "--source", "sine", "--clock", "sim", "--rate", "50", "--seconds", "5"
             )
         # Five simulated seconds: 250 ticks of 20 ms, exact by that time at any speed.
-        assert "commanded 50 Hz, achieved 50.00 Hz" in done.stdout.decode()
+        assert "commanded 50 Hz, achieved 50.00 Hz" in done.stdout
         # Samples published before the two have connected arrive with the history.
         until(lambda: [frame.count for frame in joint_frames()] == [250, 250])
         frame = joint_frames()[0]
@@ -100,8 +100,8 @@ def test_tf_measures_ages_with_the_clock_of_the_robot():
         thread.start()
         try:
             asked = ("tf", "world", "tool", "--once", "--json")
-            unknown = json.loads(zstate(*asked).stdout)
-            known = json.loads(zstate(*asked, "--clock", "sim").stdout)
+            unknown = json.loads(run_cli(*asked).stdout)
+            known = json.loads(run_cli(*asked, "--clock", "sim").stdout)
         finally:
             stop.set()
             thread.join()
@@ -124,7 +124,7 @@ def test_robots_on_another_clock_are_received_without_ages(spawn: Spawn):
 def test_first_robot_on_another_clock_does_not_exclude_others():
     with published_robot("a1", clock=ManualClock(5 * SECOND, "sim")), published_robot("b1"):
         for _ in range(3):
-            assert json.loads(zstate("tf", "b1/world", "b1/tool", "--once", "--json").stdout)["age_s"] < 60.0
+            assert json.loads(run_cli("tf", "b1/world", "b1/tool", "--once", "--json").stdout)["age_s"] < 60.0
 
 
 def test_listen_counts_stamps_that_are_off_the_clock(spawn: Spawn):

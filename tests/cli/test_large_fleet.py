@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, run_cli, started
 from helpers.processes import repeated
 
 from zstate import StatePublisher, connect, load_model
@@ -38,10 +38,10 @@ def fleet() -> Iterator[None]:
 
 @pytest.mark.processes
 def test_all_robots_are_listed(fleet: None):
-    ended = zstate("ls", "--json")
-    assert ended.returncode == 0
+    ended = run_cli("ls", "--json")
+    assert ended.code == 0
     assert len(json.loads(ended.stdout)) == ROBOTS + 1
-    assert f"r{ROBOTS - 1}" in zstate("ls").stdout.decode()
+    assert f"r{ROBOTS - 1}" in run_cli("ls").stdout
 
 
 @pytest.mark.processes
@@ -51,9 +51,9 @@ def test_all_robots_are_listed(fleet: None):
     ids=lambda command: command[0],
 )
 def test_a_command_answers(fleet: None, command: tuple[str, ...]):
-    ended = zstate(*command)
-    assert ended.returncode == 0, ended.stderr.decode()
-    assert "rrbot" in ended.stdout.decode()
+    ended = run_cli(*command)
+    assert ended.code == 0, ended.stderr
+    assert "rrbot" in ended.stdout
 
 
 @pytest.mark.processes
@@ -79,8 +79,8 @@ def test_ctrl_c_ends_a_command(
 
 @pytest.mark.processes
 def test_doctor_examines_every_robot_of_a_large_fleet_though_most_are_silent(fleet: None):
-    ended = zstate("doctor", "--json")
-    assert ended.returncode == 1, ended.stderr.decode()  # drivers are announced, and silent
+    ended = run_cli("doctor", "--json")
+    assert ended.code == 1, ended.stderr  # drivers are announced, and silent
     states: dict[str, set[str]] = {}
     for check in json.loads(ended.stdout)["checks"]:
         states.setdefault(check["robot"], set()).add(check["state"])

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import SOON_S
 
 from zstate import connect, load_model
@@ -36,9 +36,9 @@ def test_unquoted_path_with_a_space_is_recognised(tmp_path: Path, monkeypatch: p
 
 
 def test_without_a_command_the_help_is_printed():
-    alone, helped = zstate(), zstate("--help")
-    assert (alone.returncode, alone.stdout, alone.stderr) == (0, helped.stdout, b"")
-    assert zstate("snapshot").stdout.startswith(b"Usage: zstate snapshot")
+    alone, helped = run_cli(), run_cli("--help")
+    assert (alone.code, alone.stdout, alone.stderr) == (0, helped.stdout, "")
+    assert run_cli("snapshot").stdout.startswith("Usage: zstate snapshot")
 
 
 def test_mistyped_command_gets_the_nearest_one():
@@ -70,8 +70,8 @@ def test_every_synonym_leads_to_commands_that_exist():
 
 
 def test_help_is_a_command_too():
-    assert zstate("help").stdout == zstate("--help").stdout
-    assert zstate("help", "tf").stdout == zstate("tf", "--help").stdout
+    assert run_cli("help").stdout == run_cli("--help").stdout
+    assert run_cli("help", "tf").stdout == run_cli("tf", "--help").stdout
     assert "there is no command 'nothing'" in failure("help", "nothing", code=2)
 
 
@@ -182,7 +182,7 @@ def test_version_names_the_kernel_and_the_engine_of_publishers():
 
     engine = f"Pinocchio {load_pinocchio().__version__}"
     expected = f"zstate {__version__} (kernel: {kernel}, transforms of publishers: {engine})\n"
-    assert zstate("--version").stdout.decode() == expected
+    assert run_cli("--version").stdout == expected
 
 
 def test_version_and_doctor_name_the_closed_forms_where_pinocchio_cannot_be_loaded(
@@ -192,8 +192,8 @@ def test_version_and_doctor_name_the_closed_forms_where_pinocchio_cannot_be_load
         "raise ImportError('libgomp.so.1: cannot open shared object file')"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    assert zstate("--version").stdout.decode().endswith("transforms of publishers: closed forms)\n")
-    check = zstate("doctor").stdout.decode()
+    assert run_cli("--version").stdout.endswith("transforms of publishers: closed forms)\n")
+    check = run_cli("doctor").stdout
     assert "closed forms" in check
     assert "libgomp.so.1" in check
     assert "apt-get install libgomp1" in check

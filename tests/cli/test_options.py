@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, run_cli, started
 
 from zstate import TransformListener, connect
 from zstate.cli.options import load_robot, parse_models
@@ -46,9 +46,9 @@ def test_xacro_arguments_belong_to_the_model_before_them():
 
 @pytest.mark.processes
 def test_check_takes_xacro_arguments(arm: str):
-    assert json.loads(zstate("check", arm, "--json").stdout)["root"] == "base"
-    assert json.loads(zstate("check", arm, "prefix:=left_", "--json").stdout)["root"] == "left_base"
-    table = zstate("check", arm, "prefx:=left_").stdout.decode()
+    assert json.loads(run_cli("check", arm, "--json").stdout)["root"] == "base"
+    assert json.loads(run_cli("check", arm, "prefix:=left_", "--json").stdout)["root"] == "left_base"
+    table = run_cli("check", arm, "prefx:=left_").stdout
     assert "the xacro argument 'prefx' is not used by the file; did you mean 'prefix'?" in table
 
 
@@ -77,7 +77,7 @@ def test_publish_and_joints_expand_the_model_with_the_arguments(spawn: Spawn, ar
 @pytest.mark.processes
 def test_init_writes_the_arguments_and_up_publishes_with_them(spawn: Spawn, arm: str, tmp_path: Path):
     file = tmp_path / "cell.toml"
-    assert zstate("init", arm, "prefix:=left_", "-o", str(file)).returncode == 0
+    assert run_cli("init", arm, "prefix:=left_", "-o", str(file)).code == 0
     assert re.search(r'^xacro_args = { "prefix" = "left_" }$', file.read_text(), re.MULTILINE)
     started(spawn, "up", str(file)).line()
     with connect() as session, TransformListener(session, "arm") as listener:

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import DEADLINE_S, repeated, until
 from helpers.prometheus_text import row, scraped
 
@@ -63,7 +63,7 @@ def test_joint_states_transforms_and_odometry_have_separate_rates(sessions, spaw
                 until(lambda: json.loads(command.line())["odometry_hz"])
             until(lambda: json.loads(command.line())["odometry_hz"] == 0.0)
             assert json.loads(command.line())["transforms_hz"] > 0.0
-        line = zstate("monitor", "--robots", "--once").stdout.decode()
+        line = run_cli("monitor", "--robots", "--once").stdout
         assert re.match(r"rrbot  [\d.]+ Hz  transforms [\d.]+ Hz  age ", line)
         interrupted(odometry)
         until(lambda: json.loads(command.line())["transforms_hz"] == 0.0)
@@ -103,7 +103,7 @@ def test_many_robots_share_one_listener(spawn: Spawn):
 
 def test_once_prints_one_line_for_each_robot():
     with published_robot("left"), published_robot("right"):
-        lines = zstate("monitor", "--robots", "--once").stdout.decode().splitlines()
+        lines = run_cli("monitor", "--robots", "--once").stdout.splitlines()
     assert [line.split()[0] for line in lines if " Hz  age " in line] == ["left", "right"]
 
 
@@ -126,7 +126,7 @@ def test_warning_of_a_writer_has_a_line_until_it_is_withdrawn(sessions, spawn: S
         odometry.warning = text
         base = Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         with repeated(lambda: odometry.publish(base, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])):
-            rates, line = zstate("monitor", "--robots", "--once").stdout.decode().splitlines()
+            rates, line = run_cli("monitor", "--robots", "--once").stdout.splitlines()
             assert re.match(r"cart  [\d.]+ Hz  odometry [\d.]+ Hz  age ", rates)
             assert re.fullmatch(rf"cart  warn  odometry@\S+ pid {os.getpid()}: {re.escape(text)}", line)
             command = started(spawn, "monitor", "--robots", "--json")
@@ -147,7 +147,7 @@ def test_a_driver_has_a_line_of_its_own_and_is_in_the_metrics(sessions, host_dri
         teleop.wait_for_driver(DEADLINE_S)
         with repeated(lambda: teleop.send({"elbow": 0.1})):
             until(lambda: host.state == "active")
-            line, driver = zstate("monitor", "--robots", "--once").stdout.decode().splitlines()
+            line, driver = run_cli("monitor", "--robots", "--once").stdout.splitlines()
             command = started(spawn, "monitor", "--robots", "--json", "--metrics", "0")
             until(lambda: (json.loads(command.line())["driver"] or {}).get("state") == "active")
             url = re.search(r"metrics at (\S+)", command.stderr)

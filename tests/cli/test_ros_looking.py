@@ -4,7 +4,7 @@ import json
 import math
 
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import until
 from helpers.robots import wait_for_reader
 
@@ -23,7 +23,7 @@ BASE_FROM_LOWER = (0.7 * math.sin(SHOULDER), 0.1 + 0.07, 1.05 + 0.7 * math.cos(S
 
 def test_tf_needs_no_model_and_calls_frames_as_ros_does(ros_router: str):
     with published_robot(wire="ros2", router=ros_router, streams=("tf", "tf_static")):
-        answer = json.loads(zstate("tf", "base", "lower", "--once", "--json").stdout)
+        answer = json.loads(run_cli("tf", "base", "lower", "--once", "--json").stdout)
     assert (answer["target"], answer["source"]) == ("base", "lower")
     assert answer["translation"] == pytest.approx(BASE_FROM_LOWER, abs=1e-12)
 
@@ -56,7 +56,7 @@ def test_tf_between_two_trees_names_the_command_that_joins_them(ros_router: str)
 def test_tree_shows_frames_by_their_ros_names_with_the_nodes_that_write_them(ros_router: str):
     wire = "ros2:namespace=r1,frame_prefix=r1/,node=driver"
     with published_robot("r1", wire=wire, router=ros_router):
-        lines = zstate("tree").stdout.decode().splitlines()
+        lines = run_cli("tree").stdout.splitlines()
     assert lines[1].split() == ["r1/world", "root"]
     (upper,) = (line for line in lines if "r1/upper" in line)
     assert "pose" in upper
@@ -73,9 +73,9 @@ def test_tree_names_a_node_that_sends_nothing(ros_router: str):
     ):
         token = "@ros2_lv/0/{zid}/7/8/MP/%/%/mute/%tf/tf2_msgs::msg::dds_::TFMessage_/{hash}/::,100:,:,:,,"
         with session.zenoh.liveliness().declare_token(token.format(zid=session.zid, hash="RIHS01_0")):
-            ended = zstate("tree")
-    assert b"/mute announces ROS 2 topic /tf (domain 0), but has sent nothing" in ended.stderr
-    assert b"tool" in ended.stdout
+            ended = run_cli("tree")
+    assert "/mute announces ROS 2 topic /tf (domain 0), but has sent nothing" in ended.stderr
+    assert "tool" in ended.stdout
 
 
 def test_tree_without_robots_is_a_failure(ros_router: str):
@@ -84,7 +84,7 @@ def test_tree_without_robots_is_a_failure(ros_router: str):
 
 def test_echo_needs_no_robot_and_no_description(ros_router: str):
     with published_robot(wire="ros2", router=ros_router, streams=("joint_states",)):
-        document = json.loads(zstate("echo", "--once", "--json").stdout)
+        document = json.loads(run_cli("echo", "--once", "--json").stdout)
     assert document["positions"] == {"shoulder": SHOULDER, "elbow": ELBOW}
 
 
@@ -109,8 +109,8 @@ def test_echo_reads_one_namespace_or_the_selected_robot(ros_router: str):
         published_robot("r1", wire="ros2:namespace=*", router=ros_router),
         published_robot("r2", (0.0, 0.25), wire="ros2:namespace=*", router=ros_router),
     ):
-        first = zstate("echo", "--wire", "ros2:namespace=r1", "--once", "--field", "elbow")
-        second = zstate("echo", "r2", "--wire", "ros2:namespace=*", "--once", "--field", "elbow")
+        first = run_cli("echo", "--wire", "ros2:namespace=r1", "--once", "--field", "elbow")
+        second = run_cli("echo", "r2", "--wire", "ros2:namespace=*", "--once", "--field", "elbow")
     assert float(first.stdout) == ELBOW
     assert float(second.stdout) == 0.25
 
@@ -124,7 +124,7 @@ def test_missing_robot_argument_is_reported(ros_router: str):
 def test_hz_measures_all_nodes_of_a_topic_together(ros_router: str):
     with published_robot(wire="ros2", router=ros_router), published_robot(wire="ros2", router=ros_router):
         for stream in ("tf", "joint_states"):
-            measured = json.loads(zstate("hz", "--stream", stream, "--once", "--json").stdout)
+            measured = json.loads(run_cli("hz", "--stream", stream, "--once", "--json").stdout)
             # Two writers wait a hundredth of a second between samples; they may be slower, never faster.
             assert 20.0 < measured["rate_hz"] < 220.0
             assert measured["window"] > 20

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import Spawn, failure, started, zstate
+from helpers.cli_runner import Spawn, failure, run_cli, started
 from helpers.pages import blocks
 from helpers.processes import Child
 from helpers.tutorial_terminal import FOLDER, TutorialPage, check_page, masked
@@ -88,8 +88,8 @@ def stamped(stamp: str) -> None:
 
 
 def doctor(*arguments: str, code: int) -> dict[str, Any]:
-    ended = zstate("doctor", *arguments, "--json")
-    assert ended.returncode == code, ended.stdout
+    ended = run_cli("doctor", *arguments, "--json")
+    assert ended.code == code, ended.stdout
     return json.loads(ended.stdout)
 
 
@@ -127,8 +127,8 @@ def test_the_terminals_of_driving_match_real_output(tmp_path: Path, monkeypatch:
 
 def test_the_robot_runs_and_can_be_inspected(cell: Child, driver):
     driver()
-    assert zstate("wait", "robot", "arm").stdout == b"ready: 'arm' (3 frames)\n"
-    (robot,) = json.loads(zstate("ls", "--json").stdout)
+    assert run_cli("wait", "robot", "arm").stdout == "ready: 'arm' (3 frames)\n"
+    (robot,) = json.loads(run_cli("ls", "--json").stdout)
     writers = {writer["stream"]: writer["program"] for writer in robot["writers"]}
     assert writers == {
         "joint_states": "swing",
@@ -136,20 +136,20 @@ def test_the_robot_runs_and_can_be_inspected(cell: Child, driver):
         "tf": "zstate-publish",
         "tf_static": "zstate-publish",
     }
-    pose = json.loads(zstate("tf", "base", "lower", "--once", "--json").stdout)
+    pose = json.loads(run_cli("tf", "base", "lower", "--once", "--json").stdout)
     # The elbow undoes what the shoulder does: the lower link stays upright on a circle of 0.4 m.
     x, y, z = pose["translation"]
     assert math.isclose(math.hypot(x, z - 0.5), 0.4, abs_tol=1e-9)
     assert abs(y) < 1e-9
     assert math.isclose(abs(pose["rotation"][3]), 1.0, abs_tol=1e-9)
-    tree = zstate("tree").stdout.decode()
+    tree = run_cli("tree").stdout
     assert all(frame in tree for frame in ("base", "upper", "lower"))
     assert doctor("arm", code=0)["sound"]
 
 
 def test_1_dead_driver_is_reported(cell: Child, driver):
     process = driver()
-    assert zstate("wait", "robot", "arm").returncode == 0
+    assert run_cli("wait", "robot", "arm").code == 0
     process.kill()
     process.wait()
     found = doctor(code=1)["first_broken"]
@@ -170,7 +170,7 @@ def test_2_a_path_with_a_space_works_and_missing_quotes_are_reported(folder: Pat
     for name in ("arm.urdf", "cell.toml"):
         (place / name).write_bytes((folder / name).read_bytes())
     ready(started(spawn, "up", "my robot/cell.toml"), "publishing 'arm'")
-    assert zstate("check", "my robot/arm.urdf").returncode == 0
+    assert run_cli("check", "my robot/arm.urdf").code == 0
     for command in ("check", "publish"):
         message = failure(command, "my", "robot/arm.urdf", code=2)
         assert "is one path with a space in it; write it in quotes: 'my robot/arm.urdf'" in message
@@ -186,7 +186,7 @@ def test_2_a_path_with_a_space_works_and_missing_quotes_are_reported(folder: Pat
 )
 def test_3_bad_urdf_is_refused_by_every_reader(folder: Path, driver, right: str, wrong: str, message: str):
     Path("arm.urdf").write_text(ARM.replace(right, wrong))
-    assert message in zstate("check", "arm.urdf").stdout.decode()
+    assert message in run_cli("check", "arm.urdf").stdout
     assert message in failure("publish", "arm.urdf")
     assert message in failure("up", "cell.toml")
     process = driver()
@@ -209,7 +209,7 @@ def test_4_stamps_of_the_future_and_of_1970_are_used_and_reported(
 ):
     stamped(stamp)
     process = driver()
-    assert zstate("wait", "robot", "arm").returncode == 0
+    assert run_cli("wait", "robot", "arm").code == 0
     report = doctor("arm", code=1)
     found = report["first_broken"]
     assert found["name"] == "stamps"
@@ -222,7 +222,7 @@ def test_4_stamps_of_the_future_and_of_1970_are_used_and_reported(
 def test_5_unexpanded_xacro_is_recognised(folder: Path, without_xacro: None):
     Path("arm.urdf").write_text(XACRO)
     message = "this is a xacro file, which must be expanded: pip install 'zstate[xacro]'"
-    assert message in zstate("check", "arm.urdf").stdout.decode()
+    assert message in run_cli("check", "arm.urdf").stdout
     assert message in failure("publish", "arm.urdf")
     assert message in failure("up", "cell.toml")
 

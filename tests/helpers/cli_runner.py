@@ -1,7 +1,9 @@
-"""Helpers for tests of commands: commands as real processes, and a robot that stands still."""
+"""Helpers for tests of commands: commands in this process and as processes, and a robot that stands still."""
 
 from __future__ import annotations
 
+import logging
+import os
 import signal
 import subprocess
 import sys
@@ -9,11 +11,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+from click.testing import CliRunner
 from helpers.processes import DEADLINE_S, SOON_S, Child
 
 from zstate import StatePublisher, connect, load_model
+from zstate.cli.main import run
+from zstate.cli.output import logs
 from zstate.clock import Clock
 from zstate.wire.keys import Stream
 
@@ -33,19 +40,48 @@ with connect() as session:
 Spawn = Callable[..., Child]
 
 
-def zstate(*arguments: str, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:
-    """A command that ends by itself."""
+@dataclass(frozen=True)
+class Ended:
+    """A command that has ended: its exit code and what it wrote."""
+
+    code: int
+    stdout: str
+    stderr: str
+
+
+def run_cli(*arguments: str, stdin: bytes = b"") -> Ended:
+    """Run a command that ends by itself, in this process; what it changes in the process is restored."""
+    library = logging.getLogger("zstate")
+    before = library.handlers.copy(), library.level, library.propagate
+    with pytest.MonkeyPatch.context() as restored, CliRunner().isolation(stdin) as (stdout, stderr, _):
+        restored.setattr(sys, "argv", ["zstate", *arguments])
+        restored.setattr(sys, "excepthook", sys.excepthook)
+        restored.setattr(threading, "excepthook", threading.excepthook)
+        restored.setattr(logs._Settings, "format", "text")
+        restored.setenv(logs.FORMAT_VARIABLE, os.environ.get(logs.FORMAT_VARIABLE, ""))
+        try:
+            logs.use_environment_format()
+            code = run(arguments)
+        finally:
+            library.handlers[:], library.propagate = before[0], before[2]
+            library.setLevel(before[1])
+        sys.stdout.flush()
+        sys.stderr.flush()
+        return Ended(int(code), stdout.getvalue().decode(), stderr.getvalue().decode())
+
+
+def run_process(*arguments: str, stdin: bytes = b"") -> Ended:
+    """Run a command that ends by itself, as a process: for what is only seen there, such as its exit."""
     command = [sys.executable, "-m", "zstate", *arguments]
-    return subprocess.run(command, input=stdin, capture_output=True, timeout=DEADLINE_S, check=False)
+    ended = subprocess.run(command, input=stdin, capture_output=True, timeout=DEADLINE_S, check=False)
+    return Ended(ended.returncode, ended.stdout.decode(), ended.stderr.decode())
 
 
 def failure(*arguments: str, code: int = 1, stdin: bytes = b"") -> str:
-    """The message of a command that must fail, without a traceback."""
-    ended = zstate(*arguments, stdin=stdin)
-    message = ended.stderr.decode()
-    assert ended.returncode == code, (ended.returncode, ended.stdout, message)
-    assert "Traceback" not in message
-    return message
+    """The message of a command that must fail."""
+    ended = run_cli(*arguments, stdin=stdin)
+    assert ended.code == code, ended
+    return ended.stderr
 
 
 def started(spawn: Spawn, *arguments: str) -> Child:

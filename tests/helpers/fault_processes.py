@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import zstate
+from helpers.cli_runner import run_cli
 from helpers.processes import DEADLINE_S, Child, find_free_port
 
 SLACK = 3.0
@@ -93,7 +93,7 @@ class Site:
 
     def doctor(self, identity: str, *arguments: str) -> Any:
         certs = ("--certs", str(self.folder), "--identity", identity)
-        return zstate("doctor", "r1", "--connect", self.endpoint, *certs, "--timeout", "2", *arguments)
+        return run_cli("doctor", "r1", "--connect", self.endpoint, *certs, "--timeout", "2", *arguments)
 
 
 def assert_no_growth(before: dict[str, int], after: dict[str, int], *, rss_kb: int = 30_000) -> None:

@@ -301,7 +301,7 @@ def test_other_edges_of_tf_are_received_beside_joint_states(sessions):
         in_world = listener.buffer.lookup("world", "tool", STAMP)
         assert_pose(in_world, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
         assert found.translation - in_world.translation == pytest.approx([32.0, 0.0, 0.0])
-        assert writers(listener)["world"] == "/ekf"
+        until(lambda: writers(listener)["world"] == "/ekf")
         assert listener.stats.refused == {}
 
 

@@ -57,7 +57,7 @@ def test_restarted_static_writer_may_reparent_its_child(sessions):
         assert x_of(listener, "tool", "camera") == 1.0
         old.close()
         until(lambda: rival.edge(0, "base", "camera", 5.0) or x_of(listener, "base", "camera") == 5.0)
-        assert writers(listener) == {"camera": "/rival"}
+        until(lambda: writers(listener) == {"camera": "/rival"})
         assert x_of(listener, "tool", "camera") is None
 
 

@@ -442,14 +442,18 @@ def main() -> NoReturn:
     logs.use_environment_format()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _end)
-    text: str | None = None
-    code: str | int | None = 0
+    _exit(run(sys.argv[1:]))
+
+
+def run(arguments: Sequence[str]) -> str | int:
+    """Run a command; what it raises for users is written to standard error. Returns the exit code."""
     try:
-        code = group.main(prog_name="zstate", standalone_mode=False)
-    except getattr(click.exceptions, "NoArgsIsHelpError", ()) as error:
-        click.echo(error.format_message())  # click before 8.2 prints the help itself
+        return group.main(list(arguments), prog_name="zstate", standalone_mode=False) or 0
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        return 0
     except click.UsageError as error:
-        text = usage_hint(sys.argv[1:], error) or error.format_message()
+        text = usage_hint(arguments, error) or error.format_message()
         text += f"\nSee `{error.ctx.command_path} --help`." if error.ctx else ""
         code = error.exit_code
     except click.ClickException as error:
@@ -457,10 +461,9 @@ def main() -> NoReturn:
     except ZStateError as error:
         text, code = str(error), 1
     except SystemExit as leaving:
-        code = leaving.code
-    if text is not None:
-        logs.write(text, level="error", event="failed")
-    _exit(code or 0)
+        return leaving.code or 0
+    logs.write(text, level="error", event="failed")
+    return code
 
 
 def _exit(code: str | int) -> NoReturn:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, run_cli, started
 
 from zstate import connect
 from zstate.net.security.credentials import Credentials
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.processes
 def router(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """The endpoint of the fleet's router; ZSTATE_PASSWORD is right for every user."""
     acl, users = tmp_path / "acl.json5", tmp_path / "users.txt"
-    acl.write_bytes(zstate("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
+    acl.write_bytes(run_cli("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
     users.write_text("r1:secret\nr2:secret\ndesk:secret\n")
     users.chmod(0o600)
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -32,10 +32,10 @@ def router(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_late_viewer_receives_the_poses_of_the_robot(spawn: Spawn, router: str):
     started(spawn, "publish", RRBOT, "--name", "r1", "--source", "sine", "--user", "r1").line()
-    seen = zstate("tf", "base", "lower", "--once", "--json", "--user", "desk")
-    assert seen.returncode == 0, seen.stderr
+    seen = run_cli("tf", "base", "lower", "--once", "--json", "--user", "desk")
+    assert seen.code == 0, seen.stderr
     assert json.loads(seen.stdout)["target"] == "base"
-    (robot,) = json.loads(zstate("ls", "--json", "--user", "desk").stdout)
+    (robot,) = json.loads(run_cli("ls", "--json", "--user", "desk").stdout)
     assert robot["robot"] == "r1"
 
 
@@ -64,7 +64,7 @@ def test_invalid_names_are_refused():
 
 
 def test_a_placer_writes_static_edges_under_its_own_name():
-    printed = zstate("acl", "--robot", "r1", "--placer", "site").stdout.decode()
+    printed = run_cli("acl", "--robot", "r1", "--placer", "site").stdout
     assert "placers:     site" in printed
     assert '"zstate/site/tf_static/*"' in printed
     assert '"zstate/site/**"' not in printed
@@ -78,15 +78,13 @@ def test_a_file_without_access_control_is_refused(tmp_path: Path):
 
 def test_access_control_without_authentication_is_refused(tmp_path: Path):
     file = tmp_path / "acl.json5"
-    file.write_bytes(zstate("acl", "--robot", "r1").stdout)
+    file.write_bytes(run_cli("acl", "--robot", "r1").stdout)
     assert "access control without certificates or users" in failure("router", "--acl", str(file))
 
 
 def test_ros_robots_are_separated_by_namespaces():
     robots = ("--robot", "r1", "--robot", "r2")
-    printed = zstate(
-        "acl", *robots, "--wire", "native", "--wire", "ros2:domain=5,namespace=*"
-    ).stdout.decode()
+    printed = run_cli("acl", *robots, "--wire", "native", "--wire", "ros2:domain=5,namespace=*").stdout
     for key in ("zstate/r1/**", "5/r1/**", "5/r1/**/@adv/**", "@ros2_lv/5/*/*/*/NN/*/%r2/**"):
         assert f'"{key}"' in printed
     assert "namespace=*" in failure("acl", *robots, "--wire", "ros2")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import find_free_port
 
 from zstate import connect
@@ -18,9 +18,9 @@ pytestmark = pytest.mark.processes
 
 def test_certs_prints_its_files_and_a_warning(tmp_path: Path):
     folder = tmp_path / "fleet"
-    done = zstate("certs", str(folder), "--identity", "router", "--identity", "r1", "--host", "10.0.0.1")
-    assert done.returncode == 0
-    lines = done.stdout.decode().splitlines()
+    done = run_cli("certs", str(folder), "--identity", "router", "--identity", "r1", "--host", "10.0.0.1")
+    assert done.code == 0
+    lines = done.stdout.splitlines()
     assert [line.partition(":")[0] for line in lines] == ["router", "r1"]
     assert str(folder / "r1.key") in lines[1]
     assert {path.name for path in folder.iterdir()} == {
@@ -28,13 +28,13 @@ def test_certs_prints_its_files_and_a_warning(tmp_path: Path):
         *("router.pem", "router.key"),
         *("r1.pem", "r1.key"),
     }
-    assert "These are for tests" in done.stderr.decode()
-    assert "In production keep it off every robot" in done.stderr.decode()
+    assert "These are for tests" in done.stderr
+    assert "In production keep it off every robot" in done.stderr
 
 
 def test_certs_adds_identities_and_never_overwrites(tmp_path: Path):
-    assert zstate("certs", str(tmp_path), "--identity", "router").returncode == 0
-    assert zstate("certs", str(tmp_path), "--identity", "r1").returncode == 0
+    assert run_cli("certs", str(tmp_path), "--identity", "router").code == 0
+    assert run_cli("certs", str(tmp_path), "--identity", "r1").code == 0
     assert "nothing is overwritten" in failure("certs", str(tmp_path), "--identity", "r1")
     assert "--identity" in failure("certs", str(tmp_path), code=2)
     assert "--days" in failure("certs", str(tmp_path), "--identity", "r2", "--days", "0", code=2)
@@ -44,15 +44,15 @@ def test_commands_with_identities_connect_through_a_router_that_requires_them(
     spawn: Spawn, tmp_path: Path, free_port: int
 ):
     folder = str(tmp_path)
-    zstate("certs", folder, *("--identity", "router"), *("--identity", "r1"), *("--identity", "viewer"))
+    run_cli("certs", folder, *("--identity", "router"), *("--identity", "r1"), *("--identity", "viewer"))
     endpoint = f"tls/127.0.0.1:{free_port}"
     router = started(spawn, "router", "--listen", endpoint, "--certs", folder, "--identity", "router")
     assert endpoint in router.line()
     robot = ("--connect", endpoint, "--certs", folder, "--identity", "r1")
     started(spawn, "publish", RRBOT, "--source", "sine", *robot).line()
     viewer = ("--connect", endpoint, "--certs", folder, "--identity", "viewer")
-    done = zstate("tf", "base", "lower", "--once", *viewer)
-    assert done.returncode == 0, done.stderr
+    done = run_cli("tf", "base", "lower", "--once", *viewer)
+    assert done.code == 0, done.stderr
     interrupted(router)
 
 
@@ -67,13 +67,13 @@ def test_a_password_comes_from_the_environment_or_a_file(
     started(spawn, "router", "--listen", endpoint, "--users", str(users)).line()
     alice = ("ls", "--connect", endpoint, "--user", "alice")
     assert "ZSTATE_PASSWORD" in failure(*alice, code=2)
-    assert zstate(*alice, "--password-file", str(password)).returncode == 0
+    assert run_cli(*alice, "--password-file", str(password)).code == 0
     password.chmod(0o644)
     assert "chmod 600" in failure(*alice, "--password-file", str(password))
     monkeypatch.setenv("ZSTATE_PASSWORD", "wander")
     assert "the user 'alice' or the password" in failure(*alice)
     monkeypatch.setenv("ZSTATE_PASSWORD", "wonder")
-    assert zstate(*alice).returncode == 0
+    assert run_cli(*alice).code == 0
 
 
 @pytest.mark.parametrize(
@@ -89,19 +89,16 @@ def test_half_an_identity_is_wrong_usage(options: tuple[str, ...], hint: str):
 
 
 def test_a_router_that_listens_unencrypted_with_certificates_is_refused(tmp_path: Path):
-    zstate("certs", str(tmp_path), "--identity", "router")
+    run_cli("certs", str(tmp_path), "--identity", "router")
     identity = ("--certs", str(tmp_path), "--identity", "router")
     assert "write 'tls/0.0.0.0:7447'" in failure("router", "--listen", "tcp/0.0.0.0:7447", *identity)
     assert "needs a certificate" in failure("router", "--listen", "tls/0.0.0.0:7447")
-    assert "'tls/127.0.0.1:7447'" in zstate("router", "--print", *identity).stdout.decode().replace('"', "'")
+    assert "'tls/127.0.0.1:7447'" in run_cli("router", "--print", *identity).stdout.replace('"', "'")
 
 
 def test_only_server_certificates_can_listen(tmp_path):
     folder = str(tmp_path / "pki")
-    assert (
-        zstate("certs", folder, "--identity", "router", "--identity", "r1", "--server", "peer").returncode
-        == 0
-    )
+    assert run_cli("certs", folder, "--identity", "router", "--identity", "r1", "--server", "peer").code == 0
     router, peer, r1 = (Credentials.from_folder(folder, name) for name in ("router", "peer", "r1"))
     for credentials in (router, peer):
         endpoint = f"tls/127.0.0.1:{find_free_port()}"

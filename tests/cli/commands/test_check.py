@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, failure, zstate
+from helpers.cli_runner import RRBOT, failure, run_cli
 
 from zstate import load_model
 
@@ -28,9 +28,9 @@ def deep(count: int) -> str:
 
 
 def test_a_sound_model_is_drawn_as_a_tree():
-    ended = zstate("check", RRBOT)
-    headline, *lines = ended.stdout.decode().splitlines()
-    assert ended.returncode == 0
+    ended = run_cli("check", RRBOT)
+    headline, *lines = ended.stdout.splitlines()
+    assert ended.code == 0
     assert "robot 'rrbot', 7 links, 6 joints (2 driven)" in headline
     assert lines[0] == "world"
     assert lines[2].split() == ["└──", "upper", "shoulder", "continuous"]
@@ -43,8 +43,8 @@ def test_a_missing_mesh_is_a_warning_with_its_line_and_where_it_was_searched(tmp
     file = tmp_path / "arm.urdf"
     file.write_text(SOUND.replace('<link name="hand"/>', f'<link name="hand">\n{visuals}</link>'))
     (tmp_path / "there.stl").touch()
-    ended = zstate("check", str(file), "--json")
-    assert ended.returncode == 0
+    ended = run_cli("check", str(file), "--json")
+    assert ended.code == 0
     first, second = json.loads(ended.stdout)["findings"]
     assert (first["line"], first["severity"]) == (4, "warning")
     assert first["message"].startswith("the mesh 'hand.stl' is missing, so it is not drawn: ")
@@ -53,9 +53,9 @@ def test_a_missing_mesh_is_a_warning_with_its_line_and_where_it_was_searched(tmp
 
 
 def test_each_error_has_its_line():
-    ended = zstate("check", "-", stdin=WITHOUT_LIMIT.encode())
-    headline, finding = ended.stdout.decode().splitlines()
-    assert ended.returncode == 1
+    ended = run_cli("check", "-", stdin=WITHOUT_LIMIT.encode())
+    headline, finding = ended.stdout.splitlines()
+    assert ended.code == 1
     assert headline == "standard input cannot be used (1 error)"
     assert finding.split()[:3] == ["line", "4", "error"]
     assert "'wrist'" in finding
@@ -64,29 +64,29 @@ def test_each_error_has_its_line():
 def test_fix_hints_print_a_correction_below_each_finding(tmp_path: Path):
     file = tmp_path / "my arm.urdf"
     file.write_text(WITHOUT_LIMIT)
-    *_, advice = zstate("check", str(file)).stdout.decode().splitlines()
+    *_, advice = run_cli("check", str(file)).stdout.splitlines()
     assert advice == f"`zstate check '{file}' --fix-hints` prints corrections"
-    _, _, fix = zstate("check", str(file), "--fix-hints").stdout.decode().splitlines()
+    _, _, fix = run_cli("check", str(file), "--fix-hints").stdout.splitlines()
     assert fix.strip().startswith('fix: <limit lower="-3.14" upper="3.14"')
-    broken = zstate("check", "-", "--json", stdin=WITHOUT_LIMIT.encode())
+    broken = run_cli("check", "-", "--json", stdin=WITHOUT_LIMIT.encode())
     assert json.loads(broken.stdout)["findings"][0]["fix"] in fix
 
 
 def test_the_joints_are_a_table_in_the_order_of_their_positions():
-    _, headings, *rows = zstate("check", RRBOT, "--joints").stdout.decode().splitlines()
+    _, headings, *rows = run_cli("check", RRBOT, "--joints").stdout.splitlines()
     assert headings.split()[:5] == ["joint", "type", "parent", "child", "position"]
     moving = [row.split() for row in rows if " - " not in row[:60]]
     assert [(row[0], row[4]) for row in moving] == [("shoulder", "0"), ("elbow", "1")]
 
 
 def test_warning_is_printed_and_exit_code_is_0():
-    ended = zstate("check", "-", stdin=HEAVY.encode())
-    assert ended.returncode == 0
-    assert ended.stdout.decode().splitlines()[1].split()[:3] == ["line", "3", "warning"]
+    ended = run_cli("check", "-", stdin=HEAVY.encode())
+    assert ended.code == 0
+    assert ended.stdout.splitlines()[1].split()[:3] == ["line", "3", "warning"]
 
 
 def test_a_name_of_the_catalog_is_checked_too():
-    assert zstate("check", "rrbot").stdout.decode().startswith("rrbot: robot 'rrbot'")
+    assert run_cli("check", "rrbot").stdout.startswith("rrbot: robot 'rrbot'")
 
 
 def test_unknown_name_is_reported_with_near_misses():
@@ -94,13 +94,13 @@ def test_unknown_name_is_reported_with_near_misses():
 
 
 def test_json_has_all_facts():
-    facts = json.loads(zstate("check", RRBOT, "--json").stdout)
+    facts = json.loads(run_cli("check", RRBOT, "--json").stdout)
     assert facts["usable"] is True
     assert facts["digest"] == load_model(RRBOT).digest
     assert [joint["name"] for joint in facts["joints"]][1] == "shoulder"
     assert facts["joints"][1]["lower"] is None  # continuous: JSON has no infinity
-    broken = zstate("check", "-", "--json", stdin=WITHOUT_LIMIT.encode())
-    assert broken.returncode == 1
+    broken = run_cli("check", "-", "--json", stdin=WITHOUT_LIMIT.encode())
+    assert broken.code == 1
     assert json.loads(broken.stdout)["findings"][0]["line"] == 4
 
 
@@ -110,19 +110,19 @@ def test_json_has_all_facts():
     ids=["empty", "binary", "truncated", "latin-1", "text"],
 )
 def test_garbage_fails_without_a_traceback(garbage: bytes):
-    ended = zstate("check", "-", stdin=garbage)
-    assert ended.returncode == 1
-    assert b"Traceback" not in ended.stderr
+    ended = run_cli("check", "-", stdin=garbage)
+    assert ended.code == 1
+    assert "Traceback" not in ended.stderr
 
 
 def test_missing_file_is_named(tmp_path: Path):
     missing = str(tmp_path / "arm.urdf")
-    ended = zstate("check", missing)
-    assert ended.returncode == 1
-    assert "no such file" in ended.stdout.decode()
+    ended = run_cli("check", missing)
+    assert ended.code == 1
+    assert "no such file" in ended.stdout
 
 
 def test_the_deepest_allowed_chain_is_drawn():
-    ended = zstate("check", "-", stdin=deep(500).encode())
-    assert ended.returncode == 0
-    assert len(ended.stdout.decode().splitlines()) == 502
+    ended = run_cli("check", "-", stdin=deep(500).encode())
+    assert ended.code == 0
+    assert len(ended.stdout.splitlines()) == 502

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, published_robot, started, zstate
+from helpers.cli_runner import Spawn, failure, published_robot, run_cli, started
 from helpers.processes import until
 
 pytestmark = pytest.mark.processes
@@ -165,9 +165,7 @@ def test_fish_is_offered_the_same_with_all_of_the_help(tmp_path: Path, monkeypat
 
 def group_help(command: str) -> str:
     """The description of ``command`` in `zstate --help`; it has a comma."""
-    (line,) = (
-        line for line in zstate("--help").stdout.decode().splitlines() if line.split()[:1] == [command]
-    )
+    (line,) = (line for line in run_cli("--help").stdout.splitlines() if line.split()[:1] == [command])
     text = line.split(maxsplit=1)[1]
     assert "," in text
     return text

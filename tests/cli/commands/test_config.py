@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import failure, zstate
+from helpers.cli_runner import failure, run_cli
 
 pytestmark = pytest.mark.processes
 
@@ -19,8 +19,8 @@ def _bare_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def effective_config(*arguments: str, code: int = 0) -> tuple[dict[str, tuple[Any, str]], list[str]]:
     """Each setting with its origin, and the problems."""
-    ended = zstate("config", *arguments, "--json")
-    assert ended.returncode == code, ended.stderr
+    ended = run_cli("config", *arguments, "--json")
+    assert ended.code == code, ended.stderr
     output = json.loads(ended.stdout)
     return {one["name"]: (one["value"], one["origin"]) for one in output["settings"]}, output["problems"]
 
@@ -70,14 +70,14 @@ def test_ros_domain_of_the_wire_precedes_the_environment(monkeypatch):
 def test_a_password_is_never_shown(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_PASSWORD", "hunter2")
     for form in ((), ("--json",), ("--zenoh",)):
-        ended = zstate("config", "--connect", "tcp/10.0.0.1:7447", "--user", "bob", *form)
-        assert ended.returncode == 0
-        assert b"bob" in ended.stdout
-        assert b"hunter2" not in ended.stdout + ended.stderr
+        ended = run_cli("config", "--connect", "tcp/10.0.0.1:7447", "--user", "bob", *form)
+        assert ended.code == 0
+        assert "bob" in ended.stdout
+        assert "hunter2" not in ended.stdout + ended.stderr
 
 
 def test_zenoh_settings_are_listed():
-    output = json.loads(zstate("config", "--zenoh", "--json", "--connect", "tcp/10.0.0.1:7447").stdout)
+    output = json.loads(run_cli("config", "--zenoh", "--json", "--connect", "tcp/10.0.0.1:7447").stdout)
     assert output["mode"] == "client"
     assert output["connect/endpoints"] == ["tcp/10.0.0.1:7447"]
 
@@ -97,7 +97,7 @@ def test_problems_of_the_environment_are_reported(monkeypatch, variable: str, va
     _, problems = effective_config(code=1)
     assert len(problems) == 1
     assert problem in problems[0]
-    assert problem in zstate("config").stderr.decode()
+    assert problem in run_cli("config").stderr
 
 
 def test_every_option_can_be_set_in_the_environment(monkeypatch: pytest.MonkeyPatch):

@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import DEADLINE_S, Child, until
 
 from zstate import Kinematics, load_model
@@ -34,7 +34,7 @@ def is_gone(pid: int) -> bool:
 
 
 def test_it_shows_transforms_and_ends_with_a_summary():
-    output = zstate("demo", RRBOT, "--seconds", "1.5", "--rate", "50").stdout.decode()
+    output = run_cli("demo", RRBOT, "--seconds", "1.5", "--rate", "50").stdout
     first, *lines, summary = output.splitlines()
     assert first.startswith("rrbot (2 joints, 7 links): process ")
     assert "lower in world: xyz [" in lines[0]
@@ -61,7 +61,7 @@ def test_without_panda_demo_shows_rrbot_and_prints_how_to_install_more():
     )
     command = [sys.executable, "-c", code, "demo", "--seconds", "0.5"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-    assert ended.returncode == 0, ended.stderr
+    assert ended.code == 0, ended.stderr
     assert "'panda' is not installed (pip install 'zstate[robots]'), so this shows 'rrbot'" in ended.stderr
     assert "samples received" in ended.stdout
 
@@ -141,7 +141,7 @@ def test_other_commands_follow_the_rover_at_the_printed_address(spawn: Spawn):
     until(lambda: "--connect " in demo.stderr)
     address = re.search(r"--connect (\S+);", demo.stderr)
     assert address
-    robots = json.loads(zstate("ls", "--json", "--connect", address[1]).stdout)
+    robots = json.loads(run_cli("ls", "--json", "--connect", address[1]).stdout)
     room, rover = robots
     writers = {(one["stream"], one["program"]) for one in rover["writers"]}
     assert (room["robot"], rover["robot"]) == ("room", "rover")
@@ -154,7 +154,7 @@ def test_rover_without_the_libraries_of_maps_has_no_room():
     code = "import sys; sys.modules['PIL'] = None\nfrom zstate.cli.main import main; main()"
     command = [sys.executable, "-c", code, "demo", "rover", "--seconds", "0.5"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=2 * DEADLINE_S, check=False)
-    assert ended.returncode == 0, ended.stderr
+    assert ended.code == 0, ended.stderr
     assert "without a room and its laser, which need pip install 'zstate[maps]'" in ended.stderr
     assert "(map)" not in ended.stdout
     assert "joint states and" in ended.stdout
@@ -189,7 +189,7 @@ def test_laser_of_the_arm_sweeps_a_room(spawn: Spawn):
     demo.line()
     address = re.search(r"--connect (\S+);", demo.stderr)
     assert address
-    robots = json.loads(zstate("ls", "--json", "--connect", address[1]).stdout)
+    robots = json.loads(run_cli("ls", "--json", "--connect", address[1]).stdout)
     streams = {(robot["robot"], one["stream"]) for robot in robots for one in robot["writers"]}
     assert {("rrbot", "scan"), ("rrbot", "joint_states"), ("room", "map")} <= streams
     interrupted(demo)
@@ -208,7 +208,7 @@ def test_only_the_arm_has_a_room():
 def test_demo_is_isolated_with_its_publisher_in_any_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZENOH_CONFIG", "/nowhere.json5")
     monkeypatch.setenv("ZSTATE_MODE", "client")
-    assert zstate("demo", RRBOT, "--seconds", "0.5").returncode == 0
+    assert run_cli("demo", RRBOT, "--seconds", "0.5").code == 0
 
 
 def test_unknown_robot_error_names_one_that_always_works():

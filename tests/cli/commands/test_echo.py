@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import DEADLINE_S, repeated, until
 from helpers.robots import SampleCollector, wait_for_reader
 
@@ -33,7 +33,7 @@ FLOATING = """
 
 def test_a_joint_state_is_a_yaml_document():
     with published_robot(velocities=(0.25, 0.0)):
-        lines = zstate("echo", "rrbot", "--once").stdout.decode().splitlines()
+        lines = run_cli("echo", "rrbot", "--once").stdout.splitlines()
     assert lines[0].startswith("stamp: 1")
     assert lines[1].startswith("seq: ")
     assert lines[2:] == [
@@ -63,7 +63,7 @@ def test_setpoints_of_a_robot_without_a_driver_host_are_explained():
 
 def test_transforms_are_documents_of_poses_by_edge(spawn: Spawn):
     started(spawn, "transform", "odom", "base", "--xyz", "1", "2", "3", "--robot", "r1").line()
-    document = json.loads(zstate("echo", "r1", "--stream", "transforms", "--once", "--json").stdout)
+    document = json.loads(run_cli("echo", "r1", "--stream", "transforms", "--once", "--json").stdout)
     pose = {"translation": [1.0, 2.0, 3.0], "rotation": [0.0, 0.0, 0.0, 1.0]}
     assert document["transforms"] == {"odom -> base": pose}
     assert document["stamp"] > 0
@@ -71,7 +71,7 @@ def test_transforms_are_documents_of_poses_by_edge(spawn: Spawn):
 
 def test_json_is_one_object_a_line():
     with published_robot():
-        document = json.loads(zstate("echo", "rrbot", "--once", "--json").stdout)
+        document = json.loads(run_cli("echo", "rrbot", "--once", "--json").stdout)
     assert document["positions"] == {"shoulder": SHOULDER, "elbow": ELBOW}
     assert "velocities" not in document
 
@@ -91,7 +91,7 @@ def test_csv_has_one_line_of_names(spawn: Spawn):
 )
 def test_a_field_is_printed_alone(field: str, printed: str):
     with published_robot(velocities=(0.0, 0.125)):
-        assert zstate("echo", "rrbot", "--once", "--field", field).stdout.decode() == f"{printed}\n"
+        assert run_cli("echo", "rrbot", "--once", "--field", field).stdout == f"{printed}\n"
 
 
 def test_changed_prints_only_changed_documents(spawn: Spawn):
@@ -141,16 +141,16 @@ def test_a_floating_joint_has_its_seven_numbers_together(tmp_path: Path):
     pose = (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
     rates = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
     with published_robot("drone", (*pose, 0.75), velocities=(*rates, 0.7), model=str(model)):
-        document = json.loads(zstate("echo", "drone", "--once", "--json").stdout)
+        document = json.loads(run_cli("echo", "drone", "--once", "--json").stdout)
     assert document["positions"] == {"flight": list(pose), "swing": 0.75}
     assert document["velocities"] == {"flight": list(rates), "swing": 0.7}
 
 
 def test_numbers_without_a_description_have_no_names():
     with published_robot(streams=("joint_states",)):
-        ended = zstate("echo", "rrbot", "--once", "--json")
+        ended = run_cli("echo", "rrbot", "--once", "--json")
     assert json.loads(ended.stdout)["positions"] == [SHOULDER, ELBOW]
-    assert b"`zstate publish rrbot` publishes it" in ended.stderr
+    assert "`zstate publish rrbot` publishes it" in ended.stderr
 
 
 def test_echo_waits_for_a_robot_and_prints_the_reason(spawn: Spawn):
@@ -187,7 +187,7 @@ def test_a_reader_that_leaves_ends_it_quietly():
         process.stdout.readline()
         process.stdout.close()
         process.wait(DEADLINE_S)
-        assert process.stderr.read() == b""
+        assert process.stderr.read() == ""
 
 
 def test_undecodable_messages_are_reported_once_and_skipped(spawn: Spawn):
@@ -209,8 +209,8 @@ def test_a_name_that_no_robot_can_have_is_refused():
 
 def test_robot_may_be_omitted_if_there_is_only_one():
     with published_robot():
-        assert b"elbow" in zstate("echo", "--once").stdout
-        assert zstate("hz", "--once").stdout.startswith(b"average rate: ")
+        assert "elbow" in run_cli("echo", "--once").stdout
+        assert run_cli("hz", "--once").stdout.startswith("average rate: ")
 
 
 @pytest.mark.parametrize("command", ["echo", "hz"])
@@ -265,9 +265,9 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
             mocap.publish(base)
 
         with repeated(publish):
-            document = json.loads(zstate("echo", "r1", "--stream", stream, "--once", "--json").stdout)
-            rate = json.loads(zstate("hz", "r1", "--stream", stream, "--once", "--json").stdout)
-            listed = json.loads(zstate("ls", "--json").stdout)
+            document = json.loads(run_cli("echo", "r1", "--stream", stream, "--once", "--json").stdout)
+            rate = json.loads(run_cli("hz", "r1", "--stream", stream, "--once", "--json").stdout)
+            listed = json.loads(run_cli("ls", "--json").stdout)
     assert {name: value for name, value in document.items() if name not in ("stamp", "seq")} == expected
     assert rate["rate_hz"] > 1.0
     names = {writer["stream"]: writer["names"] for writer in listed[0]["writers"]}

@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import failure, zstate
+from helpers.cli_runner import failure, run_cli
 from helpers.recording_builder import MS, START, RecordingBuilder, pose, swing_positions, swing_velocities
 
 pytestmark = pytest.mark.processes
@@ -23,7 +23,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def test_table_stands_next_to_the_recording_with_a_summary(run: Path):
-    output = zstate("export", str(run), "--csv").stdout.decode()
+    output = run_cli("export", str(run), "--csv").stdout
     table = run.with_suffix(".csv")
     assert output.startswith("exported 101 rows of arm over 1.000 s in ")
     assert f"into {table} (" in output
@@ -39,7 +39,7 @@ def test_rows_without_a_pose_or_joints_are_counted(run: Path, tmp_path: Path):
     stamps.write_text("\n".join(str(START + n * 10 * MS) for n in (5, 50, 500)))
     arguments = ("--stamps", str(stamps), "--pose", "map", "arm/tool", "--parquet")
     pytest.importorskip("pyarrow", reason="pip install 'zstate[export]'")
-    output = zstate("export", str(run), *arguments, "--output", str(tmp_path / "o.parquet")).stdout.decode()
+    output = run_cli("export", str(run), *arguments, "--output", str(tmp_path / "o.parquet")).stdout
     assert "position of 2 joints, 1 pose; " in output
     assert "2 rows without 'arm/tool' in 'map', 1 row without interpolated joints" in output
 
@@ -50,7 +50,7 @@ def test_existing_table_is_kept_without_overwrite(run: Path):
     assert "exists" in message
     assert "--overwrite" in message
     assert run.with_suffix(".csv").read_text() == "precious"
-    assert zstate("export", str(run), "--csv", "--overwrite", "--rate", "10").returncode == 0
+    assert run_cli("export", str(run), "--csv", "--overwrite", "--rate", "10").code == 0
     assert len(run.with_suffix(".csv").read_text().splitlines()) == 1 + 11
 
 

@@ -6,7 +6,7 @@ import socket
 from xml.etree import ElementTree
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, published_robot, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, published_robot, run_cli, started
 from helpers.processes import until
 
 from zstate import StaticPublisher, TransformListener, connect, discover
@@ -57,7 +57,7 @@ def test_writers_and_readers_of_a_robot_are_seen_with_rates():
     here = f"@{socket.gethostname()} pid {os.getpid()}"
     with published_robot(), connect() as session, TransformListener(session, "rrbot", follow="tf"):
         until(lambda: discover(session))
-        facts = json.loads(zstate("graph", "--json").stdout)
+        facts = json.loads(run_cli("graph", "--json").stdout)
     streams = {one["stream"]: one for one in facts["streams"]}
     assert set(streams) == {"joint_states", "robot_description", "tf", "tf_static"}
     assert streams["joint_states"]["readers"] == []
@@ -71,7 +71,7 @@ def test_stream_with_readers_but_no_writer_is_marked(spawn: Spawn):
     started(spawn, "publish", RRBOT).line()
     with connect() as session:
         until(lambda: discover(session))
-    lines = zstate("graph").stdout.decode().splitlines()
+    lines = run_cli("graph").stdout.splitlines()
     assert lines[:2] == ["rrbot: joint_states", "  written by  none"]
     assert lines[2].startswith("  read by     zstate-publish@")
 
@@ -84,7 +84,7 @@ def test_reader_of_all_robots_appears_at_each_and_static_writers_have_names():
         published_robot("right"),
         TransformListener(session),
     ):
-        text = zstate("graph").stdout.decode()
+        text = run_cli("graph").stdout
     assert "left: tf_static/mount" in text
     assert text.count("read by     none") == 1  # the transforms of the right one
 
@@ -93,15 +93,15 @@ def test_reader_of_all_robots_appears_at_each_and_static_writers_have_names():
 def test_unknown_robot_is_an_error_but_an_empty_network_is_not():
     with published_robot():
         assert "did you mean 'rrbot'?" in failure("graph", "rbot")
-    ended = zstate("graph")
-    assert (ended.returncode, ended.stdout) == (0, b"")
-    assert b"no robot is announced" in ended.stderr
+    ended = run_cli("graph")
+    assert (ended.code, ended.stdout) == (0, "")
+    assert "no robot is announced" in ended.stderr
 
 
 @pytest.mark.processes
 def test_on_ros_side_topics_have_the_nodes_at_their_ends(ros_router: str):
     with published_robot(wire="ros2", router=ros_router):
-        text = zstate("graph").stdout.decode()
+        text = run_cli("graph").stdout
     assert text.splitlines()[0] == "/joint_states, /robot_description, /tf, /tf_static"
     assert text.count("written by  /") == 1
     assert text.count("read by     none") == 1
@@ -110,6 +110,6 @@ def test_on_ros_side_topics_have_the_nodes_at_their_ends(ros_router: str):
 def test_commands_go_from_the_commander_to_the_driver(sessions, host_driver):
     host_driver()
     with Commander(sessions[1], "arm", program="teleop"):
-        text = zstate("graph", "arm").stdout.decode()
+        text = run_cli("graph", "arm").stdout
     place = f"{socket.gethostname()} pid {os.getpid()}"
     assert f"arm: joint_commands\n  written by  teleop@{place}\n  read by     driver@{place}\n" in text, text

@@ -4,7 +4,7 @@ import json
 import re
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import until
 
 pytestmark = pytest.mark.processes
@@ -24,15 +24,15 @@ def test_hz_prints_rostopic_style_figures_once_a_second(spawn: Spawn):
 
 def test_hz_ends_after_the_seconds_that_are_given():
     with published_robot():
-        ended = zstate("hz", "rrbot", "--seconds", "1.5", "--json")
-    assert ended.returncode == 0
+        ended = run_cli("hz", "rrbot", "--seconds", "1.5", "--json")
+    assert ended.code == 0
     assert len(ended.stdout.splitlines()) == 2  # each of a second, the second one to its end
 
 
 @pytest.mark.parametrize("stream", ["joint_states", "tf"])
 def test_json_has_the_numbers_of_either_stream(stream: str):
     with published_robot():
-        measured = json.loads(zstate("hz", "rrbot", "--stream", stream, "--once", "--json").stdout)
+        measured = json.loads(run_cli("hz", "rrbot", "--stream", stream, "--once", "--json").stdout)
     # The publisher waits a hundredth of a second between samples; it may be slower, never faster.
     assert 10.0 < measured["rate_hz"] < 110.0
     assert measured["min_s"] <= 1.0 / measured["rate_hz"] <= measured["max_s"]
@@ -43,7 +43,7 @@ def test_transforms_of_several_writers_are_measured_together(spawn: Spawn):
     for child in ("base_link", "ball"):
         options = ("--xyz", "0", "0", "0", "--rate", "50", "--robot", "r1")
         started(spawn, "transform", "odom", child, *options).line()
-    measured = json.loads(zstate("hz", "r1", "--stream", "transforms", "--once", "--json").stdout)
+    measured = json.loads(run_cli("hz", "r1", "--stream", "transforms", "--once", "--json").stdout)
     # Two writers of 50 Hz each.
     assert measured["rate_hz"] == pytest.approx(100.0, rel=0.2)
     assert measured["missed"] == 0
@@ -53,7 +53,7 @@ def test_transforms_of_several_writers_are_measured_together(spawn: Spawn):
 
 def test_the_window_limits_what_is_measured():
     with published_robot():
-        measured = json.loads(zstate("hz", "rrbot", "--window", "5", "--once", "--json").stdout)
+        measured = json.loads(run_cli("hz", "rrbot", "--window", "5", "--once", "--json").stdout)
     assert measured["window"] == 5
 
 

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import failure, zstate
+from helpers.cli_runner import failure, run_cli
 from helpers.processes import until
 from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 from rosbags.highlevel import AnyReader
@@ -33,7 +33,7 @@ def run(sessions: tuple[Session, Session], tmp_path: Path) -> Path:
 
 
 def facts(path: Path) -> dict:
-    return json.loads(zstate("info", str(path), "--json").stdout)
+    return json.loads(run_cli("info", str(path), "--json").stdout)
 
 
 def test_info_agrees_with_rosbags(run: Path):
@@ -65,7 +65,7 @@ def test_info_has_model_streams_rates_and_writers_of_a_robot(run: Path):
 
 
 def test_text_has_the_same_facts_as_json(run: Path):
-    text = zstate("info", str(run)).stdout.decode()
+    text = run_cli("info", str(run)).stdout
     info = facts(run)
     head, start, end, *_ = text.splitlines()
     assert re.fullmatch(rf"{re.escape(str(run))}: [\d.]+ kB \(mcap, zstd\) by zstate \S+", head)
@@ -84,7 +84,7 @@ def test_text_has_the_same_facts_as_json(run: Path):
 
 def test_truncated_recording_is_reported_with_the_recover_command(run: Path):
     run.write_bytes(run.read_bytes()[:-40])
-    text = zstate("info", str(run)).stdout.decode()
+    text = run_cli("info", str(run)).stdout
     assert "\nnot complete\n" in text
     assert f"`zstate recover {run}`" in text
     assert "r1: model " in text
@@ -102,7 +102,7 @@ def test_info_of_a_ros_bag_lists_other_topics(tmp_path: Path):
     (robot,) = info["robots"]
     assert (robot["robot"], robot["model"]) == ("arm", None)
     assert [(other["topic"], other["count"]) for other in info["others"]] == [("/image", 1)]
-    text = zstate("info", str(tmp_path / "bag")).stdout.decode()
+    text = run_cli("info", str(tmp_path / "bag")).stdout
     assert "arm: no model" in text
     assert re.search(r"other topics\n  /image +sensor_msgs/msg/Image +1 +-", text)
 

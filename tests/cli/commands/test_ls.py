@@ -13,8 +13,8 @@ from helpers.cli_runner import (
     failure,
     interrupted,
     published_robot,
+    run_cli,
     started,
-    zstate,
 )
 from helpers.processes import find_free_port, until
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.processes
 
 def test_each_stream_is_listed_with_its_writer():
     with published_robot():
-        robot, *streams = zstate("ls").stdout.decode().splitlines()
+        robot, *streams = run_cli("ls").stdout.splitlines()
     assert robot == "rrbot"
     assert sorted(line.split()[0] for line in streams) == sorted(ALL_STREAMS)
     for line in streams:
@@ -40,7 +40,7 @@ def test_each_stream_is_listed_with_its_writer():
 
 def test_json_names_robots_and_writers():
     with published_robot("left", streams=("joint_states",)), published_robot("right"):
-        robots = json.loads(zstate("ls", "--json").stdout)
+        robots = json.loads(run_cli("ls", "--json").stdout)
     assert [robot["robot"] for robot in robots] == ["left", "right"]
     (writer,) = robots[0]["writers"]
     assert (writer["stream"], writer["pid"]) == ("joint_states", os.getpid())
@@ -48,19 +48,19 @@ def test_json_names_robots_and_writers():
 
 def test_static_edges_are_listed_with_the_name_of_their_writer():
     with connect() as session, StaticPublisher(session, "arm", "mount"):
-        lines = zstate("ls").stdout.decode().splitlines()
-        (robot,) = json.loads(zstate("ls", "--json").stdout)
+        lines = run_cli("ls").stdout.splitlines()
+        (robot,) = json.loads(run_cli("ls", "--json").stdout)
     assert lines[0] == "arm"
     assert lines[1].split()[0] == "tf_static/mount"
     assert [writer["names"] for writer in robot["writers"]] == [["mount"]]
 
 
 def test_empty_network_is_no_error():
-    ended = zstate("ls")
-    assert (ended.returncode, ended.stdout) == (0, b"")
-    assert b"no robot is announced" in ended.stderr
-    assert b"robots of other hosts: --mode lan, or --connect" in ended.stderr
-    assert json.loads(zstate("ls", "--json").stdout) == []
+    ended = run_cli("ls")
+    assert (ended.code, ended.stdout) == (0, "")
+    assert "no robot is announced" in ended.stderr
+    assert "robots of other hosts: --mode lan, or --connect" in ended.stderr
+    assert json.loads(run_cli("ls", "--json").stdout) == []
 
 
 @pytest.mark.parametrize("command", [("ls",), ("ls", "--json"), ("graph", "--json")], ids=" ".join)
@@ -84,8 +84,8 @@ def test_invalid_endpoint_is_named():
 
 def test_ls_measures_joint_states_and_starts_no_other_stream():
     with published_robot():
-        lines = {line.split()[0]: line for line in zstate("ls").stdout.decode().splitlines()}
-        (robot,) = json.loads(zstate("ls", "--json").stdout)
+        lines = {line.split()[0]: line for line in run_cli("ls").stdout.splitlines()}
+        (robot,) = json.loads(run_cli("ls", "--json").stdout)
     assert " Hz  " in lines["joint_states"]
     assert " Hz  " not in lines["tf"]
     (joints,) = [writer for writer in robot["writers"] if writer["stream"] == "joint_states"]
@@ -137,12 +137,12 @@ def test_on_ros_side_the_list_is_watched_too(ros_router: str, spawn: Spawn):
 def test_writers_of_transforms_have_their_names_and_rates(spawn: Spawn):
     options = ("--xyz", "0", "0", "0", "--robot", "r1", "--writer", "odometry")
     started(spawn, "transform", "odom", "base", *options).line()
-    (robot,) = json.loads(zstate("ls", "--json").stdout)
+    (robot,) = json.loads(run_cli("ls", "--json").stdout)
     (writer,) = robot["writers"]
     assert (robot["robot"], writer["stream"], writer["names"]) == ("r1", "transforms", ["odometry"])
     assert writer["rate_hz"] == pytest.approx(50.0, rel=0.2)
-    assert "transforms/odometry" in zstate("ls").stdout.decode()
-    assert "r1: transforms/odometry (" in zstate("graph").stdout.decode()
-    edges = json.loads(zstate("monitor", "--once", "--json").stdout)["edges"]
+    assert "transforms/odometry" in run_cli("ls").stdout
+    assert "r1: transforms/odometry (" in run_cli("graph").stdout
+    edges = json.loads(run_cli("monitor", "--once", "--json").stdout)["edges"]
     assert [edge["rate_hz"] for edge in edges] == [pytest.approx(50.0, rel=0.2)]
-    assert zstate("monitor", "--robots", "--once").stdout.decode().startswith("r1  ")
+    assert run_cli("monitor", "--robots", "--once").stdout.startswith("r1  ")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, run_cli, started
 
 from zstate.scans import Grid
 
@@ -28,7 +28,7 @@ def test_map_is_published_under_the_name_of_the_file_until_ctrl_c(spawn: Spawn, 
     assert child.line() == (
         "hall: 3 x 2 cells of 0.5 m, 1.5 x 1 m, in map, on zstate/hall/map/map, until Ctrl-C"
     )
-    found = json.loads(zstate("echo", "hall", "--stream", "map", "--once", "--json").stdout)
+    found = json.loads(run_cli("echo", "hall", "--stream", "map", "--once", "--json").stdout)
     assert found["frame"] == "hall/map"
     assert (found["width"], found["height"], found["size"]) == (3, 2, [1.5, 1.0])
     assert (found["occupied"], found["free"], found["unknown"]) == (2, 3, 1)
@@ -42,11 +42,11 @@ def test_map_is_published_under_the_name_of_the_file_until_ctrl_c(spawn: Spawn, 
 def test_name_frame_and_writer_are_those_given(spawn: Spawn, hall: str):
     options = ("--name", "r1", "--frame", "odom", "--writer", "slam")
     assert "in odom, on zstate/r1/map/slam" in started(spawn, "map", hall, *options).line()
-    listed = json.loads(zstate("ls", "--json").stdout)
+    listed = json.loads(run_cli("ls", "--json").stdout)
     (writer,) = listed[0]["writers"]
     assert (listed[0]["robot"], writer["stream"], writer["names"]) == ("r1", "map", ["slam"])
-    assert "map/slam" in zstate("ls").stdout.decode()
-    assert "r1: map/slam" in zstate("graph").stdout.decode()
+    assert "map/slam" in run_cli("ls").stdout
+    assert "r1: map/slam" in run_cli("graph").stdout
 
 
 def test_name_of_a_file_becomes_that_of_a_place(spawn: Spawn, hall: str):
@@ -56,9 +56,9 @@ def test_name_of_a_file_becomes_that_of_a_place(spawn: Spawn, hall: str):
 
 def test_place_with_nothing_but_a_map_is_sound(spawn: Spawn, hall: str):
     started(spawn, "map", hall).line()
-    ended = zstate("doctor", "hall", "--json")
+    ended = run_cli("doctor", "hall", "--json")
     checks = {one["name"]: one for one in json.loads(ended.stdout)["checks"] if one["robot"] == "hall"}
-    assert ended.returncode == 0
+    assert ended.code == 0
     assert {name: one["state"] for name, one in checks.items()} == {
         "writers": "ok",
         "map": "ok",
@@ -94,7 +94,7 @@ def test_missing_file_and_bad_names_are_refused(hall: str):
 
 def test_ros_wire_has_the_map_on_its_topic(spawn: Spawn, ros_router: str, hall: str):
     assert "ROS 2 topic /map" in started(spawn, "map", hall).line()
-    found = json.loads(zstate("echo", "--stream", "map", "--once", "--json").stdout)
+    found = json.loads(run_cli("echo", "--stream", "map", "--once", "--json").stdout)
     assert (found["width"], found["occupied"], found["frame"]) == (3, 2, "ros/map")
 
 

@@ -4,7 +4,7 @@ import json
 import os
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, connect, load_model
@@ -92,7 +92,7 @@ def test_stale_edge_has_its_silence_instead_of_a_rate():
 def test_each_edge_has_its_rate_latency_writer_and_clock():
     with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
         statics.set(Transform("tool", "gauge", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
-        report = json.loads(zstate("monitor", "world", "gauge", "--once", "--json").stdout)
+        report = json.loads(run_cli("monitor", "world", "gauge", "--once", "--json").stdout)
     edges = {edge["child"].partition("/")[2]: edge for edge in report["edges"]}
     assert list(edges) == ["base", "upper", "lower", "tool", "gauge"]
     assert [edge["kind"] for edge in edges.values()] == ["static", "joint", "joint", "static", "static"]
@@ -110,7 +110,7 @@ def test_fixed_edges_belong_to_the_writer_of_the_model(spawn: Spawn):
     model = started(spawn, "publish", "rrbot")
     model.line()
     with published_robot(streams=("joint_states",)):
-        report = json.loads(zstate("monitor", "world", "tool", "--once", "--json").stdout)
+        report = json.loads(run_cli("monitor", "world", "tool", "--once", "--json").stdout)
     pids = {(edge["kind"], int(edge["writer"].rpartition(" ")[2])) for edge in report["edges"]}
     assert pids == {("joint", os.getpid()), ("static", model.process.pid)}
 
@@ -154,7 +154,7 @@ def test_once_gives_up_with_the_reason():
 @pytest.mark.processes
 def test_each_edge_is_measured_on_a_ros_wire(ros_router: str):
     with published_robot(wire="ros2", router=ros_router):
-        report = json.loads(zstate("monitor", "base", "tool", "--once", "--json").stdout)
+        report = json.loads(run_cli("monitor", "base", "tool", "--once", "--json").stdout)
     assert [edge["kind"] for edge in report["edges"]] == ["pose", "pose", "static"]
     assert all(edge["rate_hz"] > 0.0 for edge in report["edges"][:2])
 
@@ -178,9 +178,9 @@ def test_overview_has_one_line_for_joints_and_one_for_fixed_edges():
 @pytest.mark.processes
 def test_without_frames_all_received_edges_are_monitored():
     with published_robot("left"), published_robot("right"):
-        lines = zstate("monitor", "--once").stdout.decode().splitlines()
-        edges = json.loads(zstate("monitor", "--once", "--json").stdout)["edges"]
-        (only,) = zstate("monitor", "--robot", "left", "--once").stdout.decode().splitlines()[1:2]
+        lines = run_cli("monitor", "--once").stdout.splitlines()
+        edges = json.loads(run_cli("monitor", "--once", "--json").stdout)["edges"]
+        (only,) = run_cli("monitor", "--robot", "left", "--once").stdout.splitlines()[1:2]
     assert [line.split()[:3] for line in lines[1:5]] == [
         ["left/*", "2", "joints"],
         ["left/*", FIXED, "static"],
@@ -208,5 +208,5 @@ def test_one_frame_is_not_enough():
 @pytest.mark.processes
 def test_all_edges_on_ros_side_have_their_ros_names(ros_router: str):
     with published_robot(wire="ros2", router=ros_router):
-        lines = zstate("monitor", "--once").stdout.decode().splitlines()
+        lines = run_cli("monitor", "--once").stdout.splitlines()
     assert [line.split()[:2] for line in lines[1:4]] == [["lower", "pose"], ["upper", "pose"], ["*", FIXED]]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import ROVER, Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import ROVER, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import DEADLINE_S, Child, repeated, until
 
 from zstate import JointReading, TransformListener, connect
@@ -41,9 +41,9 @@ def line_with(child: Child, text: str) -> str:
 
 
 def printed(*arguments: str) -> str:
-    ended = zstate(*arguments)
-    assert ended.returncode == 0, ended.stderr
-    return ended.stdout.decode()
+    ended = run_cli(*arguments)
+    assert ended.code == 0, ended.stderr
+    return ended.stdout
 
 
 def test_joints_are_moved_and_the_outcome_is_awaited(spawn: Spawn):
@@ -65,9 +65,9 @@ def test_motion_beyond_the_limits_is_refused_with_all_findings_and_stretched_on_
     assert "'elbow' moves at -5 rad/s, above 3.5" in elbow
     assert "'shoulder' accelerates at 66.6666667 rad/s^2, above 12.5" in starting
     assert "'elbow' accelerates at -66.6666667 rad/s^2, above 17.5" in bending
-    refused = zstate(*fast, "--json")
+    refused = run_cli(*fast, "--json")
     document = json.loads(refused.stdout)
-    assert (refused.returncode, document["outcome"], len(document["findings"])) == (1, "refused", 4)
+    assert (refused.code, document["outcome"], len(document["findings"])) == (1, "refused", 4)
     assert document["reason"] == "", "a text, as of every other outcome"
     assert json.loads(printed(*fast, "--stretch", "--json"))["outcome"] == "reached"
 

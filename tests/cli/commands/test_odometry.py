@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import ROVER, Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import ROVER, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import DEADLINE_S, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
@@ -35,12 +35,12 @@ def test_live_odometry_drives_the_rover_and_its_recording_gives_a_report_and_a_p
     file, plot = tmp_path / "run.mcap", tmp_path / "run.png"
     with connect() as session, TransformListener(session, "rover") as listener:
         listener.buffer.wait("odom", "base_footprint", timeout_s=DEADLINE_S)
-        assert zstate("record", str(file), "rover", "--seconds", "4").returncode == 0
+        assert run_cli("record", str(file), "rover", "--seconds", "4").code == 0
         # It drives its square as soon as it has an odometry.
         until(lambda: listener.buffer.lookup("odom", "base_footprint").translation[0] > 0.1)
-    replayed = zstate("odometry", "rover", "--file", SETTINGS, "--replay", str(file), "--plot", str(plot))
-    assert replayed.returncode == 0, replayed.stderr
-    *report, wrote = replayed.stdout.decode().splitlines()
+    replayed = run_cli("odometry", "rover", "--file", SETTINGS, "--replay", str(file), "--plot", str(plot))
+    assert replayed.code == 0, replayed.stderr
+    *report, wrote = replayed.stdout.splitlines()
     number = r"-?\d+\.\d+"
     path = rf"{number} m in {number} s; base_footprint ends at x {number} m \(sigma .* deg .*"
     assert any(re.fullmatch(path, line) for line in report)
@@ -178,10 +178,10 @@ def test_requests_place_the_base_of_a_running_odometry_and_start_it_anew(spawn: 
                 (-3, 0.5, 0),
             ),
         ):
-            ended = zstate(*request, *options)
-            assert ended.stdout.decode().startswith(f"the odometry 'legs' of 'walker' {done}"), ended.stderr
+            ended = run_cli(*request, *options)
+            assert ended.stdout.startswith(f"the odometry 'legs' of 'walker' {done}"), ended.stderr
             until(lambda: place() == pytest.approx(expected, abs=0.05))  # noqa: B023
-        assert zstate(*request, "--reset").stdout.decode() == "the odometry 'legs' of 'walker' started anew\n"
+        assert run_cli(*request, "--reset").stdout == "the odometry 'legs' of 'walker' started anew\n"
         refused = failure("odometry", "walker", "--reset")
         assert "no reply at 'zstate/walker/@odometry/odometry' within 2 s" in refused
     interrupted(live)

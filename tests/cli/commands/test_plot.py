@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from helpers.cli_runner import RRBOT, failure, published_robot, zstate
+from helpers.cli_runner import RRBOT, failure, published_robot, run_cli
 from helpers.recording_builder import START, RecordingBuilder
 
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
@@ -81,9 +81,9 @@ def test_live_joint_states_are_drawn(tmp_path: Path):
     needs_matplotlib()
     file = tmp_path / "joints.svg"
     with published_robot():
-        ended = zstate("plot", "--seconds", "0.5", "--output", str(file))
-    assert ended.returncode == 0, ended.stderr
-    assert ended.stdout.decode().startswith(f"wrote {file}: 2 curves, ")
+        ended = run_cli("plot", "--seconds", "0.5", "--output", str(file))
+    assert ended.code == 0, ended.stderr
+    assert ended.stdout.startswith(f"wrote {file}: 2 curves, ")
     assert all(name in texts(file) for name in ("rrbot: joint positions", "shoulder", "elbow", "[rad]"))
 
 
@@ -92,8 +92,8 @@ def test_the_path_of_a_frame_is_drawn(tmp_path: Path):
     needs_matplotlib()
     file = tmp_path / "path.png"
     with published_robot():
-        ended = zstate("plot", "--path", "base", "tool", "--seconds", "0.5", "--output", str(file))
-    assert ended.returncode == 0, ended.stderr
+        ended = run_cli("plot", "--path", "base", "tool", "--seconds", "0.5", "--output", str(file))
+    assert ended.code == 0, ended.stderr
     assert file.read_bytes().startswith(b"\x89PNG")
 
 
@@ -102,13 +102,13 @@ def test_a_recording_is_drawn_whole_or_in_part(tmp_path: Path):
     needs_matplotlib()
     recording, joints, path = (tmp_path / name for name in ("run.mcap", "joints.svg", "path.svg"))
     with published_robot():
-        assert zstate("record", str(recording), "--seconds", "1.5").returncode == 0
-    ended = zstate("plot", "--file", str(recording), "--joint", "elbow", "--output", str(joints))
-    assert "1 curve, " in ended.stdout.decode(), ended.stderr
+        assert run_cli("record", str(recording), "--seconds", "1.5").code == 0
+    ended = run_cli("plot", "--file", str(recording), "--joint", "elbow", "--output", str(joints))
+    assert "1 curve, " in ended.stdout, ended.stderr
     assert "shoulder" not in texts(joints)
     options = ("--path", "base", "tool", "--start", "0.5", "--seconds", "0.5", "--output", str(path))
-    ended = zstate("plot", "rrbot", "--file", str(recording), *options)
-    assert "in 0.5 s" in ended.stdout.decode(), ended.stderr
+    ended = run_cli("plot", "rrbot", "--file", str(recording), *options)
+    assert "in 0.5 s" in ended.stdout, ended.stderr
     message = failure("plot", "--file", str(recording), "--start", "60")
     assert "no joint state of 'rrbot' in that time" in message
     assert "no robot" not in message
@@ -126,8 +126,8 @@ def test_only_robot_with_joint_states_is_drawn_by_default(tmp_path: Path):
             builder.joints("rrbot", START + n * SECOND, [0.25, 0.5])
         builder.edges("cart", START, {("odom", "base"): [0, 0, 0, 0, 0, 0, 1]})
         builder.encoder.write_message("hall", hall, START, "floor")
-    ended = zstate("plot", "--file", str(path), "--output", str(tmp_path / "joints.svg"))
-    assert "2 curves, " in ended.stdout.decode(), ended.stderr
+    ended = run_cli("plot", "--file", str(path), "--output", str(tmp_path / "joints.svg"))
+    assert "2 curves, " in ended.stdout, ended.stderr
 
 
 @pytest.mark.processes
@@ -150,6 +150,6 @@ def test_mistakes_are_reported(tmp_path: Path):
 def test_missing_matplotlib_is_reported_with_the_package_to_install():
     hidden = "import sys; sys.modules['matplotlib'] = None; from zstate.cli.main import main; main()"
     ended = subprocess.run([sys.executable, "-c", hidden, "plot", RRBOT], capture_output=True, check=False)
-    assert ended.returncode == 1
-    assert b"pip install 'zstate[plot]'" in ended.stderr
-    assert b"Traceback" not in ended.stderr
+    assert ended.code == 1
+    assert "pip install 'zstate[plot]'" in ended.stderr
+    assert "Traceback" not in ended.stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import until
 from helpers.recording_builder import MS, START, RecordingBuilder, swing_positions
 
@@ -102,7 +102,7 @@ def test_publish_answers_lookups_for_devices_without_a_buffer(spawn: Spawn, sour
 
 
 def test_publish_at_a_rate_reports_the_achieved_rate():
-    output = zstate("publish", RRBOT, "--source", "sine", "--rate", "50", "--seconds", "0.2").stdout.decode()
+    output = run_cli("publish", RRBOT, "--source", "sine", "--rate", "50", "--seconds", "0.2").stdout
     # Ten ticks, 20 ms apart; a busy machine may skip some, which are then counted.
     assert "; commanded 50 Hz, achieved " in output.splitlines()[-1]
 

@@ -6,7 +6,7 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import mounted_disk, until
 
 from zstate import StatePublisher, connect, load_model
@@ -37,8 +37,8 @@ def test_ctrl_c_ends_a_recording_with_a_complete_file_and_a_summary(spawn: Spawn
 def test_a_duration_ends_it_and_only_the_chosen_robot_is_recorded(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with published_robot("left"), published_robot("right"):
-        ended = zstate("record", str(path), "left", "--seconds", "1")
-    assert ended.returncode == 0, ended.stderr
+        ended = run_cli("record", str(path), "left", "--seconds", "1")
+    assert ended.code == 0, ended.stderr
     assert read_info(path).robots == ("left",)
     with RecordingReader(path) as reader:
         assert {channel.topic for channel in reader.channels()} == {
@@ -71,35 +71,35 @@ def test_empty_recording_fails_with_the_reason(tmp_path: Path):
 def test_the_suffix_is_added_and_a_file_that_exists_is_kept_unless_it_may_be_overwritten(tmp_path: Path):
     with published_robot():
         given = ("record", str(tmp_path / "run"), "--seconds", "0.7")
-        assert f"recording into '{tmp_path}/run.mcap'" in zstate(*given).stderr.decode()
+        assert f"recording into '{tmp_path}/run.mcap'" in run_cli(*given).stderr
         before = (tmp_path / "run.mcap").read_bytes()
         message = failure(*given)
         assert "exists; choose another name" in message
         assert "--overwrite" in message
         assert (tmp_path / "run.mcap").read_bytes() == before
-        assert zstate(*given, "--overwrite").returncode == 0
+        assert run_cli(*given, "--overwrite").code == 0
     assert (tmp_path / "run.mcap").read_bytes() != before
 
 
 def test_a_recording_is_split_by_time_and_all_files_are_named(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with published_robot():
-        ended = zstate("record", str(path), "--seconds", "2.5", "--split-seconds", "1")
-    assert f"into 3 files, {path} to run_2.mcap (" in ended.stdout.decode()
+        ended = run_cli("record", str(path), "--seconds", "2.5", "--split-seconds", "1")
+    assert f"into 3 files, {path} to run_2.mcap (" in ended.stdout
     assert len(read_info(path).files) == 3
 
 
 def test_losses_are_reported(tmp_path: Path):
     with published_robot(streams=("joint_states",)):
-        ended = zstate("record", str(tmp_path / "run.mcap"), "rrbot", "--seconds", "1")
-    assert re.search(r"lost \d+ without a description that fits", ended.stdout.decode())
+        ended = run_cli("record", str(tmp_path / "run.mcap"), "rrbot", "--seconds", "1")
+    assert re.search(r"lost \d+ without a description that fits", ended.stdout)
 
 
 def test_ros_robot_is_recorded_over_its_wire(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with connect() as session, StatePublisher(session, load_model("rrbot"), "r1", wires=("ros2",)):
-        ended = zstate("record", str(path), "--wire", "ros2", "--mode", "peer", "--seconds", "1.5")
-    assert ended.returncode == 0, ended.stderr
+        ended = run_cli("record", str(path), "--wire", "ros2", "--mode", "peer", "--seconds", "1.5")
+    assert ended.code == 0, ended.stderr
     assert {channel.topic for channel in read_info(path).channels} == {"/robot_description", "/tf_static"}
     assert "no wire 'nonsense'" in failure("record", "x", "--wire", "nonsense", code=2)
 
@@ -139,24 +139,24 @@ def test_start_times_replace_directives_and_a_second_start_makes_a_second_file(
     monkeypatch.chdir(tmp_path)
     with published_robot():
         before = datetime.now().replace(microsecond=0)
-        first = zstate("record", "--seconds", "1.2")
+        first = run_cli("record", "--seconds", "1.2")
         contents = {path: path.read_bytes() for path in tmp_path.iterdir()}
-        assert zstate("record", "--seconds", "1.2").returncode == 0
+        assert run_cli("record", "--seconds", "1.2").code == 0
         after = datetime.now()
     one, two = sorted(path.name for path in tmp_path.iterdir())
     assert [path.name for path in contents] == [one]
     assert (tmp_path / one).read_bytes() == contents[Path(tmp_path / one)]
     starts = [datetime.strptime(name, "rec-%Y%m%d-%H%M%S.mcap") for name in (one, two)]
     assert before <= starts[0] < starts[1] <= after
-    assert f"recording into '{one}'" in first.stderr.decode()
+    assert f"recording into '{one}'" in first.stderr
 
 
 def test_files_of_a_split_recording_have_the_time_of_its_start(tmp_path: Path):
     pattern = str(tmp_path / "%%-%Y-%j.mcap")
     with published_robot():
         today = datetime.now()
-        ended = zstate("record", pattern, "--seconds", "1.5", "--split-seconds", "1")
-    assert ended.returncode == 0, ended.stderr
+        ended = run_cli("record", pattern, "--seconds", "1.5", "--split-seconds", "1")
+    assert ended.code == 0, ended.stderr
     first = f"%-{today:%Y-%j}"
     assert {path.name for path in tmp_path.iterdir()} == {f"{first}.mcap", f"{first}_1.mcap"}
 
@@ -180,35 +180,35 @@ def test_keep_deletes_the_oldest_recordings_at_the_start_and_after_each_split(tm
     other = tmp_path / "run.mcap"
     with published_robot():
         for path in (old, other):
-            assert zstate("record", str(path), "--seconds", "1").returncode == 0
+            assert run_cli("record", str(path), "--seconds", "1").code == 0
         notes.write_text("not a recording")
         # A second of this robot has more than 1 kB, so only the file being written stays.
-        ended = zstate(
+        ended = run_cli(
             *("record", str(tmp_path / "rec-%Y%m%d-%H%M%S.mcap"), "--seconds", "3.5"),
             *("--split-seconds", "1", "--keep", "1kB"),
         )
-    assert ended.returncode == 0, ended.stderr
+    assert ended.code == 0, ended.stderr
     (last,) = set(tmp_path.iterdir()) - {notes, other}
     assert last.name.endswith("_3.mcap")
     assert read_info(last).complete
-    log = ended.stderr.decode()
+    log = ended.stderr
     assert f"deleted '{old}' (" in log
     assert log.count("deleted ") == log.count(": --keep 1kB") == 4
-    assert "; deleted 4 files (" in ended.stdout.decode()
+    assert "; deleted 4 files (" in ended.stdout
 
 
 def test_keep_deletes_by_age(tmp_path: Path):
     pattern = str(tmp_path / "rec-%Y%m%d-%H%M%S.mcap")
     with published_robot():
-        assert zstate("record", pattern, "--seconds", "1").returncode == 0
+        assert run_cli("record", pattern, "--seconds", "1").code == 0
         (first,) = tmp_path.iterdir()
-        ended = zstate("record", pattern, "--seconds", "1", "--keep", "1h")
+        ended = run_cli("record", pattern, "--seconds", "1", "--keep", "1h")
         assert first.exists()
-        assert "--keep deletes recordings at this start only" in ended.stderr.decode()
+        assert "--keep deletes recordings at this start only" in ended.stderr
         written = first.stat().st_mtime
-        ended = zstate("record", pattern, "--seconds", "1", "--keep", f"{time.time() - written:.3f}s")
+        ended = run_cli("record", pattern, "--seconds", "1", "--keep", f"{time.time() - written:.3f}s")
     assert not first.exists()
-    assert "; deleted 1 file (" in ended.stdout.decode()
+    assert "; deleted 1 file (" in ended.stdout
 
 
 def test_keep_is_refused_where_it_cannot_work(tmp_path: Path):

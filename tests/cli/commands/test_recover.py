@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import failure, zstate
+from helpers.cli_runner import failure, run_cli
 from helpers.recording_files import joint_states, write_run
 
 from zstate.recording.info import read_info
@@ -23,7 +23,7 @@ def cut(tmp_path: Path) -> Path:
 
 def test_recover_reports_savings_and_losses_and_keeps_the_original(cut: Path):
     before = cut.read_bytes()
-    output = zstate("recover", str(cut)).stdout.decode()
+    output = run_cli("recover", str(cut)).stdout
     saved = cut.with_name("run_recovered.mcap")
     count = read_info(saved).message_count
     assert output.startswith(f"saved {count} messages in ")
@@ -35,18 +35,18 @@ def test_recover_reports_savings_and_losses_and_keeps_the_original(cut: Path):
 
 def test_target_may_be_named_and_an_existing_file_is_kept(cut: Path, tmp_path: Path):
     target = tmp_path / "saved.mcap"
-    assert zstate("recover", str(cut), str(target)).returncode == 0
+    assert run_cli("recover", str(cut), str(target)).code == 0
     before = target.read_bytes()
     message = failure("recover", str(cut), str(target))
     assert "exists" in message
     assert "--overwrite" in message
     assert target.read_bytes() == before
-    assert zstate("recover", str(cut), str(target), "--overwrite").returncode == 0
+    assert run_cli("recover", str(cut), str(target), "--overwrite").code == 0
 
 
 def test_complete_file_is_copied_and_reported_as_complete(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(10))
-    output = zstate("recover", str(tmp_path / "run.mcap")).stdout.decode()
+    output = run_cli("recover", str(tmp_path / "run.mcap")).stdout
     assert "was complete: nothing to recover" in output
 
 
@@ -54,7 +54,7 @@ def test_file_without_its_end_has_lost_nothing(tmp_path: Path):
     path = tmp_path / "run.mcap"
     write_run(path, joint_states(10), flush_every=10)
     path.write_bytes(path.read_bytes()[:-8])
-    output = zstate("recover", str(path)).stdout.decode()
+    output = run_cli("recover", str(path)).stdout
     assert "saved 11 messages" in output
     assert "nothing lost" in output
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import until
 from helpers.recording_builder import LATENCY, MS, START, Bag, RecordingBuilder, S, swing_positions
 
@@ -24,8 +24,8 @@ def file(tmp_path: Path) -> str:
 
 
 def test_replay_prints_a_heading_and_a_summary(file: str):
-    ended = zstate("replay", file)
-    first, last = ended.stdout.decode().splitlines()
+    ended = run_cli("replay", file)
+    first, last = ended.stdout.splitlines()
     # The first message is the description, the last one a sample half a second after it.
     assert first == (
         f"replaying 'arm' from {file}: 0.5 s, {START // S}.000000000 to {START // S}.500200000, "
@@ -72,12 +72,12 @@ def test_live_robot_is_not_replayed_without_takeover(file: str):
         message = failure("replay", file)
         assert "already published on the network: 'arm' by " in message
         assert "--takeover" in message
-        assert zstate("replay", file, "--takeover").returncode == 0
+        assert run_cli("replay", file, "--takeover").code == 0
 
 
 def test_a_part_can_be_replayed(file: str):
     # From 200 to 300 ms: the samples of 200 to 290 ms arrived a little later than their stamps.
-    last = zstate("replay", file, "--start", "0.2", "--seconds", "0.1", "--rate", "inf").stdout.decode()
+    last = run_cli("replay", file, "--start", "0.2", "--seconds", "0.1", "--rate", "inf").stdout
     assert "as fast as possible" in last
     assert "replayed 10 samples" in last
 
@@ -88,7 +88,7 @@ def test_readable_topics_of_a_ros_bag_are_replayed(tmp_path: Path):
         for n in range(5):
             bag.joints(START + n, {"shoulder": 0.5, "elbow": 0.1})
             bag.joints(START + n, {"knee": 0.5}, "/dog/joint_states")
-    output = zstate("replay", str(tmp_path / "bag"), "--rate", "inf").stdout.decode()
+    output = run_cli("replay", str(tmp_path / "bag"), "--rate", "inf").stdout
     assert "replaying 'dog', 'ros'" in output
     assert "replayed 10 samples" in output
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import until
 from helpers.robots import SampleCollector
 
@@ -85,7 +85,7 @@ def test_its_settings_for_ros_and_a_file_exclude_each_other(tmp_path):
 
 def test_router_runs_its_printed_configuration(spawn: Spawn, free_port: int, tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    printed = zstate("router", "--listen", endpoint, "--print")
+    printed = run_cli("router", "--listen", endpoint, "--print")
     file = tmp_path / "router.json5"
     file.write_bytes(printed.stdout)
     assert (
@@ -138,10 +138,10 @@ def test_router_with_access_control_does_not_connect_peers_to_each_other(
     """Over a direct link a robot could write another robot's keys."""
     pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
     certs, acl, endpoint = str(tmp_path / "pki"), tmp_path / "acl.json5", f"tls/127.0.0.1:{free_port}"
-    zstate(
+    run_cli(
         "certs", certs, "--identity", "router", "--identity", "ra", "--identity", "rb", "--identity", "desk"
     )
-    acl.write_bytes(zstate("acl", "--robot", "ra", "--robot", "rb", "--viewer", "desk").stdout)
+    acl.write_bytes(run_cli("acl", "--robot", "ra", "--robot", "rb", "--viewer", "desk").stdout)
     options = ("--listen", endpoint, "--certs", certs, "--identity", "router", "--acl", str(acl))
     started(spawn, "router", *options).line()
 
@@ -173,10 +173,10 @@ def test_password_is_in_the_output_file_but_masked_in_print(tmp_path: Path, monk
     users.touch(0o600)
     users.write_text("r1:open sesame\n")
     options = ("router", "--user", "r1", "--users", str(users))
-    printed = zstate(*options, "--print").stdout.decode()
+    printed = run_cli(*options, "--print").stdout
     assert 'user: "r1"' in printed
     assert "sesame" not in printed
-    assert zstate(*options, "--output", str(file)).stdout == b""
+    assert run_cli(*options, "--output", str(file)).stdout == ""
     assert 'password: "open sesame"' in file.read_text()
     assert file.read_text() == printed.replace("********", "open sesame")
     assert file.stat().st_mode & 0o777 == 0o600

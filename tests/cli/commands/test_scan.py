@@ -10,7 +10,7 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import SOON_S, repeated, until
 
 from zstate import StaticPublisher, Transform, TransformPublisher, connect
@@ -32,7 +32,7 @@ def hall(tmp_path: Path) -> str:
 
 
 def documents(stream_of: str, *options: str) -> dict:
-    return json.loads(zstate("echo", stream_of, "--stream", "scan", "--once", "--json", *options).stdout)
+    return json.loads(run_cli("echo", stream_of, "--stream", "scan", "--once", "--json", *options).stdout)
 
 
 def test_dummy_scans_have_the_pattern_of_dummy_laser(spawn: Spawn):
@@ -44,7 +44,7 @@ def test_dummy_scans_have_the_pattern_of_dummy_laser(spawn: Spawn):
     expected = abs(np.sin(np.pi * (found["stamp"] % round(np.pi / 3 * 1e9)) / round(np.pi / 3 * 1e9)))
     assert found["ranges"] == pytest.approx([expected] * 1081, abs=1e-6)
     assert found["nearest"] == found["farthest"]
-    measured = json.loads(zstate("hz", "r1", "--stream", "scan", "--once", "--json").stdout)
+    measured = json.loads(run_cli("hz", "r1", "--stream", "scan", "--once", "--json").stdout)
     assert measured["rate_hz"] == pytest.approx(30.0, rel=0.3)
     interrupted(child)
     assert "commanded 30 Hz" in child.line()
@@ -52,10 +52,10 @@ def test_dummy_scans_have_the_pattern_of_dummy_laser(spawn: Spawn):
 
 def test_summary_of_a_scan_has_no_ranges(spawn: Spawn):
     started(spawn, "scan", "r1", "--frame", "laser", "--dummy").line()
-    text = zstate("echo", "r1", "--stream", "scan", "--once").stdout.decode()
+    text = run_cli("echo", "r1", "--stream", "scan", "--once").stdout
     assert "rays: 1081\nvalid: 1081\nnearest: " in text
     assert "ranges" not in text
-    changed = zstate("echo", "r1", "--stream", "scan", "--once", "--changed").stdout.decode()
+    changed = run_cli("echo", "r1", "--stream", "scan", "--once", "--changed").stdout
     assert 'frame: "r1/laser"' in changed
 
 
@@ -130,8 +130,8 @@ def test_simulated_scan_waits_for_the_robot_and_its_frame(spawn: Spawn, hall: st
 def test_scans_in_a_frame_that_no_robot_places_are_a_finding(spawn: Spawn):
     with published_robot():
         started(spawn, "scan", "rrbot", "--frame", "baze", "--dummy", "--sensor", "front").line()
-        ended = zstate("doctor", "rrbot", "--json")
-    assert ended.returncode == 1
+        ended = run_cli("doctor", "rrbot", "--json")
+    assert ended.code == 1
     first = json.loads(ended.stdout)["first_broken"]
     assert first["name"] == "scan"
     assert "the scans of 'front' are in 'rrbot/baze', which no writer places; 'base'" in first["text"]
@@ -140,15 +140,15 @@ def test_scans_in_a_frame_that_no_robot_places_are_a_finding(spawn: Spawn):
 def test_commands_that_look_show_scans(spawn: Spawn):
     with published_robot():
         started(spawn, "scan", "rrbot", "--frame", "base", "--dummy", "--sensor", "front").line()
-        (robot,) = json.loads(zstate("ls", "--json").stdout)
+        (robot,) = json.loads(run_cli("ls", "--json").stdout)
         (writer,) = [one for one in robot["writers"] if one["stream"] == "scan"]
         assert writer["names"] == ["front"]
         assert writer["rate_hz"] == pytest.approx(30.0, rel=0.3)
-        assert "rrbot: scan/front (" in zstate("graph").stdout.decode()
-        monitored = json.loads(zstate("monitor", "--robots", "--once", "--json").stdout)
+        assert "rrbot: scan/front (" in run_cli("graph").stdout
+        monitored = json.loads(run_cli("monitor", "--robots", "--once", "--json").stdout)
         assert monitored["scans_hz"] == pytest.approx(30.0, rel=0.3)
-        assert " scans " in zstate("monitor", "--robots", "--once").stdout.decode()
-        ended = zstate("doctor", "rrbot", "--json")
+        assert " scans " in run_cli("monitor", "--robots", "--once").stdout
+        ended = run_cli("doctor", "rrbot", "--json")
         checks = [one for one in json.loads(ended.stdout)["checks"] if one["name"] == "scan"]
         assert [one["state"] for one in checks] == ["ok"]
 
@@ -179,7 +179,7 @@ def test_wrong_usage_is_refused(hall: str):
 def test_ros_wire_has_scans_on_the_topic_of_the_sensor(spawn: Spawn, ros_router: str):
     child = started(spawn, "scan", "r1", "--frame", "laser", "--dummy")
     assert "ROS 2 topic /scan" in child.line()
-    found = json.loads(zstate("echo", "--stream", "scan", "--once", "--json").stdout)
+    found = json.loads(run_cli("echo", "--stream", "scan", "--once", "--json").stdout)
     assert (found["rays"], found["frame"]) == (1081, "ros/laser")
 
 

@@ -12,8 +12,8 @@ from helpers.cli_runner import (
     failure,
     interrupted,
     published_robot,
+    run_cli,
     started,
-    zstate,
 )
 from helpers.processes import until
 
@@ -79,9 +79,9 @@ def test_loaded_robot_has_the_saved_poses(spawn: Spawn, tmp_path: Path, suffix: 
     edge = Transform("lower", "camera", (0.0, 0.1, 0.2), (0.0, 0.0, 0.6, 0.8))
     with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "calibration") as static:
         static.set(edge)
-        saved = zstate("snapshot", "save", str(file))
-        assert saved.returncode == 0, saved.stderr
-        assert b"(1 robot, 1 static edge)" in saved.stderr
+        saved = run_cli("snapshot", "save", str(file))
+        assert saved.code == 0, saved.stderr
+        assert "(1 robot, 1 static edge)" in saved.stderr
         with TransformListener(session, "rrbot") as listener:
             there = listener.buffer.wait("world", "camera", timeout_s=10.0)
     (shot,) = read_snapshot(file).robot
@@ -129,8 +129,8 @@ def test_snapshot_is_loaded_on_this_host_unless_as_saved(spawn: Spawn, tmp_path:
     file, router = tmp_path / "cell.toml", f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", router).line()
     with published_robot(router=router):
-        assert zstate("snapshot", "save", str(file), "--connect", router).returncode == 0
-    here = zstate("snapshot", "load", str(file), "--seconds", "0.1").stderr.decode()
+        assert run_cli("snapshot", "save", str(file), "--connect", router).code == 0
+    here = run_cli("snapshot", "load", str(file), "--seconds", "0.1").stderr
     assert f"with --mode client --connect {router}; --as-saved uses the same options" in here
     child = started(spawn, "snapshot", "load", str(file), "--as-saved")
     child.line()
@@ -145,7 +145,7 @@ def test_only_the_named_robots_are_saved_and_loaded(tmp_path: Path):
     file = tmp_path / "cell.toml"
     with published_robot("left"), published_robot("right"):
         assert "left" in failure("snapshot", "save", str(file), "lef")
-        assert zstate("snapshot", "save", str(file), "left").returncode == 0
+        assert run_cli("snapshot", "save", str(file), "left").code == 0
     assert [shot.name for shot in read_snapshot(file).robot] == ["left"]
     assert "has no robot 'right'; it has left" in failure("snapshot", "load", str(file), "right")
 
@@ -153,9 +153,9 @@ def test_only_the_named_robots_are_saved_and_loaded(tmp_path: Path):
 @pytest.mark.processes
 def test_robot_without_joint_states_is_saved_without_positions():
     with published_robot(streams=("robot_description", "tf_static")):
-        saved = zstate("snapshot", "save", "-")
-    assert b"positions" not in saved.stdout
-    assert b"[[robot]]" in saved.stdout
+        saved = run_cli("snapshot", "save", "-")
+    assert "positions" not in saved.stdout
+    assert "[[robot]]" in saved.stdout
 
 
 @pytest.mark.processes
@@ -164,7 +164,7 @@ def test_a_file_that_exists_is_kept_unless_forced(tmp_path: Path):
     file.write_text("mine")
     assert "--force replaces it" in failure("snapshot", "save", str(file))
     with published_robot():
-        assert zstate("snapshot", "save", str(file), "--force").returncode == 0
+        assert run_cli("snapshot", "save", str(file), "--force").code == 0
     assert json.loads(file.read_text())["robot"][0]["name"] == "rrbot"
 
 

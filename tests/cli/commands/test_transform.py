@@ -4,7 +4,7 @@ import json
 import signal
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, run_cli, started
 from helpers.processes import SOON_S, until
 
 from zstate import Transform, TransformListener, connect
@@ -50,10 +50,10 @@ def test_lines_of_json_are_published_with_their_stamps_until_ctrl_c(spawn: Spawn
 
 def test_bad_line_is_reported_with_its_number_and_the_next_ones_go_on():
     lines = ["nonsense", line("map", "ball"), "[1]", "", line("map", "map"), line("map", "ball", 2.0)]
-    ended = zstate("transform", "--stdin", "--robot", "r1", stdin="\n".join(lines).encode())
-    assert ended.stdout.decode().endswith("2 transforms published, 3 lines refused\n")
-    assert ended.returncode == 1
-    reports = [text for text in ended.stderr.decode().splitlines() if "line " in text]
+    ended = run_cli("transform", "--stdin", "--robot", "r1", stdin="\n".join(lines).encode())
+    assert ended.stdout.endswith("2 transforms published, 3 lines refused\n")
+    assert ended.code == 1
+    reports = [text for text in ended.stderr.splitlines() if "line " in text]
     assert [text.split(": ")[1] for text in reports] == ["line 1", "line 3", "line 5"]
     assert "a transform is a JSON object, not list" in reports[1]
     assert "placed on itself" in reports[2]
@@ -83,7 +83,7 @@ def test_ros_wire_has_messages_that_tf_reads(spawn: Spawn, ros_router: str):
     options = ("--wire", "ros2", "--connect", ros_router)
     child = started(spawn, "transform", "odom", "base_link", "--xyz", "4", "0", "0", *options)
     assert "ROS 2 topic /tf" in child.line()
-    found = zstate("tf", "odom", "base_link", "--once", "--json", *options)
+    found = run_cli("tf", "odom", "base_link", "--once", "--json", *options)
     assert json.loads(found.stdout)["translation"] == [4.0, 0.0, 0.0]
 
 

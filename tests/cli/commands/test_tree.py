@@ -4,7 +4,7 @@ import json
 from xml.etree import ElementTree
 
 import pytest
-from helpers.cli_runner import failure, published_robot, zstate
+from helpers.cli_runner import failure, published_robot, run_cli
 
 from zstate import StaticPublisher, Transform, connect
 
@@ -12,9 +12,9 @@ pytestmark = pytest.mark.processes
 
 
 def drawn(*arguments: str) -> list[str]:
-    ended = zstate("tree", *arguments)
-    assert ended.returncode == 0, ended.stderr
-    return ended.stdout.decode().splitlines()
+    ended = run_cli("tree", *arguments)
+    assert ended.code == 0, ended.stderr
+    return ended.stdout.splitlines()
 
 
 def test_each_edge_has_its_kind_rate_age_and_writer():
@@ -102,16 +102,16 @@ def test_missing_robot_error_lists_the_others():
 
 
 def test_empty_network_is_no_error_and_prints_how_to_start():
-    ended = zstate("tree")
-    assert (ended.returncode, ended.stdout) == (0, b"")
-    assert b"zstate publish" in ended.stderr
-    assert json.loads(zstate("tree", "--json").stdout) == []
+    ended = run_cli("tree")
+    assert (ended.code, ended.stdout) == (0, "")
+    assert "zstate publish" in ended.stderr
+    assert json.loads(run_cli("tree", "--json").stdout) == []
     assert "robot 'rrbot' is not announced" in failure("tree", "rrbot")
 
 
 def test_joint_states_without_model_have_no_tree_and_print_how_to_publish_one():
     with published_robot(streams=("joint_states",)):
-        ended = zstate("tree")
-    assert ended.returncode == 0
-    assert ended.stdout == b""
-    assert b"zstate publish" in ended.stderr
+        ended = run_cli("tree")
+    assert ended.code == 0
+    assert ended.stdout == ""
+    assert "zstate publish" in ended.stderr

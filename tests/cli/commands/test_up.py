@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import Child, until
 
 from zstate import TransformListener, connect, discover
@@ -113,10 +113,7 @@ def test_all_parts_connect_to_the_router_of_the_file(up, free_port: int):
 
 
 def test_certificates_of_the_file_encrypt_connections_to_its_router(up, free_port: int, tmp_path: Path):
-    assert (
-        zstate("certs", str(tmp_path / "fleet"), "--identity", "router", "--identity", "rrbot").returncode
-        == 0
-    )
+    assert run_cli("certs", str(tmp_path / "fleet"), "--identity", "router", "--identity", "rrbot").code == 0
     endpoint = f"tls/127.0.0.1:{free_port}"
     child = up(
         f'[router]\nlisten = ["{endpoint}"]\ncerts = "fleet"\nidentity = "router"\n'
@@ -236,14 +233,14 @@ def test_a_file_that_several_include_is_read_once(tmp_path: Path):
     for number in range(24):
         (tmp_path / f"part_{number}.toml").write_text(f"include = {[f'part_{number + 1}.toml'] * 2}\n")
     (tmp_path / "part_24.toml").write_text(robot())
-    shown = zstate("up", str(tmp_path / "part_0.toml"), "--check")
-    assert [line.split()[0] for line in shown.stdout.decode().splitlines()] == ["rrbot"], shown.stderr
+    shown = run_cli("up", str(tmp_path / "part_0.toml"), "--check")
+    assert [line.split()[0] for line in shown.stdout.splitlines()] == ["rrbot"], shown.stderr
 
 
 def test_check_prints_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SPEED", "20")
     text = robot(rate="${SPEED}", wires=["native", "ros2"], metrics=9100, takeover=True, restart="always")
-    shown = zstate("up", str(file_of(tmp_path, text)), "--check").stdout.decode().split()
+    shown = run_cli("up", str(file_of(tmp_path, text)), "--check").stdout.split()
     assert shown[:3] == ["rrbot", "zstate", "publish"]
     assert " ".join(shown).endswith(
         "--rate 20.0 --wire native --wire ros2 --takeover --metrics 127.0.0.1:9100"
@@ -256,7 +253,7 @@ def test_check_prints_the_commands_of_maps_and_scanners(tmp_path: Path):
     text += table("map", file="hall.yaml", name="r1", writer="slam", wires=["native", "ros2"])
     text += table("scan", robot="r1", frame="laser", simulate="hall.yaml", map_frame="hall/floor", rate=10)
     text += table("scan", robot="r1", frame="laser", dummy=True, sensor="front", after="r1/scan")
-    shown = zstate("up", str(file_of(tmp_path, text)), "--check").stdout.decode().splitlines()
+    shown = run_cli("up", str(file_of(tmp_path, text)), "--check").stdout.splitlines()
     file = tmp_path / "hall.yaml"
     assert [" ".join(line.split()) for line in shown] == [
         f"hall/map zstate map {file} --name hall --frame floor --wire native",
@@ -291,8 +288,8 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
     (tmp_path / "hall.yaml").touch()
     lines = [line.strip() for line in help_text[help_text.index("include =") :].splitlines()]
     text = "\n".join(lines).replace('model = "panda"', f'model = "{RRBOT}"')
-    shown = zstate("up", str(file_of(tmp_path, text)), "--check", "rate=20")
-    assert [line.split()[0] for line in shown.stdout.decode().splitlines()] == (
+    shown = run_cli("up", str(file_of(tmp_path, text)), "--check", "rate=20")
+    assert [line.split()[0] for line in shown.stdout.splitlines()] == (
         ["router", "left", "right", "arm1", "arm2", "arm3", "static", "hall/map", "left/scan", "driver"]
     ), shown.stderr
     assert max(map(len, lines)) <= 78, "it wraps on a terminal of 80 columns"

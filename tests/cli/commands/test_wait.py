@@ -12,8 +12,8 @@ from helpers.cli_runner import (
     failure,
     interrupted,
     published_robot,
+    run_cli,
     started,
-    zstate,
 )
 from helpers.processes import Child, until
 
@@ -23,8 +23,8 @@ pytestmark = pytest.mark.processes
 
 
 def waited(*arguments: str, code: int) -> dict[str, object]:
-    ended = zstate("wait", *arguments, "--json")
-    assert ended.returncode == code, ended.stderr
+    ended = run_cli("wait", *arguments, "--json")
+    assert ended.code == code, ended.stderr
     return json.loads(ended.stdout)
 
 
@@ -34,9 +34,9 @@ def await_text(child: Child, text: str) -> None:
 
 def test_available_robot_is_ready_at_once():
     with published_robot():
-        ended = zstate("wait", "robot", "rrbot")
-    assert (ended.returncode, ended.stdout.decode()) == (0, "ready: 'rrbot' (7 frames)\n")
-    assert ended.stderr == b""
+        ended = run_cli("wait", "robot", "rrbot")
+    assert (ended.code, ended.stdout) == (0, "ready: 'rrbot' (7 frames)\n")
+    assert ended.stderr == ""
 
 
 def test_a_robot_is_ready_when_it_moves_and_not_before(spawn: Spawn):

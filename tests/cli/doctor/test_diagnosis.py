@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import ALL_STREAMS, RRBOT, Spawn, failure, published_robot, started, zstate
+from helpers.cli_runner import ALL_STREAMS, RRBOT, Spawn, failure, published_robot, run_cli, started
 from helpers.processes import DEADLINE_S, find_free_port, repeated, until
 
 from zstate import PartialStatePublisher, StatePublisher, StaticPublisher, Transform, connect, load_model
@@ -39,9 +39,9 @@ LINKS = ["zstate", "network", "robots", "writers", "model", "joint_states", "clo
 
 def diagnosed(*arguments: str, code: int) -> dict[str, Any]:
     """The JSON output of doctor."""
-    ended = zstate("doctor", *arguments, "--json", "--timeout", "2")
-    assert ended.returncode == code, (ended.stdout, ended.stderr)
-    assert ended.stderr == b""
+    ended = run_cli("doctor", *arguments, "--json", "--timeout", "2")
+    assert ended.code == code, (ended.stdout, ended.stderr)
+    assert ended.stderr == ""
     return json.loads(ended.stdout)
 
 
@@ -75,7 +75,7 @@ def test_every_link_of_a_working_robot_is_ok(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_KERNEL", "reference")  # selected by the user: no warning
     with published_robot():
         report = diagnosed("rrbot", code=0)
-        text = zstate("doctor", "rrbot").stdout.decode()
+        text = run_cli("doctor", "rrbot").stdout
     assert report["sound"]
     assert report["first_broken"] is None
     assert [check["name"] for check in report["checks"]] == [*LINKS, "tf_static", "poses"]
@@ -86,7 +86,7 @@ def test_every_link_of_a_working_robot_is_ok(monkeypatch: pytest.MonkeyPatch):
 
 def test_working_robots_among_several_take_one_line():
     with published_robot("left"), published_robot("right", streams=("tf_static", "robot_description")):
-        lines = zstate("doctor").stdout.decode().splitlines()
+        lines = run_cli("doctor").stdout.splitlines()
     (left,) = [line for line in lines if "left" in line and "announced" not in line]
     assert left.split()[:2] == ["ok", "left"]
     assert lines[-2] == "first broken link: joint_states of 'right'"
@@ -165,7 +165,7 @@ def test_stopped_writer_is_distinguished_from_a_closed_one(spawn: Spawn, free_po
     started(spawn, "router", "--listen", endpoint).line()
     child = started(spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint)
     child.line()
-    assert zstate("wait", "robot", "rrbot", "--connect", endpoint).returncode == 0
+    assert run_cli("wait", "robot", "rrbot", "--connect", endpoint).code == 0
     os.kill(child.process.pid, signal.SIGSTOP)
     found = broken_link("rrbot", "--connect", endpoint)
     assert found["name"] == "writers"
@@ -404,8 +404,8 @@ def test_robots_on_different_clocks_are_a_warning():
         published_robot("left"),
         published_robot("right", clock=ManualClock(5 * SECOND, "sim")),
     ):
-        done = zstate("doctor")
-    lines = done.stdout.decode().splitlines()
+        done = run_cli("doctor")
+    lines = done.stdout.splitlines()
     (line,) = [line for line in lines if "different clocks" in line]
     assert line.split()[:2] == ["warning", "clocks"]
     assert "'left' in 'system' time; 'right' in 'sim' time" in line
@@ -475,8 +475,8 @@ def test_static_edge_that_closes_a_loop_is_a_warning_with_its_writer(model_first
         for step in steps if model_first else reversed(steps):
             step()
         report = warnings("rrbot")
-        assert json.loads(zstate("tf", "world", "tool", "--once", "--json").stdout)["source"] == "tool"
-        assert "tool" in zstate("tree", "rrbot").stdout.decode()
+        assert json.loads(run_cli("tf", "world", "tool", "--once", "--json").stdout)["source"] == "tool"
+        assert "tool" in run_cli("tree", "rrbot").stdout
     assert "tf_static" in report  # on a busy machine there may be others
     assert report["tf_static"].startswith("static edge of 'mix-up' (rigger@")
     assert "would close the loop" in report["tf_static"]
@@ -527,11 +527,11 @@ def test_stopped_program_that_blocks_the_rendezvous_is_reported(
     assert process in found["text"]
     assert reason in found["text"]
     assert found["next"] == f"kill -CONT {keeper.process.pid}"
-    assert reason in zstate("ls").stderr.decode()
+    assert reason in run_cli("ls").stderr
     # With a second address, the other programs meet there and are found.
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", f"{rendezvous} 127.0.0.1:{free_port}")
     with published_robot("r1"):
-        assert b"r1" in zstate("ls", "--json").stdout
+        assert "r1" in run_cli("ls", "--json").stdout
         report = warnings()["network"]
     assert reason in report
     assert f"the others meet at 127.0.0.1:{free_port}" in report
@@ -541,7 +541,7 @@ def test_stopped_program_that_blocks_the_rendezvous_is_reported(
 def guarded(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A router that lets r1 and r2 write, desk read, and r3 connect only; r1 is published behind it."""
     acl, users = tmp_path / "acl.json5", tmp_path / "users.txt"
-    acl.write_bytes(zstate("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
+    acl.write_bytes(run_cli("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
     users.write_text("".join(f"{name}:secret\n" for name in ("r1", "r2", "r3", "desk")))
     users.chmod(0o600)
     endpoint = f"tcp/127.0.0.1:{free_port}"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import RRBOT, published_robot, zstate
+from helpers.cli_runner import RRBOT, published_robot, run_cli
 from helpers.processes import repeated
 
 from zstate import connect
@@ -38,14 +38,14 @@ class Found:
     """The checks of doctor by link."""
 
     def __init__(self, *arguments: str, code: int = 0) -> None:
-        ended = zstate("doctor", *arguments, "--json", "--timeout", "2")
-        assert ended.returncode == code, (ended.stdout, ended.stderr)
+        ended = run_cli("doctor", *arguments, "--json", "--timeout", "2")
+        assert ended.code == code, (ended.stdout, ended.stderr)
         report: dict[str, Any] = json.loads(ended.stdout)
         self.first_broken = report["first_broken"]
         self.states = {check["name"]: check["state"] for check in report["checks"]}
         self.texts = {check["name"]: check["text"] for check in report["checks"]}
         self.next = {check["name"]: check["next"] for check in report["checks"]}
-        assert "ros/" not in ended.stdout.decode()
+        assert "ros/" not in ended.stdout
 
 
 @pytest.mark.processes

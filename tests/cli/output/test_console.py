@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
-from helpers.cli_runner import RRBOT, zstate
+from helpers.cli_runner import RRBOT, run_cli
 from helpers.processes import repeated
 
 from zstate import StatePublisher, connect, load_model
@@ -56,7 +56,7 @@ def stranger() -> Iterator[None]:
 @pytest.mark.processes
 @pytest.mark.parametrize("command", [("ls",), ("tree",), ("graph",), ("doctor",), ("doctor", "rrbot")])
 def test_a_command_prints_foreign_names_without_acting_on_them(stranger: None, command: tuple[str, ...]):
-    ended = zstate(*command)
+    ended = run_cli(*command)
     printed = (ended.stdout + ended.stderr).decode()
     assert "rrbot" in printed
     assert [letter for letter in printed if letter != "\n" and not letter.isprintable()] == []

@@ -12,7 +12,7 @@ import termios
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, published_robot, zstate
+from helpers.cli_runner import RRBOT, published_robot, run_cli
 
 pytestmark = pytest.mark.processes
 
@@ -80,5 +80,5 @@ def test_comment_of_a_long_example_is_above_it():
     lines = run_in_terminal("tree", "--help")
     place = lines.index("  zstate tree --wire ros2")
     assert lines[place - 1] == "  # reads /tf and /tf_static"
-    in_a_pipe = zstate("tree", "--help").stdout.decode().splitlines()
+    in_a_pipe = run_cli("tree", "--help").stdout.splitlines()
     assert any(line.startswith("  zstate tree --wire ros2  ") for line in in_a_pipe)
