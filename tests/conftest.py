@@ -1,16 +1,23 @@
-"""Fixtures of every test: its own rendezvous, free ports, sessions and child processes that end with it."""
+"""What runs, and what every test has: a rendezvous, free ports, sessions, processes that end with it.
+
+``pytest`` runs the tests that need pip's packages only. ``--system`` adds those that need more, each with the
+marker of its requirement (helpers/requirements.py); ``--soak`` adds long trials.
+"""
 
 from __future__ import annotations
 
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from helpers.processes import Child, find_free_port, until
+from helpers.requirements import REQUIREMENTS
 from hypothesis import settings
 
 from zstate.net.session import Session, connect
@@ -28,6 +35,61 @@ if ROOT not in sys.path:
 # An example may take any time: on a busy machine one takes seconds.
 settings.register_profile("zstate", deadline=None)
 settings.load_profile("zstate")
+
+
+LEFT_OUT = pytest.StashKey[Counter[str]]()
+SYSTEM = "need system packages, root, a browser or other interpreters; `pytest --system` runs them"
+SOAK = "are long trials; `pytest --soak` runs them"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--system", action="store_true", help="also tests that need more than pip's packages")
+    parser.addoption("--soak", action="store_true", help="also long trials")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[LEFT_OUT] = Counter()
+    for name, requirement in REQUIREMENTS.items():
+        config.addinivalue_line("markers", f"{name}: runs with --system; {requirement.install}")
+
+
+@cache
+def is_met(requirement: str) -> bool:
+    return REQUIREMENTS[requirement].is_met()
+
+
+def reason_to_leave_out(item: pytest.Item) -> str | None:
+    if item.get_closest_marker("soak") and not item.config.getoption("--soak"):
+        return SOAK
+    needed = [name for name in REQUIREMENTS if item.get_closest_marker(name)]
+    if needed and not item.config.getoption("--system"):
+        return SYSTEM
+    missing = next((name for name in needed if not is_met(name)), None)
+    return f"need what the marker {missing!r} names: {REQUIREMENTS[missing].install}" if missing else None
+
+
+@pytest.hookimpl(trylast=True)  # after -m and -k
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    reasons = {item: reason for item in items if (reason := reason_to_leave_out(item))}
+    config.stash[LEFT_OUT].update(reasons.values())
+    config.hook.pytest_deselected(items=list(reasons))
+    items[:] = [item for item in items if item not in reasons]
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["left_out"] = dict(session.config.stash[LEFT_OUT])
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    # Each worker collects all tests.
+    node.config.stash[LEFT_OUT] |= Counter(getattr(node, "workeroutput", {}).get("left_out", {}))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    for reason, count in config.stash[LEFT_OUT].items():
+        terminalreporter.write_line(f"LEFT OUT: {count} tests that {reason}")
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from bench import robot
 from bench.job import Job
 from bench.scenario import Scenario
-from bench.subjects import dds, ros1, ros1_master
+from bench.subjects import dds, ros1
 from bench.subjects.tf_messages import HISTORY_NS, TfBytes, TfHistory
 from bench.subjects.wakeup_reader import WakeupReader
 from bench.trial import run_trial
@@ -151,7 +151,6 @@ print(*sorted(outside - {{"__main__", "bench"}}))
 
 
 @pytest.mark.ros1
-@pytest.mark.skipif(ros1_master.python() is None, reason=f"ROS 1 is not installed: {ros1_master.INSTALL[0]}")
 def test_ros_1_answers_equal_the_poses_of_zstate(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(robot.MODELS, "rrbot", str(MODELS / "rrbot.urdf"))
     facts = run_trial(ros1.SUBJECT, Scenario("rate", "rrbot", 50.0, seconds=0.5))

@@ -20,7 +20,6 @@ from helpers.tf2_scenarios import (
     Answer,
     S,
     a_scenario,
-    missing_tf2_reason,
     tf2_answers,
     tf2_error_kind,
     zstate_answers,
@@ -30,7 +29,7 @@ from helpers.tf2_scenarios import (
 from zstate.errors import NoData
 from zstate.transform import Transform
 
-pytestmark = [pytest.mark.tf2, pytest.mark.skipif(bool(missing_tf2_reason()), reason=missing_tf2_reason())]
+pytestmark = pytest.mark.tf2
 
 SCENARIOS, QUESTIONS = 700, 48
 TOLERANCE = 1e-9

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers.deployment import DEPLOY
-from helpers.network_namespaces import REASON, NamespaceHosts, can_create_namespaces
+from helpers.network_namespaces import NamespaceHosts
 from helpers.processes import until
 
 RULES = DEPLOY / "router.nft"
@@ -20,11 +19,7 @@ PORT = 7447
 WITHIN_S = 60.0
 """A TLS handshake and a query, beside a flood, on a busy machine."""
 
-pytestmark = [
-    pytest.mark.netns,
-    pytest.mark.skipif(not can_create_namespaces(), reason=REASON),
-    pytest.mark.skipif(shutil.which("nft") is None, reason="needs nft: apt-get install nftables"),
-]
+pytestmark = pytest.mark.netns
 
 FLOOD = """
 import socket, sys, time

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.network_namespaces import REASON, NamespaceHosts, can_create_namespaces
+from helpers.network_namespaces import NamespaceHosts
 from helpers.processes import DEADLINE_S, until
 from helpers.simulated_motors import SimulatedMotors
 
@@ -342,7 +342,6 @@ UDP_MULTICAST = """
 
 
 @pytest.mark.netns
-@pytest.mark.skipif(not can_create_namespaces(), reason=REASON)
 def test_can_motors_are_driven_over_udp_multicast():
     # In a namespace with a route for multicast, which a machine without a network does not have.
     with NamespaceHosts("robot") as hosts:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 from collections import Counter
 from collections.abc import Iterator
@@ -38,8 +37,6 @@ from zstate.transform import Transform
 
 PERIOD = 10_000_000
 CLIENT = str(Path(__file__).parents[1] / "helpers" / "foxglove_client.js")
-NPM_FOLDER = os.environ.get("ZSTATE_FOXGLOVE_CLIENT")
-NODE = os.environ.get("ZSTATE_NODE") or shutil.which("node") or "node"
 TOPICS = ("/joint_states", "/tf", "/tf_static", "/robot_description")
 
 
@@ -123,15 +120,14 @@ def test_decoded_transforms_joints_and_description_are_those_of_lookups(sessions
 @pytest.mark.npm
 @pytest.mark.parametrize("subprotocol", SUBPROTOCOLS)
 def test_the_published_client_decodes_what_lookups_answer(sessions, serve, subprotocol: str):
-    if NPM_FOLDER is None:
-        pytest.skip("ZSTATE_FOXGLOVE_CLIENT is not set: the folder of the packages that the marker npm names")
     writer, reader = sessions
+    node_js, packages = os.environ["ZSTATE_NODE"], os.environ["ZSTATE_FOXGLOVE_CLIENT"]
     counts = {"/tf": 20, "/joint_states": 20, "/tf_static": 1, "/robot_description": 1}
     with (
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "r1") as listener,
         subprocess.Popen(
-            [NODE, CLIENT, NPM_FOLDER, serve("r1").url, subprotocol, json.dumps(counts)],
+            [node_js, CLIENT, packages, serve("r1").url, subprotocol, json.dumps(counts)],
             stdout=subprocess.PIPE,
             text=True,
         ) as node,

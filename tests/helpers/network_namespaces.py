@@ -6,22 +6,9 @@ Each host has its own cable to the router. Needs root and iproute2.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 from pathlib import Path
 from types import TracebackType
-
-REASON = "needs root, iproute2 and network namespaces"
-
-
-def can_create_namespaces() -> bool:
-    if os.geteuid() != 0 or shutil.which("ip") is None:
-        return False
-    name = f"zstate-probe-{os.getpid()}"
-    made = subprocess.run(["ip", "netns", "add", name], capture_output=True, check=False).returncode == 0
-    if made:
-        _ip("netns", "del", name)
-    return made
 
 
 def _ip(*arguments: str) -> None:

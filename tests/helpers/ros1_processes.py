@@ -6,11 +6,9 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import signal
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -142,21 +140,6 @@ class RosPeer:
         """How often each stamp was received on ``joint_states``."""
         self.collect()
         return Counter(stamp for stamp, *_ in self.joints)
-
-
-@functools.cache
-def missing_ros_reason() -> str:
-    """The reason why ROS 1 cannot be used here; empty if it can."""
-    for program in (ROSCORE, STATE_PUBLISHER):
-        if not program.exists():
-            return f"{program} is not installed (Debian's python3-roslaunch, ros-robot-state-publisher)"
-    code = "import rospy, sensor_msgs, tf2_ros, sys; print(*sys.version_info[:2])"
-    result = subprocess.run([DEBIAN_PYTHON, "-c", code], capture_output=True, text=True, check=False)
-    if result.returncode:
-        return f"Debian's Python has no ROS 1: {result.stderr.strip().splitlines()[-1]}"
-    if result.stdout.split() != [str(part) for part in sys.version_info[:2]]:
-        return f"ROS 1 is installed for Python {'.'.join(result.stdout.split())}"
-    return ""
 
 
 class Roscore:

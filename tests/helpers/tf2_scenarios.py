@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import random
 import subprocess
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -36,18 +35,6 @@ TF2_KINDS = {
     "ConnectivityException": "disconnected",
     "ExtrapolationException": "time",
 }
-
-
-@cache
-def missing_tf2_reason() -> str:
-    """The reason why tf2 cannot be used here; empty if it can."""
-    try:
-        probe = subprocess.run(
-            [SYSTEM_PYTHON, "-c", "import tf2_py"], capture_output=True, timeout=30, check=False, text=True
-        )
-    except OSError as error:
-        return f"there is no {SYSTEM_PYTHON}: {error}"
-    return "" if probe.returncode == 0 else "tf2 is not installed (apt-get install python3-tf2)"
 
 
 def tf2_answers(scenarios: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 import textwrap
@@ -91,8 +90,6 @@ def test_client_that_loses_its_router_uses_another(spawn, free_port: int):
 @pytest.fixture
 def machines() -> Iterator[Callable[..., Child]]:
     """``start(machine, code, *arguments)``: a Child on machine 0, 1 or 2 of the network 10.98.0.0/24."""
-    if os.geteuid() != 0 or shutil.which("ip") is None:
-        pytest.skip("needs root and iproute2")
     names = [f"zstate-{os.getpid()}-{number}" for number in range(3)]
     children: list[Child] = []
 
@@ -114,11 +111,8 @@ def machines() -> Iterator[Callable[..., Child]]:
 
 def _wire_up(names: list[str]) -> None:
     """Creates a switch in the first namespace, with a cable to each of the others."""
-    try:
-        for name in names:
-            _ip("netns", "add", name)
-    except subprocess.CalledProcessError:
-        pytest.skip("network namespaces are not allowed here")
+    for name in names:
+        _ip("netns", "add", name)
     _ip("-n", names[0], "link", "add", "switch", "type", "bridge")
     _ip("-n", names[0], "link", "set", "switch", "up", "address", "02:00:00:00:00:aa")
     _ip("-n", names[0], "addr", "add", "10.98.0.1/24", "dev", "switch")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import pytest
+from helpers.requirements import CHROMIUM
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from zstate.view.sliders import SliderPublisher
     from zstate.view.view import View
 
-CHROMIUM = "/usr/bin/chromium"
 FLAGS = (
     "--no-sandbox",
     "--disable-background-networking",
@@ -104,9 +104,8 @@ def server(page: ViewServer) -> Iterator[ViserServer]:
 
 @pytest.fixture(scope="module")  # not longer: while it is open, no other test of this thread can run asyncio
 def browser() -> Iterator[Browser]:
-    sync_api = pytest.importorskip("playwright.sync_api")
-    if not Path(CHROMIUM).exists():
-        pytest.skip("needs Debian's chromium")
+    from playwright import sync_api
+
     with sync_api.sync_playwright() as playwright:
         opened = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
         yield opened

@@ -24,7 +24,6 @@ from helpers.ros1_processes import (
     Roscore,
     RosPeer,
     Spawn,
-    missing_ros_reason,
     ros_environment,
 )
 
@@ -42,7 +41,7 @@ from zstate import (
 from zstate.bridges.ros1.node import Master
 from zstate.sources import JointStateListener
 
-pytestmark = [pytest.mark.ros1, pytest.mark.skipif(bool(missing_ros_reason()), reason=missing_ros_reason())]
+pytestmark = pytest.mark.ros1
 
 Bridge = Callable[..., Child]
 MODEL = load_model(RRBOT)

@@ -3,7 +3,6 @@ from __future__ import annotations
 import os
 import pty
 import re
-import shutil
 import subprocess
 import sys
 from contextlib import suppress
@@ -118,15 +117,11 @@ def with_zstate() -> dict[str, str]:
     return {**os.environ, "PATH": path, "TERM": "dumb", "PS1": "$ "}
 
 
-def needs(shell: str) -> pytest.MarkDecorator:
-    return pytest.mark.skipif(shutil.which(shell) is None, reason=f"apt-get install {shell}")
-
-
 @pytest.mark.parametrize(
     "shell",
     [
         pytest.param(("bash", "--norc", "--noprofile", "-i"), id="bash"),
-        pytest.param(("zsh", "-f", "-i"), id="zsh", marks=needs("zsh")),
+        pytest.param(("zsh", "-f", "-i"), id="zsh", marks=pytest.mark.shells),
     ],
 )
 def test_tab_completes_commands_options_robots_and_files(
@@ -142,7 +137,7 @@ def test_tab_completes_commands_options_robots_and_files(
         typist.completed("zstate up ce", "zstate up cell.toml ")
 
 
-@needs("fish")
+@pytest.mark.shells
 def test_fish_is_offered_the_same_with_all_of_the_help(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "cell.toml").touch()
     monkeypatch.chdir(tmp_path)

@@ -34,13 +34,6 @@ class Oracle(NamedTuple):
     variable: str
     packages: tuple[str, ...]
 
-    @property
-    def reason(self) -> str:
-        """The reason for skipping a test that needs it."""
-        name = next(name for name, oracle in ORACLES.items() if oracle == self)
-        made_by = f"`python tests/helpers/ros2/oracles.py {name} FOLDER`"
-        return f"{self.variable} is not set; {made_by} prints it (pip install {' '.join(self.packages)})"
-
 
 _ZENOH = "eclipse-zenoh>=1.10.2,<1.11"
 _KILTED = ("rclpy[fastrtps]", "sensor-msgs", "nav-msgs", "geometry-msgs", "std-msgs", "rosgraph-msgs")

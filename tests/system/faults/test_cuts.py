@@ -9,13 +9,12 @@ from typing import NamedTuple
 import pytest
 from helpers.fault_processes import SLACK, FaultProcess, Start, assert_no_growth, client
 from helpers.fault_queries import MAX_AGE_S
-from helpers.network_namespaces import REASON, NamespaceHosts, can_create_namespaces
+from helpers.network_namespaces import NamespaceHosts
 from helpers.processes import until
 
 pytestmark = [
     pytest.mark.processes,
     pytest.mark.netns,
-    pytest.mark.skipif(not can_create_namespaces(), reason=REASON),
 ]
 
 RATE_HZ = 100.0

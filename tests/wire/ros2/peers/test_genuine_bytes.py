@@ -36,7 +36,7 @@ from zstate.wire.ros2.encoder import JointStateEncoder, RosStreamEncoder, TfMess
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
 
-pytestmark = [pytest.mark.heavy, pytest.mark.processes]
+pytestmark = [pytest.mark.kilted, pytest.mark.processes]
 
 Piece = tuple[Literal["u32", "text", "f64", "f32", "i8"], Any]
 

@@ -44,9 +44,9 @@ SCAN = laser_scan(
 CELLS = [[0, 100, -1], [50, 1, 0]]
 GRID = occupancy_grid(STAMP, "map", 0.25, TURN, CELLS)
 
-SDK = pytest.param("sdk", marks=pytest.mark.ros2_peer)
-PYZEROS = pytest.param("pyzeros", marks=pytest.mark.heavy)
-KILTED = pytest.param("kilted", marks=pytest.mark.heavy)
+SDK = pytest.param("sdk", marks=pytest.mark.sdk)
+PYZEROS = pytest.param("pyzeros", marks=pytest.mark.pyzeros)
+KILTED = pytest.param("kilted", marks=pytest.mark.kilted)
 every_peer = pytest.mark.parametrize("peer", [SDK, PYZEROS, KILTED], indirect=True)
 # pyzeros has no transient local durability, and its peer no scans.
 every_peer_that_latches = pytest.mark.parametrize("peer", [SDK, KILTED], indirect=True)

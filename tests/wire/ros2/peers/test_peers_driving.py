@@ -17,7 +17,7 @@ from zstate.driving import DriverHost, Limits, Setpoint, SimulatedDriver
 from zstate.net.session import Session
 
 sdk = pytest.mark.parametrize("peer", ["sdk"], indirect=True)
-pytestmark = [pytest.mark.processes, pytest.mark.ros2_peer]
+pytestmark = [pytest.mark.processes, pytest.mark.sdk]
 
 CONTROLLER = "/forward_position_controller"
 TTL_S = 30.0

@@ -26,8 +26,8 @@ OURS = {
     "/tf_static": (TF_MESSAGE, LATCHED),
 }
 
-SDK = pytest.param("sdk", marks=pytest.mark.ros2_peer)
-PYZEROS = pytest.param("pyzeros", marks=pytest.mark.heavy)
+SDK = pytest.param("sdk", marks=pytest.mark.sdk)
+PYZEROS = pytest.param("pyzeros", marks=pytest.mark.pyzeros)
 pytestmark = pytest.mark.processes
 
 
