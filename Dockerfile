@@ -17,7 +17,7 @@ RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
 
 FROM build AS test
 COPY . .
-RUN python3 -m venv .venv && .venv/bin/pip install -q -e '.[robots,test]' && .venv/bin/python -m pytest
+RUN python3 -m venv .venv && .venv/bin/pip install -q -e '.[robots,test]' && .venv/bin/python -m pytest -n auto
 
 FROM python:3.12-slim AS runtime
 # Pinocchio's wheel needs the system's OpenMP, which slim images lack (gcc installs it in the other stages).

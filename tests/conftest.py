@@ -6,6 +6,7 @@ marker of its requirement (helpers/requirements.py); ``--soak`` adds long trials
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections import Counter
@@ -51,6 +52,12 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[LEFT_OUT] = Counter()
     for name, requirement in REQUIREMENTS.items():
         config.addinivalue_line("markers", f"{name}: runs with --system; {requirement.install}")
+    config.addinivalue_line("markers", "system: has one of those markers")
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    if any(item.get_closest_marker(name) for name in REQUIREMENTS):
+        item.add_marker("system")
 
 
 @cache
@@ -79,6 +86,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_sessionfinish(session: pytest.Session) -> None:
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["left_out"] = dict(session.config.stash[LEFT_OUT])
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    return 2 * (os.cpu_count() or 1)  # tests wait more than they compute
 
 
 @pytest.hookimpl(optionalhook=True)
