@@ -159,11 +159,14 @@ def host_driver(
 
 @pytest.fixture
 def spawn() -> Iterator[Callable[..., Child]]:
-    """``spawn(code, *arguments)`` starts a Child, which is killed at the end of the test."""
+    """``spawn(code, *arguments)`` starts a Child, which is killed at the end of the test.
+
+    With ``is_forked=True`` it is a fork of a process that has imported zstate, a tenth of the cost.
+    """
     children: list[Child] = []
 
-    def start(code: str, *arguments: str) -> Child:
-        children.append(Child(code, *arguments))
+    def start(code: str, *arguments: str, is_forked: bool = False) -> Child:
+        children.append(Child(code, *arguments, is_forked=is_forked))
         return children[-1]
 
     yield start

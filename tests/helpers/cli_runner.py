@@ -85,8 +85,8 @@ def failure(*arguments: str, code: int = 1, stdin: bytes = b"") -> str:
 
 
 def started(spawn: Spawn, *arguments: str) -> Child:
-    """A command that runs until it is stopped."""
-    return spawn("from zstate.cli.main import main; main()", *arguments)
+    """A command that runs until it is stopped: a process, forked from one that has imported zstate."""
+    return spawn("from zstate.cli.main import main; main()", *arguments, is_forked=True)
 
 
 def interrupted(child: Child) -> None:

@@ -18,6 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from helpers.fork_server import ForkedProcess, server
 
 DEADLINE_S = 15.0
 SOON_S = 3.0
@@ -112,14 +113,19 @@ class SteppingClock:
 class Child:
     """A Python process that runs ``code`` and exchanges lines with the test."""
 
-    def __init__(self, code: str, *arguments: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-u", "-c", textwrap.dedent(code), *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+    process: subprocess.Popen[str] | ForkedProcess
+
+    def __init__(self, code: str, *arguments: str, is_forked: bool = False) -> None:
+        if is_forked:
+            self.process = server().start(textwrap.dedent(code), *arguments)
+        else:
+            self.process = subprocess.Popen(
+                [sys.executable, "-u", "-c", textwrap.dedent(code), *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
         self._lines: queue.Queue[str] = queue.Queue()
         self._errors: list[str] = []
         self._readers = [
