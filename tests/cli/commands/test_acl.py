@@ -20,7 +20,7 @@ pytestmark = pytest.mark.processes
 def router(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """The endpoint of the fleet's router; ZSTATE_PASSWORD is right for every user."""
     acl, users = tmp_path / "acl.json5", tmp_path / "users.txt"
-    acl.write_bytes(run_cli("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
+    acl.write_text(run_cli("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
     users.write_text("r1:secret\nr2:secret\ndesk:secret\n")
     users.chmod(0o600)
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -78,7 +78,7 @@ def test_a_file_without_access_control_is_refused(tmp_path: Path):
 
 def test_access_control_without_authentication_is_refused(tmp_path: Path):
     file = tmp_path / "acl.json5"
-    file.write_bytes(run_cli("acl", "--robot", "r1").stdout)
+    file.write_text(run_cli("acl", "--robot", "r1").stdout)
     assert "access control without certificates or users" in failure("router", "--acl", str(file))
 
 

@@ -61,7 +61,7 @@ def test_without_panda_demo_shows_rrbot_and_prints_how_to_install_more():
     )
     command = [sys.executable, "-c", code, "demo", "--seconds", "0.5"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-    assert ended.code == 0, ended.stderr
+    assert ended.returncode == 0, ended.stderr
     assert "'panda' is not installed (pip install 'zstate[robots]'), so this shows 'rrbot'" in ended.stderr
     assert "samples received" in ended.stdout
 
@@ -154,7 +154,7 @@ def test_rover_without_the_libraries_of_maps_has_no_room():
     code = "import sys; sys.modules['PIL'] = None\nfrom zstate.cli.main import main; main()"
     command = [sys.executable, "-c", code, "demo", "rover", "--seconds", "0.5"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=2 * DEADLINE_S, check=False)
-    assert ended.code == 0, ended.stderr
+    assert ended.returncode == 0, ended.stderr
     assert "without a room and its laser, which need pip install 'zstate[maps]'" in ended.stderr
     assert "(map)" not in ended.stdout
     assert "joint states and" in ended.stdout

@@ -229,7 +229,7 @@ def rates_of(joints: JointStateListener) -> Callable[[], np.ndarray]:
 
 
 def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: Spawn):
-    assert spawn(ROVER).line() == "ready"
+    assert spawn(ROVER, is_forked=True).line() == "ready"
     with (
         connect() as session,
         JointStateListener(session, "rover") as joints,

@@ -150,6 +150,6 @@ def test_mistakes_are_reported(tmp_path: Path):
 def test_missing_matplotlib_is_reported_with_the_package_to_install():
     hidden = "import sys; sys.modules['matplotlib'] = None; from zstate.cli.main import main; main()"
     ended = subprocess.run([sys.executable, "-c", hidden, "plot", RRBOT], capture_output=True, check=False)
-    assert ended.code == 1
+    assert ended.returncode == 1
     assert "pip install 'zstate[plot]'" in ended.stderr
     assert "Traceback" not in ended.stderr

@@ -93,7 +93,7 @@ def test_missing_viser_error_names_the_package_to_install(tmp_path: Path):
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); sys.argv[1:] = ['view']\n"
     code += "from zstate.cli.main import main; main()"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert ended.code == 1
+    assert ended.returncode == 1
     assert "pip install 'zstate[view]'" in ended.stderr
     assert "Traceback" not in ended.stderr
 
@@ -106,7 +106,7 @@ def test_a_snapshot_is_a_picture_of_the_robot(tmp_path: Path):
         command = [sys.executable, "-m", "zstate", "view", "rrbot", "--snapshot", str(picture)]
         command += ["--size", "320", "240"]
         ended = subprocess.run(command, capture_output=True, text=True, timeout=100.0, check=False)
-    assert ended.code == 0, ended.stderr
+    assert ended.returncode == 0, ended.stderr
     assert ended.stdout == f"wrote {picture}: rrbot, 320 x 240 pixels\n"
     pixels = np.asarray(image.open(picture))
     assert pixels.shape == (240, 320, 3)
@@ -122,7 +122,7 @@ def test_snapshot_of_a_robot_without_a_model_shows_its_frames(tmp_path: Path):
         tracker.publish([cup])
         command = [sys.executable, "-m", "zstate", "view", "cam", "--snapshot", str(picture)]
         ended = subprocess.run(command, capture_output=True, text=True, timeout=100.0, check=False)
-    assert ended.code == 0, ended.stderr
+    assert ended.returncode == 0, ended.stderr
     assert ended.stdout == f"wrote {picture}: cam, 1280 x 800 pixels\n"
 
 
@@ -147,7 +147,7 @@ def test_snapshot_names_visible_robots_hidden_robots_and_missing_meshes(tmp_path
         ended = subprocess.run(
             command, capture_output=True, text=True, timeout=100.0, check=False, cwd=urdf.parents[1]
         )
-        assert ended.code == 0, ended.stderr
+        assert ended.returncode == 0, ended.stderr
         return ended
 
     with connect() as session, StatePublisher(session, load_model(urdf)) as mine, published_robot():

@@ -541,7 +541,7 @@ def test_stopped_program_that_blocks_the_rendezvous_is_reported(
 def guarded(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A router that lets r1 and r2 write, desk read, and r3 connect only; r1 is published behind it."""
     acl, users = tmp_path / "acl.json5", tmp_path / "users.txt"
-    acl.write_bytes(run_cli("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
+    acl.write_text(run_cli("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
     users.write_text("".join(f"{name}:secret\n" for name in ("r1", "r2", "r3", "desk")))
     users.chmod(0o600)
     endpoint = f"tcp/127.0.0.1:{free_port}"
