@@ -165,8 +165,8 @@ def spawn() -> Iterator[Callable[..., Child]]:
     """
     children: list[Child] = []
 
-    def start(code: str, *arguments: str, is_forked: bool = False) -> Child:
-        children.append(Child(code, *arguments, is_forked=is_forked))
+    def start(code: str, *arguments: str, **options: Any) -> Child:
+        children.append(Child(code, *arguments, **options))
         return children[-1]
 
     yield start

@@ -17,8 +17,6 @@ from zstate.buffer.frame_tree import FrameInfo
 from zstate.clock import ManualClock
 from zstate.nodes.clock import ClockPublisher
 
-pytestmark = pytest.mark.processes
-
 MS = 1_000_000
 SECOND = 1_000_000_000
 
@@ -64,6 +62,7 @@ def test_publish_uses_the_simulated_time_for_stamps_and_rate():
         assert listener.stats.off_clock == 0
 
 
+@pytest.mark.processes
 def test_missing_simulated_time_is_waited_for_with_a_note(spawn: Spawn):
     child = started(spawn, "joints", RRBOT, "--clock", "sim")
     until(lambda: "waiting for the simulated time on zstate/clock" in child.stderr)
@@ -73,6 +72,7 @@ def test_missing_simulated_time_is_waited_for_with_a_note(spawn: Spawn):
         interrupted(child)
 
 
+@pytest.mark.processes
 def test_a_wait_for_the_time_ends_with_ctrl_c(spawn: Spawn):
     child = started(spawn, "publish", RRBOT, "--clock", "sim")
     until(lambda: "waiting for the simulated time" in child.stderr)
@@ -109,6 +109,7 @@ def test_tf_measures_ages_with_the_clock_of_the_robot():
     assert known["age_s"] == pytest.approx(2.0)
 
 
+@pytest.mark.processes
 def test_robots_on_another_clock_are_received_without_ages(spawn: Spawn):
     with simulation(), published_robot():
         listening = started(spawn, "monitor", "--robots", "--clock", "sim", "--json")
@@ -127,6 +128,7 @@ def test_first_robot_on_another_clock_does_not_exclude_others():
             assert json.loads(run_cli("tf", "b1/world", "b1/tool", "--once", "--json").stdout)["age_s"] < 60.0
 
 
+@pytest.mark.processes
 def test_listen_counts_stamps_that_are_off_the_clock(spawn: Spawn):
     stop = threading.Event()
     with connect() as session, StatePublisher(session, load_model(RRBOT), "rrbot") as robot:

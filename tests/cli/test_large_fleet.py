@@ -36,7 +36,6 @@ def fleet() -> Iterator[None]:
         yield
 
 
-@pytest.mark.processes
 def test_all_robots_are_listed(fleet: None):
     ended = run_cli("ls", "--json")
     assert ended.code == 0
@@ -44,7 +43,6 @@ def test_all_robots_are_listed(fleet: None):
     assert f"r{ROBOTS - 1}" in run_cli("ls").stdout
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize(
     "command",
     [("graph",), ("tree", "rrbot"), ("doctor", "rrbot"), ("tf", "rrbot/world", "rrbot/tool", "--once")],
@@ -77,7 +75,6 @@ def test_ctrl_c_ends_a_command(
     child.wait()
 
 
-@pytest.mark.processes
 def test_doctor_examines_every_robot_of_a_large_fleet_though_most_are_silent(fleet: None):
     ended = run_cli("doctor", "--json")
     assert ended.code == 1, ended.stderr  # drivers are announced, and silent

@@ -8,15 +8,13 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, run_process, started
 from helpers.processes import SOON_S
 
 from zstate import connect, load_model
 from zstate.cli import main
 from zstate.model.pinocchio_solver import load_pinocchio
 from zstate.sources import JointStateListener
-
-pytestmark = pytest.mark.processes
 
 
 def await_samples() -> None:
@@ -132,6 +130,7 @@ def test_unreachable_router_is_reported(tmp_path: Path, free_port: int):
     assert f"`zstate doctor --connect {endpoint}`" in message
 
 
+@pytest.mark.processes
 def test_ctrl_c_interrupts_connecting_to_a_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = spawn(
@@ -148,6 +147,7 @@ def test_ctrl_c_interrupts_connecting_to_a_router(spawn: Spawn, free_port: int):
     interrupted(child)
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_sigterm_ends_in_order(spawn: Spawn, number: signal.Signals):
     child = started(spawn, "joints", RRBOT)
@@ -168,6 +168,7 @@ def test_the_session_options_are_read_from_the_environment(monkeypatch: pytest.M
     assert "'tcp/here'" in failure("joints", RRBOT)
 
 
+@pytest.mark.processes
 def test_closed_output_ends_a_command_quietly():
     command = [sys.executable, "-m", "zstate", "check", RRBOT]
     read_end, write_end = os.pipe()
@@ -185,6 +186,7 @@ def test_version_names_the_kernel_and_the_engine_of_publishers():
     assert run_cli("--version").stdout == expected
 
 
+@pytest.mark.processes
 def test_version_and_doctor_name_the_closed_forms_where_pinocchio_cannot_be_loaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -192,13 +194,14 @@ def test_version_and_doctor_name_the_closed_forms_where_pinocchio_cannot_be_load
         "raise ImportError('libgomp.so.1: cannot open shared object file')"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    assert run_cli("--version").stdout.endswith("transforms of publishers: closed forms)\n")
-    check = run_cli("doctor").stdout
+    assert run_process("--version").stdout.endswith("transforms of publishers: closed forms)\n")
+    check = run_process("doctor").stdout
     assert "closed forms" in check
     assert "libgomp.so.1" in check
     assert "apt-get install libgomp1" in check
 
 
+@pytest.mark.processes
 def test_ctrl_c_during_publishing_prints_the_achieved_rate(spawn: Spawn):
     child = started(spawn, "joints", RRBOT, "--rate", "50")
     assert child.line() == "rrbot: a sine on 2 joints, 50 Hz, on zstate/rrbot/joint_states"

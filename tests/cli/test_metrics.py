@@ -8,11 +8,17 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, started
+from helpers.cli_runner import (
+    RRBOT,
+    Spawn,
+    failure,
+    interrupted,
+    missing_library,
+    published_robot,
+    started,
+)
 from helpers.processes import Child, until
 from helpers.prometheus_text import Row, row, scraped
-
-pytestmark = pytest.mark.processes
 
 
 def url_of(command: Child) -> str:
@@ -29,6 +35,7 @@ def grown(url: str, grows: Row) -> dict[Row, float]:
     return scraped(url)
 
 
+@pytest.mark.processes
 def test_publisher_serves_its_metrics(spawn: Spawn):
     command = started(spawn, "publish", RRBOT, "--source", "sine", "--metrics", "0")
     labels = {"robot": "rrbot", "wire": "native"}
@@ -43,6 +50,7 @@ def test_publisher_serves_its_metrics(spawn: Spawn):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_listener_serves_its_counts(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--json", "--metrics", "0")
     url = url_of(command)
@@ -60,6 +68,7 @@ def test_listener_serves_its_counts(spawn: Spawn):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_router_serves_its_connections_and_writers(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     command = started(spawn, "router", "--listen", endpoint, "--metrics", "0")
@@ -73,6 +82,7 @@ def test_router_serves_its_connections_and_writers(spawn: Spawn, free_port: int)
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_recorder_serves_its_metrics(spawn: Spawn, tmp_path: Path):
     with published_robot():
         command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0")
@@ -85,6 +95,7 @@ def test_recorder_serves_its_metrics(spawn: Spawn, tmp_path: Path):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_bridge_serves_the_carried_robots(spawn: Spawn, ros_router: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ZSTATE_CONNECT")
     monkeypatch.delenv("ZSTATE_WIRE")
@@ -96,6 +107,7 @@ def test_bridge_serves_the_carried_robots(spawn: Spawn, ros_router: str, monkeyp
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_busy_port_and_invalid_address_are_reported(spawn: Spawn):
     command = started(spawn, "joints", RRBOT, "--metrics", "0")
     port = url_of(command).split(":")[2].split("/")[0]
@@ -103,16 +115,12 @@ def test_busy_port_and_invalid_address_are_reported(spawn: Spawn):
     assert "for instance 9100" in failure("joints", RRBOT, "--metrics", "here", code=2)
 
 
-def test_missing_library_is_reported_with_the_package_to_install(spawn: Spawn):
-    child = spawn(
-        "import sys; sys.modules['prometheus_client'] = None\nfrom zstate.cli.main import main; main()",
-        *("joints", RRBOT, "--metrics", "0"),
-    )
-    assert child.wait() == 1
-    assert "pip install 'zstate[metrics]'" in child.stderr
-    assert "Traceback" not in child.stderr
+def test_missing_library_is_reported_with_the_package_to_install():
+    with missing_library("prometheus_client"):
+        assert "pip install 'zstate[metrics]'" in failure("joints", RRBOT, "--metrics", "0")
 
 
+@pytest.mark.processes
 def test_commands_without_it_load_no_library():
     code = (
         "import sys\n"

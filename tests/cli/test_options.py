@@ -44,7 +44,6 @@ def test_xacro_arguments_belong_to_the_model_before_them():
     }
 
 
-@pytest.mark.processes
 def test_check_takes_xacro_arguments(arm: str):
     assert json.loads(run_cli("check", arm, "--json").stdout)["root"] == "base"
     assert json.loads(run_cli("check", arm, "prefix:=left_", "--json").stdout)["root"] == "left_base"
@@ -52,14 +51,12 @@ def test_check_takes_xacro_arguments(arm: str):
     assert "the xacro argument 'prefx' is not used by the file; did you mean 'prefix'?" in table
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize("command", ["publish", "joints", "init", "demo", "check"])
 def test_plain_urdf_takes_no_xacro_arguments(command: str):
     message = failure(command, RRBOT, "prefix:=left_")
     assert "contains no xacro, so it takes no xacro arguments; got prefix:=left_" in message
 
 
-@pytest.mark.processes
 def test_an_argument_of_another_form_or_without_a_model_is_wrong_usage():
     assert "unexpected extra argument (prefix=left_)" in failure("publish", RRBOT, "prefix=left_", code=2)
     message = failure("init", "prefix:=left_", code=2)
@@ -84,7 +81,6 @@ def test_init_writes_the_arguments_and_up_publishes_with_them(spawn: Spawn, arm:
         listener.buffer.wait("left_base", "left_tip", timeout_s=10.0)
 
 
-@pytest.mark.processes
 def test_up_refuses_xacro_arguments_for_a_plain_urdf(tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text('[[robot]]\nmodel = "rrbot"\nxacro_args = { prefix = "left_", lab = true }\n')

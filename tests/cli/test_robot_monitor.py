@@ -15,9 +15,8 @@ from zstate import Transform
 from zstate.driving import Commander
 from zstate.odometry import OdometryPublisher
 
-pytestmark = pytest.mark.processes
 
-
+@pytest.mark.processes
 def test_each_robot_has_a_line_a_second(spawn: Spawn):
     command = started(spawn, "monitor", "--robots")
     robots: set[str] = set()
@@ -27,6 +26,7 @@ def test_each_robot_has_a_line_a_second(spawn: Spawn):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_json_has_rate_age_latency_and_every_count(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--json")
     with published_robot():
@@ -41,6 +41,7 @@ def test_json_has_rate_age_latency_and_every_count(spawn: Spawn):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_robot_that_publishes_only_transforms_is_monitored(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--json")
     with published_robot(streams=("tf", "tf_static", "robot_description")):
@@ -48,6 +49,7 @@ def test_robot_that_publishes_only_transforms_is_monitored(spawn: Spawn):
     assert "following zstate/rrbot/tf" in command.stderr
 
 
+@pytest.mark.processes
 def test_joint_states_transforms_and_odometry_have_separate_rates(sessions, spawn: Spawn):
     """Also if the transforms were there first: then the joint states are followed when they appear."""
     command = started(spawn, "monitor", "--robots", "--json")
@@ -71,6 +73,7 @@ def test_joint_states_transforms_and_odometry_have_separate_rates(sessions, spaw
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_the_missing_robot_is_reported(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot")
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
@@ -83,6 +86,7 @@ def test_a_name_that_no_robot_can_have_is_refused():
     assert "'a/b'" in failure("monitor", "--robots", "--robot", "a/b")
 
 
+@pytest.mark.processes
 def test_many_robots_share_one_listener(spawn: Spawn):
     def threads() -> int:
         return len(list(Path(f"/proc/{command.process.pid}/task").iterdir()))
@@ -112,6 +116,7 @@ def test_once_gives_up_with_the_reason():
     assert "gave up after 0.5 s: no robot is announced" in message
 
 
+@pytest.mark.processes
 def test_a_robot_that_stops_is_silent(spawn: Spawn):
     command = started(spawn, "monitor", "--robots")
     with published_robot():
@@ -120,6 +125,7 @@ def test_a_robot_that_stops_is_silent(spawn: Spawn):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_warning_of_a_writer_has_a_line_until_it_is_withdrawn(sessions, spawn: Spawn):
     text = "wheels: NIS 14.2 for 3 numbers, expected 0.2 to 9.3: its sigmas are about 2 times too small"
     with OdometryPublisher(sessions[0], "cart", program="odometry") as odometry:
@@ -141,6 +147,7 @@ def test_robots_and_frames_exclude_each_other():
     assert "--metrics needs --robots" in failure("monitor", "--metrics", "0", code=2)
 
 
+@pytest.mark.processes
 def test_a_driver_has_a_line_of_its_own_and_is_in_the_metrics(sessions, host_driver, spawn: Spawn):
     host = host_driver()
     with Commander(sessions[1], "arm", program="teleop") as teleop:

@@ -13,8 +13,6 @@ from zstate.net.session import Session
 from zstate.sources import JointStateListener
 from zstate.wire.protocol import SerializedSample
 
-pytestmark = pytest.mark.processes
-
 EVERYTHING = {"joint_states", "robot_description", "tf", "tf_static"}
 
 
@@ -28,6 +26,7 @@ def streams(session: Session, wire: str = "ros2") -> set[str]:
     return {stream for info in discover(session, wire=wire) for stream, _ in info.writers}
 
 
+@pytest.mark.processes
 def test_publish_takes_the_place_of_robot_state_publisher(spawn: Spawn, ros_router: str, client: Session):
     command = started(spawn, "publish", RRBOT)
     assert command.line() == (
@@ -45,6 +44,7 @@ def test_publish_takes_the_place_of_robot_state_publisher(spawn: Spawn, ros_rout
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_native_joint_states_are_published_completely_on_ros(spawn: Spawn, ros_router: str, client: Session):
     command = started(spawn, "publish", RRBOT, "--wire", "native", "--wire", "ros2")
     assert command.line() == (
@@ -61,6 +61,7 @@ def test_native_joint_states_are_published_completely_on_ros(spawn: Spawn, ros_r
     assert list(reading.positions) == [0.5, -0.25]
 
 
+@pytest.mark.processes
 def test_a_sine_is_published_on_all_wires(spawn: Spawn, ros_router: str, client: Session):
     wires = ("--wire", "native", "--wire", "ros2:namespace=r1")
     started(spawn, "publish", RRBOT, "--source", "sine", *wires).line()
@@ -76,12 +77,14 @@ def test_native_and_ros_wires_together_report_the_router_option():
     assert "pass --connect" in result.stderr
 
 
+@pytest.mark.processes
 def test_joints_names_its_topic(spawn: Spawn, client: Session):
     line = started(spawn, "joints", RRBOT).line()
     assert line == "rrbot: a sine on 2 joints, 100 Hz, on ROS 2 topic /joint_states (domain 0)"
     assert streams(client) == {"joint_states"}
 
 
+@pytest.mark.processes
 def test_a_static_edge_of_two_ros_frames_needs_no_robot(spawn: Spawn, client: Session):
     line = started(spawn, "static", "r1/base", "laser", "--xyz", "1", "0", "0").line()
     assert "on ROS 2 topic /tf_static (domain 0)" in line
@@ -90,6 +93,7 @@ def test_a_static_edge_of_two_ros_frames_needs_no_robot(spawn: Spawn, client: Se
     assert placed.translation.tolist() == [1.0, 0.0, 0.0]
 
 
+@pytest.mark.processes
 def test_topics_have_the_configured_names(spawn: Spawn, client: Session):
     received: list[SerializedSample] = []
     started(spawn, "static", "r1/base", "laser", "--xyz", "1", "0", "0").line()
@@ -99,6 +103,7 @@ def test_topics_have_the_configured_names(spawn: Spawn, client: Session):
     assert b"\0laser\0" in received[0].payload
 
 
+@pytest.mark.processes
 def test_a_file_starts_robots_on_several_wires_and_the_router_of_ros(
     spawn: Spawn, tmp_path: Path, free_port: int
 ):

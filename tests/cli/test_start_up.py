@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.processes
+
 HEAVY = {
     *("numpy", "scipy", "zenoh", "pinocchio", "msgspec", "rich", "mcap", "yaml", "viser", "matplotlib"),
     *("asyncio", "concurrent.futures", "http", "multiprocessing", "ssl", "subprocess", "tomllib", "xml.dom"),
@@ -27,7 +29,6 @@ print(json.dumps([loaded, texts]))
 """
 
 
-@pytest.mark.processes
 def test_help_names_every_command_and_the_help_of_none_loads_a_library():
     ended = subprocess.run([sys.executable, "-c", ASK], capture_output=True, text=True, check=True)
     loaded, texts = json.loads(ended.stdout)

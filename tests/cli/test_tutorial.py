@@ -18,8 +18,6 @@ from helpers.pages import blocks
 from helpers.processes import Child
 from helpers.tutorial_terminal import FOLDER, TutorialPage, check_page, masked
 
-pytestmark = pytest.mark.processes
-
 ARM, SWING, CELL = ((FOLDER / name).read_text() for name in ("arm.urdf", "swing.py", "cell.toml"))
 """A robot; its driver, which publishes only joint states; and a cell that computes its transforms."""
 
@@ -79,6 +77,7 @@ def without_xacro(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / ".without").mkdir()
     for name in ("xacro", "xacrodoc"):
         (folder / ".without" / f"{name}.py").write_text("raise ImportError")
+        monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setenv("PYTHONPATH", str(folder / ".without"), prepend=os.pathsep)
 
 
@@ -125,6 +124,7 @@ def test_the_terminals_of_driving_match_real_output(tmp_path: Path, monkeypatch:
     check_page(TutorialPage((FOLDER / "DRIVING.md").read_text()), tmp_path / "tutorial")
 
 
+@pytest.mark.processes
 def test_the_robot_runs_and_can_be_inspected(cell: Child, driver):
     driver()
     assert run_cli("wait", "robot", "arm").stdout == "ready: 'arm' (3 frames)\n"
@@ -147,6 +147,7 @@ def test_the_robot_runs_and_can_be_inspected(cell: Child, driver):
     assert doctor("arm", code=0)["sound"]
 
 
+@pytest.mark.processes
 def test_1_dead_driver_is_reported(cell: Child, driver):
     process = driver()
     assert run_cli("wait", "robot", "arm").code == 0
@@ -164,6 +165,7 @@ def test_1_without_a_publisher_the_robot_is_missing(folder: Path):
     assert "its publisher is not running" in found["text"]
 
 
+@pytest.mark.processes
 def test_2_a_path_with_a_space_works_and_missing_quotes_are_reported(folder: Path, spawn: Spawn):
     place = folder / "my robot"
     place.mkdir()
@@ -176,6 +178,7 @@ def test_2_a_path_with_a_space_works_and_missing_quotes_are_reported(folder: Pat
         assert "is one path with a space in it; write it in quotes: 'my robot/arm.urdf'" in message
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("right", "wrong", "message"),
     [
@@ -195,6 +198,7 @@ def test_3_bad_urdf_is_refused_by_every_reader(folder: Path, driver, right: str,
     assert message in process.stderr.read().decode()
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("stamp", "cause"),
     [

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import os
+import pty
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +20,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from helpers.fork_server import ForkedProcess, server
 from helpers.processes import DEADLINE_S, SOON_S, Child
 
 from zstate import StatePublisher, connect, load_model
@@ -37,6 +42,12 @@ with connect() as session:
 """
 """The program with the hardware of `zstate demo rover`, on the test's network."""
 
+MAIN = "from zstate.cli.main import main; main()"
+"""The program ``zstate``, as code."""
+
+_IMPORTS = {"view": ("zstate.view.server",), "foxglove": ("zstate.foxglove.server",)}
+"""What takes a second to import, by command."""
+
 Spawn = Callable[..., Child]
 
 
@@ -55,6 +66,7 @@ def run_cli(*arguments: str, stdin: bytes = b"") -> Ended:
     before = library.handlers.copy(), library.level, library.propagate
     with pytest.MonkeyPatch.context() as restored, CliRunner().isolation(stdin) as (stdout, stderr, _):
         restored.setattr(sys, "argv", ["zstate", *arguments])
+        restored.setattr(sys, "__stdout__", sys.stdout)  # whose terminal has a width
         restored.setattr(sys, "excepthook", sys.excepthook)
         restored.setattr(threading, "excepthook", threading.excepthook)
         restored.setattr(logs._Settings, "format", "text")
@@ -84,9 +96,37 @@ def failure(*arguments: str, code: int = 1, stdin: bytes = b"") -> str:
     return ended.stderr
 
 
+@contextmanager
+def missing_library(name: str, *users: str) -> Iterator[None]:
+    """An interpreter that cannot import ``name``, nor has imported the packages ``users``, which do."""
+    packages = (name, *users)
+    with pytest.MonkeyPatch.context() as restored:
+        for module in [*sys.modules]:
+            if any(module == package or module.startswith(f"{package}.") for package in packages):
+                restored.delitem(sys.modules, module)
+        restored.setitem(sys.modules, name, None)
+        yield
+
+
 def started(spawn: Spawn, *arguments: str) -> Child:
     """A command that runs until it is stopped: a process, forked from one that has imported zstate."""
-    return spawn("from zstate.cli.main import main; main()", *arguments, is_forked=True)
+    imports = _IMPORTS.get(arguments[0], ())
+    return spawn(MAIN, *arguments, is_forked=True, imports=imports)
+
+
+@contextmanager
+def in_terminal(*arguments: str, columns: int = 80) -> Iterator[tuple[ForkedProcess, int]]:
+    """A command in a terminal: its process, and the descriptor that writes to it and reads from it."""
+    keyboard, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+    process = server().start(MAIN, *arguments, terminal=terminal)
+    os.close(terminal)
+    try:
+        yield process, keyboard
+    finally:
+        process.kill()
+        process.wait(DEADLINE_S)
+        os.close(keyboard)
 
 
 def interrupted(child: Child) -> None:

@@ -1,8 +1,8 @@
 """Child processes without the imports: a server that has imported zstate, and forks for each of them.
 
-A process that runs a command computes 0.3 to 0.5 s before it does anything, nearly all of it imports. What
-the server starts is a process like any other: with its own signals, streams, environment and exit code. It
-differs in what is decided by imports (``ZSTATE_KERNEL``, ``PYTHON*``), and in the parent, which is the server.
+A command computes 0.3 to 0.5 s before it does anything, nearly all of it imports. What the server starts
+is a process like any other: with its own signals, streams, environment and exit code. It differs in what is
+decided by imports (``ZSTATE_KERNEL``, ``PYTHON*``), and in its parent, which is the server.
 
 ``server()`` starts it once for the tests of one process; it ends with them, and its children with it.
 """
@@ -10,6 +10,7 @@ differs in what is decided by imports (``ZSTATE_KERNEL``, ``PYTHON*``), and in t
 from __future__ import annotations
 
 import atexit
+import gc
 import json
 import os
 import select
@@ -20,9 +21,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
+from importlib import import_module
+from pathlib import Path
 from typing import Any, TextIO
 
 _LENGTH = struct.Struct("<I")
@@ -40,8 +43,11 @@ PRELOADED = (
 class ForkedProcess:
     """A child of the server, with the methods of ``subprocess.Popen`` that tests use."""
 
-    def __init__(self, status: int, stdin: TextIO, stdout: TextIO, stderr: TextIO) -> None:
-        self.stdin, self.stdout, self.stderr = stdin, stdout, stderr
+    stdin: TextIO | None = None
+    stdout: TextIO | None = None
+    stderr: TextIO | None = None
+
+    def __init__(self, status: int) -> None:
         self.returncode: int | None = None
         self._status = status
         self._lock = threading.Lock()
@@ -97,20 +103,31 @@ class ForkServer:
             )
         atexit.register(self.close)
 
-    def start(self, code: str, *arguments: str) -> ForkedProcess:
-        """Run ``code`` in a process, with the environment and the folder of this one."""
-        request = {"code": code, "arguments": arguments, "environment": dict(os.environ), "folder": os.getcwd()}
+    def start(
+        self, code: str, *arguments: str, terminal: int | None = None, imports: Sequence[str] = ()
+    ) -> ForkedProcess:
+        """Run ``code`` in a process, with the environment and the folder of this one.
+
+        Its streams are pipes, or ``terminal``. The server imports ``imports`` first, if it has not yet.
+        """
+        request = {
+            **{"code": code, "arguments": arguments, "imports": imports},
+            **{"environment": dict(os.environ), "folder": str(Path.cwd())},
+        }
         data = json.dumps(request).encode()
-        (stdin, to), (out, stdout), (err, stderr), (ended, status) = (os.pipe() for _ in range(4))
-        theirs = [stdin, stdout, stderr, status]
+        ended, status = os.pipe()
+        (stdin, to), (out, stdout), (err, stderr) = (os.pipe() for _ in range(3))
+        theirs = [stdin, stdout, stderr] if terminal is None else [terminal] * 3
         try:
             with self._lock:
-                socket.send_fds(self._control, [_LENGTH.pack(len(data))], theirs)
+                socket.send_fds(self._control, [_LENGTH.pack(len(data))], [*theirs, status])
                 self._control.sendall(data)
         finally:
-            for one in theirs:
+            for one in (stdin, stdout, stderr, status):
                 os.close(one)
-        return ForkedProcess(ended, os.fdopen(to, "w"), os.fdopen(out), os.fdopen(err))
+        process = ForkedProcess(ended)
+        process.stdin, process.stdout, process.stderr = os.fdopen(to, "w"), os.fdopen(out), os.fdopen(err)
+        return process
 
     def close(self) -> None:
         """End the server, and its children with it."""
@@ -150,6 +167,8 @@ def _serve(control: socket.socket) -> Callable[[], None]:
             raise SystemExit
         request = json.loads(_read(control, *_LENGTH.unpack(head)))
         *streams, status = descriptors
+        for name in request["imports"]:
+            import_module(name)
         pid = os.fork()
         if pid == 0:
             signal.set_wakeup_fd(-1)
@@ -186,9 +205,6 @@ def _run(request: dict[str, Any], streams: list[int]) -> None:
 
 
 def _main() -> None:
-    import gc
-    from importlib import import_module
-
     for name in PRELOADED:
         import_module(name)
     gc.freeze()

@@ -13,7 +13,7 @@ import tempfile
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -115,9 +115,11 @@ class Child:
 
     process: subprocess.Popen[str] | ForkedProcess
 
-    def __init__(self, code: str, *arguments: str, is_forked: bool = False) -> None:
+    def __init__(
+        self, code: str, *arguments: str, is_forked: bool = False, imports: Sequence[str] = ()
+    ) -> None:
         if is_forked:
-            self.process = server().start(textwrap.dedent(code), *arguments)
+            self.process = server().start(textwrap.dedent(code), *arguments, imports=imports)
         else:
             self.process = subprocess.Popen(
                 [sys.executable, "-u", "-c", textwrap.dedent(code), *arguments],

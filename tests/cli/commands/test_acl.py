@@ -13,8 +13,6 @@ from zstate.net.security.credentials import Credentials
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.protocol import SerializedSample
 
-pytestmark = pytest.mark.processes
-
 
 @pytest.fixture
 def router(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
@@ -30,6 +28,7 @@ def router(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.Mon
     return endpoint
 
 
+@pytest.mark.processes
 def test_late_viewer_receives_the_poses_of_the_robot(spawn: Spawn, router: str):
     started(spawn, "publish", RRBOT, "--name", "r1", "--source", "sine", "--user", "r1").line()
     seen = run_cli("tf", "base", "lower", "--once", "--json", "--user", "desk")
@@ -39,6 +38,7 @@ def test_late_viewer_receives_the_poses_of_the_robot(spawn: Spawn, router: str):
     assert robot["robot"] == "r1"
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("user", ["r2", "desk"])
 def test_other_user_cannot_write_the_robot_and_the_error_names_the_reason(router: str, user: str):
     credentials = Credentials(user="desk", password="secret")
@@ -52,6 +52,7 @@ def test_other_user_cannot_write_the_robot_and_the_error_names_the_reason(router
     assert received == []
 
 
+@pytest.mark.processes
 def test_a_viewer_that_releases_stops_is_told_that_only_commanders_do(router: str):
     message = failure("stop", "r1", "--release", "--user", "desk")
     assert "Only commanders command a robot and release its stops" in message

@@ -6,7 +6,6 @@ from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, pub
 from zstate import TransformListener, connect, load_model
 from zstate.model.kinematics import Kinematics
 
-pytestmark = pytest.mark.processes
 EACH = "ros2:namespace=*"
 
 
@@ -18,6 +17,7 @@ def ros(spawn: Spawn, free_port: int) -> str:
     return endpoint
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("given", [["rrbot"], [], ["--wire", EACH]], ids=["named", "alone", "all"])
 def test_native_robot_is_carried_to_ros_with_a_line_at_start_and_end(
     spawn: Spawn, ros: str, given: list[str]
@@ -39,6 +39,7 @@ def test_native_robot_is_carried_to_ros_with_a_line_at_start_and_end(
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_ros_robot_is_carried_to_native(spawn: Spawn, ros: str):
     command = started(spawn, "bridge", "arm", "--ros", ros)
     command.line()
@@ -50,6 +51,7 @@ def test_ros_robot_is_carried_to_native(spawn: Spawn, ros: str):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_several_robots_do_not_share_the_root_namespace(ros: str):
     with published_robot("left"), published_robot("right"):
         message = failure("bridge", "--ros", ros)
@@ -58,6 +60,7 @@ def test_several_robots_do_not_share_the_root_namespace(ros: str):
     assert EACH in message
 
 
+@pytest.mark.processes
 def test_bridge_without_a_robot_prints_how_to_name_one(ros: str):
     assert "zstate bridge panda" in failure("bridge", "--ros", ros)
 

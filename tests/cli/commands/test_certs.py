@@ -13,7 +13,6 @@ from zstate.errors import AccessDenied
 from zstate.net.security.credentials import Credentials
 
 pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
-pytestmark = pytest.mark.processes
 
 
 def test_certs_prints_its_files_and_a_warning(tmp_path: Path):
@@ -40,6 +39,7 @@ def test_certs_adds_identities_and_never_overwrites(tmp_path: Path):
     assert "--days" in failure("certs", str(tmp_path), "--identity", "r2", "--days", "0", code=2)
 
 
+@pytest.mark.processes
 def test_commands_with_identities_connect_through_a_router_that_requires_them(
     spawn: Spawn, tmp_path: Path, free_port: int
 ):
@@ -56,6 +56,7 @@ def test_commands_with_identities_connect_through_a_router_that_requires_them(
     interrupted(router)
 
 
+@pytest.mark.processes
 def test_a_password_comes_from_the_environment_or_a_file(
     spawn: Spawn, tmp_path: Path, free_port: int, monkeypatch: pytest.MonkeyPatch
 ):

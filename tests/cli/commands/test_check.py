@@ -8,8 +8,6 @@ from helpers.cli_runner import RRBOT, failure, run_cli
 
 from zstate import load_model
 
-pytestmark = pytest.mark.processes
-
 LINKS = '<robot name="arm">\n<link name="base"/>\n<link name="hand"/>\n'
 SOUND = LINKS + '<joint name="wrist" type="fixed"><parent link="base"/><child link="hand"/></joint>\n</robot>'
 WITHOUT_LIMIT = SOUND.replace('type="fixed"', 'type="revolute"')

@@ -12,8 +12,6 @@ import pytest
 from helpers.cli_runner import Spawn, failure, published_robot, run_cli, started
 from helpers.processes import until
 
-pytestmark = pytest.mark.processes
-
 CLEARED = "\x15"
 """Ctrl-U, which empties the line."""
 
@@ -34,23 +32,27 @@ def offered(*words: str) -> list[str]:
     return answer.stdout.split()
 
 
+@pytest.mark.processes
 def test_commands_and_their_options_are_offered():
     assert offered("sn") == ["plain,snapshot"]
     assert offered("snapshot", "l") == ["plain,load"]
     assert "plain,--fix-hints" in offered("check", "--f")
 
 
+@pytest.mark.processes
 def test_completion_offers_models_by_name_and_files():
     assert "plain,rrbot" in offered("publish", "rr")
     assert offered("check", "./models/rr") == ["file,./models/rr"]
 
 
+@pytest.mark.processes
 def test_announced_robots_are_offered():
     with published_robot("left"), published_robot("right"):
         assert offered("tree", "le") == ["plain,left"]
         assert offered("snapshot", "save", "a.toml", "r") == ["plain,right"]
 
 
+@pytest.mark.processes
 def test_drivers_and_the_joints_of_a_driver_are_offered(spawn: Spawn):
     assert offered("drive", "s") == ["plain,sim"]
     assert offered("drive", "sim", "rr") == ["plain,rrbot"]
@@ -58,10 +60,12 @@ def test_drivers_and_the_joints_of_a_driver_are_offered(spawn: Spawn):
     until(lambda: offered("move", "rrbot", "sh") == ["plain,shoulder="])
 
 
+@pytest.mark.processes
 def test_completion_without_robots_offers_and_prints_nothing():
     assert offered("echo", "l") == []
 
 
+@pytest.mark.processes
 def test_parameters_of_a_file_are_offered(tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text("[parameters]\nspeed = 1\nsite = 'lab'\n")
@@ -117,6 +121,7 @@ def with_zstate() -> dict[str, str]:
     return {**os.environ, "PATH": path, "TERM": "dumb", "PS1": "$ "}
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     "shell",
     [
@@ -137,6 +142,7 @@ def test_tab_completes_commands_options_robots_and_files(
         typist.completed("zstate up ce", "zstate up cell.toml ")
 
 
+@pytest.mark.processes
 @pytest.mark.shells
 def test_fish_is_offered_the_same_with_all_of_the_help(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "cell.toml").touch()

@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from helpers.cli_runner import failure, run_cli
 
-pytestmark = pytest.mark.processes
-
 
 @pytest.fixture(autouse=True)
 def _bare_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,19 +4,16 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
-from helpers.processes import DEADLINE_S, Child, until
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, missing_library, run_cli, started
+from helpers.processes import Child, until
 
 from zstate import Kinematics, load_model
 from zstate.cli.odometry_file import read_settings
 from zstate.cli.rover import ROVER_BASE, ROVER_JOINTS, ROVER_MODEL, ROVER_WHEELS, settings_file
+from zstate.model import catalog
 from zstate.odometry import DiffDrive, WheelNoise
-
-pytestmark = pytest.mark.processes
 
 
 def publisher_of(demo: Child) -> int:
@@ -33,6 +30,7 @@ def is_gone(pid: int) -> bool:
     return False
 
 
+@pytest.mark.processes
 def test_it_shows_transforms_and_ends_with_a_summary():
     output = run_cli("demo", RRBOT, "--seconds", "1.5", "--rate", "50").stdout
     first, *lines, summary = output.splitlines()
@@ -53,19 +51,16 @@ def test_it_shows_transforms_and_ends_with_a_summary():
     assert "\x1b" not in output
 
 
-def test_without_panda_demo_shows_rrbot_and_prints_how_to_install_more():
-    code = (
-        "from zstate.model import catalog\n"
-        "catalog._COLLECTIONS.pop('example-robot-data')\n"
-        "from zstate.cli.main import main; main()"
-    )
-    command = [sys.executable, "-c", code, "demo", "--seconds", "0.5"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-    assert ended.returncode == 0, ended.stderr
+@pytest.mark.processes
+def test_without_panda_demo_shows_rrbot_and_prints_how_to_install_more(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delitem(catalog._COLLECTIONS, "example-robot-data")
+    ended = run_cli("demo", "--seconds", "0.5")
+    assert ended.code == 0, ended.stderr
     assert "'panda' is not installed (pip install 'zstate[robots]'), so this shows 'rrbot'" in ended.stderr
     assert "samples received" in ended.stdout
 
 
+@pytest.mark.processes
 def test_ctrl_c_ends_both_processes_with_the_summary(spawn: Spawn):
     demo = started(spawn, "demo", RRBOT)
     publisher = publisher_of(demo)
@@ -75,6 +70,7 @@ def test_ctrl_c_ends_both_processes_with_the_summary(spawn: Spawn):
     until(lambda: is_gone(publisher))
 
 
+@pytest.mark.processes
 def test_a_publisher_that_dies_ends_the_demo(spawn: Spawn):
     demo = started(spawn, "demo", RRBOT)
     publisher = publisher_of(demo)
@@ -84,6 +80,7 @@ def test_a_publisher_that_dies_ends_the_demo(spawn: Spawn):
     assert "the process 'publisher' ended with exit code -9" in demo.stderr
 
 
+@pytest.mark.processes
 def test_a_publisher_does_not_outlive_a_demo_that_is_killed(spawn: Spawn):
     demo = started(spawn, "demo", RRBOT)
     publisher = publisher_of(demo)
@@ -103,6 +100,7 @@ def rover_programs(demo: Child) -> list[int]:
     return [int(pid) for pid in match.groups()]
 
 
+@pytest.mark.processes
 def test_rover_shows_its_odometry_and_places_the_scans_of_its_room(spawn: Spawn):
     demo = started(spawn, "demo", "rover")
     programs = rover_programs(demo)
@@ -125,6 +123,7 @@ def test_rover_shows_its_odometry_and_places_the_scans_of_its_room(spawn: Spawn)
     until(lambda: all(map(is_gone, [*programs, int(room[1])])))
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("number, name", [(0, "wheels"), (1, "odometry")])
 def test_a_program_of_the_rover_that_dies_ends_the_demo(spawn: Spawn, number: int, name: str):
     demo = started(spawn, "demo", "rover")
@@ -136,6 +135,7 @@ def test_a_program_of_the_rover_that_dies_ends_the_demo(spawn: Spawn, number: in
     until(lambda: all(map(is_gone, programs)))
 
 
+@pytest.mark.processes
 def test_other_commands_follow_the_rover_at_the_printed_address(spawn: Spawn):
     demo = started(spawn, "demo", "rover")
     until(lambda: "--connect " in demo.stderr)
@@ -150,11 +150,11 @@ def test_other_commands_follow_the_rover_at_the_printed_address(spawn: Spawn):
     interrupted(demo)
 
 
+@pytest.mark.processes
 def test_rover_without_the_libraries_of_maps_has_no_room():
-    code = "import sys; sys.modules['PIL'] = None\nfrom zstate.cli.main import main; main()"
-    command = [sys.executable, "-c", code, "demo", "rover", "--seconds", "0.5"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=2 * DEADLINE_S, check=False)
-    assert ended.returncode == 0, ended.stderr
+    with missing_library("PIL"):
+        ended = run_cli("demo", "rover", "--seconds", "0.5")
+    assert ended.code == 0, ended.stderr
     assert "without a room and its laser, which need pip install 'zstate[maps]'" in ended.stderr
     assert "(map)" not in ended.stdout
     assert "joint states and" in ended.stdout
@@ -177,6 +177,7 @@ def test_the_wheels_of_the_rover_have_the_measures_of_its_model():
     assert poses["right_wheel"][:3] == pytest.approx([0.0, -track / 2, radius])
 
 
+@pytest.mark.processes
 def test_laser_of_the_arm_sweeps_a_room(spawn: Spawn):
     demo = started(spawn, "demo", "rrbot", "--world")
     demo.line()
@@ -205,6 +206,7 @@ def test_only_the_arm_has_a_room():
     assert "--world is for 'rrbot' alone; got 'rover'" in failure("demo", "rover", "--world", code=2)
 
 
+@pytest.mark.processes
 def test_demo_is_isolated_with_its_publisher_in_any_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZENOH_CONFIG", "/nowhere.json5")
     monkeypatch.setenv("ZSTATE_MODE", "client")

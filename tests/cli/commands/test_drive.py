@@ -17,8 +17,6 @@ from zstate import JointReading, TransformListener, connect, load_model
 from zstate.driving import Commander
 from zstate.sources import JointStateListener
 
-pytestmark = pytest.mark.processes
-
 ARM = """
 import socket
 import time
@@ -97,6 +95,7 @@ def line_with(child: Child, text: str) -> str:
     return line
 
 
+@pytest.mark.processes
 def test_changes_of_state_are_lines_and_the_end_is_a_report(spawn: Spawn):
     child = started(spawn, "drive", "sim", "rrbot", "--ttl", "0.5")
     assert child.line() == (
@@ -119,6 +118,7 @@ def test_changes_of_state_are_lines_and_the_end_is_a_report(spawn: Spawn):
     assert child.line().endswith(" written, 0 failures of the driver, commands refused: none")
 
 
+@pytest.mark.processes
 def test_a_second_signal_does_not_skip_the_stop_of_the_driver(spawn: Spawn, arm: str, tmp_path: Path):
     log = tmp_path / "log"
     child = started(spawn, "drive", f"{arm}:SlowToStop", "rrbot", "--param", f"log={log}", "--ttl", "20")
@@ -151,6 +151,7 @@ def _is_moved(commander: Commander) -> bool:
     return commander.driver is not None and commander.driver.state == "active"
 
 
+@pytest.mark.processes
 def test_driver_of_a_file_gets_its_parameters_and_is_closed_at_the_end(
     spawn: Spawn, arm: str, tmp_path: Path
 ):
@@ -163,6 +164,7 @@ def test_driver_of_a_file_gets_its_parameters_and_is_closed_at_the_end(
     assert log.read_text() == "shoulder elbow closed"
 
 
+@pytest.mark.processes
 def test_parameters_have_the_types_that_the_driver_annotates(spawn: Spawn, arm: str, tmp_path: Path):
     log = tmp_path / "log.txt"
     given = [f"--param={one}" for one in (f"log={log}", "ids=[1, 2]", "serial=0042")]
@@ -171,6 +173,7 @@ def test_parameters_have_the_types_that_the_driver_annotates(spawn: Spawn, arm: 
     assert log.read_text() == "[1, 2] '0042'"
 
 
+@pytest.mark.processes
 def test_ros_nodes_command_the_joints_as_a_controller_and_receive_them(spawn: Spawn):
     given = ("drive", "sim", "rrbot", "--wire", "native", "--wire", "ros2", "--ttl", "10")
     child = started(spawn, *given, "--ros2-controller", "forward_position_controller")
@@ -190,6 +193,7 @@ def test_ros_nodes_command_the_joints_as_a_controller_and_receive_them(spawn: Sp
     assert "active, commanded by /teleop" in line_with(child, "active")
 
 
+@pytest.mark.processes
 def test_device_sets_the_pace_of_the_loop(spawn: Spawn, arm: str, tmp_path: Path):
     given = ("drive", f"{arm}:Paced", "rrbot", "--param", f"log={tmp_path / 'log.txt'}")
     child = started(spawn, *given, "--rate", "device", "--seconds", "0.5")
@@ -198,6 +202,7 @@ def test_device_sets_the_pace_of_the_loop(spawn: Spawn, arm: str, tmp_path: Path
     assert re.match(r"\d+ samples at the pace of the device, [\d.]+ Hz$", line_with(child, "samples"))
 
 
+@pytest.mark.processes
 def test_driver_that_fails_three_times_in_a_row_ends_the_command_stopped(
     spawn: Spawn, arm: str, tmp_path: Path
 ):
@@ -257,6 +262,7 @@ def test_joint_without_a_velocity_limit_needs_one(tmp_path: Path):
     assert "no limit for the velocity of turn; give one, such as --velocity turn=1.0" in message
 
 
+@pytest.mark.processes
 def test_second_host_of_a_robot_is_refused_with_the_name_of_the_first(spawn: Spawn):
     child = started(spawn, "drive", "sim", "rrbot")
     line_with(child, "ready")
@@ -264,6 +270,7 @@ def test_second_host_of_a_robot_is_refused_with_the_name_of_the_first(spawn: Spa
     assert f"zstate-drive@{os.uname().nodename} pid {child.process.pid}" in message
 
 
+@pytest.mark.processes
 def test_up_starts_a_driver_as_a_program_and_closes_it(spawn: Spawn, arm: str, tmp_path: Path):
     log = tmp_path / "log.txt"
     run = ["zstate", "drive", "arm.py:Arm", RRBOT, "--param", f"log={log}"]

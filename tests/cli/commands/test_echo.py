@@ -18,8 +18,6 @@ from zstate import Transform, connect
 from zstate.cli.output.joint_state_text import ChangeFilter
 from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
 
-pytestmark = pytest.mark.processes
-
 FLOATING = """
 <robot name="drone">
   <link name="world"/> <link name="body"/> <link name="arm"/>
@@ -47,6 +45,7 @@ def test_a_joint_state_is_a_yaml_document():
     ]
 
 
+@pytest.mark.processes
 def test_documents_follow_each_other_until_ctrl_c(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "seq")
     with published_robot():
@@ -61,6 +60,7 @@ def test_setpoints_of_a_robot_without_a_driver_host_are_explained():
     assert "'rrbot' has no driver host; start the program with its zstate.driving.DriverHost" in message
 
 
+@pytest.mark.processes
 def test_transforms_are_documents_of_poses_by_edge(spawn: Spawn):
     started(spawn, "transform", "odom", "base", "--xyz", "1", "2", "3", "--robot", "r1").line()
     document = json.loads(run_cli("echo", "r1", "--stream", "transforms", "--once", "--json").stdout)
@@ -76,6 +76,7 @@ def test_json_is_one_object_a_line():
     assert "velocities" not in document
 
 
+@pytest.mark.processes
 def test_csv_has_one_line_of_names(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--csv")
     with published_robot():
@@ -94,6 +95,7 @@ def test_a_field_is_printed_alone(field: str, printed: str):
         assert run_cli("echo", "rrbot", "--once", "--field", field).stdout == f"{printed}\n"
 
 
+@pytest.mark.processes
 def test_changed_prints_only_changed_documents(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--changed", "--json")
     with published_robot():
@@ -153,6 +155,7 @@ def test_numbers_without_a_description_have_no_names():
     assert "`zstate publish rrbot` publishes it" in ended.stderr
 
 
+@pytest.mark.processes
 def test_echo_waits_for_a_robot_and_prints_the_reason(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
@@ -168,6 +171,7 @@ def test_once_gives_up_with_the_reason():
     assert "zstate: gave up after 1 s: joint_states of 'rrbot' has no writer" in message
 
 
+@pytest.mark.processes
 def test_sigterm_ends_it_as_well(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
     with published_robot():
@@ -176,6 +180,7 @@ def test_sigterm_ends_it_as_well(spawn: Spawn):
         assert command.wait(2.0) == 128 + signal.SIGTERM
 
 
+@pytest.mark.processes
 def test_a_reader_that_leaves_ends_it_quietly():
     command = [sys.executable, "-m", "zstate", "echo", "rrbot"]
     with (
@@ -187,9 +192,10 @@ def test_a_reader_that_leaves_ends_it_quietly():
         process.stdout.readline()
         process.stdout.close()
         process.wait(DEADLINE_S)
-        assert process.stderr.read() == ""
+        assert process.stderr.read() == b""
 
 
+@pytest.mark.processes
 def test_undecodable_messages_are_reported_once_and_skipped(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
     with published_robot(), connect() as stranger:

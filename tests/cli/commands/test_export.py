@@ -6,8 +6,6 @@ import pytest
 from helpers.cli_runner import failure, run_cli
 from helpers.recording_builder import MS, START, RecordingBuilder, pose, swing_positions, swing_velocities
 
-pytestmark = pytest.mark.processes
-
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:

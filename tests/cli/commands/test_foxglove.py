@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started
+from helpers.cli_runner import (
+    ELBOW,
+    SHOULDER,
+    Spawn,
+    failure,
+    interrupted,
+    missing_library,
+    published_robot,
+    started,
+)
 from helpers.foxglove_client import FoxgloveClient
 from helpers.processes import until
 
 from zstate.web_access import listen
 
-pytestmark = pytest.mark.processes
 
-
+@pytest.mark.processes
 def test_a_client_receives_a_robot_until_ctrl_c(spawn: Spawn):
     command = started(spawn, "foxglove", "rrbot", "--port", "0")
     found = re.fullmatch(r"Foxglove can connect to (ws://127\.0\.0\.1:\d+)", command.line())
@@ -32,6 +37,7 @@ def test_a_client_receives_a_robot_until_ctrl_c(spawn: Spawn):
         interrupted(command)
 
 
+@pytest.mark.processes
 def test_other_hosts_are_served_with_a_token_that_is_printed(spawn: Spawn):
     command = started(spawn, "foxglove", "--host", "0.0.0.0", "--port", "0")
     assert re.fullmatch(r"Foxglove can connect to ws://[^/]+:\d+/\?token=[\w-]{20,}", command.line())
@@ -48,11 +54,6 @@ def test_hosts_ports_and_names_that_cannot_be_used_are_refused():
     assert "the robot name 'a/b' contains '/'" in failure("foxglove", "a/b", "--port", "0")
 
 
-def test_missing_websockets_error_names_the_extra_to_install(tmp_path: Path):
-    (tmp_path / "websockets.py").write_text("raise ImportError('no module of that name')")
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); sys.argv[1:] = ['foxglove']\n"
-    code += "from zstate.cli.main import main; main()"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert ended.returncode == 1
-    assert "pip install 'zstate[foxglove]'" in ended.stderr
-    assert "Traceback" not in ended.stderr
+def test_missing_websockets_error_names_the_extra_to_install():
+    with missing_library("websockets", "zstate.foxglove"):
+        assert "pip install 'zstate[foxglove]'" in failure("foxglove")

@@ -52,7 +52,6 @@ def test_drawings_have_nodes_for_programs_and_stream_groups_and_edges_for_uses()
     assert sum(" --> " in line for line in mermaid(graph_drawing(GRAPH)).splitlines()) == 5
 
 
-@pytest.mark.processes
 def test_writers_and_readers_of_a_robot_are_seen_with_rates():
     here = f"@{socket.gethostname()} pid {os.getpid()}"
     with published_robot(), connect() as session, TransformListener(session, "rrbot", follow="tf"):
@@ -76,7 +75,6 @@ def test_stream_with_readers_but_no_writer_is_marked(spawn: Spawn):
     assert lines[2].startswith("  read by     zstate-publish@")
 
 
-@pytest.mark.processes
 def test_reader_of_all_robots_appears_at_each_and_static_writers_have_names():
     with (
         connect() as session,
@@ -89,7 +87,6 @@ def test_reader_of_all_robots_appears_at_each_and_static_writers_have_names():
     assert text.count("read by     none") == 1  # the transforms of the right one
 
 
-@pytest.mark.processes
 def test_unknown_robot_is_an_error_but_an_empty_network_is_not():
     with published_robot():
         assert "did you mean 'rrbot'?" in failure("graph", "rbot")

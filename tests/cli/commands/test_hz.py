@@ -7,9 +7,8 @@ import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import until
 
-pytestmark = pytest.mark.processes
 
-
+@pytest.mark.processes
 def test_hz_prints_rostopic_style_figures_once_a_second(spawn: Spawn):
     command = started(spawn, "hz", "rrbot")
     with published_robot():
@@ -39,6 +38,7 @@ def test_json_has_the_numbers_of_either_stream(stream: str):
     assert measured["missed"] == 0
 
 
+@pytest.mark.processes
 def test_transforms_of_several_writers_are_measured_together(spawn: Spawn):
     for child in ("base_link", "ball"):
         options = ("--xyz", "0", "0", "0", "--rate", "50", "--robot", "r1")

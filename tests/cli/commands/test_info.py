@@ -16,8 +16,6 @@ from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
 from zstate.recording.recorder import Recorder
 
-pytestmark = pytest.mark.processes
-
 
 @pytest.fixture
 def run(sessions: tuple[Session, Session], tmp_path: Path) -> Path:

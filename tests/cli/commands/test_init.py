@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 
-pytestmark = pytest.mark.processes
 
-
+@pytest.mark.processes
 def test_up_runs_the_file_that_init_writes(spawn: Spawn, tmp_path: Path):
     file = tmp_path / "cell.toml"
     written = run_cli("init", "rrbot", "-o", str(file))

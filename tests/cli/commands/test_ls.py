@@ -25,8 +25,6 @@ from zstate.net.topic_statistics import TopicStatistics
 from zstate.wire.identity import WriterId
 from zstate.wire.registry import get_wire
 
-pytestmark = pytest.mark.processes
-
 
 def test_each_stream_is_listed_with_its_writer():
     with published_robot():
@@ -63,6 +61,7 @@ def test_empty_network_is_no_error():
     assert json.loads(run_cli("ls", "--json").stdout) == []
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("command", [("ls",), ("ls", "--json"), ("graph", "--json")], ids=" ".join)
 def test_no_robot_beside_a_stopped_program_is_no_empty_fleet(
     spawn: Spawn, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
@@ -93,6 +92,7 @@ def test_ls_measures_joint_states_and_starts_no_other_stream():
     assert 0.0 <= joints["silent_s"] < 1.0
 
 
+@pytest.mark.processes
 def test_watch_prints_the_list_again_after_each_change(spawn: Spawn):
     command = started(spawn, "ls", "--watch")
     assert command.line().startswith("no robot is announced")
@@ -103,6 +103,7 @@ def test_watch_prints_the_list_again_after_each_change(spawn: Spawn):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_watch_as_json_prints_a_document_a_second(spawn: Spawn):
     with published_robot():
         command = started(spawn, "ls", "--watch", "--json")
@@ -126,6 +127,7 @@ def test_narrow_terminal_abbreviates_start_times_and_ages():
     assert narrowest.split() == ["joint_states", "driver@jetson", "pid", "412"]
 
 
+@pytest.mark.processes
 def test_on_ros_side_the_list_is_watched_too(ros_router: str, spawn: Spawn):
     command = started(spawn, "ls", "--watch")
     assert command.line().startswith("no ROS 2 node")
@@ -134,6 +136,7 @@ def test_on_ros_side_the_list_is_watched_too(ros_router: str, spawn: Spawn):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_writers_of_transforms_have_their_names_and_rates(spawn: Spawn):
     options = ("--xyz", "0", "0", "0", "--robot", "r1", "--writer", "odometry")
     started(spawn, "transform", "odom", "base", *options).line()

@@ -9,8 +9,6 @@ from helpers.cli_runner import Spawn, failure, interrupted, run_cli, started
 
 from zstate.scans import Grid
 
-pytestmark = pytest.mark.processes
-
 # Two rows of three cells: two occupied, three free, one unknown.
 CELLS = [[100, 0, 0], [-1, 0, 100]]
 
@@ -23,6 +21,7 @@ def hall(tmp_path: Path) -> str:
     return str(path)
 
 
+@pytest.mark.processes
 def test_map_is_published_under_the_name_of_the_file_until_ctrl_c(spawn: Spawn, hall: str):
     child = started(spawn, "map", hall)
     assert child.line() == (
@@ -39,6 +38,7 @@ def test_map_is_published_under_the_name_of_the_file_until_ctrl_c(spawn: Spawn, 
     assert "robot 'hall' is not announced" in failure("hz", "hall", "--once", "--timeout", "1")
 
 
+@pytest.mark.processes
 def test_name_frame_and_writer_are_those_given(spawn: Spawn, hall: str):
     options = ("--name", "r1", "--frame", "odom", "--writer", "slam")
     assert "in odom, on zstate/r1/map/slam" in started(spawn, "map", hall, *options).line()
@@ -49,11 +49,13 @@ def test_name_frame_and_writer_are_those_given(spawn: Spawn, hall: str):
     assert "r1: map/slam" in run_cli("graph").stdout
 
 
+@pytest.mark.processes
 def test_name_of_a_file_becomes_that_of_a_place(spawn: Spawn, hall: str):
     path = Path(hall).rename(Path(hall).with_name("floor 2 @home.yaml"))
     assert started(spawn, "map", str(path)).line().startswith("floor_2_home: ")
 
 
+@pytest.mark.processes
 def test_place_with_nothing_but_a_map_is_sound(spawn: Spawn, hall: str):
     started(spawn, "map", hall).line()
     ended = run_cli("doctor", "hall", "--json")
@@ -67,6 +69,7 @@ def test_place_with_nothing_but_a_map_is_sound(spawn: Spawn, hall: str):
     assert "3 x 2 cells of 0.5 m in 'hall/map'" in checks["map"]["text"]
 
 
+@pytest.mark.processes
 def test_second_map_of_a_place_is_refused_with_the_first(spawn: Spawn, hall: str):
     started(spawn, "map", hall).line()
     assert "'hall'" in failure("map", hall)
@@ -92,6 +95,7 @@ def test_missing_file_and_bad_names_are_refused(hall: str):
     assert "'a/b'" in failure("map", hall, "--writer", "a/b")
 
 
+@pytest.mark.processes
 def test_ros_wire_has_the_map_on_its_topic(spawn: Spawn, ros_router: str, hall: str):
     assert "ROS 2 topic /map" in started(spawn, "map", hall).line()
     found = json.loads(run_cli("echo", "--stream", "map", "--once", "--json").stdout)

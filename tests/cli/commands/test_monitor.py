@@ -88,7 +88,6 @@ def test_stale_edge_has_its_silence_instead_of_a_rate():
     assert "silent 12.0 s" in text
 
 
-@pytest.mark.processes
 def test_each_edge_has_its_rate_latency_writer_and_clock():
     with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
         statics.set(Transform("tool", "gauge", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
@@ -145,7 +144,6 @@ def test_missing_numbers_and_latency_are_measured():
     assert statistics.measure(frame("r2/left", "r2/torso")) is None
 
 
-@pytest.mark.processes
 def test_once_gives_up_with_the_reason():
     message = failure("monitor", "base", "tool", "--once", "--timeout", "0.7")
     assert "gave up after 0.7 s: no robot is announced" in message
@@ -175,7 +173,6 @@ def test_overview_has_one_line_for_joints_and_one_for_fixed_edges():
     assert narrow[-2:] == [f"a: {DRIVER}", "b: odometry"]
 
 
-@pytest.mark.processes
 def test_without_frames_all_received_edges_are_monitored():
     with published_robot("left"), published_robot("right"):
         lines = run_cli("monitor", "--once").stdout.splitlines()
@@ -195,7 +192,6 @@ def test_without_frames_all_received_edges_are_monitored():
     assert all(edge["rate_hz"] > 0.0 for edge in edges if edge["kind"] == "joint")
 
 
-@pytest.mark.processes
 def test_without_frames_and_robots_the_error_names_the_reason():
     message = failure("monitor", "--once", "--timeout", "0.7")
     assert "gave up after 0.7 s: no robot is announced" in message

@@ -22,8 +22,6 @@ from zstate import JointReading, TransformListener, connect
 from zstate.driving import Commander
 from zstate.sources import JointStateListener
 
-pytestmark = pytest.mark.processes
-
 
 def driven(spawn: Spawn, name: str = "rrbot") -> Child:
     """A simulated driver of ``name`` that is ready; on a busy machine a commander may pause."""
@@ -46,6 +44,7 @@ def printed(*arguments: str) -> str:
     return ended.stdout
 
 
+@pytest.mark.processes
 def test_joints_are_moved_and_the_outcome_is_awaited(spawn: Spawn):
     host = driven(spawn)
     assert re.fullmatch(r"reached in \d+\.\d s\n", printed("move", "rrbot", "shoulder=0.3", "elbow=-0.2"))
@@ -55,6 +54,7 @@ def test_joints_are_moved_and_the_outcome_is_awaited(spawn: Spawn):
         until(lambda: np.allclose(listener.buffer.joint_positions("rrbot")[0], [0.3, -0.2], atol=0.02))
 
 
+@pytest.mark.processes
 def test_motion_beyond_the_limits_is_refused_with_all_findings_and_stretched_on_request(spawn: Spawn):
     driven(spawn)
     fast = ("move", "rrbot", "shoulder=1", "elbow=-1", "--seconds", "0.3")
@@ -72,6 +72,7 @@ def test_motion_beyond_the_limits_is_refused_with_all_findings_and_stretched_on_
     assert json.loads(printed(*fast, "--stretch", "--json"))["outcome"] == "reached"
 
 
+@pytest.mark.processes
 def test_degrees_are_converted_on_request_and_guessed_in_a_refusal(spawn: Spawn):
     line_with(started(spawn, "drive", "sim", "gripper", "--ttl", "10"), "ready")
     text = failure("move", "gripper", "thumb_joint=60")
@@ -90,6 +91,7 @@ def test_degrees_are_converted_on_request_and_guessed_in_a_refusal(spawn: Spawn)
         until(lambda: is_there([0.03, np.pi / 3]))
 
 
+@pytest.mark.processes
 def test_points_of_a_file_are_followed(spawn: Spawn, tmp_path: Path):
     driven(spawn)
     points = tmp_path / "wave.csv"
@@ -105,6 +107,7 @@ def test_points_of_a_file_are_followed(spawn: Spawn, tmp_path: Path):
     )
 
 
+@pytest.mark.processes
 def test_wheels_keep_a_velocity_for_some_seconds_and_brake(spawn: Spawn):
     host = driven(spawn, "diffbot")
     turned: list[JointReading] = []
@@ -120,6 +123,7 @@ def test_wheels_keep_a_velocity_for_some_seconds_and_brake(spawn: Spawn):
     assert "limits" not in failure("move", "diffbot", "--velocity", "left_wheel=2")
 
 
+@pytest.mark.processes
 def test_ctrl_c_brakes_wheels(spawn: Spawn):
     driven(spawn, "diffbot")
     child = started(spawn, "move", "diffbot", "--velocity", "left_wheel_joint=2", "--seconds", "60")
@@ -129,6 +133,7 @@ def test_ctrl_c_brakes_wheels(spawn: Spawn):
         until(lambda: (reading := joints.read(0)) and abs(reading.velocities[0]) < 1e-3)
 
 
+@pytest.mark.processes
 def test_ctrl_c_cancels_a_motion_and_the_joints_brake(spawn: Spawn):
     host = driven(spawn)
     child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
@@ -138,6 +143,7 @@ def test_ctrl_c_cancels_a_motion_and_the_joints_brake(spawn: Spawn):
     assert "cancelled: the joints of 'rrbot' brake" in child.stderr
 
 
+@pytest.mark.processes
 def test_motion_ends_with_the_stop_of_another_program(spawn: Spawn):
     host = driven(spawn)
     child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
@@ -163,6 +169,7 @@ def test_motions_without_a_driver_or_joints_are_refused(tmp_path: Path):
         assert error in failure("move", "rrbot", *arguments, code=2)
 
 
+@pytest.mark.processes
 def test_stop_is_latched_over_a_restart_of_the_driver_until_the_release(spawn: Spawn):
     host = driven(spawn)
     assert printed("stop", "rrbot", "--reason", "door open").startswith("rrbot: stopped by zstate-stop@")
@@ -176,6 +183,7 @@ def test_stop_is_latched_over_a_restart_of_the_driver_until_the_release(spawn: S
     line_with(again, "ready: released by zstate-stop@")
 
 
+@pytest.mark.processes
 def test_all_drivers_are_stopped_and_reported_as_json(spawn: Spawn):
     for name in ("left", "right"):
         driven(spawn, name)
@@ -185,6 +193,7 @@ def test_all_drivers_are_stopped_and_reported_as_json(spawn: Spawn):
         assert (document["state"], document["is_stopped"], document["error"]) == ("stopped", True, None)
 
 
+@pytest.mark.processes
 def test_release_while_another_program_commands_is_refused_with_its_name(spawn: Spawn):
     driven(spawn)
     with connect() as session, Commander(session, "rrbot", program="teleop") as commander:
@@ -228,6 +237,7 @@ def rates_of(joints: JointStateListener) -> Callable[[], np.ndarray]:
     return measured
 
 
+@pytest.mark.processes
 def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: Spawn):
     assert spawn(ROVER, is_forked=True).line() == "ready"
     with (
@@ -248,6 +258,7 @@ def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: 
         assert move.wait(DEADLINE_S) == 0
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("end", ["q", "signal"])
 def test_wheels_stop_at_once_when_the_program_of_the_keys_ends(spawn: Spawn, end: str):
     # By its ttl the driver would turn the wheels for longer than this test waits.
@@ -264,6 +275,7 @@ def test_wheels_stop_at_once_when_the_program_of_the_keys_ends(spawn: Spawn, end
         until(lambda: np.allclose(measured(), 0.0, atol=0.01))
 
 
+@pytest.mark.processes
 def test_keys_need_a_terminal_and_joints_that_are_wheels(spawn: Spawn):
     assert "reads the keys of a terminal, and standard input is none" in failure("move", "rrbot", "--keys")
     assert "--keys goes with --wheels" in failure("move", "rrbot", "--keys", "elbow=1", code=2)

@@ -18,11 +18,10 @@ from zstate import StatePublisher, TransformListener, connect, load_model
 from zstate.net.session import Session
 from zstate.odometry import ImuPublisher, VelocityPublisher
 
-pytestmark = pytest.mark.processes
-
 SETTINGS = str(Path(__file__).parents[3] / "models" / "rover.toml")
 
 
+@pytest.mark.processes
 def test_live_odometry_drives_the_rover_and_its_recording_gives_a_report_and_a_plot(
     spawn: Spawn, tmp_path: Path
 ):
@@ -88,6 +87,7 @@ def walker(session: Session) -> Generator[threading.Event]:
             thread.join()
 
 
+@pytest.mark.processes
 def test_feet_that_slide_back_under_a_walker_move_it_ahead(spawn: Spawn):
     live = started(spawn, "odometry", "walker", "--feet", "foot1,foot2")
     with connect() as session, TransformListener(session, "walker") as listener, walker(session) as walks:
@@ -98,12 +98,14 @@ def test_feet_that_slide_back_under_a_walker_move_it_ahead(spawn: Spawn):
     interrupted(live)
 
 
+@pytest.mark.processes
 def test_what_is_missing_is_printed_while_it_waits(spawn: Spawn):
     waiting = started(spawn, "odometry", "rover", "--file", SETTINGS)
     until(lambda: "waiting: 'rover' has no message on imu/imu" in waiting.stderr)
     interrupted(waiting)
 
 
+@pytest.mark.processes
 def test_sensor_that_no_driver_publishes_is_named_with_those_that_there_are(spawn: Spawn):
     live = started(spawn, "odometry", "walker", "--velocity", "flwo:sigma=0.05", "--base", "base")
     with (
@@ -120,6 +122,7 @@ def test_sensor_that_no_driver_publishes_is_named_with_those_that_there_are(spaw
         interrupted(live)
 
 
+@pytest.mark.processes
 def test_velocities_without_noise_end_the_command_with_the_key_that_states_it(spawn: Spawn):
     live = started(spawn, "odometry", "walker", "--velocity", "flow", "--base", "base")
     with (
@@ -139,6 +142,7 @@ def test_velocities_without_noise_end_the_command_with_the_key_that_states_it(sp
     )
 
 
+@pytest.mark.processes
 def test_stated_noise_and_initial_pose_place_the_base_where_it_starts(spawn: Spawn):
     start = ("--initial-pose", "2", "1", "90")
     live = started(spawn, "odometry", "walker", "--velocity", "flow:sigma=0.05", "--base", "base", *start)
@@ -159,6 +163,7 @@ def test_stated_noise_and_initial_pose_place_the_base_where_it_starts(spawn: Spa
     interrupted(live)
 
 
+@pytest.mark.processes
 def test_requests_place_the_base_of_a_running_odometry_and_start_it_anew(spawn: Spawn):
     live = started(spawn, "odometry", "walker", "--feet", "foot1,foot2", "--writer", "legs")
     request = ("odometry", "walker", "--writer", "legs")

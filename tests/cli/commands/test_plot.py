@@ -1,14 +1,12 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from helpers.cli_runner import RRBOT, failure, published_robot, run_cli
+from helpers.cli_runner import RRBOT, failure, missing_library, published_robot, run_cli
 from helpers.recording_builder import START, RecordingBuilder
 
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
@@ -76,7 +74,6 @@ def test_path_is_sampled_evenly_over_its_history():
         path_series(circling(), "map", "car", start_s=9.0)
 
 
-@pytest.mark.processes
 def test_live_joint_states_are_drawn(tmp_path: Path):
     needs_matplotlib()
     file = tmp_path / "joints.svg"
@@ -87,7 +84,6 @@ def test_live_joint_states_are_drawn(tmp_path: Path):
     assert all(name in texts(file) for name in ("rrbot: joint positions", "shoulder", "elbow", "[rad]"))
 
 
-@pytest.mark.processes
 def test_the_path_of_a_frame_is_drawn(tmp_path: Path):
     needs_matplotlib()
     file = tmp_path / "path.png"
@@ -97,7 +93,6 @@ def test_the_path_of_a_frame_is_drawn(tmp_path: Path):
     assert file.read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.processes
 def test_a_recording_is_drawn_whole_or_in_part(tmp_path: Path):
     needs_matplotlib()
     recording, joints, path = (tmp_path / name for name in ("run.mcap", "joints.svg", "path.svg"))
@@ -115,7 +110,6 @@ def test_a_recording_is_drawn_whole_or_in_part(tmp_path: Path):
     assert "its robots: 'rrbot'" in failure("plot", "panda", "--file", str(recording))
 
 
-@pytest.mark.processes
 def test_only_robot_with_joint_states_is_drawn_by_default(tmp_path: Path):
     needs_matplotlib()
     path = tmp_path / "r.mcap"
@@ -130,7 +124,6 @@ def test_only_robot_with_joint_states_is_drawn_by_default(tmp_path: Path):
     assert "2 curves, " in ended.stdout, ended.stderr
 
 
-@pytest.mark.processes
 def test_mistakes_are_reported(tmp_path: Path):
     needs_matplotlib()
     assert ".png, .svg, .pdf" in failure("plot", "rrbot", "--output", "plot.jpg", code=2)
@@ -148,8 +141,5 @@ def test_mistakes_are_reported(tmp_path: Path):
 
 
 def test_missing_matplotlib_is_reported_with_the_package_to_install():
-    hidden = "import sys; sys.modules['matplotlib'] = None; from zstate.cli.main import main; main()"
-    ended = subprocess.run([sys.executable, "-c", hidden, "plot", RRBOT], capture_output=True, check=False)
-    assert ended.returncode == 1
-    assert "pip install 'zstate[plot]'" in ended.stderr
-    assert "Traceback" not in ended.stderr
+    with missing_library("matplotlib"):
+        assert "pip install 'zstate[plot]'" in failure("plot", RRBOT)

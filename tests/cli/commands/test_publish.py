@@ -14,8 +14,6 @@ from zstate import NoData, StatePublisher, Transform, TransformListener, connect
 from zstate.errors import Unreachable
 from zstate.net.queryable import query_lookup
 
-pytestmark = pytest.mark.processes
-
 DERIVED = {"robot_description", "tf_static", "tf"}
 
 
@@ -24,11 +22,13 @@ def streams_of(robot: str) -> set[str]:
         return {stream for info in discover(session) if info.name == robot for stream, _ in info.writers}
 
 
+@pytest.mark.processes
 def test_joints_writes_joint_states_and_nothing_else(spawn: Spawn):
     started(spawn, "joints", RRBOT).line()
     assert streams_of("rrbot") == {"joint_states"}
 
 
+@pytest.mark.processes
 def test_publish_follows_joint_states_and_writes_the_rest(spawn: Spawn):
     assert started(spawn, "publish", RRBOT).line() == (
         "publishing 'rrbot' (7 links, 2 joints) on zstate/rrbot/{robot_description,tf_static,tf}"
@@ -36,11 +36,13 @@ def test_publish_follows_joint_states_and_writes_the_rest(spawn: Spawn):
     assert streams_of("rrbot") == DERIVED
 
 
+@pytest.mark.processes
 def test_publish_with_its_own_source_writes_joint_states_too(spawn: Spawn):
     started(spawn, "publish", RRBOT, "--source", "sine").line()
     assert streams_of("rrbot") == DERIVED | {"joint_states"}
 
 
+@pytest.mark.processes
 def test_writers_have_the_name_of_their_command(spawn: Spawn):
     child = started(spawn, "joints", RRBOT)
     child.line()
@@ -49,6 +51,7 @@ def test_writers_have_the_name_of_their_command(spawn: Spawn):
     assert (writer.program, writer.pid) == ("zstate-joints", child.process.pid)
 
 
+@pytest.mark.processes
 def test_every_joint_state_becomes_transforms_of_the_same_stamp(spawn: Spawn):
     child = started(spawn, "publish", RRBOT)
     child.line()
@@ -77,6 +80,7 @@ def test_every_joint_state_becomes_transforms_of_the_same_stamp(spawn: Spawn):
     assert "receiving zstate/rrbot/joint_states: 2 positions" in child.stderr
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("source", ["joints", "sine"])
 def test_publish_answers_lookups_for_devices_without_a_buffer(spawn: Spawn, source: str):
     publisher = started(spawn, "publish", RRBOT, "--source", source)
@@ -113,6 +117,7 @@ def test_missing_joint_states_are_a_failure_with_a_hint():
     assert "received nothing on zstate/rrbot/joint_states in 0.3 s; `zstate ls`" in message
 
 
+@pytest.mark.processes
 def test_joint_states_of_another_model_are_reported(spawn: Spawn):
     child = started(spawn, "publish", RRBOT)
     child.line()
@@ -132,6 +137,7 @@ def test_unknown_wire_error_lists_known_wires():
     assert "'native'" in message
 
 
+@pytest.mark.processes
 def test_a_recording_is_published_with_present_stamps(spawn: Spawn, tmp_path: Path):
     with RecordingBuilder(tmp_path / "run.mcap", "arm") as builder:
         builder.describe("arm")

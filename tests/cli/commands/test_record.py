@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
-from helpers.processes import mounted_disk, until
+from helpers.processes import mounted_disk
 
 from zstate import StatePublisher, connect, load_model
+from zstate.cli.commands import record
 from zstate.recording.info import read_info
 from zstate.recording.reader import RecordingReader
 
-pytestmark = pytest.mark.processes
 
-
+@pytest.mark.processes
 def test_ctrl_c_ends_a_recording_with_a_complete_file_and_a_summary(spawn: Spawn, tmp_path: Path):
     path = tmp_path / "run.mcap"
     with published_robot("left"), published_robot("right"):
@@ -46,6 +46,7 @@ def test_a_duration_ends_it_and_only_the_chosen_robot_is_recorded(tmp_path: Path
         }
 
 
+@pytest.mark.processes
 def test_record_prints_the_reason_while_it_waits_and_the_start(spawn: Spawn, tmp_path: Path):
     command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot")
     assert command.line().endswith("  no robot yet")
@@ -114,23 +115,29 @@ def test_invalid_limits_and_names_are_refused(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
-def test_disk_that_fills_within_a_day_is_a_single_warning(spawn: Spawn, tmp_path: Path):
+@pytest.fixture
+def short_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is checked every second, not every ten."""
+    assert record._DISK_WINDOW_S == 10.0
+    monkeypatch.setattr(record, "_DISK_WINDOW_S", 0.9)
+
+
+@pytest.mark.usefixtures("short_window")
+def test_disk_that_fills_within_a_day_is_a_single_warning(tmp_path: Path):
     # 100 samples a second need at least 100 bytes each; in a day that is 800 MB.
     with published_robot(), mounted_disk(tmp_path / "disk", "64m") as disk:
-        command = started(spawn, "record", str(disk / "run.mcap"))
-        until(lambda: command.line().startswith("21 s"), 40.0)  # two checks, every 10 s
-        interrupted(command)
-        assert command.stderr.count(f"the disk of '{disk}/run.mcap' is full in ") == 1
-        assert "or bound recordings with --keep and --split-size" in command.stderr
+        log = run_cli("record", str(disk / "run.mcap"), "--seconds", "4").stderr  # three checks
+        assert log.count(f"the disk of '{disk}/run.mcap' is full in ") == 1
+        assert "or bound recordings with --keep and --split-size" in log
 
 
-def test_disk_that_recordings_cannot_fill_is_no_warning(spawn: Spawn, tmp_path: Path):
+@pytest.mark.usefixtures("short_window")
+def test_disk_that_recordings_cannot_fill_is_no_warning(tmp_path: Path):
     with published_robot(), mounted_disk(tmp_path / "disk", "64m") as disk:
         file = str(disk / "%Y%m%d-%H%M%S.mcap")
-        command = started(spawn, "record", file, "--split-size", "1", "--keep", "20MB")
-        until(lambda: command.line().startswith("11 s"), 30.0)
-        interrupted(command)
-        assert "is full" not in command.stderr
+        ended = run_cli("record", file, "--split-size", "1", "--keep", "20MB", "--seconds", "3")
+        assert ended.code == 0, ended.stderr
+        assert "is full" not in ended.stderr
 
 
 def test_start_times_replace_directives_and_a_second_start_makes_a_second_file(

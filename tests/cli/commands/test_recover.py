@@ -8,8 +8,6 @@ from helpers.recording_files import joint_states, write_run
 
 from zstate.recording.info import read_info
 
-pytestmark = pytest.mark.processes
-
 
 @pytest.fixture
 def cut(tmp_path: Path) -> Path:

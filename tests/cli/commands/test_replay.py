@@ -10,8 +10,6 @@ from helpers.recording_builder import LATENCY, MS, START, Bag, RecordingBuilder,
 from zstate import TransformListener, connect, discover
 from zstate.wire.messages import OccupancyGrid, to_block
 
-pytestmark = pytest.mark.processes
-
 
 @pytest.fixture
 def file(tmp_path: Path) -> str:
@@ -37,6 +35,7 @@ def test_replay_prints_a_heading_and_a_summary(file: str):
     assert "not published" not in last
 
 
+@pytest.mark.processes
 def test_listener_receives_the_recorded_stamps(file: str, spawn: Spawn):
     with connect() as session, TransformListener(session, "arm") as listener:
         child = started(spawn, "replay", file, "arm", "--loop", "--rate", "5")
@@ -50,6 +49,7 @@ def test_listener_receives_the_recorded_stamps(file: str, spawn: Spawn):
     assert child.line().startswith("replayed ")
 
 
+@pytest.mark.processes
 def test_writers_have_the_name_of_their_command(file: str, spawn: Spawn):
     child = started(spawn, "replay", file, "--rate", "0.001")
     child.line()
@@ -60,6 +60,7 @@ def test_writers_have_the_name_of_their_command(file: str, spawn: Spawn):
     assert {writer.program for _, writer in robot.writers} == {"zstate-replay"}
 
 
+@pytest.mark.processes
 def test_replay_prints_progress_each_second(file: str, spawn: Spawn):
     child = started(spawn, "replay", file, "--rate", "0.1", "--seconds", "0.2")
     child.line()
@@ -113,6 +114,7 @@ def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):
     assert "is not a recording" in failure("replay", str(tmp_path / "x.mcap"))
 
 
+@pytest.mark.processes
 def test_maps_alone_are_published_until_the_command_is_interrupted(tmp_path: Path, spawn: Spawn):
     path = tmp_path / "maps.mcap"
     grid = OccupancyGrid(4, START, "map", 0.5, 1, 1, to_block([0, 0, 0, 0, 0, 0, 1]), b"\x64")

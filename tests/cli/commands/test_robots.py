@@ -2,12 +2,9 @@ from __future__ import annotations
 
 import json
 
-import pytest
 from helpers.cli_runner import failure, run_cli
 
 from zstate.model.catalog import catalog
-
-pytestmark = pytest.mark.processes
 
 
 def test_every_robot_of_the_catalog_is_listed_with_its_collection():

@@ -14,9 +14,8 @@ from zstate import TransformListener, connect
 from zstate.net.security.credentials import Credentials
 from zstate.net.session import Session
 
-pytestmark = pytest.mark.processes
 
-
+@pytest.mark.processes
 def test_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = started(spawn, "router", "--listen", endpoint)
@@ -31,6 +30,7 @@ def test_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
     interrupted(router)
 
 
+@pytest.mark.processes
 def test_busy_port_is_reported_at_once(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", endpoint).line()
@@ -53,6 +53,7 @@ def ros_node(port: int) -> zenoh.Session:
     return zenoh.open(config)
 
 
+@pytest.mark.processes
 def test_ros_nodes_and_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = started(spawn, "router", "--ros2", "--listen", endpoint)
@@ -83,11 +84,12 @@ def test_its_settings_for_ros_and_a_file_exclude_each_other(tmp_path):
     assert "--config" in failure("router", "--ros2", "--config", str(file), code=2)
 
 
+@pytest.mark.processes
 def test_router_runs_its_printed_configuration(spawn: Spawn, free_port: int, tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     printed = run_cli("router", "--listen", endpoint, "--print")
     file = tmp_path / "router.json5"
-    file.write_bytes(printed.stdout)
+    file.write_text(printed.stdout)
     assert (
         started(spawn, "router", "--config", str(file))
         .line()
@@ -97,6 +99,7 @@ def test_router_runs_its_printed_configuration(spawn: Spawn, free_port: int, tmp
         assert session.zenoh.info.routers_zid()
 
 
+@pytest.mark.processes
 def test_router_downsamples_streams_to_neighbours(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     options = ("--downsample", "joint_states=5", "--robot", "rrbot", "--wan", "lo")
@@ -132,6 +135,7 @@ def test_a_file_is_the_whole_configuration(tmp_path):
         assert "exclude each other" in message
 
 
+@pytest.mark.processes
 def test_router_with_access_control_does_not_connect_peers_to_each_other(
     spawn: Spawn, free_port: int, tmp_path: Path
 ):
@@ -141,7 +145,7 @@ def test_router_with_access_control_does_not_connect_peers_to_each_other(
     run_cli(
         "certs", certs, "--identity", "router", "--identity", "ra", "--identity", "rb", "--identity", "desk"
     )
-    acl.write_bytes(run_cli("acl", "--robot", "ra", "--robot", "rb", "--viewer", "desk").stdout)
+    acl.write_text(run_cli("acl", "--robot", "ra", "--robot", "rb", "--viewer", "desk").stdout)
     options = ("--listen", endpoint, "--certs", certs, "--identity", "router", "--acl", str(acl))
     started(spawn, "router", *options).line()
 

@@ -16,8 +16,6 @@ from helpers.processes import SOON_S, repeated, until
 from zstate import StaticPublisher, Transform, TransformPublisher, connect
 from zstate.scans import Grid, ScanListener
 
-pytestmark = pytest.mark.processes
-
 WALL_M = 3.0
 
 
@@ -35,6 +33,7 @@ def documents(stream_of: str, *options: str) -> dict:
     return json.loads(run_cli("echo", stream_of, "--stream", "scan", "--once", "--json", *options).stdout)
 
 
+@pytest.mark.processes
 def test_dummy_scans_have_the_pattern_of_dummy_laser(spawn: Spawn):
     child = started(spawn, "scan", "r1", "--frame", "laser", "--dummy", "--sensor", "front")
     assert child.line() == "r1: scans in laser, 30 Hz, on zstate/r1/scan/front"
@@ -50,6 +49,7 @@ def test_dummy_scans_have_the_pattern_of_dummy_laser(spawn: Spawn):
     assert "commanded 30 Hz" in child.line()
 
 
+@pytest.mark.processes
 def test_summary_of_a_scan_has_no_ranges(spawn: Spawn):
     started(spawn, "scan", "r1", "--frame", "laser", "--dummy").line()
     text = run_cli("echo", "r1", "--stream", "scan", "--once").stdout
@@ -67,6 +67,7 @@ def drive(publisher: TransformPublisher) -> None:
     publisher.publish([Transform("odom", "laser", (math.sin(angle), 0.5, 0.0), rotation, stamp)])
 
 
+@pytest.mark.processes
 def test_simulated_scans_hit_the_walls_while_the_robot_drives(spawn: Spawn, hall: str):
     """Placed by the transforms of the network, each point is on a wall, wherever the laser was."""
     with (
@@ -91,6 +92,7 @@ def test_simulated_scans_hit_the_walls_while_the_robot_drives(spawn: Spawn, hall
     assert scans.dropped == {}
 
 
+@pytest.mark.processes
 def test_a_laser_that_is_outside_the_map_is_a_warning(spawn: Spawn, hall: str):
     with connect() as session, StaticPublisher(session, "r1", "mount") as statics:
         statics.set(Transform.from_rpy("r1/base", "r1/laser", (3.1, 0.0, 0.3), (0.0, 0.0, 0.0)))
@@ -102,6 +104,7 @@ def test_a_laser_that_is_outside_the_map_is_a_warning(spawn: Spawn, hall: str):
         until(lambda: "laser is outside the map, which stands in r1/base" in child.stderr)
 
 
+@pytest.mark.processes
 def test_map_stands_in_its_frame_once_the_robot_has_that(spawn: Spawn, hall: str):
     """The hall's axes are turned by a quarter against the robot's root, and 1 m in front of it."""
     with connect() as session, StaticPublisher(session, "r1", "mount") as statics:
@@ -117,6 +120,7 @@ def test_map_stands_in_its_frame_once_the_robot_has_that(spawn: Spawn, hall: str
     assert [ranges[540], ranges[180], ranges[900]] == pytest.approx([3.0, 2.0, 4.0], abs=1e-4)
 
 
+@pytest.mark.processes
 def test_simulated_scan_waits_for_the_robot_and_its_frame(spawn: Spawn, hall: str):
     child = started(spawn, "scan", "rrbot", "--frame", "nozzle", "--simulate", hall)
     until(lambda: "waiting: robot 'rrbot' is not announced" in child.stderr)
@@ -127,6 +131,7 @@ def test_simulated_scan_waits_for_the_robot_and_its_frame(spawn: Spawn, hall: st
     assert "no scan in 1 s: robot 'r9' is not announced" in message
 
 
+@pytest.mark.processes
 def test_scans_in_a_frame_that_no_robot_places_are_a_finding(spawn: Spawn):
     with published_robot():
         started(spawn, "scan", "rrbot", "--frame", "baze", "--dummy", "--sensor", "front").line()
@@ -137,6 +142,7 @@ def test_scans_in_a_frame_that_no_robot_places_are_a_finding(spawn: Spawn):
     assert "the scans of 'front' are in 'rrbot/baze', which no writer places; 'base'" in first["text"]
 
 
+@pytest.mark.processes
 def test_commands_that_look_show_scans(spawn: Spawn):
     with published_robot():
         started(spawn, "scan", "rrbot", "--frame", "base", "--dummy", "--sensor", "front").line()
@@ -153,6 +159,7 @@ def test_commands_that_look_show_scans(spawn: Spawn):
         assert [one["state"] for one in checks] == ["ok"]
 
 
+@pytest.mark.processes
 def test_metrics_count_scans(spawn: Spawn):
     child = started(spawn, "scan", "r1", "--frame", "laser", "--dummy", "--metrics", "0")
     until(lambda: "metrics at " in child.stderr)
@@ -176,6 +183,7 @@ def test_wrong_usage_is_refused(hall: str):
     assert "'a/b'" in failure("scan", "r1", "--frame", "f", "--dummy", "--sensor", "a/b")
 
 
+@pytest.mark.processes
 def test_ros_wire_has_scans_on_the_topic_of_the_sensor(spawn: Spawn, ros_router: str):
     child = started(spawn, "scan", "r1", "--frame", "laser", "--dummy")
     assert "ROS 2 topic /scan" in child.line()

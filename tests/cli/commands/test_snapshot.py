@@ -65,7 +65,6 @@ def test_snapshot_file_round_trips(tmp_path: Path, urdf: str, text, suffix: str)
         ("format = \n", "is not TOML"),
     ],
 )
-@pytest.mark.processes
 def test_invalid_snapshot_error_names_the_place_in_the_file(tmp_path: Path, text: str, error: str):
     file = tmp_path / "cell.toml"
     file.write_text(text)
@@ -140,7 +139,6 @@ def test_snapshot_is_loaded_on_this_host_unless_as_saved(spawn: Spawn, tmp_path:
     interrupted(child)
 
 
-@pytest.mark.processes
 def test_only_the_named_robots_are_saved_and_loaded(tmp_path: Path):
     file = tmp_path / "cell.toml"
     with published_robot("left"), published_robot("right"):
@@ -150,7 +148,6 @@ def test_only_the_named_robots_are_saved_and_loaded(tmp_path: Path):
     assert "has no robot 'right'; it has left" in failure("snapshot", "load", str(file), "right")
 
 
-@pytest.mark.processes
 def test_robot_without_joint_states_is_saved_without_positions():
     with published_robot(streams=("robot_description", "tf_static")):
         saved = run_cli("snapshot", "save", "-")
@@ -158,7 +155,6 @@ def test_robot_without_joint_states_is_saved_without_positions():
     assert "[[robot]]" in saved.stdout
 
 
-@pytest.mark.processes
 def test_a_file_that_exists_is_kept_unless_forced(tmp_path: Path):
     file = tmp_path / "cell.json"
     file.write_text("mine")
@@ -168,7 +164,6 @@ def test_a_file_that_exists_is_kept_unless_forced(tmp_path: Path):
     assert json.loads(file.read_text())["robot"][0]["name"] == "rrbot"
 
 
-@pytest.mark.processes
 def test_empty_network_saves_no_file(tmp_path: Path):
     file = tmp_path / "cell.toml"
     failure("snapshot", "save", str(file))

@@ -10,11 +10,10 @@ from zstate import StaticPublisher, Transform, TransformListener, connect
 from zstate.cli.frame_checks import unknown_target_warnings
 from zstate.cli.up.cell import StaticSection
 
-pytestmark = pytest.mark.processes
-
 POSE = ("--xyz", "0.1", "0", "-0.2", "--rpy-deg", "0", "0", "90")
 
 
+@pytest.mark.processes
 def test_edge_is_published_until_ctrl_c_and_then_withdrawn(spawn: Spawn):
     with published_robot(), connect() as session, TransformListener(session, "rrbot") as listener:
         child = started(spawn, "static", "lower", "flange", *POSE)
@@ -30,6 +29,7 @@ def test_edge_is_published_until_ctrl_c_and_then_withdrawn(spawn: Spawn):
         until(lambda: not listener.buffer.can_lookup("lower", "flange"))
 
 
+@pytest.mark.processes
 def test_several_writers_coexist_and_a_full_name_needs_no_robot(spawn: Spawn):
     started(spawn, "static", "fleet/map", "r1/odom", *POSE).line()
     started(spawn, "static", "r1/odom", "beacon", *POSE).line()
@@ -39,6 +39,7 @@ def test_several_writers_coexist_and_a_full_name_needs_no_robot(spawn: Spawn):
     assert abs(both.translation - [0.1, 0.1, -0.4]).max() < 1e-12
 
 
+@pytest.mark.processes
 def test_a_file_places_all_its_edges(spawn: Spawn, tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text(
@@ -63,6 +64,7 @@ def test_a_file_places_all_its_edges(spawn: Spawn, tmp_path: Path):
     assert lens.translation.tolist() == [1.0, 0.0, 2.0]
 
 
+@pytest.mark.processes
 def test_edge_belongs_to_the_selected_robot(spawn: Spawn):
     with published_robot(), connect() as session, TransformListener(session, placers=["site"]) as listener:
         child = started(spawn, "static", "site/map", "rrbot/world", "--xyz", "1", "0", "0", "--robot", "site")
@@ -93,6 +95,7 @@ def test_invalid_pose_error_names_the_reason():
     assert "itself" in failure("static", "r/a", "r/a", *POSE)
 
 
+@pytest.mark.processes
 def test_omitted_rotation_or_translation_is_zero(spawn: Spawn):
     placed, turned = "r/a", "r/b"
     sentence = started(spawn, "static", "r/base", placed, "--xyz", "1", "2", "3").line()
@@ -106,6 +109,7 @@ def test_half_an_edge_is_wrong_usage():
     assert "TARGET" in failure("static", "--xyz", "0", "0", "0", code=2)
 
 
+@pytest.mark.processes
 def test_edge_of_a_file_is_published_on_each_of_its_wires(spawn: Spawn, ros_router: str, tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text(
@@ -122,6 +126,7 @@ def test_edge_of_a_file_is_published_on_each_of_its_wires(spawn: Spawn, ros_rout
                 assert listener.buffer.wait("tool", "camera", timeout_s=10.0).translation[2] == 2.5
 
 
+@pytest.mark.processes
 def test_target_similar_to_a_frame_of_the_robot_gets_a_warning(spawn: Spawn):
     with published_robot():
         child = started(spawn, "static", "lowr", "flange", *POSE)
@@ -131,6 +136,7 @@ def test_target_similar_to_a_frame_of_the_robot_gets_a_warning(spawn: Spawn):
     assert "'rrbot' has no frame 'lowr'; did you mean 'lower'" in child.stderr
 
 
+@pytest.mark.processes
 def test_new_target_above_the_robot_is_advised_to_be_a_shared_frame(spawn: Spawn):
     with published_robot():
         child = started(spawn, "static", "map", "world", *POSE)
@@ -143,6 +149,7 @@ def test_new_target_above_the_robot_is_advised_to_be_a_shared_frame(spawn: Spawn
     assert "for instance fleet/map" in child.stderr
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     "edge",
     [

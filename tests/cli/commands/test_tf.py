@@ -12,8 +12,6 @@ from helpers.processes import until
 from zstate import StaticPublisher, Transform, connect
 from zstate.cli.commands.tf import transform_text
 
-pytestmark = pytest.mark.processes
-
 # From the model: the shoulder stands 1.05 m above the base, the elbow 0.7 m further along the upper
 # link, each a little to the side; both turn about y, which is pitch.
 BASE_FROM_LOWER = (0.7 * math.sin(SHOULDER), 0.1 + 0.07, 1.05 + 0.7 * math.cos(SHOULDER))
@@ -96,6 +94,7 @@ def test_fixed_frames_are_found_without_moving_joints():
     assert lines[1:3] == ["At any time (static)", "- Translation: [0.000, 0.000, 0.800]"]
 
 
+@pytest.mark.processes
 def test_tf_prints_the_reason_while_it_waits_and_the_end_of_the_wait(spawn: Spawn):
     command = started(spawn, "tf", "base", "lower", "--rate", "20")
     assert command.line() == "pose of lower in base"
@@ -108,6 +107,7 @@ def test_tf_prints_the_reason_while_it_waits_and_the_end_of_the_wait(spawn: Spaw
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_tf_reports_when_samples_stop(spawn: Spawn):
     command = started(spawn, "tf", "base", "lower", "--rate", "20")
     with published_robot():

@@ -9,14 +9,13 @@ from helpers.processes import SOON_S, until
 
 from zstate import Transform, TransformListener, connect
 
-pytestmark = pytest.mark.processes
-
 
 def line(target: str, source: str, x: float = 0.0, **others: object) -> str:
     pose = {"translation": [x, 0.0, 0.0], "rotation": [0.0, 0.0, 0.0, 1.0]}
     return json.dumps({"target": target, "source": source, **pose, **others})
 
 
+@pytest.mark.processes
 def test_pose_is_published_at_the_rate_as_a_moving_edge(spawn: Spawn):
     with connect() as session, TransformListener(session, "r1") as listener:
         options = ("--xyz", "1", "2", "0", "--rpy-deg", "0", "0", "90", "--rate", "200", "--robot", "r1")
@@ -35,6 +34,7 @@ def test_pose_is_published_at_the_rate_as_a_moving_edge(spawn: Spawn):
     assert "commanded 200 Hz" in child.line()
 
 
+@pytest.mark.processes
 def test_lines_of_json_are_published_with_their_stamps_until_ctrl_c(spawn: Spawn):
     with connect() as session, TransformListener(session, "r1") as listener:
         child = started(spawn, "transform", "--stdin", "--robot", "r1")
@@ -59,6 +59,7 @@ def test_bad_line_is_reported_with_its_number_and_the_next_ones_go_on():
     assert "placed on itself" in reports[2]
 
 
+@pytest.mark.processes
 def test_output_of_tf_is_an_input(spawn: Spawn):
     pose = Transform("odom", "base_link", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), 5).to_dict()
     with connect() as session, TransformListener(session, "twin") as listener:
@@ -67,11 +68,13 @@ def test_output_of_tf_is_an_input(spawn: Spawn):
         assert listener.buffer.wait("odom", "base_link", 5, timeout_s=2 * SOON_S).translation[2] == 3.0
 
 
+@pytest.mark.processes
 def test_robot_is_that_of_a_full_name(spawn: Spawn):
     child = started(spawn, "transform", "fleet/map", "r7/odom", "--xyz", "0", "0", "0")
     assert "zstate/r7/transforms/" in child.line()
 
 
+@pytest.mark.processes
 def test_second_writer_of_an_edge_is_refused_with_the_first(spawn: Spawn):
     edge = ("odom", "base", "--xyz", "0", "0", "0", "--robot", "r1")
     started(spawn, "transform", *edge, "--writer", "wheels").line()
@@ -79,6 +82,7 @@ def test_second_writer_of_an_edge_is_refused_with_the_first(spawn: Spawn):
     assert "'wheels'" in failure("static", *edge, "--writer", "lidar")
 
 
+@pytest.mark.processes
 def test_ros_wire_has_messages_that_tf_reads(spawn: Spawn, ros_router: str):
     options = ("--wire", "ros2", "--connect", ros_router)
     child = started(spawn, "transform", "odom", "base_link", "--xyz", "4", "0", "0", *options)

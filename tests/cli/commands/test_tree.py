@@ -8,8 +8,6 @@ from helpers.cli_runner import failure, published_robot, run_cli
 
 from zstate import StaticPublisher, Transform, connect
 
-pytestmark = pytest.mark.processes
-
 
 def drawn(*arguments: str) -> list[str]:
     ended = run_cli("tree", *arguments)

@@ -13,8 +13,6 @@ from zstate import TransformListener, connect, discover
 from zstate.cli.commands.up import up_command
 from zstate.scans import Grid
 
-pytestmark = pytest.mark.processes
-
 STATIC = '[[static]]\ntarget = "lower"\nsource = "flange"\nxyz = [0, 0, 1]\nrpy_deg = [0, 0, 0]\n'
 
 
@@ -60,6 +58,7 @@ def printed_pid(child: Child, name: str) -> int:
     return int(line.split()[-1])
 
 
+@pytest.mark.processes
 def test_robots_and_statics_of_one_file_run_until_ctrl_c(up):
     child = up(robot(name="left", rate=50.0) + STATIC)
     lines = lines_until(child, "publishing 'left'", "pose of flange in lower")
@@ -69,6 +68,7 @@ def test_robots_and_statics_of_one_file_run_until_ctrl_c(up):
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_plain_python_program_connects_to_the_router_of_the_file(up, free_port: int):
     program = "\n".join(
         [
@@ -86,6 +86,7 @@ def test_plain_python_program_connects_to_the_router_of_the_file(up, free_port: 
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_a_loop_starts_a_robot_for_each_name_with_its_own_static_edges(up):
     child = up(
         "[parameters]\nrate = 100.0\n"
@@ -103,6 +104,7 @@ def test_a_loop_starts_a_robot_for_each_name_with_its_own_static_edges(up):
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_all_parts_connect_to_the_router_of_the_file(up, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = up(f'[router]\nlisten = ["{endpoint}"]\n' + robot())
@@ -112,6 +114,7 @@ def test_all_parts_connect_to_the_router_of_the_file(up, free_port: int):
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_certificates_of_the_file_encrypt_connections_to_its_router(up, free_port: int, tmp_path: Path):
     assert run_cli("certs", str(tmp_path / "fleet"), "--identity", "router", "--identity", "rrbot").code == 0
     endpoint = f"tls/127.0.0.1:{free_port}"
@@ -124,6 +127,7 @@ def test_certificates_of_the_file_encrypt_connections_to_its_router(up, free_por
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_a_part_that_dies_ends_all_with_its_last_error(up):
     child = up(robot(name="one") + robot(name="two"))
     lines_until(child, "publishing 'one'", "publishing 'two'")
@@ -135,6 +139,7 @@ def test_a_part_that_dies_ends_all_with_its_last_error(up):
     assert not is_alive(pids["one"])
 
 
+@pytest.mark.processes
 def test_part_with_restarts_is_restarted_and_the_others_continue(up):
     child = up(
         table("program", name="shell", run=["sh", "-c", "echo at $$; exec sleep 60"], restart="on-failure")
@@ -146,6 +151,7 @@ def test_part_with_restarts_is_restarted_and_the_others_continue(up):
     assert "'shell' ended with exit code -9: it printed no error; it starts again in 0.5 s" in child.stderr
 
 
+@pytest.mark.processes
 def test_last_error_of_a_process_is_reported_as_the_cause(up, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     with connect(listen=endpoint):
@@ -154,6 +160,7 @@ def test_last_error_of_a_process_is_reported_as_the_cause(up, free_port: int):
     assert f"'rrbot' ended with exit code 1: zstate: another program listens at {endpoint!r}" in child.stderr
 
 
+@pytest.mark.processes
 def test_error_of_several_lines_is_reported_in_full(up):
     script = "echo Trouble >&2; echo 'Bad: a file' >&2; echo '  line 3  it has no end' >&2; exit 3"
     child = up(table("program", name="driver", run=["sh", "-c", script]))
@@ -161,6 +168,7 @@ def test_error_of_several_lines_is_reported_in_full(up):
     assert "'driver' ended with exit code 3: Bad: a file line 3  it has no end\n" in child.stderr
 
 
+@pytest.mark.processes
 def test_program_starts_when_its_dependency_is_ready(up):
     child = up(
         table("program", name="late", run=["echo", "now"], after=["slow", "rrbot"])
@@ -178,11 +186,13 @@ def test_program_starts_when_its_dependency_is_ready(up):
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_up_succeeds_when_every_part_has_finished(up):
     child = up(table("program", run=["sh", "-c", "exit 0"]) + table("program", run="zstate check rrbot"))
     assert child.wait() == 0
 
 
+@pytest.mark.processes
 def test_processes_end_before_the_ones_they_need(up):
     waits = "trap 'echo {} ends; exit 0' INT; echo {} runs; while :; do sleep 0.05; done"
     child = up(
@@ -196,6 +206,7 @@ def test_processes_end_before_the_ones_they_need(up):
     assert [line.split("| ")[1] for line in (child.line(), child.line())] == ["top ends", "base ends"]
 
 
+@pytest.mark.processes
 def test_programs_end_with_up_however_it_ends(up):
     child = up(table("program", run=["sh", "-c", "echo at $$; exec sleep 60"]))
     pid = printed_pid(child, "at")
@@ -203,6 +214,7 @@ def test_programs_end_with_up_however_it_ends(up):
     until(lambda: not is_alive(pid))
 
 
+@pytest.mark.processes
 def test_leftover_children_and_programs_that_ignore_signals_are_killed(up):
     """Else a second driver would come to the same arm when it is started again."""
     deaf = "trap '' INT TERM; sleep 60 & echo at $!; echo at $$; sleep 60"
@@ -212,6 +224,7 @@ def test_leftover_children_and_programs_that_ignore_signals_are_killed(up):
     until(lambda: not any(map(is_alive, pids)))
 
 
+@pytest.mark.processes
 def test_a_line_without_an_end_is_cut(up):
     code = "import sys; [sys.stdout.write('x' * 65536) for _ in range(100)]; print(); print('after')"
     child = up(table("program", name="loud", run=["python3", "-c", code], restart="always"))
@@ -222,6 +235,7 @@ def test_a_line_without_an_end_is_cut(up):
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_paths_are_relative_to_the_file(tmp_path: Path, up):
     (tmp_path / "arm.urdf").write_text(Path(RRBOT).read_text())
     (tmp_path / "robots.toml").write_text(robot(model="arm.urdf", name="${arm}"))
@@ -264,6 +278,7 @@ def test_check_prints_the_commands_of_maps_and_scanners(tmp_path: Path):
     ]
 
 
+@pytest.mark.processes
 def test_map_and_a_scanner_in_it_run(up, tmp_path: Path):
     Grid([[0, 100]], 0.1, (0.0, 0.0, 0.0)).save(tmp_path / "hall.yaml")
     scan = table("scan", robot="rrbot", frame="base", simulate="hall.yaml", after="rrbot")
@@ -272,6 +287,7 @@ def test_map_and_a_scanner_in_it_run(up, tmp_path: Path):
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_json_lines_name_their_process(up):
     child = up(robot(source="joints"), "--log-format", "json")
     child.line()

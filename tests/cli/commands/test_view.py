@@ -11,12 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import RRBOT, failure, interrupted, published_robot, run_cli, started
+from helpers.cli_runner import RRBOT, failure, interrupted, missing_library, published_robot, run_cli, started
 from helpers.processes import until
 
 from zstate import StatePublisher, Transform, TransformPublisher, connect, load_model
-
-pytestmark = [pytest.mark.processes]
 
 
 def address(line: str) -> str:
@@ -25,6 +23,7 @@ def address(line: str) -> str:
     return found[1]
 
 
+@pytest.mark.processes
 def test_view_prints_the_address_to_open(spawn):
     child = started(spawn, "view", "--port", "0")
     url = address(child.line())
@@ -35,6 +34,7 @@ def test_view_prints_the_address_to_open(spawn):
     assert child.stderr == ""
 
 
+@pytest.mark.processes
 def test_without_a_port_it_takes_the_first_free_one_and_a_taken_one_is_an_error(spawn):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -44,6 +44,7 @@ def test_without_a_port_it_takes_the_first_free_one_and_a_taken_one_is_an_error(
     assert address(first.line()) != address(second.line())
 
 
+@pytest.mark.processes
 def test_view_beyond_loopback_has_a_token_in_its_address_and_a_warning(spawn):
     child = started(spawn, "view", "--host", "0.0.0.0", "--port", "0")
     assert re.search(r":\d+/\?token=[\w-]{20,}$", address(child.line()))
@@ -51,6 +52,7 @@ def test_view_beyond_loopback_has_a_token_in_its_address_and_a_warning(spawn):
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_robot_moved_by_sliders_is_published(spawn):
     child = started(spawn, "view", RRBOT, "--sliders", "--port", "0")
     child.line()
@@ -59,6 +61,7 @@ def test_robot_moved_by_sliders_is_published(spawn):
     interrupted(child)
 
 
+@pytest.mark.processes
 def test_sliders_do_not_move_a_robot_with_another_writer_and_name_it(spawn):
     with published_robot():
         child = started(spawn, "view", "rrbot", "--sliders", "--port", "0")
@@ -88,16 +91,12 @@ def test_wrong_arguments_are_reported_on_one_line(arguments: list[str], code: in
     assert text in failure("view", *arguments, code=code)
 
 
-def test_missing_viser_error_names_the_package_to_install(tmp_path: Path):
-    (tmp_path / "viser.py").write_text("raise ImportError('no module of that name')")
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); sys.argv[1:] = ['view']\n"
-    code += "from zstate.cli.main import main; main()"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert ended.returncode == 1
-    assert "pip install 'zstate[view]'" in ended.stderr
-    assert "Traceback" not in ended.stderr
+def test_missing_viser_error_names_the_package_to_install():
+    with missing_library("viser", "zstate.view"):
+        assert "pip install 'zstate[view]'" in failure("view")
 
 
+@pytest.mark.processes
 @pytest.mark.browser
 def test_a_snapshot_is_a_picture_of_the_robot(tmp_path: Path):
     image = pytest.importorskip("PIL.Image")
@@ -114,6 +113,7 @@ def test_a_snapshot_is_a_picture_of_the_robot(tmp_path: Path):
     assert (middle.min(axis=2) < 200).mean() > 0.02
 
 
+@pytest.mark.processes
 @pytest.mark.browser
 def test_snapshot_of_a_robot_without_a_model_shows_its_frames(tmp_path: Path):
     picture = tmp_path / "cam.png"
@@ -130,6 +130,7 @@ MINE = """<robot name="mine"><link name="base"><visual><geometry>
 <mesh filename="package://mine/meshes/base.stl"/></geometry></visual></link></robot>"""
 
 
+@pytest.mark.processes
 @pytest.mark.browser
 def test_snapshot_names_visible_robots_hidden_robots_and_missing_meshes(tmp_path: Path):
     trimesh = pytest.importorskip("trimesh")

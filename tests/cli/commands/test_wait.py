@@ -19,8 +19,6 @@ from helpers.processes import Child, until
 
 from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 
-pytestmark = pytest.mark.processes
-
 
 def waited(*arguments: str, code: int) -> dict[str, object]:
     ended = run_cli("wait", *arguments, "--json")
@@ -39,6 +37,7 @@ def test_available_robot_is_ready_at_once():
     assert ended.stderr == ""
 
 
+@pytest.mark.processes
 def test_a_robot_is_ready_when_it_moves_and_not_before(spawn: Spawn):
     child = started(spawn, "wait", "robot", "rrbot")
     await_text(child, "robot 'rrbot' is not announced")
@@ -86,6 +85,7 @@ def test_only_placers_place_the_root_of_the_robot_of_a_pose(placer: str, timeout
     assert outcome["ready"] is (code == 0)
 
 
+@pytest.mark.processes
 def test_a_router_may_come_late(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = started(spawn, "wait", "router", endpoint)
@@ -95,6 +95,7 @@ def test_a_router_may_come_late(spawn: Spawn, free_port: int):
     assert child.wait() == 0
 
 
+@pytest.mark.processes
 def test_robot_behind_a_late_router_is_waited_for(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = started(spawn, "wait", "robot", "rrbot", "--connect", endpoint)
@@ -110,6 +111,7 @@ def test_missing_router_ends_the_wait_in_time(free_port: int):
     assert time.monotonic() - began < 10.0
 
 
+@pytest.mark.processes
 def test_ctrl_c_ends_a_wait(spawn: Spawn):
     child = started(spawn, "wait", "robot", "rrbot")
     await_text(child, "waiting:")

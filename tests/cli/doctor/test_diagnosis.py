@@ -31,8 +31,6 @@ from zstate.wire.keys import Stream, writer_key
 from zstate.wire.messages import JointState, order_digest
 from zstate.wire.native import ENCODINGS, encode
 
-pytestmark = pytest.mark.processes
-
 SECOND = 1_000_000_000
 LINKS = ["zstate", "network", "robots", "writers", "model", "joint_states", "clocks", "stamps"]
 
@@ -106,6 +104,7 @@ def test_missing_robot_is_reported_with_the_announced_ones():
     assert found["next"] == "zstate doctor rrbot"
 
 
+@pytest.mark.processes
 def test_robots_that_an_option_hides_are_found(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", endpoint).line()
@@ -160,6 +159,7 @@ def test_joints_of_another_model_are_refused_with_the_reason(tmp_path: Path):
     assert "do both sides use the same URDF?" in found["text"]
 
 
+@pytest.mark.processes
 def test_stopped_writer_is_distinguished_from_a_closed_one(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", endpoint).line()
@@ -273,6 +273,7 @@ def test_odometry_whose_driver_has_ended_names_the_streams_that_it_waits_for():
     assert first["next"].startswith("zstate ls  # start ")
 
 
+@pytest.mark.processes
 def test_readers_of_other_programs_wait_for_nothing_that_a_robot_lacks(spawn: Spawn):
     """Such as `zstate echo` of a stream that the robot does not have."""
     edge = Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -455,6 +456,7 @@ def test_warning_of_a_writer_of_transforms_is_reported_though_it_keeps_its_rate(
     assert re.fullmatch(rf"odometry@\S+ pid {os.getpid()} reports: {re.escape(text)}", found)
 
 
+@pytest.mark.processes
 def test_disconnected_frames_are_a_warning(spawn: Spawn):
     child = started(spawn, "static", "rrbot/map", "rrbot/odom", "--xyz", "0", "0", "1")
     child.line()
@@ -508,6 +510,7 @@ def test_unknown_host_name_is_distinguished_from_a_refusing_host():
     assert "the host name 'no-such-host.invalid' is unknown" in found["text"]
 
 
+@pytest.mark.processes
 def test_another_program_at_the_rendezvous_address_is_detected(monkeypatch: pytest.MonkeyPatch):
     with socket.create_server(("127.0.0.1", find_free_port())) as server:
         monkeypatch.setenv("ZSTATE_RENDEZVOUS", "{}:{}".format(*server.getsockname()))
@@ -515,6 +518,7 @@ def test_another_program_at_the_rendezvous_address_is_detected(monkeypatch: pyte
     assert (found["name"], "does not answer: it is another program" in found["text"]) == ("network", True)
 
 
+@pytest.mark.processes
 def test_stopped_program_that_blocks_the_rendezvous_is_reported(
     spawn: Spawn, rendezvous: str, free_port: int, monkeypatch: pytest.MonkeyPatch
 ):
@@ -552,10 +556,12 @@ def guarded(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.Mo
     return endpoint
 
 
+@pytest.mark.processes
 def test_viewer_behind_a_router_finds_everything_sound(guarded: str):
     assert diagnosed("r1", "--user", "desk", code=0)["sound"]
 
 
+@pytest.mark.processes
 def test_identity_without_read_permission_is_reported_with_its_name(guarded: str):
     found = broken_link("r1", "--user", "r2")
     assert found["name"] == "access"
@@ -563,11 +569,13 @@ def test_identity_without_read_permission_is_reported_with_its_name(guarded: str
     assert found["next"].startswith("zstate acl --viewer")
 
 
+@pytest.mark.processes
 def test_identity_that_may_not_write_as_its_robot_gets_the_missing_rule(guarded: str):
     found = broken_link("r3", "--user", "r3")
     assert (found["name"], found["next"]) == ("access", "zstate acl --robot r3")
 
 
+@pytest.mark.processes
 def test_missing_credentials_lead_to_the_option_that_sets_them(guarded: str):
     found = broken_link()
     assert found["name"] == "network"
@@ -578,6 +586,7 @@ def test_a_file_argument_is_refused_with_the_check_command():
     assert "`zstate check arm.urdf`" in failure("doctor", "arm.urdf", code=2)
 
 
+@pytest.mark.processes
 def test_ros_robots_are_found_when_there_are_no_native_ones(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--ros2", "--listen", endpoint).line()

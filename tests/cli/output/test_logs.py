@@ -23,8 +23,6 @@ from zstate.net.streams import StreamPublisher
 from zstate.wire.messages import JointState
 from zstate.wire.native import ENCODINGS
 
-pytestmark = pytest.mark.processes
-
 
 def entries(stderr: str) -> list[dict[str, object]]:
     return [json.loads(line) for line in stderr.splitlines()]
@@ -58,6 +56,7 @@ def test_unknown_format_is_refused():
     assert "'jason' is not one of 'text', 'json'" in failure("joints", RRBOT, "--log-format", "jason", code=2)
 
 
+@pytest.mark.processes
 def test_every_line_of_a_running_command_is_json(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
@@ -69,6 +68,7 @@ def test_every_line_of_a_running_command_is_json(spawn: Spawn):
     assert {entry.get("robot") for entry in output if "following" in str(entry["text"])} == {publisher.robot}
 
 
+@pytest.mark.processes
 def test_standard_output_of_a_service_is_json_too(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = started(spawn, "router", "--listen", endpoint, "--log-format", "json")
@@ -81,6 +81,7 @@ def test_standard_output_of_a_service_is_json_too(spawn: Spawn, free_port: int):
         assert text in str(entry["text"])
 
 
+@pytest.mark.processes
 def test_library_warning_has_its_event_and_reason(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
     key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]
@@ -94,6 +95,7 @@ def test_library_warning_has_its_event_and_reason(spawn: Spawn):
     interrupted(command)
 
 
+@pytest.mark.processes
 def test_unhandled_exception_of_a_thread_is_a_json_line(spawn: Spawn):
     child = spawn(
         "import threading\n"
@@ -164,6 +166,7 @@ def live_on_a_terminal(errors: int | None) -> tuple[list[str], str]:
     return lines, output
 
 
+@pytest.mark.processes
 def test_status_line_during_a_live_display_stays_above_it():
     lines, _ = live_on_a_terminal(None)
     assert "recording panda" in lines
@@ -172,6 +175,7 @@ def test_status_line_during_a_live_display_stays_above_it():
     assert not [line for line in lines if "12 messages" in line]
 
 
+@pytest.mark.processes
 def test_redirected_standard_error_gets_lines_during_a_live_display():
     lines, output = live_on_a_terminal(subprocess.PIPE)
     assert output == "recording panda\nzstate: a gap\n"

@@ -2,41 +2,32 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-import pty
-import struct
-import subprocess
-import sys
-import termios
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, published_robot, run_cli
+from helpers.cli_runner import RRBOT, in_terminal, published_robot, run_cli
+from helpers.processes import DEADLINE_S
 
 pytestmark = pytest.mark.processes
 
 WIDTH = 60
 
 
-def run_in_terminal(*arguments: str, **environment: str) -> list[str]:
+def run_in_terminal(*arguments: str) -> list[str]:
     """The lines of a command on a terminal with WIDTH columns."""
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, WIDTH, 0, 0))
-    plain = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "NO_COLOR")}
-    with subprocess.Popen(
-        [sys.executable, "-m", "zstate", *arguments],
-        stdin=theirs,
-        stdout=theirs,
-        stderr=theirs,
-        env={**plain, **environment},
-    ):
-        os.close(theirs)
-        received = b""
-        while part := _read(ours):
+    received = b""
+    with in_terminal(*arguments, columns=WIDTH) as (process, terminal):
+        while part := _read(terminal):
             received += part
-    os.close(ours)
+        process.wait(DEADLINE_S)
     return received.decode().replace("\r\n", "\n").split("\n")
+
+
+@pytest.fixture(autouse=True)
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("COLUMNS", "NO_COLOR"):
+        monkeypatch.delenv(name, raising=False)
 
 
 def _read(terminal: int) -> bytes:
@@ -46,7 +37,8 @@ def _read(terminal: int) -> bytes:
         return b""
 
 
-def test_commands_about_running_robots_fit_the_width():
+def test_commands_about_running_robots_fit_the_width(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("NO_COLOR", "1")
     with published_robot("left"), published_robot("right"):
         for command in (
             ("ls",),
@@ -58,7 +50,7 @@ def test_commands_about_running_robots_fit_the_width():
             ("monitor", "left/base", "left/lower", "--once"),
             ("tf", "left/base", "nothing", "--once", "--timeout", "0.6"),
         ):
-            lines = run_in_terminal(*command, NO_COLOR="1")
+            lines = run_in_terminal(*command)
             assert max(map(len, lines)) <= WIDTH + 2 * (command[0] == "tf"), (command, lines)
             assert "\x1b" not in "".join(lines)
 

@@ -94,7 +94,6 @@ def test_calibration_is_published_with_renamed_frames(spawn: Spawn, tmp_path: Pa
     assert child.line().startswith("pose of eye in flange: xyz [0.1, 0.2, -0.3] m")
 
 
-@pytest.mark.processes
 def test_static_reports_an_invalid_file(tmp_path: Path):
     several = file_of(tmp_path, f"[{OURS}, {OURS}]", "eyes.json")
     assert "has 2 transforms" in failure("static", "a", "b", "--file", str(several), code=2)
