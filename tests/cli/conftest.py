@@ -7,6 +7,9 @@ from pathlib import Path
 import pytest
 from helpers.cli_runner import Spawn, started
 
+from zstate.cli import session
+from zstate.cli.commands import view
+
 
 @pytest.fixture(autouse=True)
 def state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -22,3 +25,11 @@ def ros_router(spawn: Spawn, free_port: int, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setenv("ZSTATE_WIRE", "ros2")
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     return endpoint
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands of this process give up on routers and robots that are not there in a tenth of the time."""
+    for module, name in ((session, "_ROUTER_WITHIN_S"), (session, "_LOCAL_ROUTER_WITHIN_S")):
+        monkeypatch.setattr(module, name, 0.5)
+    monkeypatch.setattr(view, "_ANNOUNCED_WITHIN_S", 0.5)

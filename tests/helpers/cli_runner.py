@@ -6,6 +6,7 @@ import fcntl
 import logging
 import os
 import pty
+import shlex
 import signal
 import struct
 import subprocess
@@ -16,8 +17,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
+import click.formatting
 import pytest
 from click.testing import CliRunner
 from helpers.fork_server import ForkedProcess, server
@@ -61,25 +64,41 @@ class Ended:
 
 
 def run_cli(*arguments: str, stdin: bytes = b"") -> Ended:
-    """Run a command that ends by itself, in this process; what it changes in the process is restored."""
+    """Run a command that ends by itself, in this process; what it changes in the process is restored.
+
+    Standard input and output are no terminals, whatever those of the tests are. For the main thread, as
+    commands are. What the command has written is in the notes of an exception that it does not handle.
+    """
     library = logging.getLogger("zstate")
     before = library.handlers.copy(), library.level, library.propagate
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     with pytest.MonkeyPatch.context() as restored, CliRunner().isolation(stdin) as (stdout, stderr, _):
         restored.setattr(sys, "argv", ["zstate", *arguments])
-        restored.setattr(sys, "__stdout__", sys.stdout)  # whose terminal has a width
+        # The width of help is that of a pipe, neither that of the tests' terminal nor click's for tests.
+        restored.setattr(sys, "__stdout__", sys.stdout)
+        restored.setattr(click.formatting, "FORCED_WIDTH", None)
         restored.setattr(sys, "excepthook", sys.excepthook)
         restored.setattr(threading, "excepthook", threading.excepthook)
         restored.setattr(logs._Settings, "format", "text")
         restored.setenv(logs.FORMAT_VARIABLE, os.environ.get(logs.FORMAT_VARIABLE, ""))
+
+        def written(stream: BytesIO) -> str:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            return stream.getvalue().decode()
+
         try:
             logs.use_environment_format()
             code = run(arguments)
+        except BaseException as error:
+            error.add_note(f"zstate {shlex.join(arguments)} wrote:\n{written(stdout)}{written(stderr)}")
+            raise
         finally:
             library.handlers[:], library.propagate = before[0], before[2]
             library.setLevel(before[1])
-        sys.stdout.flush()
-        sys.stderr.flush()
-        return Ended(int(code), stdout.getvalue().decode(), stderr.getvalue().decode())
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        return Ended(int(code), written(stdout), written(stderr))
 
 
 def run_process(*arguments: str, stdin: bytes = b"") -> Ended:

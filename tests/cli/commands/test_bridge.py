@@ -65,6 +65,7 @@ def test_bridge_without_a_robot_prints_how_to_name_one(ros: str):
     assert "zstate bridge panda" in failure("bridge", "--ros", ros)
 
 
+@pytest.mark.usefixtures("impatient")
 def test_missing_router_error_names_it_and_how_to_start_one(free_port: int):
     message = failure("bridge", "panda", "--ros", f"tcp/127.0.0.1:{free_port}")
     assert f"'tcp/127.0.0.1:{free_port}'" in message

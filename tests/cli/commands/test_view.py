@@ -167,6 +167,7 @@ def test_snapshot_names_visible_robots_hidden_robots_and_missing_meshes(tmp_path
         assert own.stderr == ""
 
 
+@pytest.mark.usefixtures("impatient")
 def test_snapshot_of_an_absent_robot_names_the_received_ones(tmp_path: Path):
     text = failure("view", "absent", "--snapshot", str(tmp_path / "x.png"))
-    assert "waited 5 s for 'absent'; robots that were received: none" in text
+    assert "waited 0.5 s for 'absent'; robots that were received: none" in text

@@ -114,6 +114,7 @@ def test_robots_that_an_option_hides_are_found(spawn: Spawn, free_port: int):
     assert found["next"] == "zstate doctor rrbot"
 
 
+@pytest.mark.usefixtures("impatient")
 def test_robots_of_this_host_are_found_when_the_router_is_missing(free_port: int):
     with published_robot():
         found = broken_link("--connect", f"tcp/127.0.0.1:{free_port}")
@@ -497,6 +498,7 @@ def test_static_edge_on_a_frame_of_another_robot_is_a_warning():
     assert "'r1/camera' is a frame of robot 'r1'" in text
 
 
+@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("mode", ["client", "peer"])
 def test_endpoint_without_a_listener_is_broken(mode: str, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -505,6 +507,7 @@ def test_endpoint_without_a_listener_is_broken(mode: str, free_port: int):
     assert "connection refused" in found["text"]
 
 
+@pytest.mark.usefixtures("impatient")
 def test_unknown_host_name_is_distinguished_from_a_refusing_host():
     found = broken_link("--connect", "tcp/no-such-host.invalid:7447")
     assert "the host name 'no-such-host.invalid' is unknown" in found["text"]
@@ -596,6 +599,7 @@ def test_ros_robots_are_found_when_there_are_no_native_ones(spawn: Spawn, free_p
     assert diagnosed(*ros, code=0)["sound"]
 
 
+@pytest.mark.usefixtures("impatient")
 def test_ros_wire_without_a_router_leads_to_the_router_command(free_port: int):
     found = broken_link("--wire", "ros2", "--connect", f"tcp/127.0.0.1:{free_port}")
     assert found["next"] == "zstate router --ros2"

@@ -1,0 +1,123 @@
+"""What the tests of commands rest on: commands in the process of a test, and forked ones."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+import click
+import pytest
+from helpers.cli_runner import RRBOT, Spawn, in_terminal, missing_library, run_cli, run_process
+from helpers.processes import DEADLINE_S
+
+from zstate.cli.main import group
+from zstate.cli.output import logs
+
+
+def state() -> list[object]:
+    """What commands change in their process."""
+    library = logging.getLogger("zstate")
+    return [
+        *(sys.argv, sys.stdin, sys.stdout, sys.__stdout__, sys.stderr, sys.excepthook, threading.excepthook),
+        *(signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)),
+        *(library.handlers.copy(), library.level, library.propagate, logs.is_json(), dict(os.environ)),
+    ]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("check", RRBOT),
+        ("ls", "--log-format", "json"),
+        ("doctor", "--json"),
+        ("check", "no/such.urdf"),
+        ("x",),
+    ],
+)
+def test_a_command_in_process_leaves_the_process_as_it_was(arguments: tuple[str, ...]):
+    before = state()
+    ended = run_cli(*arguments)
+    assert ended.stdout + ended.stderr
+    assert state() == before
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    "arguments",
+    [("check", RRBOT), ("check", "no/such.urdf"), ("x",), ("help",), ("config",), ("ls", "--json")],
+)
+def test_a_command_in_process_ends_and_writes_as_its_process_does(arguments: tuple[str, ...]):
+    assert run_cli(*arguments) == run_process(*arguments)
+
+
+def test_what_a_command_wrote_is_in_the_notes_of_its_crash(monkeypatch: pytest.MonkeyPatch):
+    @click.command("crash")
+    def crash() -> None:
+        click.echo("so far")
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(group, "resolve_command", lambda *_: ("crash", crash, []))
+    before = state()
+    with pytest.raises(ZeroDivisionError) as crashed:
+        run_cli("crash", "it")
+    assert crashed.value.__notes__ == ["zstate crash it wrote:\nso far\n"]
+    assert state() == before
+
+
+def test_a_library_is_missing_in_the_block_only():
+    with missing_library("rich"), pytest.raises(ImportError):
+        import rich.live
+    import rich.live
+
+    assert rich.live.Live
+
+
+@pytest.mark.processes
+def test_a_forked_process_has_its_own_streams_folder_environment_and_end(
+    spawn: Spawn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OF_THIS_TEST", "yes")
+    child = spawn(
+        """
+        import os, sys
+        print(os.getcwd(), os.environ["OF_THIS_TEST"], sys.argv[1:], os.getpid())
+        print("trouble", file=sys.stderr)
+        sys.exit(int(sys.stdin.readline()))
+        """,
+        *("a", "b"),
+        is_forked=True,
+    )
+    assert child.line() == f"{tmp_path} yes ['a', 'b'] {child.process.pid}"
+    assert child.process.poll() is None
+    child.send_line("7")
+    assert child.wait() == 7
+    assert child.stderr == "trouble\n"
+
+
+@pytest.mark.processes
+def test_a_forked_process_ends_by_signals_and_crashes_as_others_do(spawn: Spawn):
+    child = spawn("import time; print(1); time.sleep(60)", is_forked=True)
+    child.line()
+    child.kill()
+    assert child.wait() == -signal.SIGKILL
+    crashed = spawn("1 / 0", is_forked=True)
+    assert crashed.wait() == 1
+    assert crashed.stderr.endswith("ZeroDivisionError: division by zero\n")
+
+
+@pytest.mark.processes
+def test_a_command_in_a_terminal_sees_its_width():
+    with in_terminal("check", "--help", columns=50) as (process, terminal):
+        received = b""
+        try:
+            while part := os.read(terminal, 65536):
+                received += part
+        except OSError:  # Linux reports the closed terminal so
+            pass
+        assert process.wait(DEADLINE_S) == 0
+    assert max(map(len, received.decode().splitlines())) <= 50
