@@ -21,6 +21,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
@@ -169,7 +170,9 @@ def _serve(control: socket.socket) -> Callable[[], None]:
         *streams, status = descriptors
         for name in request["imports"]:
             import_module(name)
-        pid = os.fork()
+        with warnings.catch_warnings():  # of threads, as numpy has them; they are ended by fork handlers
+            warnings.simplefilter("ignore", DeprecationWarning)
+            pid = os.fork()
         if pid == 0:
             signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)

@@ -151,6 +151,13 @@ class Child:
         except queue.Empty:
             raise AssertionError(f"silent for {timeout_s} s; stderr: {self.stderr!r}") from None
 
+    def rest(self) -> str:
+        """The lines of its output that were not read; for after its end."""
+        lines: list[str] = []
+        while not self._lines.empty():
+            lines.append(self._lines.get() + "\n")
+        return "".join(lines)
+
     def send_line(self, line: str = "") -> None:
         assert self.process.stdin
         self.process.stdin.write(line + "\n")

@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, published_robot, run_cli, started
-from helpers.processes import until
+from helpers.cli_runner import MAIN, Spawn, failure, published_robot, run_cli, started
+from helpers.processes import Child, until
 
 CLEARED = "\x15"
 """Ctrl-U, which empties the line."""
@@ -19,33 +19,27 @@ CLEARED = "\x15"
 def offered(*words: str) -> list[str]:
     """What bash would be offered for the last of ``words``."""
     line = ["zstate", *words]
-    asked = {"_ZSTATE_COMPLETE": "bash_complete", "COMP_WORDS": " ".join(line), "COMP_CWORD": str(len(words))}
-    answer = subprocess.run(
-        [sys.executable, "-m", "zstate"],
-        env={**os.environ, **asked},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=15.0,
-    )
+    with pytest.MonkeyPatch.context() as shell:
+        shell.setenv("_ZSTATE_COMPLETE", "bash_complete")
+        shell.setenv("COMP_WORDS", " ".join(line))
+        shell.setenv("COMP_CWORD", str(len(words)))
+        answer = Child(MAIN, is_forked=True)
+    assert answer.wait() == 0
     assert answer.stderr == ""
-    return answer.stdout.split()
+    return answer.rest().split()
 
 
-@pytest.mark.processes
 def test_commands_and_their_options_are_offered():
     assert offered("sn") == ["plain,snapshot"]
     assert offered("snapshot", "l") == ["plain,load"]
     assert "plain,--fix-hints" in offered("check", "--f")
 
 
-@pytest.mark.processes
 def test_completion_offers_models_by_name_and_files():
     assert "plain,rrbot" in offered("publish", "rr")
     assert offered("check", "./models/rr") == ["file,./models/rr"]
 
 
-@pytest.mark.processes
 def test_announced_robots_are_offered():
     with published_robot("left"), published_robot("right"):
         assert offered("tree", "le") == ["plain,left"]
@@ -60,12 +54,10 @@ def test_drivers_and_the_joints_of_a_driver_are_offered(spawn: Spawn):
     until(lambda: offered("move", "rrbot", "sh") == ["plain,shoulder="])
 
 
-@pytest.mark.processes
 def test_completion_without_robots_offers_and_prints_nothing():
     assert offered("echo", "l") == []
 
 
-@pytest.mark.processes
 def test_parameters_of_a_file_are_offered(tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text("[parameters]\nspeed = 1\nsite = 'lab'\n")
