@@ -69,6 +69,7 @@ def run_cli(*arguments: str, stdin: bytes = b"") -> Ended:
     Standard input and output are no terminals, whatever those of the tests are. For the main thread, as
     commands are. What the command has written is in the notes of an exception that it does not handle.
     """
+    assert threading.current_thread() is threading.main_thread(), "one command at a time; see run_process"
     library = logging.getLogger("zstate")
     before = library.handlers.copy(), library.level, library.propagate
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}

@@ -116,7 +116,7 @@ class Child:
     process: subprocess.Popen[str] | ForkedProcess
 
     def __init__(
-        self, code: str, *arguments: str, is_forked: bool = False, imports: Sequence[str] = ()
+        self, code: str, *arguments: str, is_forked: bool = True, imports: Sequence[str] = ()
     ) -> None:
         if is_forked:
             self.process = server().start(textwrap.dedent(code), *arguments, imports=imports)

@@ -442,6 +442,7 @@ class StillBase:
         return [Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp)]
 
 
+@pytest.mark.usefixtures("whole_window")
 def test_warning_of_a_writer_of_transforms_is_reported_though_it_keeps_its_rate():
     text = "wheels: NIS 14.2 for 3 numbers, expected 0.2 to 9.3: its sigmas are about 2 times too small"
     with connect() as session, TransformPublisher(session, "cart", "wheels", program="odometry") as odometry:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 import signal
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -160,13 +159,11 @@ def test_writer_frozen_for_so_long_that_another_took_its_edge_continues_and_the_
 def test_denied_writer_gets_the_missing_rule_and_doctor_reports_a_denied_reader(start: Start, site: Site):
     start("odometry", robot="r1", session=site.join("r1"), writer="wheels")
     denied = start("odometry", robot="r1", session=site.join("r2"), writer="visual", wait=False)
-    with ThreadPoolExecutor() as threads:
-        robot, stranger = (threads.submit(site.doctor, identity) for identity in ("r2", "stranger"))
-    assert robot.result().returncode == stranger.result().returncode == 1
-    report = robot.result().stdout.decode()
-    assert "none of its data arrives: the router denies zstate/r1/** to the certificate" in report
-    assert "next: zstate acl --viewer NAME" in report
-    assert "or the router shows none to the certificate" in stranger.result().stdout.decode()
+    robot, stranger = site.doctor("r2"), site.doctor("stranger")
+    assert robot.code == stranger.code == 1
+    assert "none of its data arrives: the router denies zstate/r1/** to the certificate" in robot.stdout
+    assert "next: zstate acl --viewer NAME" in robot.stdout
+    assert "or the router shows none to the certificate" in stranger.stdout
     assert denied.child.wait() != 0
     for text in ("AccessDenied", "r2.pem", "'r1 writes'", "`zstate acl --robot r1`"):
         assert text in denied.child.stderr
