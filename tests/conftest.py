@@ -161,7 +161,8 @@ def host_driver(
 def spawn() -> Iterator[Callable[..., Child]]:
     """``spawn(code, *arguments)`` starts a Child, which is killed at the end of the test.
 
-    With ``is_forked=True`` it is a fork of a process that has imported zstate, a tenth of the cost.
+    It is a fork of a process that has imported zstate, a tenth of the cost; with ``is_forked=False`` an
+    interpreter of its own, for what depends on imports.
     """
     children: list[Child] = []
 

@@ -90,7 +90,6 @@ def test_a_forked_process_has_its_own_streams_folder_environment_and_end(
         sys.exit(int(sys.stdin.readline()))
         """,
         *("a", "b"),
-        is_forked=True,
     )
     assert child.line() == f"{tmp_path} yes ['a', 'b'] {child.process.pid}"
     assert child.process.poll() is None
@@ -101,11 +100,11 @@ def test_a_forked_process_has_its_own_streams_folder_environment_and_end(
 
 @pytest.mark.processes
 def test_a_forked_process_ends_by_signals_and_crashes_as_others_do(spawn: Spawn):
-    child = spawn("import time; print(1); time.sleep(60)", is_forked=True)
+    child = spawn("import time; print(1); time.sleep(60)")
     child.line()
     child.kill()
     assert child.wait() == -signal.SIGKILL
-    crashed = spawn("1 / 0", is_forked=True)
+    crashed = spawn("1 / 0")
     assert crashed.wait() == 1
     assert crashed.stderr.endswith("ZeroDivisionError: division by zero\n")
 

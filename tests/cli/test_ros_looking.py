@@ -173,14 +173,14 @@ def test_ros_commands_join_the_router_of_this_host(
 ):
     monkeypatch.delenv("ZSTATE_CONNECT")
     with published_robot(wire="ros2:node=driver", router=ros_router):
-        command = spawn(ELSEWHERE, ros_router, "ls", is_forked=True)
+        command = spawn(ELSEWHERE, ros_router, "ls")
         assert [command.line(), command.line()] == ["1 node in domain 0", "  /driver"]
 
 
 @pytest.mark.processes
 def test_missing_router_is_reported_with_the_commands_that_start_one(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    command = spawn(ELSEWHERE, endpoint, "ls", "--wire", "ros2", is_forked=True)
+    command = spawn(ELSEWHERE, endpoint, "ls", "--wire", "ros2")
     assert command.wait() == 1
     assert f"zstate: nothing answers at {endpoint!r}" in command.stderr
     for advice in ("ros2 run rmw_zenoh_cpp rmw_zenohd", "zstate router --ros2", "--connect"):

@@ -77,7 +77,7 @@ def without_xacro(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / ".without").mkdir()
     for name in ("xacro", "xacrodoc"):
         (folder / ".without" / f"{name}.py").write_text("raise ImportError")
-        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.syspath_prepend(folder / ".without")
     monkeypatch.setenv("PYTHONPATH", str(folder / ".without"), prepend=os.pathsep)
 
 

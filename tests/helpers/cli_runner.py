@@ -131,7 +131,7 @@ def missing_library(name: str, *users: str) -> Iterator[None]:
 def started(spawn: Spawn, *arguments: str) -> Child:
     """A command that runs until it is stopped: a process, forked from one that has imported zstate."""
     imports = _IMPORTS.get(arguments[0], ())
-    return spawn(MAIN, *arguments, is_forked=True, imports=imports)
+    return spawn(MAIN, *arguments, imports=imports)
 
 
 @contextmanager

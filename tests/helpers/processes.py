@@ -111,7 +111,10 @@ class SteppingClock:
 
 
 class Child:
-    """A Python process that runs ``code`` and exchanges lines with the test."""
+    """A Python process that runs ``code`` and exchanges lines with the test.
+
+    It is a fork of a process that has imported zstate and ``imports``, unless ``is_forked`` is false.
+    """
 
     process: subprocess.Popen[str] | ForkedProcess
 

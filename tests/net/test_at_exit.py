@@ -9,7 +9,8 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,13 @@ from helpers.processes import DEADLINE_S, SOON_S, Child
 
 from zstate import Recording, SineSource, StatePublisher, connect, load_model
 from zstate.net.at_exit import TIMEOUT_S
+
+
+@pytest.fixture
+def spawn(spawn: Callable[..., Child]) -> Callable[..., Child]:
+    """Interpreters of their own: what an exit does depends on what was imported, and when."""
+    return partial(spawn, is_forked=False)
+
 
 PROGRAMS = {
     "listener": """

@@ -403,7 +403,7 @@ def test_chunk_that_decompresses_without_bounds_is_refused(tmp_path: Path, compr
         (peak,) = (line for line in open("/proc/self/status") if line.startswith("VmHWM"))
         print(int(peak.split()[1]) // 1024)
     """
-    child = Child(code, str(tmp_path))
+    child = Child(code, str(tmp_path), is_forked=False)
     bomb, cut, peak_mb = child.line(60.0), child.line(60.0), int(child.line())
     assert child.wait() == 0
     assert f"states {stated} bytes" in bomb or "disagree on their size" in bomb

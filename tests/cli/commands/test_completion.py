@@ -23,7 +23,7 @@ def offered(*words: str) -> list[str]:
         shell.setenv("_ZSTATE_COMPLETE", "bash_complete")
         shell.setenv("COMP_WORDS", " ".join(line))
         shell.setenv("COMP_CWORD", str(len(words)))
-        answer = Child(MAIN, is_forked=True)
+        answer = Child(MAIN)
     assert answer.wait() == 0
     assert answer.stderr == ""
     return answer.rest().split()

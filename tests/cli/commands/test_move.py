@@ -239,7 +239,7 @@ def rates_of(joints: JointStateListener) -> Callable[[], np.ndarray]:
 
 @pytest.mark.processes
 def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: Spawn):
-    assert spawn(ROVER, is_forked=True).line() == "ready"
+    assert spawn(ROVER).line() == "ready"
     with (
         connect() as session,
         JointStateListener(session, "rover") as joints,

@@ -25,7 +25,7 @@ SETTINGS = str(Path(__file__).parents[3] / "models" / "rover.toml")
 def test_live_odometry_drives_the_rover_and_its_recording_gives_a_report_and_a_plot(
     spawn: Spawn, tmp_path: Path
 ):
-    assert spawn(ROVER, is_forked=True).line() == "ready"
+    assert spawn(ROVER).line() == "ready"
     live = started(spawn, "odometry", "rover", "--file", SETTINGS, "--rate", "50")
     first = (
         "publishing the odometry of 'rover', odom -> base_footprint, as 'odometry', from its IMU 'imu', its "
