@@ -34,8 +34,9 @@ def jackal() -> Recording:
 
 @cache
 def track_of(*, as_joints: bool = False, has_compass: bool = False, start: float = 0.0) -> Track:
+    """A replay of the recording, once for all tests of it."""
     calls = calls_of(husky(), as_joints=as_joints, has_compass=has_compass, start=start)
-    return played(husky(), calls, wheels=WHEELS if as_joints else None)
+    return played(husky(), calls, wheels=WHEELS if as_joints else None, reads_live=True)
 
 
 def dead_reckoning(start: float = 0.0) -> float:
@@ -80,9 +81,19 @@ def test_wheels_and_gyro_alone_are_three_metres_off_after_359_metres():
     assert dead_reckoning() == pytest.approx(3.06, abs=0.01)
 
 
-@pytest.mark.parametrize("start", [0.0, HUSKY_REST_S], ids=["in motion", "at rest"])
-@pytest.mark.parametrize("has_compass", [False, True], ids=["no compass", "bad compass"])
-@pytest.mark.parametrize("as_joints", [False, True], ids=["velocity", "joints"])
+@pytest.mark.parametrize(
+    ("as_joints", "has_compass", "start"),
+    [
+        pytest.param(False, False, 0.0, id="velocity-no compass-in motion"),
+        pytest.param(True, True, 0.0, id="joints-bad compass-in motion"),
+        pytest.param(False, True, HUSKY_REST_S, id="velocity-bad compass-at rest"),
+        pytest.param(True, False, HUSKY_REST_S, id="joints-no compass-at rest"),
+        pytest.param(False, True, 0.0, id="velocity-bad compass-in motion", marks=pytest.mark.soak),
+        pytest.param(True, False, 0.0, id="joints-no compass-in motion", marks=pytest.mark.soak),
+        pytest.param(False, False, HUSKY_REST_S, id="velocity-no compass-at rest", marks=pytest.mark.soak),
+        pytest.param(True, True, HUSKY_REST_S, id="joints-bad compass-at rest", marks=pytest.mark.soak),
+    ],
+)
 def test_a_husky_is_found_as_well_as_by_dead_reckoning_and_inside_its_claim(
     as_joints: bool, has_compass: bool, start: float
 ):
@@ -94,15 +105,29 @@ def test_a_husky_is_found_as_well_as_by_dead_reckoning_and_inside_its_claim(
     assert track.way == pytest.approx(359.0 if start == 0.0 else 130.0, rel=0.03)
 
 
-@pytest.mark.parametrize("as_joints", [False, True], ids=["velocity", "joints"])
-def test_a_pose_in_odom_is_continuous(as_joints: bool):
+@pytest.mark.parametrize(
+    ("as_joints", "has_compass"),
+    [
+        pytest.param(False, False, id="velocity-no compass"),
+        pytest.param(True, True, id="joints-bad compass"),
+        pytest.param(False, True, id="velocity-bad compass", marks=pytest.mark.soak),
+        pytest.param(True, False, id="joints-no compass", marks=pytest.mark.soak),
+    ],
+)
+def test_a_pose_in_odom_is_continuous(as_joints: bool, has_compass: bool):
     """REP-105: no state is further from the last one than its velocity explains, at 10 Hz."""
-    assert track_of(as_joints=as_joints, has_compass=True).longest_jump < 0.1
-    assert track_of(as_joints=as_joints).longest_jump < 0.1
+    assert track_of(as_joints=as_joints, has_compass=has_compass).longest_jump < 0.1
 
 
-@pytest.mark.parametrize("wheel_step", [1, 3])
-@pytest.mark.parametrize("as_joints", [False, True], ids=["velocity", "joints"])
+@pytest.mark.parametrize(
+    ("as_joints", "wheel_step"),
+    [
+        pytest.param(False, 3, id="velocity-3"),
+        pytest.param(True, 1, id="joints-1"),
+        pytest.param(False, 1, id="velocity-1", marks=pytest.mark.soak),
+        pytest.param(True, 3, id="joints-3", marks=pytest.mark.soak),
+    ],
+)
 def test_slow_sensors_cost_accuracy_and_no_more(as_joints: bool, wheel_step: int):
     """The IMU at 10 Hz, and the wheels at 10 or 3.3 Hz."""
     calls = calls_of(husky(), as_joints=as_joints, imu_step=3, wheel_step=wheel_step)
@@ -161,7 +186,7 @@ def test_thirty_seconds_without_a_source_are_inside_the_claim(kind: str):
 )
 def test_a_gyro_that_contradicts_the_wheels_is_named_and_the_base_does_not_fly_off(calls: object):
     assert callable(calls)
-    _, track = changed_score(calls())
+    track = played(husky(), calls(), reads_live=True)
     assert any("gyro" in sentence or "imu" in sentence for sentence in track.sentences.values())
     assert np.linalg.norm(track.live[:, 4:], axis=1).max() < 3.0  # it drives 1 m/s
 
@@ -175,9 +200,16 @@ def test_late_and_shuffled_data_of_a_recording_change_nothing():
     np.testing.assert_allclose(first.poses[:-2], second.poses[: len(first.poses) - 2], atol=1e-9)
 
 
-@pytest.mark.parametrize("as_joints", [False, True], ids=["velocity", "joints"])
-@pytest.mark.parametrize("has_compass", [False, True], ids=["no compass", "true compass"])
-def test_a_jackal_that_turns_before_it_drives_keeps_its_yaw(has_compass: bool, as_joints: bool):
+@pytest.mark.parametrize(
+    ("as_joints", "has_compass"),
+    [
+        pytest.param(False, True, id="velocity-true compass"),
+        pytest.param(True, False, id="joints-no compass"),
+        pytest.param(True, True, id="joints-true compass", marks=pytest.mark.soak),
+        pytest.param(False, False, id="velocity-no compass", marks=pytest.mark.soak),
+    ],
+)
+def test_a_jackal_that_turns_before_it_drives_keeps_its_yaw(as_joints: bool, has_compass: bool):
     """The raw gyro drifts 1.5 degrees in this minute."""
     calls = calls_of(jackal(), as_joints=as_joints, has_compass=has_compass)
     track = played(jackal(), calls, wheels=WHEELS if as_joints else None)

@@ -85,8 +85,15 @@ def check(ends: Sequence[Errors], bound: float, *, has_exact_noise: bool) -> Non
         assert 0.1 * freedom < mean < 1.2 * high, squares
 
 
-@pytest.mark.parametrize("name", [name for name in VIBRATIONS if name != "none"])
-@pytest.mark.parametrize("kind", ["diff drive", "velocity"])
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("diff drive", "white"),
+        ("diff drive", "banded, twice"),
+        ("velocity", "white, twice"),
+        ("velocity", "banded"),
+    ],
+)
 def test_vibration_leaves_the_end_inside_its_claim(kind: str, name: str):
     ends = [end_of(kind, seed, 30.0, VIBRATIONS[name]) for seed in range(2)]
     check(ends, END_SIGMAS, has_exact_noise=False)

@@ -11,8 +11,6 @@ from helpers.processes import DEADLINE_S
 
 pytestmark = pytest.mark.processes
 
-STARTS = 200
-
 FORKING = """
     import json, multiprocessing, os, select, sys, threading, time
     from zstate import JointStateListener, PartialStatePublisher, SimulatedClock, SineSource, StatePublisher
@@ -93,7 +91,7 @@ FORKING = """
         def receives_samples():
             return buffer.wait("world", "tool", buffer.latest("world", "tool") + 1, timeout_s=5.0).stamp > 0
 
-        for way in ["os.fork", "multiprocessing"] * 5:
+        for way in ["os.fork", "multiprocessing"] * int(sys.argv[2]):
             read_fd, write_fd = os.pipe()
             if way == "multiprocessing":
                 child = multiprocessing.get_context("fork").Process(target=in_child, args=(write_fd,))
@@ -130,22 +128,23 @@ STARTING = """
             publisher.publish([0.1, 0.2])
             listener.buffer.wait("world", "tool", timeout_s=10.0)
 
-    for _ in range(20):
+    for _ in range(10):
         once()
     before, began = resource_counts(), time.monotonic()
-    for _ in range(int(sys.argv[2]) - 20):
+    for _ in range(int(sys.argv[2])):
         once()
     print(json.dumps([before, resource_counts(), time.monotonic() - began]))
 """
 
 
+@pytest.mark.parametrize("rounds", [1, pytest.param(5, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("mode", ["client", "peer"])
 def test_forked_child_gets_an_error_naming_connect_and_affects_no_other_process(
-    spawn, start: Start, endpoint: str, mode: str
+    spawn, start: Start, endpoint: str, mode: str, rounds: int
 ):
     start("router", listen=endpoint)
-    child = spawn(FORKING, json.dumps(client(endpoint) if mode == "client" else {}))
-    for _ in range(10):
+    child = spawn(FORKING, json.dumps(client(endpoint) if mode == "client" else {}), str(rounds))
+    for _ in range(2 * rounds):
         way, refusals, code, receives_samples = json.loads(child.line(30.0))
         assert (refusals, code, receives_samples) == ([True] * 17, 0, True), way
     assert child.line() == "closed"
@@ -168,13 +167,20 @@ def test_writer_of_transforms_that_exits_without_close_releases_its_name_and_edg
         assert (child.line(), child.stderr) == ("published", "")
 
 
-@pytest.mark.parametrize("way", ["client", "peer"])
-def test_two_hundred_starts_and_stops_leave_no_resources_behind(spawn, start: Start, endpoint: str, way: str):
-    count = STARTS if way == "client" else STARTS // 4
+@pytest.mark.parametrize(
+    ("way", "count"),
+    [
+        ("client", 30),
+        ("peer", 15),
+        pytest.param("client", 200, marks=pytest.mark.soak),
+        pytest.param("peer", 50, marks=pytest.mark.soak),
+    ],
+)
+def test_starts_and_stops_leave_no_resources_behind(spawn, start: Start, endpoint: str, way: str, count: int):
     start("router", listen=endpoint)
     child = spawn(STARTING, json.dumps(client(endpoint) if way == "client" else {}), str(count), TESTS)
     before, after, seconds = json.loads(child.line(6 * DEADLINE_S))
-    print(f"{count} starts as {way}: {before} grew to {after}; the last {count - 20} took {seconds:.1f} s")
+    print(f"{count} starts as {way}: {before} grew to {after} in {seconds:.1f} s")
     assert_no_growth(before, after, rss_kb=15_000)
     assert child.wait() == 0
     assert child.stderr == ""

@@ -47,7 +47,15 @@ def test_newer_of_two_conflicting_writers_is_used_and_samples_of_the_other_are_c
     assert reader.query("after", "r1", time.time_ns())  # the first is received again
 
 
-@pytest.mark.parametrize("step", [HOUR, -HOUR, 85_000, -85_000], ids=["+1h", "-1h", "+85us", "-85us"])
+@pytest.mark.parametrize(
+    "step",
+    [
+        pytest.param(-HOUR, id="-1h"),
+        pytest.param(85_000, id="+85us"),
+        pytest.param(HOUR, id="+1h", marks=pytest.mark.soak),
+        pytest.param(-85_000, id="-85us", marks=pytest.mark.soak),
+    ],
+)
 def test_writer_with_a_clock_step_is_received_again_within_a_second_also_after_the_step_back(
     start: Start, endpoint: str, step: int
 ):
