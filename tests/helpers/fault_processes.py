@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import run_cli
+from helpers.cli_runner import Ended, run_cli
 from helpers.processes import DEADLINE_S, Child, find_free_port
 
 SLACK = 3.0
@@ -91,7 +91,7 @@ class Site:
     def join(self, identity: str) -> dict[str, Any]:
         return client(self.endpoint) | {"certificates": (str(self.folder), identity)}
 
-    def doctor(self, identity: str, *arguments: str) -> Any:
+    def doctor(self, identity: str, *arguments: str) -> Ended:
         certs = ("--certs", str(self.folder), "--identity", identity)
         return run_cli("doctor", "r1", "--connect", self.endpoint, *certs, "--timeout", "2", *arguments)
 

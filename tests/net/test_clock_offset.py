@@ -234,9 +234,11 @@ def test_a_query_that_no_writer_receives_is_told_from_one_that_times_out(session
     frozen, absent = (
         WriterId(name, "host", 7, 0, number) for number, name in enumerate(("frozen", "absent"))
     )
-    queryable = writer.zenoh.declare_queryable(clock_key("r1", frozen.identity), queries.append)
     with StatePublisher(writer, RRBOT, "r1"):
         (measured,) = measure_offsets(reader, "r1", timeout_s=5.0)
+        queryable = writer.zenoh.declare_queryable(clock_key("r1", frozen.identity), queries.append)
+        querier = reader.zenoh.declare_querier(clock_key("r1", frozen.identity))
+        until(lambda: querier.matching_status.matching)
         of_robot = {("r1", one) for one in (frozen, absent, measured.writer)}
         assert unanswered(reader, of_robot, 1.0) == {("r1", frozen): True, ("r1", absent): False}
     assert queries

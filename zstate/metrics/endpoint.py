@@ -126,6 +126,7 @@ class _Server(ThreadingMixIn, WSGIServer):
     """
 
     daemon_threads = True
+    request_queue_size = 128  # connections to accept; with the 5 of socketserver a burst waits for seconds
     access: AccessCheck
     samplers: Sequence[Callable[[], None]] = ()
     _sampled_s = -EVERY_S
