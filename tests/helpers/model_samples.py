@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
@@ -57,3 +59,22 @@ def random_positions(model: RobotModel, seed: int, spread: float = 20.0) -> np.n
 
 def floating_columns(model: RobotModel) -> Iterator[int]:
     return (model.columns[joint.name] for joint in model.driven_joints if joint.type == "floating")
+
+
+SIX_ROBOTS = {
+    "double_pendulum_continuous",  # continuous joints only
+    "iris_simple",  # fixed joints only
+    "panda",  # revolute and prismatic joints, a mimic
+    "pr2",  # continuous joints, a prismatic one, ten mimics
+    "talos_full_v2",  # a humanoid with grippers of mimics
+    "tiago_dual",  # 129 joints
+}
+"""Robots of example-robot-data with each type of joint that it has; all others are in the soak."""
+
+
+def six_of(robots: Iterable[Any], name_of: Callable[[Any], str] = str) -> list[Any]:
+    """``robots`` as parameters of a test, all but SIX_ROBOTS marked as soak."""
+    return [
+        pytest.param(one, id=name_of(one), marks=() if name_of(one) in SIX_ROBOTS else pytest.mark.soak)
+        for one in robots
+    ]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.matrix_kinematics import MatrixKinematics, matrices
-from helpers.model_samples import every_joint, local_model, random_positions
+from helpers.model_samples import every_joint, local_model, random_positions, six_of
 
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.kinematics import Kinematics, MovingEdges
@@ -79,7 +79,7 @@ def plain_pinocchio(model: RobotModel, positions: np.ndarray) -> dict[str, np.nd
 
 
 @pytest.mark.robots
-@pytest.mark.parametrize("path", example_urdfs(), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", six_of(example_urdfs(), lambda path: path.stem))
 def test_poses_agree_with_pinocchios_plain_api(path: Path) -> None:
     model = parse_urdf(path.read_bytes(), path.name)
     kinematics = Kinematics(model)
@@ -233,7 +233,7 @@ def moving_poses(model: RobotModel, positions: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.robots
-@pytest.mark.parametrize("path", example_urdfs(), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", six_of(example_urdfs(), lambda path: path.stem))
 def test_moving_edges_of_every_robot_agree_with_the_closed_forms(path: Path) -> None:
     model = parse_urdf(path.read_bytes(), path.name)
     edges = MovingEdges(model)
