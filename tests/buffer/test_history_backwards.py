@@ -27,7 +27,7 @@ def test_past_is_not_copied_for_each_sample(make: type[History]):
 
 
 @HISTORIES
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 5))])
 def test_samples_in_any_order_are_sorted_and_leave_earlier_views_unchanged(make: type[History], seed: int):
     choose, span = random.Random(seed), 400
     history = make(2, span)

@@ -212,7 +212,8 @@ class Bench:
         self.outcomes.update(one.name for one in self.loop.motions.outcomes)
 
 
-def test_ten_thousand_take_overs_replacements_stops_faults_and_restarts_never_step_above_the_limits():
+@pytest.mark.parametrize("count", [2_500, pytest.param(10_000, marks=pytest.mark.soak)])
+def test_take_overs_replacements_stops_faults_and_restarts_never_step_above_the_limits(count: int):
     bench = Bench(np.random.default_rng(19))
     events: list[Callable[[], None]] = [
         *[bench.command] * 6,
@@ -223,7 +224,7 @@ def test_ten_thousand_take_overs_replacements_stops_faults_and_restarts_never_st
     ]
     happened: Counter[str] = Counter()
     states: Counter[str] = Counter()
-    for number in bench.random.integers(0, len(events), 10_000):
+    for number in bench.random.integers(0, len(events), count):
         events[number]()
         happened[events[number].__name__] += 1
         for _ in range(bench.random.integers(1, 6)):
@@ -232,9 +233,9 @@ def test_ten_thousand_take_overs_replacements_stops_faults_and_restarts_never_st
     bench.keep_outcomes()
     assert 1.0 - EXACT < bench.driver.longest <= 1.0 + EXACT
     # It is no empty claim: joints have moved in each state, and each kind of end was seen.
-    assert min(happened[name] for name in ("take_over", "motion", "stop", "restart")) > 400
+    assert min(happened[name] for name in ("take_over", "motion", "stop", "restart")) > count / 25
     assert set(states) >= {"ready", "active", "holding", "stopped"}
-    assert states["active"] > 10_000
+    assert states["active"] > count
     assert set(bench.outcomes) == {"reached", "aborted", "replaced", "cancelled", "stopped"}
     assert set(bench.refusals.counts) >= {"second commander", "stopped", "not released", "outside limits"}
 

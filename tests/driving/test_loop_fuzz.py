@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import pytest
 from driving.loop_fuzz import run_all
 
-SEEDS = 20
 TICKS = 1000
 
 
-def test_no_history_of_commands_stops_and_faults_has_a_setpoint_that_must_not_be():
-    happened = run_all(range(SEEDS), TICKS)
-    assert happened["tick"] >= SEEDS * TICKS
+@pytest.mark.parametrize("seeds", [12, pytest.param(200, marks=pytest.mark.soak)])
+def test_no_history_of_commands_stops_and_faults_has_a_setpoint_that_must_not_be(seeds: int):
+    happened = run_all(range(seeds), TICKS)
+    assert happened["tick"] >= seeds * TICKS
     assert happened["write"] > 0.3 * happened["tick"]
     # It is no empty claim: there were all states, and all events.
     states = {"ready", "active", "holding", "stopped"}

@@ -34,7 +34,8 @@ def started(position: float = 0.0, moving: float = 0.0, **limits: float) -> Setp
     return limiter
 
 
-def test_ten_thousand_take_overs_replacements_stops_and_restarts_never_step_above_the_limits():
+@pytest.mark.parametrize("events", [2_000, pytest.param(10_000, marks=pytest.mark.soak)])
+def test_take_overs_replacements_stops_and_restarts_never_step_above_the_limits(events: int):
     generator = np.random.default_rng(19)
     count = 24
     limits = Limits(
@@ -50,7 +51,7 @@ def test_ten_thousand_take_overs_replacements_stops_and_restarts_never_step_abov
     positions, velocities = np.zeros(count), np.zeros(count)
     worst_step = worst_change = 0.0
     limiter.start(positions)
-    for _ in range(10_000):
+    for _ in range(events):
         event = generator.choice(["take over", "replace", "stop", "restart"])
         target = generator.uniform(low, high)
         if event == "take over":  # of a robot at rest, which may be outside its limits

@@ -9,7 +9,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -134,13 +134,24 @@ def program(body: str, ending: str, *, in_function: bool) -> str:
     return f"import os, signal, sys, threading, time, zstate\n{body}\n{ending}"
 
 
+def some_endings(row: int) -> list[int]:
+    """Two endings, one of a program in a function and one at the top; neighbours share one of them."""
+    return [row % 4, (row + 1) % 4]
+
+
 @pytest.mark.usefixtures("rrbot")
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_program_that_closes_nothing_keeps_its_exit_code(spawn, name: str):
-    children: list[tuple[Child, int]] = [
-        (spawn(program(PROGRAMS[name], ending, in_function=number % 2 == 0)), code)
-        for number, (ending, code) in enumerate(ENDINGS.items())
-    ]
+@pytest.mark.parametrize(
+    ("name", "endings"),
+    [
+        *((name, some_endings(row)) for row, name in enumerate(PROGRAMS)),
+        *(pytest.param(name, range(4), marks=pytest.mark.soak) for name in PROGRAMS),
+    ],
+)
+def test_program_that_closes_nothing_keeps_its_exit_code(spawn, name: str, endings: Sequence[int]):
+    children: list[tuple[Child, int]] = []
+    for number in endings:
+        ending, code = list(ENDINGS.items())[number]
+        children.append((spawn(program(PROGRAMS[name], ending, in_function=number % 2 == 0)), code))
     for child, code in children:
         assert (child.wait(4 * DEADLINE_S), child.stderr.count("FATAL")) == (code, 0), child.stderr
 
