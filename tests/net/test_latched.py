@@ -202,7 +202,10 @@ def test_values_of_many_publishers_are_requested_a_few_at_a_time(free_port: int)
         assert len(tokens) == robots
 
 
-def test_value_that_does_not_arrive_is_logged(caplog: pytest.LogCaptureFixture):
+def test_value_that_does_not_arrive_is_logged(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("zstate.net.latched._ANSWER_WITHIN_S", 0.2)
     with connect() as writer, connect() as reader:
         token = f"{key('a')}/@adv/pub/{writer.zid}/7/_"
         requests: zenoh.Queryable = writer.zenoh.declare_queryable(token, zenoh.handlers.FifoChannel(8))

@@ -151,8 +151,11 @@ def test_free_port_is_unreachable_and_the_refusing_endpoint_of_two_is_reported(
     assert f"nothing answers at '{unused}'" in str(caught.value)
 
 
-def test_listener_without_replies_is_not_reported_as_one_without_tls(fleet: AccessRouters):
+def test_listener_without_replies_is_not_reported_as_one_without_tls(
+    fleet: AccessRouters, monkeypatch: pytest.MonkeyPatch
+):
     """Like the kernel, which accepts connections for a stopped router process."""
+    monkeypatch.setattr("zstate.net.security.connection_check._DENIAL_TIMEOUT_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         for endpoint, credentials in (
