@@ -19,7 +19,7 @@ import threading
 import time
 import traceback
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -120,16 +120,23 @@ def write(roles: Roles, runner: RunnerConnection, label: str) -> None:
         writer.close()
 
 
-def send_at_rate(writers: Sequence[Writer], job: Job, ended: threading.Event, stamps: array[int]) -> None:
+def send_at_rate(
+    writers: Sequence[Writer],
+    job: Job,
+    ended: threading.Event,
+    stamps: array[int],
+    pause: Callable[[float], object] = time.sleep,
+    now_ns: Callable[[], int] = time.monotonic_ns,
+) -> None:
     """Sends one sample of every robot at each absolute deadline."""
     period_ns, rows = 1e9 / job.rate_hz, len(job.rows)
-    begin, tick = time.monotonic_ns(), 0
+    begin, tick = now_ns(), 0
     while not ended.is_set():
         send_all(writers, tick % rows, stamps)
         tick += 1
-        left_ns = begin + tick * period_ns - time.monotonic_ns()
+        left_ns = begin + tick * period_ns - now_ns()
         if left_ns > 0:
-            time.sleep(left_ns * 1e-9)
+            pause(left_ns * 1e-9)
         elif left_ns < -MAX_BEHIND_NS:
             begin -= round(left_ns)
 

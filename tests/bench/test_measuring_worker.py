@@ -8,13 +8,14 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.processes import until
+from numpy.typing import NDArray
 
 from bench.job import Job
 from bench.subjects.subject import Answered
@@ -188,24 +189,67 @@ def test_late_joiner_reports_the_time_until_the_whole_tree(start_role: Callable[
     assert 0.0 <= result["connected_s"] <= result["whole_s"]
 
 
-def test_writer_keeps_its_deadlines_if_sending_is_slow(job: Job) -> None:
+@dataclass
+class SlowSending:
+    """A writer that takes 3 ms of its own clock for a sample, and once ``longest_s``; 50 samples in all."""
+
+    ended: threading.Event
+    longest_s: float = 0.003
+    now_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        self.sent_at: list[float] = []
+
+    def pause(self, seconds: float) -> None:
+        self.now_s += seconds
+
+    def send(self, row: int, stamp: int) -> None:
+        self.sent_at.append(self.now_s)
+        self.pause(self.longest_s if len(self.sent_at) == 10 else 0.003)
+        if len(self.sent_at) == 50:
+            self.ended.set()
+
+    def close(self) -> None:
+        pass
+
+
+def send_slowly(job: Job, longest_s: float = 0.003) -> NDArray[np.float64]:
+    """The times [s] of 50 samples at 200 Hz."""
     ended = threading.Event()
+    slow = SlowSending(ended, longest_s)
     stamps = SampleLog(job).stamps
-
-    class Slow(Writer):
-        def send(self, row: int, stamp: int) -> None:
-            time.sleep(0.003)
-            if len(stamps) == 49:
-                ended.set()
-
-    began = time.monotonic()
-    send_at_rate([Slow(Loopback(), job)], replace(job, rate_hz=200.0), ended, stamps)
-    # 50 samples at 200 Hz: the last is due after 245 ms. Without deadlines it would take 400 ms.
+    send_at_rate([slow], replace(job, rate_hz=200.0), ended, stamps, slow.pause, lambda: round(1e9 * slow.now_s))
     assert len(stamps) == 50
-    assert time.monotonic() - began >= 0.245
-    gaps = np.diff(np.array(stamps))
-    # 8 ms without deadlines; below 5 ms while it catches up after a pause of the machine.
-    assert 3e6 <= np.median(gaps) < 5.5e6
+    return np.array(slow.sent_at)
+
+
+def test_writer_keeps_its_deadlines_if_sending_is_slow(job: Job) -> None:
+    # Without deadlines the gaps would be of 8 ms.
+    assert 1e9 * np.diff(send_slowly(job)) == pytest.approx(5e6, abs=10.0)
+
+
+def test_writer_catches_up_after_a_pause_and_then_keeps_the_same_deadlines(job: Job) -> None:
+    times = send_slowly(job, longest_s=0.023)
+    gaps = 1e9 * np.diff(times)
+    # The next sample is 18 ms late; each of the following gaps is of 3 ms, until the rest is less than 2 ms.
+    assert gaps[9] == pytest.approx(23e6, abs=10.0)
+    assert gaps[10:19] == pytest.approx(3e6, abs=10.0)
+    assert np.median(gaps) == pytest.approx(5e6, rel=0.1)
+    assert times[-1] - times[0] == pytest.approx(49 * 0.005, abs=1e-7)
+
+
+def test_samples_have_the_stamps_of_their_sending(job: Job) -> None:
+    loopback, ended = Loopback(), threading.Event()
+
+    class Once(Writer):
+        def send(self, row: int, stamp: int) -> None:
+            super().send(row, stamp)
+            ended.set()
+
+    before, stamps = time.time_ns(), SampleLog(job).stamps
+    send_at_rate([Once(loopback, job)], job, ended, stamps)
+    assert [stamp for _, _, stamp in loopback.sent] == list(stamps)
+    assert before <= stamps[0] <= time.time_ns()
 
 
 def test_slow_reader_sleeps_in_the_answering_thread(job: Job) -> None:
