@@ -120,7 +120,7 @@ def write(roles: Roles, runner: RunnerConnection, label: str) -> None:
         writer.close()
 
 
-def send_at_rate(
+def send_at_rate(  # noqa: PLR0917 - the last two are a clock, which tests turn
     writers: Sequence[Writer],
     job: Job,
     ended: threading.Event,

@@ -218,7 +218,9 @@ def send_slowly(job: Job, longest_s: float = 0.003) -> NDArray[np.float64]:
     ended = threading.Event()
     slow = SlowSending(ended, longest_s)
     stamps = SampleLog(job).stamps
-    send_at_rate([slow], replace(job, rate_hz=200.0), ended, stamps, slow.pause, lambda: round(1e9 * slow.now_s))
+    send_at_rate(
+        [slow], replace(job, rate_hz=200.0), ended, stamps, slow.pause, lambda: round(1e9 * slow.now_s)
+    )
     assert len(stamps) == 50
     return np.array(slow.sent_at)
 

@@ -16,7 +16,7 @@ import pytest
 from helpers.cli_runner import Spawn, failure, run_cli, started
 from helpers.pages import blocks
 from helpers.processes import Child
-from helpers.tutorial_terminal import FOLDER, TutorialPage, check_page, masked
+from helpers.tutorial_terminal import FOLDER, TutorialPage, check_page
 
 ARM, SWING, CELL = ((FOLDER / name).read_text() for name in ("arm.urdf", "swing.py", "cell.toml"))
 """A robot; its driver, which publishes only joint states; and a cell that computes its transforms."""
@@ -106,11 +106,6 @@ def test_the_driver_is_a_dozen_lines():
 def test_the_pages_show_the_files_of_their_folder(page: str, files: dict[str, str]):
     for language, name in files.items():
         assert blocks(language, (FOLDER / page).read_text()) == [(FOLDER / name).read_text()]
-
-
-@pytest.mark.parametrize("uptime_s", [1, 59, 3_600, 9_999, 10_000, 86_400 * 400])
-def test_a_stamp_is_masked_whatever_the_uptime_of_the_machine(uptime_s: int):
-    assert masked([str(uptime_s * 1_000_000_000)]) == ["STAMP"]
 
 
 def test_the_terminal_blocks_match_real_output(folder: Path, without_xacro: None):

@@ -14,6 +14,14 @@ def blocks(language: str, text: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
+def terminals(text: str) -> list[tuple[tuple[str, ...], str]]:
+    """The blocks of terminals, each after what a comment before it names, ``<!-- varies: one; two -->``."""
+    found = re.findall(
+        r"^(?:<!-- varies: ([^\n]*) -->\n)?```console\n(.*?)^```$", text, re.MULTILINE | re.DOTALL
+    )
+    return [(tuple(varies.split("; ")) if varies else (), block) for varies, block in found]
+
+
 def languages(text: str) -> set[str]:
     """The languages of all blocks; that of a block without one is empty."""
     return set(re.findall(r"^ *```([^\n`]*)\n.*?^ *```$", text, re.MULTILINE | re.DOTALL))

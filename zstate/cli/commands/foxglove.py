@@ -71,8 +71,6 @@ def foxglove_command(
     with (
         open_session(network, (wire,)) as session,
         FoxgloveServer(host, port, origins=origins, on_event=print_status) as server,
-        FoxgloveBridge(session, server, robots, wire=wire, on_event=print_status) as bridge,
-        RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as directory,
     ):
         print_result(f"Foxglove can connect to {server.url}")
         if not is_loopback(host):
@@ -80,13 +78,17 @@ def foxglove_command(
         elif os.environ.get("SSH_CONNECTION"):
             tunnel = f"ssh -L {server.port}:127.0.0.1:{server.port} {os.uname().nodename}"
             print_status(f"from your own machine: {tunnel}")
-        if not bridge.wait(_DISCOVERY_S):
-            announced = directory.robots()
-            missing = set(robots) - {info.name for info in announced}
-            for robot in sorted(missing):
-                print_status(f"waiting: {directory.messages.unknown(robot, announced)}")
-            if not robots and not announced:
-                print_status(f"waiting: {directory.messages.announced(announced)}")
-            bridge.wait()
-        if bridge.failure is not None:
-            raise bridge.failure
+        with (
+            FoxgloveBridge(session, server, robots, wire=wire, on_event=print_status) as bridge,
+            RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as directory,
+        ):
+            if not bridge.wait(_DISCOVERY_S):
+                announced = directory.robots()
+                missing = set(robots) - {info.name for info in announced}
+                for robot in sorted(missing):
+                    print_status(f"waiting: {directory.messages.unknown(robot, announced)}")
+                if not robots and not announced:
+                    print_status(f"waiting: {directory.messages.announced(announced)}")
+                bridge.wait()
+            if bridge.failure is not None:
+                raise bridge.failure
