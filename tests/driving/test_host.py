@@ -10,6 +10,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 
 import numpy as np
@@ -812,17 +813,25 @@ def test_a_stop_that_the_driver_failed_to_carry_out_is_repeated_before_it_is_con
 
 def test_a_stop_is_confirmed_when_the_driver_has_stopped(sessions):
     class Slow(RecordingDriver):
-        has_stopped = False
+        is_stopping, may_stop = threading.Event(), threading.Event()
 
         def stop(self, how: StopMode) -> None:
-            threading.Event().wait(0.3)
+            self.is_stopping.set()
+            assert self.may_stop.wait(DEADLINE_S)
             super().stop(how)
-            self.has_stopped = True
 
     driver = Slow()
-    with running(sessions[0], driver):
-        assert stop(sessions[1], "arm").state == "stopped"
-        assert driver.has_stopped
+    with running(sessions[0], driver), ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(stop, sessions[1], "arm")
+        assert driver.is_stopping.wait(DEADLINE_S)
+        # A confirmation before the stop would have arrived before the replies to these queries.
+        for _ in range(5):
+            found = wait_for_state(sessions[1], "arm", lambda _: True, DEADLINE_S)
+            assert found is not None
+            assert found.state != "stopped"
+        assert not asked.done()
+        driver.may_stop.set()
+        assert asked.result(DEADLINE_S).state == "stopped"
 
 
 def test_an_enable_that_failed_half_way_is_followed_by_a_stop_after_silence(sessions):
@@ -1347,9 +1356,13 @@ class DevicePaced(RecordingDriver):
     def __init__(self) -> None:
         super().__init__()
         self.pulses = threading.Semaphore(0)
+        self.silent_reads = 0
 
     def read(self, stamp: int) -> JointReading | None:
-        return super().read(stamp) if self.pulses.acquire(timeout=0.05) else None
+        if self.pulses.acquire(timeout=0.05):
+            return super().read(stamp)
+        self.silent_reads += 1
+        return None
 
 
 def test_a_device_sets_the_pace_and_no_joint_moves_for_longer_than_the_time_that_passes(sessions):
@@ -1364,7 +1377,8 @@ def test_a_device_sets_the_pace_and_no_joint_moves_for_longer_than_the_time_that
 
         until(lambda: pulsed() > 50)
         before = len(driver.written())
-        threading.Event().wait(0.2)  # the device is silent
+        silent_before = driver.silent_reads
+        until(lambda: driver.silent_reads >= silent_before + 4)
         until(lambda: pulsed() > before)
         report = host.report()
     writes = [(at, value[0]) for name, at, value in driver.calls if name == "write"]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.access_routers import join, router_with_users
-from helpers.processes import DEADLINE_S, SOON_S, repeated, until
+from helpers.processes import DEADLINE_S, repeated, until
 from helpers.robots import RRBOT, wait_for_reader
 from msgspec.structs import replace
 
@@ -194,7 +194,7 @@ def test_parallel_stops_of_one_session_are_all_confirmed(sessions):
         sent.append(decode(sample.payload, sample.encoding, Stop).reason)
 
     def stop_it(reason: str) -> None:
-        states.append(stop(sessions[1], "arm", reason, timeout_s=SOON_S).state)
+        states.append(stop(sessions[1], "arm", reason, timeout_s=DEADLINE_S).state)
 
     with hosted(sessions[0], Slow(RRBOT)), Commander(sessions[1], "arm") as arm, ExitStack() as joined:
         arm.wait_for_driver()

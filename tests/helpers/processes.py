@@ -21,6 +21,8 @@ import pytest
 from helpers.fork_server import ForkedProcess, server
 
 DEADLINE_S = 15.0
+ZENOH_CLOSE_S = 10.0
+"""For so long Zenoh waits for a neighbour that does not respond, when a session closes."""
 SOON_S = 3.0
 """A limit for actions that take less than a second, with slack for a busy machine."""
 

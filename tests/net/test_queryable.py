@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from helpers.processes import SOON_S, until
+from helpers.processes import until
 
 from zstate.net import query_workers
 from zstate.net.queryable import Queryable, Reply, RequestQueryable, parse_parameters, query
@@ -253,12 +253,10 @@ def test_answer_may_close_its_own_queryable(sessions: tuple[Session, Session]):
     until(lambda: query_threads() == 0)
 
 
-def test_close_is_quick_and_may_be_repeated(sessions: tuple[Session, Session]):
+def test_close_may_be_repeated(sessions: tuple[Session, Session]):
     service = Queryable(sessions[0], KEY, lambda _: None)
-    start = time.monotonic()
     service.close()
     service.close()
-    assert time.monotonic() - start < SOON_S
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import threading
 import time
 
 import pytest
-from helpers.processes import SOON_S, Child, until
+from helpers.processes import DEADLINE_S, Child, until
 
 from zstate.errors import ConfigError
 from zstate.net.rendezvous import RENDEZVOUS, rendezvous_addresses, silent_addresses
@@ -136,7 +136,7 @@ def test_session_opened_while_the_owner_is_stopped_has_discovered_the_others(spa
         os.kill(owner.process.pid, signal.SIGSTOP)
         until(silent_addresses)
         with connect() as newcomer:
-            until(lambda: have_met(newcomer, other), SOON_S)
+            until(lambda: have_met(newcomer, other), DEADLINE_S)
             assert len(silent_addresses()) == 1
         os.kill(owner.process.pid, signal.SIGCONT)
         until(lambda: not silent_addresses())

@@ -5,7 +5,7 @@ import time
 
 import pytest
 import zenoh
-from helpers.processes import SOON_S, Child, until
+from helpers.processes import ZENOH_CLOSE_S, Child, until
 
 from zstate.errors import Closed, ConfigError, InvalidInput, NetworkError, PortBusy, Unreachable
 from zstate.net.session import connect
@@ -118,7 +118,7 @@ def test_close_may_be_called_twice_and_later_use_raises_closed():
     assert "closed" in repr(session)
 
 
-def test_close_with_a_frozen_reader_returns_within_a_second(spawn):
+def test_close_with_a_frozen_reader_does_not_wait_until_zenoh_gives_it_up(spawn):
     reader: Child = spawn(
         """
         import sys, zenoh
@@ -138,7 +138,7 @@ def test_close_with_a_frozen_reader_returns_within_a_second(spawn):
         publisher.put(bytes(10_000))
     started = time.monotonic()
     session.close()
-    assert time.monotonic() - started < SOON_S
+    assert time.monotonic() - started < ZENOH_CLOSE_S
 
 
 def test_forked_child_is_refused_and_may_close_safely():

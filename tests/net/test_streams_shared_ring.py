@@ -6,7 +6,7 @@ import threading
 
 import pytest
 import zenoh
-from helpers.processes import SOON_S, until
+from helpers.processes import DEADLINE_S, until
 
 from zstate.net.streams import SharedRing, StreamPublisher, StreamSubscriber
 from zstate.wire.protocol import SerializedSample
@@ -39,7 +39,7 @@ def test_every_item_reaches_a_receiver_that_waits_for_each():
         writer.start()
     until(lambda: len(got) == 10_000)
     ring.close()
-    receiver.join(SOON_S)
+    receiver.join(DEADLINE_S)
     assert not receiver.is_alive()
     assert sorted(got) == sorted([*range(5000)] * 2)
 
@@ -70,7 +70,7 @@ def test_thread_of_a_subscriber_to_two_keys_ends_with_the_session(sessions):
     subscriber = StreamSubscriber(sessions[1], KEYS, lambda samples: None)
     (thread,) = set(threading.enumerate()) - before
     sessions[1].close()
-    thread.join(SOON_S)
+    thread.join(DEADLINE_S)
     assert not thread.is_alive()
     subscriber.close()
 

@@ -8,7 +8,7 @@ from itertools import count
 
 import numpy as np
 import pytest
-from helpers.processes import SOON_S, Child, until
+from helpers.processes import DEADLINE_S, Child, until
 from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
@@ -162,7 +162,7 @@ def test_listener_of_several_robots_gets_the_samples_that_each_cached(sessions):
             publisher.publish([0.1, 0.2], stamp=now)
         with TransformListener(reader, ("r1", "r2")) as listener:
             for name in ("r1", "r2"):
-                listener.buffer.wait(f"{name}/world", f"{name}/camera_link", timeout_s=SOON_S)
+                listener.buffer.wait(f"{name}/world", f"{name}/camera_link", timeout_s=DEADLINE_S)
                 assert listener.buffer.latest(f"{name}/world", f"{name}/camera_link") == now
 
 
@@ -235,17 +235,15 @@ def test_invalid_follow_and_placers_are_refused(sessions):
         TransformListener(sessions[0], "r1", placers=["site"], wire="ros2")
 
 
-def test_close_is_fast_ends_reception_and_may_be_repeated(sessions):
+def test_close_ends_reception_and_may_be_repeated(sessions):
     writer, reader = sessions
     listener = TransformListener(reader, "r1")
     with StatePublisher(writer, RRBOT, "r1") as publisher:
         wait_for_stream_readers(writer, "r1")
         publisher.publish([0.0, 0.0], stamp=STAMP)
         listener.buffer.wait("world", "tool", timeout_s=5.0)
-        began = time.monotonic()
         listener.close()
         listener.close()
-        assert time.monotonic() - began < SOON_S
         with StreamPublisher(writer, "zstate/r1/joint_states", "") as probe:
             until(lambda: not probe.has_readers)
         assert listener.buffer.latest("world", "tool") == STAMP

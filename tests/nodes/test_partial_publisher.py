@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from helpers.processes import SOON_S, until
+from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, assert_pose, kinematic_pose
 from helpers.urdf_text import joint
 
@@ -55,7 +55,7 @@ def test_each_joint_is_interpolated_between_the_samples_of_its_own_driver(sessio
         lower.publish([1.0], stamp=stamp + 100 * MS)
         upper.publish({ELBOW: 2.0}, stamp=stamp + 20 * MS)
         upper.publish({ELBOW: 0.0}, stamp=stamp + 60 * MS)
-        found = listener.buffer.wait("world", RRBOT.links[-1], stamp + 30 * MS, timeout_s=SOON_S)
+        found = listener.buffer.wait("world", RRBOT.links[-1], stamp + 30 * MS, timeout_s=DEADLINE_S)
         # The shoulder is 30 ms into 100 ms, the elbow 10 ms into 40 ms.
         assert_pose(found, kinematic_pose(RRBOT, [0.3, 1.5], "world", RRBOT.links[-1]))
         positions, at = listener.buffer.joint_positions("r1", stamp + 30 * MS)
@@ -73,12 +73,12 @@ def test_a_driver_that_stops_leaves_exactly_its_own_links_behind(sessions):
     with shoulder_and_elbow(first, second) as (lower, upper), TransformListener(second, "r1") as listener:
         for publisher in (lower, upper):
             publisher.publish([0.5], stamp=stamp)
-        listener.buffer.wait("world", hand, stamp, timeout_s=SOON_S)
+        listener.buffer.wait("world", hand, stamp, timeout_s=DEADLINE_S)
         # Samples may overtake the token that names their writer, and a closed writer has none.
         until(lambda: any("wrist.py" in (frame.writer or "") for frame in listener.buffer.frames()))
         upper.close()
         lower.publish([0.5], stamp=stamp + 50 * MS)
-        listener.buffer.wait("world", upper_arm, stamp + 50 * MS, timeout_s=SOON_S)
+        listener.buffer.wait("world", upper_arm, stamp + 50 * MS, timeout_s=DEADLINE_S)
         listener.buffer.lookup("world", hand, stamp)  # its samples stay
         with pytest.raises(InFuture, match=r"wrist\.py") as raised:
             listener.buffer.lookup("world", hand, stamp + 50 * MS)
@@ -95,7 +95,7 @@ def test_joint_without_a_driver_has_no_data(sessions):
         TransformListener(second, "r1") as listener,
     ):
         lower.publish([0.5])
-        listener.buffer.wait("base", "upper", timeout_s=SOON_S)  # received live, or as history
+        listener.buffer.wait("base", "upper", timeout_s=DEADLINE_S)  # received live, or as history
         with pytest.raises(NoData):
             listener.buffer.lookup("world", RRBOT.links[-1])
 
@@ -111,9 +111,9 @@ def test_mimic_joints_follow_the_driver_of_their_master(sessions):
     ):
         wrist.publish([0.0], stamp=stamp)
         gripper.publish([0.04], [0.5], stamp=stamp)
-        found = listener.buffer.wait("palm", "right", stamp, timeout_s=SOON_S)
+        found = listener.buffer.wait("palm", "right", stamp, timeout_s=DEADLINE_S)
         assert found.translation == pytest.approx([0.0, -0.04, 0.0])
-        listener.buffer.wait("wrist", "right", stamp, timeout_s=SOON_S)
+        listener.buffer.wait("wrist", "right", stamp, timeout_s=DEADLINE_S)
         samples = listener.buffer.joint_states("hand")
         assert samples.stamps.tolist() == [stamp]
         assert samples.positions.tolist() == [[0.0, 0.04]]

@@ -2,13 +2,12 @@ import logging
 import subprocess
 import sys
 import threading
-import time
 from functools import partial
 
 import numpy as np
 import pytest
 from helpers.matrix_kinematics import matrices
-from helpers.processes import SOON_S, until
+from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, STAMP, SampleCollector, wait_for_reader
 
 from zstate.clock import ManualClock
@@ -171,10 +170,8 @@ def test_stamp_is_the_time_of_the_clock_by_default(sessions):
 
 def test_closed_publisher_raises_closed_and_closes_twice(sessions):
     publisher = StatePublisher(sessions[0], RRBOT, "r1")
-    began = time.monotonic()
     publisher.close()
     publisher.close()
-    assert time.monotonic() - began < SOON_S
     with pytest.raises(Closed, match="publisher of 'r1' is closed"):
         publisher.publish([0.0, 0.0])
 
@@ -296,7 +293,7 @@ def test_handler_of_the_warning_about_limits_may_publish_or_close(sessions, is_p
             action = publisher.close if closes else partial(publisher.publish, [2.5], stamp=STAMP + 1)
             other = threading.Thread(target=action, daemon=True)
             other.start()
-            other.join(SOON_S)
+            other.join(DEADLINE_S)
             assert not other.is_alive()
             done.set()
 
@@ -304,7 +301,7 @@ def test_handler_of_the_warning_about_limits_may_publish_or_close(sessions, is_p
         logging.getLogger("zstate").addHandler(handler)
         try:
             threading.Thread(target=lambda: publisher.publish([2.5], stamp=STAMP), daemon=True).start()
-            assert done.wait(2.0 * SOON_S)
+            assert done.wait(2.0 * DEADLINE_S)
         finally:
             logging.getLogger("zstate").removeHandler(handler)
         until(lambda: publisher.stats.outside_limits == (1 if closes else 2))

@@ -1,8 +1,7 @@
 import sys
-import time
 
 import pytest
-from helpers.processes import SOON_S, until
+from helpers.processes import until
 from helpers.robots import RRBOT
 
 from zstate.buffer.buffer import TransformBuffer
@@ -295,10 +294,8 @@ def test_publishers_without_a_name_coexist_in_one_process(sessions, monkeypatch:
 def test_closed_static_publisher_raises_closed_and_closes_twice(sessions):
     statics = StaticPublisher(sessions[0], "r1", "mount")
     statics.set(edge("tool", "camera"))
-    began = time.monotonic()
     statics.close()
     statics.close()
-    assert time.monotonic() - began < SOON_S
     for use in (lambda: statics.set(edge("tool", "camera")), lambda: statics.withdraw("camera")):
         with pytest.raises(Closed, match="'mount' is closed"):
             use()

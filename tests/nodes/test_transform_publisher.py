@@ -8,7 +8,7 @@ from itertools import count
 
 import numpy as np
 import pytest
-from helpers.processes import SOON_S, find_free_port, until
+from helpers.processes import DEADLINE_S, find_free_port, until
 from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.clock import ManualClock
@@ -47,7 +47,7 @@ def test_odometry_moves_the_joints_of_a_robot(sessions):
         for step in range(3):
             wheels.publish([0.0, 0.0], stamp=stamp + step * 20 * MS)
             odometry.publish([pose("odom", "world", float(step))], stamp + step * 20 * MS)
-        found = listener.buffer.wait("odom", "base", stamp + 30 * MS, timeout_s=SOON_S)
+        found = listener.buffer.wait("odom", "base", stamp + 30 * MS, timeout_s=DEADLINE_S)
         base = listener.buffer.lookup("world", "base", stamp + 30 * MS)
         assert found.translation - base.translation == pytest.approx([1.5, 0.0, 0.0])
         assert found.kind == "interpolated"
@@ -61,7 +61,7 @@ def test_listeners_receive_transforms_whatever_they_follow(sessions, follow):
         TransformListener(reader, "*", follow=follow) as listener,
     ):
         tracker.publish([pose("map", "ball", 2.0)])
-        assert listener.buffer.wait("map", "ball", timeout_s=SOON_S).translation[0] == 2.0
+        assert listener.buffer.wait("map", "ball", timeout_s=DEADLINE_S).translation[0] == 2.0
         assert listener.robots() == ("r1",)
 
 
@@ -103,7 +103,7 @@ def test_two_writers_of_one_robot_publish_different_edges(sessions):
     ):
         odometry.publish([pose("odom", "base_link", 1.0)], stamp)
         localisation.publish([pose("map", "odom", 10.0)], stamp)
-        assert listener.buffer.wait("map", "base_link", timeout_s=SOON_S).translation[0] == 11.0
+        assert listener.buffer.wait("map", "base_link", timeout_s=DEADLINE_S).translation[0] == 11.0
         writers = {
             name for info in discover(reader) for stream, name in info.writers if stream == "transforms"
         }
@@ -136,11 +136,11 @@ def test_edge_is_free_once_its_writer_is_closed(sessions):
     with TransformListener(second_session, "r1") as listener:
         with TransformPublisher(first_session, "r1", "odometry") as first:
             first.publish([pose("odom", "base_link", 1.0)], stamp)
-            listener.buffer.wait("odom", "base_link", timeout_s=SOON_S)
+            listener.buffer.wait("odom", "base_link", timeout_s=DEADLINE_S)
         until(lambda: not discover(second_session))
         with TransformPublisher(second_session, "r1", "visual") as second:
             second.publish([pose("odom", "base_link", 2.0)], stamp + SECOND)
-            listener.buffer.wait("odom", "base_link", stamp + SECOND, timeout_s=SOON_S)
+            listener.buffer.wait("odom", "base_link", stamp + SECOND, timeout_s=DEADLINE_S)
         assert listener.stats.refused == {}
 
 
@@ -170,7 +170,7 @@ def test_of_two_writers_that_start_an_edge_at_once_one_is_refused(sessions):
         ThreadPoolExecutor(2) as threads,
     ):
         futures = [threads.submit(writer.publish, [pose("odom", "base_link")]) for writer in (one, other)]
-        errors = [future.exception(timeout=SOON_S) for future in futures]
+        errors = [future.exception(timeout=DEADLINE_S) for future in futures]
     assert sorted(type(error).__name__ for error in errors) == ["NoneType", "SecondWriter"]
 
 
@@ -222,7 +222,7 @@ def test_token_of_an_earlier_writer_ends_none_that_publishes_an_edge(sessions):
 
             assert publish_both("another", 0.3)
             with pytest.raises(SecondWriter) as raised:
-                publish_both("base_link", SOON_S)
+                publish_both("base_link", DEADLINE_S)
     assert raised.value.first == stranger.writer
 
 
@@ -346,7 +346,7 @@ def test_covariance_comes_back_from_lookups_of_its_edge(sessions):
             moved = pose("odom", "base_link").with_covariance(covariance)
             odometry.publish([moved, pose("base_link", "wheel")], at)
         buffer = listener.buffer
-        buffer.wait("odom", "wheel", stamp + 2 * MS, timeout_s=SOON_S)
+        buffer.wait("odom", "wheel", stamp + 2 * MS, timeout_s=DEADLINE_S)
         assert np.array_equal(buffer.lookup("odom", "base_link", stamp).covariance, first)
         between = buffer.lookup("odom", "base_link", stamp + MS)
         assert np.allclose(between.covariance, (first + last) / 2)
@@ -400,7 +400,7 @@ def test_edges_of_writers_that_have_left_stay(sessions):
         for number in range(3):
             with TransformPublisher(writer, "r1", f"writer{number}") as publisher:
                 publisher.publish([pose("odom", f"frame{number}")])
-                listener.buffer.wait("odom", f"frame{number}", timeout_s=SOON_S)
+                listener.buffer.wait("odom", f"frame{number}", timeout_s=DEADLINE_S)
             left = 2 * (number + 1)  # each has joined and left
             until(lambda left=left: len(listener.events()) == left)
         assert all(listener.buffer.can_lookup("odom", f"frame{number}") for number in range(3))
@@ -420,7 +420,7 @@ def test_samples_lost_in_a_full_ring_are_counted_and_the_others_inserted(
 
         def slowly(*arguments: object, **options: object) -> bool:
             is_inserting.set()
-            goes_on.wait(SOON_S)
+            goes_on.wait(DEADLINE_S)
             return insert(*arguments, **options)
 
         monkeypatch.setattr(listener.buffer, "insert_many", slowly)
@@ -432,7 +432,7 @@ def test_samples_lost_in_a_full_ring_are_counted_and_the_others_inserted(
 
         wait_for_reader(writer, "zstate/r1/transforms/odometry")
         move()
-        assert is_inserting.wait(SOON_S)  # samples before the first one received are not counted
+        assert is_inserting.wait(DEADLINE_S)  # samples before the first one received are not counted
         for _ in range(500):
             move()
         goes_on.set()
@@ -490,7 +490,7 @@ def test_publish_from_many_threads_numbers_the_samples_and_close_ends_them(sessi
         until(lambda: odometry.stats.sent >= 400)
         odometry.close()
         for future in published:
-            future.result(timeout=SOON_S)
+            future.result(timeout=DEADLINE_S)
         assert odometry.stats.sent == sum(sent)
         until(lambda: listener.stats.received > 0)
         assert (listener.stats.refused, listener.stats.late) == ({}, 0)

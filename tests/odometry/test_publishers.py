@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.processes import SOON_S, until
+from helpers.processes import DEADLINE_S, until
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput, LookupFailed, SecondWriter
@@ -161,8 +161,8 @@ def test_odometry_is_a_moving_edge_with_its_covariance(sessions):
         for step in range(3):
             pose = base(float(step)).with_covariance((step + 1) * POSE_COVARIANCE)
             odometry.publish(pose, *STILL, stamp + step * 20 * MS)
-        found = listener.buffer.wait("odom", "base_link", stamp + 20 * MS, timeout_s=SOON_S)
-        between = listener.buffer.wait("odom", "base_link", stamp + 30 * MS, timeout_s=SOON_S)
+        found = listener.buffer.wait("odom", "base_link", stamp + 20 * MS, timeout_s=DEADLINE_S)
+        between = listener.buffer.wait("odom", "base_link", stamp + 30 * MS, timeout_s=DEADLINE_S)
         listener_stats = listener.stats
     assert (found.kind, found.translation[0]) == ("exact", 1.0)
     assert found.covariance == pytest.approx(2 * POSE_COVARIANCE)
@@ -197,7 +197,7 @@ def test_odometry_in_ros_is_a_message_and_an_edge_on_tf(sessions):
         OdometryPublisher(writer, "r1", "odom", "ros2") as odometry,
     ):
         sample = samples.first(lambda: odometry.publish(pose, [1, 2, 3], [4, 5, 6]))
-        assert listener.buffer.wait("odom", "base_link", 5, timeout_s=SOON_S).translation[0] == 2.0
+        assert listener.buffer.wait("odom", "base_link", 5, timeout_s=DEADLINE_S).translation[0] == 2.0
         (robot,) = discover(reader, wire="ros2")
     assert isinstance(sample, Odometry)
     assert sample.edges == (("odom", "base_link"),)

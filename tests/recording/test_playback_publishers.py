@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.processes import SOON_S, until
+from helpers.processes import DEADLINE_S, until
 from helpers.recording_builder import MS, START, Bag, RecordingBuilder, S, pose, recorded_buffer
 from helpers.robots import RRBOT, SampleCollector, wait_for_reader, wait_for_stream_readers
 from msgspec import structs
@@ -179,7 +179,7 @@ def test_writer_restarted_under_another_name_is_played_without_loss(sessions, re
         assert player.run().samples == 3 * COUNT
         stamps = [START + n * 10 * MS for n in range(2 * COUNT)]
         for child in ("base", "ball"):
-            listener.buffer.lookup("cart/odom", f"cart/{child}", stamps[-1], timeout_s=SOON_S)
+            listener.buffer.lookup("cart/odom", f"cart/{child}", stamps[-1], timeout_s=DEADLINE_S)
         base, has_base = listener.buffer.lookup_many("cart/odom", "cart/base", stamps)
         ball, has_ball = listener.buffer.lookup_many("cart/odom", "cart/ball", stamps)
         assert has_base.all()
@@ -220,7 +220,7 @@ def test_covariances_are_played_with_their_samples(sessions, tmp_path: Path):
         Player(sessions[1], path, rate=math.inf) as player,
     ):
         assert player.run().samples == 2
-        without = listener.buffer.lookup("cart/odom", "cart/base", START + MS, timeout_s=SOON_S)
+        without = listener.buffer.lookup("cart/odom", "cart/base", START + MS, timeout_s=DEADLINE_S)
         assert without.covariance is None
         found = listener.buffer.lookup("cart/odom", "cart/base", START)
         assert np.array_equal(found.covariance, known)
@@ -441,7 +441,7 @@ def test_sensors_and_odometry_are_replayed_as_they_were_recorded(sessions, drive
         with Player(writer, driven) as player:
             report = player.run()
         until(lambda: measured(recorder) == 4 * COUNT)
-        found = listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=SOON_S)
+        found = listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=DEADLINE_S)
     assert (report.samples, report.refused) == (4 * COUNT, {})
     assert messages(again) == messages(driven)
     assert found.translation[0] == 5.0
@@ -459,7 +459,9 @@ def test_odometry_is_replayed_to_ros_with_its_edge_on_tf(sessions, driven: Path)
         for stream, name in (("odometry", "wheels"), ("tf", "")):
             wait_for_reader(writer, RmwKeys(Ros2Options()).key("cart", stream, name))
         assert player.run().samples == 5 * COUNT
-        assert listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=SOON_S).translation[0] == 5.0
+        assert (
+            listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=DEADLINE_S).translation[0] == 5.0
+        )
         until(lambda: len(samples) == COUNT)
 
 

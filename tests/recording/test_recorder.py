@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.processes import SOON_S, until
+from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, STAMP, UPRIGHT, SampleCollector, wait_for_reader, wait_for_stream_readers
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -468,7 +468,7 @@ def test_full_disk_ends_the_recording_with_a_reason_and_what_it_has_lost_is_coun
     assert lost > 0
 
 
-def test_close_finishes_the_file_within_a_second_and_may_be_repeated(sessions, tmp_path: Path):
+def test_close_finishes_the_file_and_may_be_repeated(sessions, tmp_path: Path):
     writer, reader = sessions
     recorder = Recorder(reader, tmp_path / "run.mcap", ["r1"])
     with StatePublisher(writer, RRBOT, "r1") as publisher:
@@ -476,10 +476,8 @@ def test_close_finishes_the_file_within_a_second_and_may_be_repeated(sessions, t
         publisher.publish([0.0, 0.0], stamp=STAMP)
         until(lambda: count(recorder, "r1") == 1)
         assert not recorder.wait(0.0)
-        began = time.monotonic()
         recorder.close()
         recorder.close()
-        assert time.monotonic() - began < SOON_S
         assert recorder.wait(0.0)
         with StreamPublisher(writer, "zstate/r1/joint_states", "") as probe:
             until(lambda: not probe.has_readers)
@@ -699,7 +697,9 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
             mocap.publish(pose, now + k)
         until(lambda: [count(recorder, "r1", one) for one in ODOMETRY_STREAMS] == [5] * 4)
         until(lambda: count(recorder, "r1", {"native": "transforms", "ros2": "tf"}[wire]) == 5)
-        live = [listener.buffer.wait("odom", "base", at, SOON_S) for at in (now + PERIOD // 2, now + PERIOD)]
+        live = [
+            listener.buffer.wait("odom", "base", at, DEADLINE_S) for at in (now + PERIOD // 2, now + PERIOD)
+        ]
     assert (recorder.stats.missed, recorder.stats.refused) == (0, {})
     for other in OTHERS:
         by_topic: dict[str, list[Any]] = {}
@@ -819,12 +819,12 @@ def test_states_motions_and_stops_of_a_driver_are_recorded_and_not_replayed(sess
     ):
         loop = threading.Thread(target=host.run)
         loop.start()
-        arm.wait_for_driver(SOON_S)
+        arm.wait_for_driver(DEADLINE_S)
         until(lambda: count(recorder, "arm", "joint_states"))  # the driver knows its joints
-        assert arm.move({"elbow": [0.05]}, [0.2], stretch=True).wait(SOON_S).name == "reached"
-        stop(sessions[1], "arm", "door open", timeout_s=SOON_S)
+        assert arm.move({"elbow": [0.05]}, [0.2], stretch=True).wait(DEADLINE_S).name == "reached"
+        stop(sessions[1], "arm", "door open", timeout_s=DEADLINE_S)
         until(lambda: count(recorder, "arm", "stop"))
-        assert arm.release(SOON_S).state == "ready"
+        assert arm.release(DEADLINE_S).state == "ready"
         host.close()
         loop.join()
         until(lambda: count(recorder, "arm", "joint_states"))

@@ -3,7 +3,7 @@ from __future__ import annotations
 import time
 from contextlib import closing
 
-from helpers.processes import SOON_S, until
+from helpers.processes import until
 from helpers.robots import SampleCollector, wait_for_reader
 
 from zstate.net.latched import LatchedPublisher
@@ -62,7 +62,7 @@ def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):
     assert len(payloads(batches)) < sent
 
 
-def test_close_is_fast_without_a_reader_and_keeps_waiting_batches(sessions):
+def test_close_ends_without_a_reader_and_keeps_waiting_batches(sessions):
     writer, reader = sessions
     inbox = MessageQueue(reader)
     with StreamPublisher(writer, "a/samples", "") as samples:
@@ -70,10 +70,8 @@ def test_close_is_fast_without_a_reader_and_keeps_waiting_batches(sessions):
         until(lambda: samples.has_readers)
         for number in range(QUEUE_LENGTH + 2 * CAPACITY):
             samples.put(b"%d" % number)
-    began = time.monotonic()
     inbox.close()
     inbox.close()
-    assert time.monotonic() - began < SOON_S
     # How many its ring lost before them is the machine's business.
     waiting = [int(payload) for payload in payloads(inbox.pop_all())]
     assert waiting

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from helpers.processes import DEADLINE_S, SOON_S, until
+from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, SampleCollector
 
 from zstate.driving import Commander, DriverHost, stop
@@ -68,7 +68,7 @@ def test_slider_value_is_published(arm, sessions):
 
 def test_listener_receives_link_and_mimic_joint_of_a_moved_slider(arm, sessions):
     with TransformListener(sessions[1], "arm1") as listener:
-        listener.buffer.wait("base", "left", timeout_s=SOON_S)
+        listener.buffer.wait("base", "left", timeout_s=DEADLINE_S)
         arm.set("finger", 0.03)
 
         def follows() -> bool:
