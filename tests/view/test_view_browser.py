@@ -48,13 +48,19 @@ def field(view_tab, label: str):
     return view_tab.tab.locator(f'xpath=//label[normalize-space(.)="{label}"]/ancestor::div[2]//input').last
 
 
+def shape_of(view_tab) -> tuple[int, int]:
+    """The height and width of the canvas, in pixels."""
+    box = view_tab.tab.locator("canvas").first.bounding_box()
+    return round(box["height"]), round(box["width"])
+
+
 def picture(view_tab) -> NDArray[np.int16]:
     """The pixels of the canvas, when four pictures in a row are the same: a page shows a change late."""
-    box = view_tab.tab.locator("canvas").first.bounding_box()
+    height, width = shape_of(view_tab)
     last, same = np.zeros(0), 1
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
-        pixels = view_tab.pixels()[: round(box["height"]), : round(box["width"])].astype(np.int16)
+        pixels = view_tab.pixels()[:height, :width].astype(np.int16)
         same = same + 1 if last.shape == pixels.shape and changed(last, pixels).mean() < 1e-4 else 1
         if same == 4:
             return pixels
@@ -226,28 +232,30 @@ def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):
         view_tab = open_tab(shown.page.url)
         until(lambda: world.version == 1, PATIENCE_S)
         until_fitted(shown)
-        # The page has the map and the fitted camera when a click has come through it.
-        field(view_tab, "Maps").click()
-        until(lambda: not world.maps)
-        bare = picture(view_tab)
-        field(view_tab, "Maps").click()
-        until(lambda: world.maps)
-
         snapshot = shown.source.snapshot()
         placed = snapshot.poses_in("rrbot/world")
         corners = np.array([(x, y, 0.0) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
         meshes = shown.view.scene.corners(snapshot.tree, placed)
         framing = fit_camera(snapshot, placed, 1.0, meshes, corners)
         assert framing is not None
-        height, width = bare.shape[:2]
+        height, width = shape_of(view_tab)
         middles = np.array([(0.7, 0.7, 0.0), (-0.7, -0.7, 0.0), (0.7, -0.7, 0.0)])
         occupied, unknown, free = pixels_of(middles, framing, (width, height)).round().astype(int).tolist()
-        until(lambda: picture(view_tab)[occupied[1], occupied[0]].max() < 60, PATIENCE_S)
-        full = picture(view_tab)
+
+        def lightness(at: list[int]) -> list[int]:
+            return view_tab.pixels()[at[1], at[0]].tolist()
+
+        # A page shows a change late: each picture is awaited, with the map, without and with it again.
+        until(lambda: max(lightness(occupied)) < 60, PATIENCE_S)
+        field(view_tab, "Maps").click()
+        until(lambda: not world.maps)
+        until(lambda: min(lightness(occupied)) > 180, PATIENCE_S)
+        field(view_tab, "Maps").click()
+        until(lambda: world.maps)
+        until(lambda: max(lightness(occupied)) < 60, PATIENCE_S)
         view_tab.save_screenshot("map")
-        assert bare[occupied[1], occupied[0]].min() > 180
-        for x, y in (unknown, free):
-            assert full[y, x].min() > 180
+        for place in (unknown, free):
+            assert min(lightness(place)) > 180
 
 
 def test_map_without_any_frame_is_drawn_in_its_own(open_tab, show_view, sessions):
