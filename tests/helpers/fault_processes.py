@@ -12,10 +12,10 @@ import pytest
 from helpers.cli_runner import Ended, run_cli
 from helpers.processes import DEADLINE_S, Child, find_free_port
 
-SLACK = 3.0
-"""Factor on the stated bounds, as a CI machine is busy with other tests; beyond it, recovery has failed.
+RECOVERED_WITHIN_S = 3.0
+"""Below the 10 s after which Zenoh gives up a neighbour or repeats a query: beyond it, recovery has failed.
 
-The figures are printed (``-rP``); compare them with the bounds on an idle machine (``-n 0``).
+The figures themselves are printed (``-rP``), for an idle machine (``-n 0``).
 """
 
 TESTS = str(Path(__file__).parents[1])

@@ -6,7 +6,14 @@ import time
 from collections.abc import Sequence
 
 import pytest
-from helpers.fault_processes import SLACK, FaultProcess, Start, assert_no_growth, client, print_figures
+from helpers.fault_processes import (
+    RECOVERED_WITHIN_S,
+    FaultProcess,
+    Start,
+    assert_no_growth,
+    client,
+    print_figures,
+)
 from helpers.processes import find_free_port
 
 pytestmark = pytest.mark.processes
@@ -15,7 +22,6 @@ KILLS = pytest.mark.parametrize(
     "kills", [pytest.param(1, id="once"), pytest.param(20, id="twenty times", marks=pytest.mark.soak)]
 )
 RATE_HZ = 200.0
-BOUND_S = 1.0
 SETTLED = 2
 
 
@@ -38,7 +44,7 @@ def killed(process: FaultProcess) -> int:
 
 
 @KILLS
-def test_killed_publisher_is_received_again_within_a_second(start: Start, endpoint: str, kills: int):
+def test_killed_publisher_is_received_again(start: Start, endpoint: str, kills: int):
     def publisher(mark: float) -> FaultProcess:
         return start(
             "publisher", robot="r1", session=client(endpoint), rate_hz=RATE_HZ, mark=mark, wait=False
@@ -62,8 +68,8 @@ def test_killed_publisher_is_received_again_within_a_second(start: Start, endpoi
     print_figures("publisher killed: silent, with the time to start another", silent)
     print_figures("publisher killed: answers again after the new one is ready", answered)
     print_figures("publisher killed: new latched value after", latched)
-    assert max(answered) < BOUND_S * SLACK
-    assert max(latched) < BOUND_S * SLACK
+    assert max(answered) < RECOVERED_WITHIN_S
+    assert max(latched) < RECOVERED_WITHIN_S
     assert reader.query("stats")["refused"] == {}
 
 
@@ -91,12 +97,12 @@ def test_killed_router_loses_no_latched_value_changed_during_the_outage(
     print_figures("router killed: silent, with the time to start another", silent)
     print_figures("router killed: answers again after the new one is ready", answered)
     print_figures("router killed: latched value changed during the outage after", latched)
-    assert max(answered) < BOUND_S * SLACK
-    assert max(latched) < BOUND_S * SLACK
+    assert max(answered) < RECOVERED_WITHIN_S
+    assert max(latched) < RECOVERED_WITHIN_S
 
 
 @KILLS
-def test_killed_listener_has_all_data_within_a_second(start: Start, endpoint: str, kills: int):
+def test_killed_listener_has_all_data_again(start: Start, endpoint: str, kills: int):
     router = start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint), rate_hz=RATE_HZ, mark=7.0)
     witness = start("reader", session=client(endpoint))
@@ -113,8 +119,8 @@ def test_killed_listener_has_all_data_within_a_second(start: Start, endpoint: st
     assert (stats["missed"], stats["dropped"], stats["refused"]) == (0, 0, {})
     print_figures("listener killed: answers again after", answered)
     print_figures("listener killed: latched value after", latched)
-    assert max(answered) < BOUND_S * SLACK
-    assert max(latched) < BOUND_S * SLACK
+    assert max(answered) < RECOVERED_WITHIN_S
+    assert max(latched) < RECOVERED_WITHIN_S
 
 
 def test_clients_of_a_killed_router_continue_with_the_next(start: Start):
@@ -136,4 +142,4 @@ def test_clients_of_a_killed_router_continue_with_the_next(start: Start):
     watched = reader.query("watched", "r1")
     print(f"router fail-over: a gap of {watched['gap_ns'] * 1e-9:.3f} s")
     assert watched["went_back"] == 0
-    assert watched["gap_ns"] * 1e-9 < BOUND_S * SLACK
+    assert watched["gap_ns"] * 1e-9 < RECOVERED_WITHIN_S

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
-from helpers.fault_processes import Start, client
+from helpers.fault_processes import RECOVERED_WITHIN_S, Start, client
 
 pytestmark = pytest.mark.processes
 
@@ -56,7 +56,7 @@ def test_newer_of_two_conflicting_writers_is_used_and_samples_of_the_other_are_c
         pytest.param(-85_000, id="-85us", marks=pytest.mark.soak),
     ],
 )
-def test_writer_with_a_clock_step_is_received_again_within_a_second_also_after_the_step_back(
+def test_writer_with_a_clock_step_is_received_again_also_after_the_step_back(
     start: Start, endpoint: str, step: int
 ):
     start("router", listen=endpoint)
@@ -72,7 +72,7 @@ def test_writer_with_a_clock_step_is_received_again_within_a_second_also_after_t
         assert reader.query("near", "r1", stepped)
         assert reader.query("after", "r1", stepped + 50_000_000)
         print(f"clock of the writer set {shift:+} ns: answers after {time.monotonic() - began:.3f} s")
-        assert time.monotonic() - began < 3.0
+        assert time.monotonic() - began < RECOVERED_WITHIN_S
     watched, stats = reader.query("watched", "r2"), reader.query("stats")
     print(stats)
     assert (watched["went_back"], watched["old_as_fresh"], watched["stale"]) == (0, 0, 0)
