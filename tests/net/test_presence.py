@@ -125,7 +125,7 @@ def test_discover_without_robots_takes_its_timeout():
     with connect() as session:
         started = time.monotonic()
         assert discover(session, timeout_s=0.3) == ()
-        assert 0.3 <= time.monotonic() - started < 2.0
+        assert time.monotonic() - started >= 0.3
         for timeout_s in (0.0, -1.0, float("nan"), float("inf"), 1e300):
             with pytest.raises(InvalidInput, match="timeout_s"):
                 discover(session, timeout_s=timeout_s)

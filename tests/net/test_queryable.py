@@ -11,7 +11,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from helpers.processes import until
+import zenoh
+from helpers.processes import DEADLINE_S, until
 
 from zstate.net import query_workers
 from zstate.net.queryable import Queryable, Reply, RequestQueryable, parse_parameters, query
@@ -164,11 +165,15 @@ def test_thread_of_a_queryable_without_queries_does_not_wake_up(sessions: tuple[
     with Queryable(sessions[0], KEY, lambda _: Reply(b"x", "")):
         assert answered(sessions[1], KEY) == [(True, b"x", "zenoh/bytes")]
         threads = set(threading.enumerate()) - before
-        counts = [_voluntary_switches(threads)]
-        for _ in range(4):
-            threading.Event().wait(0.25)
-            counts.append(_voluntary_switches(threads))
-    assert counts[-1] == counts[1]  # in three quarters of a second; a channel of Zenoh wakes it seven times
+        channel = zenoh.handlers.FifoChannel(1)
+        with sessions[0].zenoh.declare_subscriber("nobody/writes/here", channel) as subscriber:
+            waiting = threading.Thread(target=lambda: list(subscriber), name="a channel of Zenoh")
+            waiting.start()
+            until(lambda: waiting.native_id and _voluntary_switches([waiting]) >= 3)
+            idle, woken = _voluntary_switches(threads), _voluntary_switches([waiting])
+            until(lambda: _voluntary_switches([waiting]) >= woken + 8)
+            assert _voluntary_switches(threads) - idle <= 1, "a thread in a channel of Zenoh woke up 8 times"
+        waiting.join(DEADLINE_S)
 
 
 def _voluntary_switches(threads: Iterable[threading.Thread]) -> int:
