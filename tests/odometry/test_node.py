@@ -58,6 +58,7 @@ class Rover:
         self.has_imu.set()
         self.has_joints.set()
         self.stop = threading.Event()
+        self.ticks = 0
         self._joints = StatePublisher(session, MODEL, "r1")
         self._imu = ImuPublisher(session, "r1", "imu", frame="imu_link")
         self._thread = threading.Thread(target=self._run)
@@ -72,6 +73,7 @@ class Rover:
                 if tick % 4 == 0 and self.has_joints.is_set():
                     joints = self.truth.joints(stamp)
                     self._joints.publish(joints.positions, joints.velocities, stamp=joints.stamp)
+                self.ticks += 1
 
     def close(self) -> None:
         self.stop.set()
@@ -163,13 +165,14 @@ def test_without_its_imu_it_goes_on_with_the_wheels_and_without_all_it_ends():
         before = node.published
         until(lambda: node.published > before + 20)
         rover.has_joints.clear()
-        until(lambda: _is_silent(node))
+        until(lambda: _is_silent(rover, node))
 
 
-def _is_silent(node: OdometryNode) -> bool:
-    """Whether nothing is published in a fifth of a second."""
-    before = node.published
-    return not threading.Event().wait(0.2) and node.published == before
+def _is_silent(rover: Rover, node: OdometryNode) -> bool:
+    """Whether nothing is published during 40 ticks of the rover, in which it would publish 10 joint states."""
+    before, tick = node.published, rover.ticks
+    until(lambda: rover.ticks >= tick + 40)
+    return node.published == before
 
 
 def test_rate_limits_the_samples_of_a_faster_imu():
