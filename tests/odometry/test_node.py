@@ -169,7 +169,7 @@ def test_without_its_imu_it_goes_on_with_the_wheels_and_without_all_it_ends():
 
 
 def _is_silent(rover: Rover, node: OdometryNode) -> bool:
-    """Whether nothing is published during 40 ticks of the rover, in which it would publish 10 joint states."""
+    """Whether nothing is published during 40 ticks of the rover, in which it publishes 10 joint states."""
     before, tick = node.published, rover.ticks
     until(lambda: rover.ticks >= tick + 40)
     return node.published == before
