@@ -32,3 +32,16 @@ def test_a_reason_is_logged_once_for_all_that_share_a_parent(caplog: pytest.LogC
     assert len(caplog.records) == 1
     assert (one.counts["loop"], other.counts["loop"], parent.counts["loop"]) == (1, 1, 1)
     assert parent.first == {"loop": "text"}
+
+
+def test_a_refusal_is_explained_before_it_is_counted():
+    refusals, counted = Refusals(), []
+
+    class Text:
+        def __str__(self) -> str:
+            counted.append(refusals.counts["late"])
+            return "too late"
+
+    refusals.count("late", Text())
+    assert counted[0] == 0
+    assert (refusals.counts, refusals.first) == ({"late": 1}, {"late": "too late"})

@@ -469,6 +469,7 @@ def test_writer_with_a_clock_set_back_restarts_only_its_own_edges(sessions):
         for step in range(3):  # the first late sample may have a wrong stamp; the second begins a new epoch
             wheels.publish([pose("odom", "base_link")], now - 3600 * SECOND + step * MS)
         until(lambda: counts() == {"r1/base_link": 2, "r1/ball": 5})
+        until(lambda: "set back" in [event.kind for event in listener.events()])
         (event,) = [event for event in listener.events() if event.kind == "set back"]
         assert (event.stream, event.writer and event.writer.session) == ("transforms", wheels._session_id)
 

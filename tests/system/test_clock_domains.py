@@ -324,6 +324,7 @@ def test_clock_set_back_by_less_than_the_history_starts_a_new_history_of_that_ro
         assert not buffer.can_lookup("r1/world", "r1/tool", NOW)
         assert buffer.can_lookup("r2/world", "r2/tool", NOW)
         until(lambda: [one.robot for one in listener.events() if one.kind == "set back"] == ["r1"])
+        until(lambda: "the clock of 'r1' went back by 5.0 s: its history restarts" in caplog.text)
     assert caplog.text.count("the clock of 'r1' went back by 5.0 s: its history restarts") == 1
     assert "'r2'" not in caplog.text
 

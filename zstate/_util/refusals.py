@@ -28,12 +28,12 @@ class Refusals:
         self._lock = fork_safe_lock()
 
     def count(self, reason: str, text: object) -> None:
-        """Count one refusal for ``reason``; ``text`` explains it."""
+        """Count one refusal for ``reason``; ``text`` explains it, in ``first`` before it is counted."""
+        is_first = reason not in self.first and self._is_first(reason, str(text))
         with self._lock:
             self.counts[reason] += 1
             self.newest = text
-            is_known = reason in self.first
-        if not is_known and self._is_first(reason, str(text)):
+        if is_first:
             facts = {"event": "refused", "reason": reason}
             text = f"{self._prefix}refused ({reason}): {text}; further ones are only counted"
             _LOG.warning("%s", text, extra=facts)
