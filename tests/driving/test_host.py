@@ -16,7 +16,7 @@ from contextlib import ExitStack, closing, contextmanager
 import numpy as np
 import pytest
 from helpers.manual_cdr import rosbags_numbers
-from helpers.processes import DEADLINE_S, repeated, until
+from helpers.processes import DEADLINE_S, repeated, take, until
 from helpers.raw_ros_nodes import COMMANDS, RosNode, RosPublisher, announced_publisher, attachment
 from helpers.robots import RRBOT, SampleCollector, wait_for_reader
 
@@ -540,7 +540,7 @@ def test_no_writes_follow_each_other_at_once_after_a_read_that_blocked(sessions)
         def read(self, stamp: int) -> JointReading:
             if self.is_slow:
                 self.is_slow = False
-                threading.Event().wait(20 / RATE_HZ)
+                take(20 / RATE_HZ)
             return super().read(stamp)
 
     driver = SlowOnce()
@@ -840,7 +840,7 @@ def test_an_enable_that_failed_half_way_is_followed_by_a_stop_after_silence(sess
             super().enable(on)
             self.calls.clear()
             if on:
-                threading.Event().wait(0.06)
+                take(0.06)
                 raise OSError("servo 6 did not answer")
 
     driver = Half()

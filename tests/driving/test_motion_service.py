@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers.access_routers import join, router_with_users
 from helpers.manual_cdr import rosbags_trajectory
-from helpers.processes import DEADLINE_S, until
+from helpers.processes import DEADLINE_S, take, until
 from helpers.raw_ros_nodes import COMMANDS, TRAJECTORY, RosPublisher, announced_publisher, tokens
 from helpers.robots import RRBOT, wait_for_reader
 
@@ -332,7 +332,7 @@ class Slow(Written):
 
     def write(self, setpoint) -> None:
         super().write(setpoint)
-        threading.Event().wait(4.0 / RATE_HZ)
+        take(4.0 / RATE_HZ)
 
 
 def test_a_motion_starts_at_its_stamp_also_if_ticks_are_missed_and_not_in_the_past(sessions):

@@ -58,6 +58,11 @@ def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> Non
         time.sleep(0.002)
 
 
+def take(seconds: float) -> None:
+    """The time that a simulated device takes for an action: an input of the test, which waits for nothing."""
+    time.sleep(seconds)
+
+
 @contextmanager
 def repeated(action: Callable[[], object], every_s: float = 0.01) -> Iterator[None]:
     """Calls ``action`` every ``every_s`` inside the block, in a thread."""
