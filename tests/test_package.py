@@ -153,7 +153,9 @@ def test_install_page_lists_the_extras_and_the_base_without_pinocchio():
 
 
 def test_docker_test_stage_runs_the_test_command_of_the_readme():
-    (in_docker,) = re.findall(r"^RUN (.* -m pytest -n auto)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    (in_docker,) = re.findall(
+        r"^RUN (.* -m pytest -n auto)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE
+    )
     assert in_docker in (ROOT / "README.md").read_text().splitlines()
 
 
