@@ -233,7 +233,7 @@ def test_commands_of_another_session_are_refused_while_the_first_are_valid(sessi
     driver = RecordingDriver()
     with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
         arm.wait_for_driver()
-        with raw_commands(sessions[1]) as put:
+        with raw_commands(sessions) as put:
             send_until(arm, {"elbow": 0.1}, lambda: host.state == "active")
 
             def both() -> bool:
@@ -246,15 +246,22 @@ def test_commands_of_another_session_are_refused_while_the_first_are_valid(sessi
 
 
 @contextmanager
-def raw_commands(session: Session) -> Iterator:
-    """``put`` for commands of the announced sessions 7 and 8."""
-    key = "zstate/arm/joint_commands"
+def raw_commands(sessions: tuple[Session, Session]) -> Iterator:
+    """``put`` for commands of the announced sessions 7 and 8, which the session of the host knows."""
+    host, session = sessions
+    key, known = "zstate/arm/joint_commands", set[str]()
+    keys = [writer_key("arm", "joint_commands", local_writer(number, "raw").identity) for number in (7, 8)]
+    # A command may overtake the token of its session.
+    watched = host.zenoh.liveliness().declare_subscriber(
+        "zstate/arm/@writer/**", lambda token: known.add(str(token.key_expr))
+    )
     with ExitStack() as opened:
-        for number in (7, 8):
-            token = writer_key("arm", "joint_commands", local_writer(number, "raw").identity)
+        for token in keys:
             opened.enter_context(announce(session, token))
         publisher = opened.enter_context(StreamPublisher(session, key, ENCODINGS[JointCommand]))
         wait_for_reader(session, key)
+        until(lambda: known.issuperset(keys))
+        watched.undeclare()
         yield publisher.put
 
 
@@ -298,7 +305,7 @@ def command(seq: int = 0, ttl: int = 0, session: int = 7, age_s: float = 0.0, **
 )
 def test_a_bad_command_is_refused_counted_and_moves_nothing(sessions, payload: bytes, reason: str):
     driver = RecordingDriver()
-    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+    with running(sessions[0], driver) as host, raw_commands(sessions) as put:
         put(payload)
         until(lambda: host.report().refused == {reason: 1})
         numbers = iter(range(10**6))
@@ -316,7 +323,7 @@ def test_positions_outside_limits_are_refused_and_counted(sessions):
     driver = RecordingDriver()
     with (
         DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=narrow) as host,
-        raw_commands(sessions[1]) as put,
+        raw_commands(sessions) as put,
     ):
         put(command(elbow=0.6))
         put(command(1, elbow=0.6, shoulder=0.1))
@@ -327,7 +334,7 @@ def test_positions_outside_limits_are_refused_and_counted(sessions):
 
 def test_an_old_command_is_refused(sessions):
     driver = RecordingDriver()
-    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+    with running(sessions[0], driver) as host, raw_commands(sessions) as put:
         put(command(5, elbow=0.1))
         put(command(5, elbow=0.2))
         put(command(4, elbow=0.2))
@@ -338,7 +345,7 @@ def test_an_old_command_is_refused(sessions):
 def test_a_command_that_was_sent_earlier_than_its_ttl_moves_nothing(sessions):
     """As one that waited before a slow link, or for the end of a cut: in order, and after silence."""
     driver = RecordingDriver()
-    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+    with running(sessions[0], driver) as host, raw_commands(sessions) as put:
         put(command(0, elbow=0.1))
         until(lambda: host.state == "active")
         until(lambda: host.state == "holding")
@@ -357,7 +364,7 @@ def test_a_command_that_was_sent_earlier_than_its_ttl_moves_nothing(sessions):
 
 def test_commands_of_a_session_that_is_not_announced_are_refused_like_its_motions(sessions):
     driver = RecordingDriver()
-    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+    with running(sessions[0], driver) as host, raw_commands(sessions) as put:
         numbers = iter(range(10**6))
 
         def is_refused() -> bool:
@@ -377,7 +384,7 @@ def test_a_commander_that_has_closed_moves_nothing_by_what_arrives_later(session
     with running(sessions[0], driver) as host:
         numbers = iter(range(10**6))
         with StreamPublisher(sessions[1], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as publisher:
-            with raw_commands(sessions[1]) as put:
+            with raw_commands(sessions) as put:
 
                 def is_moved() -> bool:
                     put(command(next(numbers), shoulder=50.0))
@@ -426,7 +433,7 @@ def test_a_commander_that_did_not_release_the_stop_does_not_move_the_robot_by_a_
     with (
         running(sessions[0], driver) as host,
         Commander(sessions[1], "arm") as arm,
-        raw_commands(sessions[1]) as put,
+        raw_commands(sessions) as put,
     ):
         numbers = iter(range(10**6))
 
@@ -704,7 +711,7 @@ def test_a_second_run_obeys_a_stop_that_is_still_latched(sessions):
     driver = RecordingDriver()
     with (
         DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS) as host,
-        raw_commands(sessions[1]) as put,
+        raw_commands(sessions) as put,
     ):
         with pytest.raises(TimeoutError):
             stop(sessions[1], "arm", "door open", timeout_s=0.05)
@@ -717,7 +724,7 @@ def test_a_second_run_obeys_a_stop_that_is_still_latched(sessions):
 
 def test_joints_of_an_expired_commander_come_to_rest_when_another_one_takes_over(sessions):
     driver = RecordingDriver()
-    with running(sessions[0], driver) as host, raw_commands(sessions[1]) as put:
+    with running(sessions[0], driver) as host, raw_commands(sessions) as put:
         first, other = iter(range(10**6)), iter(range(10**6))
 
         def is_active() -> bool:  # a command may expire before a late tick
@@ -846,7 +853,7 @@ def test_an_enable_that_failed_half_way_is_followed_by_a_stop_after_silence(sess
     driver = Half()
     with (
         running(sessions[0], driver, on_silence="relax", ttl_s=0.05) as host,
-        raw_commands(sessions[1]) as put,
+        raw_commands(sessions) as put,
     ):
         put(command(elbow=0.1))
         until(lambda: driver.stops() == ["relax"])
@@ -860,7 +867,7 @@ def test_an_interrupted_stop_is_repeated_when_the_loop_ends(sessions):
         DriverHost(
             sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS, on_silence="relax"
         ) as host,
-        raw_commands(sessions[1]) as put,
+        raw_commands(sessions) as put,
     ):
         enable = driver.enable
 
@@ -1071,7 +1078,7 @@ def test_a_tick_looks_at_a_bounded_number_of_commands_and_the_others_are_counted
     narrow = Limits(RRBOT.joint_names, [-1.0, -0.5], [1.0, 0.5], [2.0, 2.0], [np.inf, np.inf])
     with (
         DriverHost(sessions[0], RecordingDriver(), RRBOT, "arm", rate_hz=RATE_HZ, limits=narrow) as host,
-        raw_commands(sessions[1]) as put,
+        raw_commands(sessions) as put,
     ):
         for number in range(100):
             put(command(number, elbow=0.6))
@@ -1149,7 +1156,7 @@ def test_a_command_from_before_the_release_that_arrives_after_it_is_refused(sess
     key = release_key("arm", releaser.identity)
     with (
         running(sessions[0], driver) as host,
-        raw_commands(sessions[1]) as put,
+        raw_commands(sessions) as put,
         StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
     ):
         wait_for_reader(sessions[1], key)
@@ -1484,7 +1491,7 @@ def test_a_driver_without_positions_turns_only_the_joints_that_are_commanded(ses
             InvalidInput, match=r"commanded in mode velocity, .* mode position is not one of them"
         ):
             arm.send({"elbow": 0.5})
-        with raw_commands(sessions[1]) as put:
+        with raw_commands(sessions) as put:
             put(command(elbow=0.5))
             until(lambda: host.report().refused.get("mode"))
             assert str(host.report().refused) == "{'mode': 1}"
