@@ -169,7 +169,8 @@ def test_transform_of_a_link_that_a_driver_moves_is_refused(sessions):
         pytest.raises(SecondWriter, match=r"gripper\.py"),
     ):
         pose = Transform(elbow.parent, elbow.child, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-        tracker.publish([pose])
+        # It is refused once the token of the driver has arrived.
+        until(lambda: tracker.publish([pose]))
 
 
 def test_joint_may_be_claimed_again_once_its_driver_has_closed(sessions):
