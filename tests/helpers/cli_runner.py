@@ -139,7 +139,9 @@ def in_terminal(*arguments: str, columns: int = 80) -> Iterator[tuple[ForkedProc
     """A command in a terminal: its process, and the descriptor that writes to it and reads from it."""
     keyboard, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
-    process = server().start(MAIN, *arguments, terminal=terminal)
+    with pytest.MonkeyPatch.context() as environment:
+        environment.delenv("COLUMNS", raising=False)
+        process = server().start(MAIN, *arguments, terminal=terminal)
     os.close(terminal)
     try:
         yield process, keyboard

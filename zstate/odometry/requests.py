@@ -8,6 +8,7 @@ commas. The reply has no payload; an error reply has its text.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping
 from typing import Literal
 
@@ -17,6 +18,8 @@ from zstate.net.session import Session
 from zstate.odometry.estimator import BaseEstimator
 from zstate.transform import Transform
 from zstate.wire.keys import odometry_request_key, shortened
+
+_RETRY_S = 0.02
 
 Action = Literal["reset", "set_pose"]
 
@@ -40,11 +43,16 @@ def request_odometry(
     selector = f"{key}?do={action}"
     if odom_from_base is not None:
         selector += f";pose={','.join(map(repr, odom_from_base.pose7.tolist()))}"
-    for reply in query(session.zenoh, selector, timeout_s):
-        if reply.ok is not None:
-            return
-        if reply.err is not None and str(reply.err.encoding).startswith("text/plain"):
-            raise InvalidInput(f"the odometry of {robot!r} refused: {reply.err.payload.to_string()}")
+    deadline_s = time.monotonic() + timeout_s
+    while (left_s := deadline_s - time.monotonic()) > 0.0:
+        for reply in query(session.zenoh, selector, left_s):
+            if reply.ok is not None:
+                return
+            if reply.err is not None and str(reply.err.encoding).startswith("text/plain"):
+                raise InvalidInput(f"the odometry of {robot!r} refused: {reply.err.payload.to_string()}")
+        # A query that ends before its timeout had no receiver: a session that has just been opened does not
+        # know all of them yet.
+        time.sleep(_RETRY_S)
     raise Unreachable(
         f"no reply at {key!r} within {timeout_s:g} s: is `zstate odometry {robot}` running, and may this "
         "program change it (`zstate acl`)?",
