@@ -2,14 +2,13 @@
 
 Two writers restart their tracks as fast as they can. Every number of an epoch is the number of that epoch,
 also the variances, so that an answer of two epochs shows: by numbers that differ, or by fractions, which come
-of an interpolation between two of them. 0.2 s for each call, 2 s with ZSTATE_LONG=1.
+of an interpolation between two of them. 0.2 s for each call.
 """
 
 from __future__ import annotations
 
 import asyncio
 import itertools
-import os
 import sys
 import threading
 import time
@@ -28,7 +27,7 @@ from zstate.errors import LookupFailed, Stale
 from zstate.model.load import load_model
 from zstate.transform import Transform
 
-SECONDS = 2.0 if os.environ.get("ZSTATE_LONG") == "1" else 0.2
+SECONDS = 0.2
 
 CRANE = """<robot name="crane"><link name="base"/><link name="trolley"/><link name="hook"/>
   <joint name="reach" type="prismatic"><parent link="base"/><child link="trolley"/>

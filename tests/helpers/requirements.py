@@ -67,7 +67,8 @@ REQUIREMENTS = {
         "run as root, where real-time scheduling is permitted",
     ),
     "disk": Requirement(
-        lambda: os.geteuid() == 0 and has_programs("mount"), "run as root, where file systems may be mounted"
+        lambda: is_permitted("unshare", "--mount", "mount", "-t", "tmpfs", "zstate-probe", "/mnt"),
+        "run as root, where file systems may be mounted",
     ),
     "systemd": Requirement(lambda: has_programs("systemd-analyze"), "apt-get install systemd"),
     "tf2": Requirement(

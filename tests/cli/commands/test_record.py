@@ -122,6 +122,7 @@ def short_window(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(record, "_DISK_WINDOW_S", 0.9)
 
 
+@pytest.mark.disk
 @pytest.mark.usefixtures("short_window")
 def test_disk_that_fills_within_a_day_is_a_single_warning(tmp_path: Path):
     # 100 samples a second need at least 100 bytes each; in a day that is 800 MB.
@@ -131,6 +132,7 @@ def test_disk_that_fills_within_a_day_is_a_single_warning(tmp_path: Path):
         assert "or bound recordings with --keep and --split-size" in log
 
 
+@pytest.mark.disk
 @pytest.mark.usefixtures("short_window")
 def test_disk_that_recordings_cannot_fill_is_no_warning(tmp_path: Path):
     with published_robot(), mounted_disk(tmp_path / "disk", "64m") as disk:
