@@ -30,7 +30,7 @@ MONOTONIC = "monotonic"
 """The domain of the time since an arbitrary instant, which nothing sets; its stamps never leave a process."""
 
 SET_BACK_NS = 100_000_000
-"""Samples older than their predecessors by more than this mean that the writer's clock was set back."""
+"""A clock that is behind its newest stamp by more than this [ns] was set back; by less, samples are late."""
 
 
 class ClockOffset(NamedTuple):

@@ -178,27 +178,29 @@ def test_velocities_at_the_start_are_reduced_to_those_that_can_be_stopped_within
     assert started(moving=7.0).brake(DT).velocities[0] == pytest.approx(1.0 - 4.0 * DT)
 
 
-def test_a_joint_outside_its_limits_may_stay_or_move_inwards_only():
-    limiter = started(position=2.05)
-    assert limiter.check([2.05]).tolist() == [2.05]
-    assert limiter.check([2.01]).tolist() == [2.01]
+@pytest.mark.parametrize(("side", "allowed"), [(1.0, "-2 to 2.05"), (-1.0, "-2.05 to 2")])
+def test_a_joint_outside_its_limits_may_stay_or_move_inwards_only(side: float, allowed: str):
+    limiter = started(position=side * 2.05)
+    assert limiter.check([side * 2.05]).tolist() == [side * 2.05]
+    assert limiter.check([side * 2.01]).tolist() == [side * 2.01]
     with pytest.raises(
         InvalidInput,
-        match=r"'elbow' at 2.06 rad is outside -2 to 2.05; "
-        r"'elbow' at 2.05 rad is outside -2 to 2 already, and the joint may only move inwards",
+        match=rf"'elbow' at {side * 2.06} rad is outside {allowed}; "
+        rf"'elbow' at {side * 2.05} rad is outside -2 to 2 already, and the joint may only move inwards",
     ):
-        limiter.check([2.06])
-    assert limiter.step([2.5], DT).positions.tolist() == [2.05]
+        limiter.check([side * 2.06])
+    assert limiter.step([side * 2.5], DT).positions.tolist() == [side * 2.05]
     for _ in range(100):
-        inside = limiter.step([1.9], DT).positions[0]
-    assert inside < 2.0
-    with pytest.raises(InvalidInput, match=r"'elbow' at 2.01 rad is outside -2 to 2$"):
-        limiter.check([2.01])
+        inside = limiter.step([side * 1.9], DT).positions[0]
+    assert abs(inside) < 2.0
+    with pytest.raises(InvalidInput, match=rf"'elbow' at {side * 2.01} rad is outside -2 to 2$"):
+        limiter.check([side * 2.01])
 
 
-def test_a_target_beyond_a_limit_is_never_followed_beyond_it():
-    limiter = started(position=1.9)
-    reached = [limiter.step([5.0], DT).positions[0] for _ in range(2_000)]
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_target_beyond_a_limit_is_never_followed_beyond_it(side: float):
+    limiter = started(position=side * 1.9)
+    reached = [side * limiter.step([side * 5.0], DT).positions[0] for _ in range(2_000)]
     assert max(reached) <= 2.0
     assert reached[-1] == pytest.approx(2.0, abs=1e-12)
 

@@ -9,8 +9,8 @@ import pytest
 from helpers.robots import RRBOT, assert_pose, kinematic_pose
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.clock import MONOTONIC, ManualClock
 from zstate.errors import LookupFailed
-from zstate.ingest import base
 from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
@@ -55,10 +55,13 @@ class IngestCase:
         *,
         is_shared: bool = False,
     ) -> None:
+        self.clock = sharing.clock if sharing else ManualClock(domain=MONOTONIC)
         self.ownership = (
             sharing.ownership
             if sharing
-            else FrameOwnership(buffer or TransformBuffer(), Counters(), is_shared=is_shared)
+            else FrameOwnership(
+                buffer or TransformBuffer(), Counters(), is_shared=is_shared, clock=self.clock
+            )
         )
         self.buffer, self.counters, self.live = (
             self.ownership.buffer,
@@ -146,6 +149,17 @@ def test_second_sample_of_a_clock_set_back_starts_a_new_epoch(case: IngestCase):
     assert (stats.received, stats.late, stats.refused) == (3, 1, {})
     assert case.buffer.latest("r1/upper", "r1/lower") == 1200
     assert case.elbow_is([0, 0.2], 1100)
+
+
+@pytest.mark.parametrize(("behind_ns", "is_set_back"), [(100_000_000, False), (100_000_001, True)])
+def test_clock_more_than_a_tenth_of_a_second_behind_was_set_back(
+    case: IngestCase, behind_ns: int, is_set_back: bool
+):
+    case.ingest.describe(description())
+    newest = 10_000_000_000
+    stamps = (newest, newest - behind_ns - 1, newest - behind_ns)
+    case.receive(*(case.sample(seq, [0, 0.1 * seq], stamp=at) for seq, at in enumerate(stamps)))
+    assert case.buffer.latest("r1/upper", "r1/lower") == (newest - behind_ns if is_set_back else newest)
 
 
 def test_delayed_sample_does_not_end_the_epoch(case: IngestCase):
@@ -250,31 +264,28 @@ def test_older_of_two_writers_is_counted_and_stays_refused(case: IngestCase):
     assert case.buffer.explain("r1/upper", "r1/lower", 0) is not None
 
 
-def test_announced_writer_is_accepted_again_after_a_stray_sample_and_silence(
-    case: IngestCase, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("silent_ns", "is_accepted"), [(2_000_000_000 - 1, False), (2_000_000_000, True)])
+def test_announced_writer_is_accepted_again_two_seconds_after_a_stray_sample(
+    case: IngestCase, silent_ns: int, is_accepted: bool
 ):
     case.ingest.describe(description())
     case.ingest.name_writer(1, "driver")
     stray = msgspec.structs.replace(case.sample(0, [9.0, 9.0], session=9, stamp=0), order=bytes(8))
     case.receive(case.sample(0, [1.0, 1.0], session=1, stamp=1), stray)
-    case.receive(*[case.sample(seq, [1.0, 1.0], session=1, stamp=seq + 1) for seq in (1, 2)])
-    assert case.counters.stats().refused["second writer"] == 2
-    monkeypatch.setattr(base, "SILENT_S", 0.0)
-    case.receive(case.sample(3, [2.0, 2.0], session=1, stamp=4))
-    assert case.counters.stats().refused["second writer"] == 2
-    assert case.elbow_is([2.0, 2.0], at=4)
+    case.receive(case.sample(1, [1.0, 1.0], session=1, stamp=2))
+    case.clock.set(silent_ns)
+    case.receive(case.sample(2, [2.0, 2.0], session=1, stamp=3))
+    assert case.counters.stats().refused["second writer"] == (1 if is_accepted else 2)
+    if is_accepted:
+        assert case.elbow_is([2.0, 2.0], at=3)
 
 
-def test_announced_writer_stays_refused_while_an_unannounced_one_sends(
-    case: IngestCase, monkeypatch: pytest.MonkeyPatch
-):
-    now_s = 0.0
-    monkeypatch.setattr(base.time, "monotonic", lambda: now_s)
+def test_announced_writer_stays_refused_while_an_unannounced_one_sends(case: IngestCase):
     case.ingest.describe(description())
     case.ingest.name_writer(1, "driver")
     case.receive(case.sample(0, [1.0, 1.0], session=1, stamp=0))
     for seq in range(5):
-        now_s += 0.9 * base.SILENT_S
+        case.clock.advance(1.9)
         case.receive(case.sample(seq, [2.0, 2.0], session=2, stamp=2 * seq + 1))
         case.receive(case.sample(seq + 1, [1.0, 1.0], session=1, stamp=2 * seq + 2))
     assert case.counters.stats().refused == {"second writer": 5}

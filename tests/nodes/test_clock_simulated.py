@@ -12,6 +12,7 @@ from helpers.processes import until
 from helpers.robots import wait_for_reader
 
 from zstate._util.bounded import MAX_ENTRIES
+from zstate.clock import MONOTONIC, ManualClock
 from zstate.errors import Closed, NoClock
 from zstate.model.load import load_model
 from zstate.net.streams import StreamPublisher
@@ -174,6 +175,21 @@ def test_jump_back_ends_waits_and_is_logged_once(sessions, caplog):
     assert "'zstate/clock' went back by 89.9 s" in caplog.text or "by 90.0 s" in caplog.text
 
 
+def test_time_that_goes_back_by_more_than_a_tenth_of_a_second_ends_waits_and_by_less_does_not(sessions):
+    writer, reader = sessions
+    with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
+        wait_for_reader(writer, "zstate/clock")
+        publish_time = publishing(publisher, clock)
+        publish_time(100 * SECOND)
+        waiting = Waiting(clock, 101 * SECOND)
+        publish_time(100 * SECOND - 100 * MS)
+        assert (waiting.reached, clock.epoch) == (None, 0)
+        publish_time(100 * SECOND)
+        publish_time(100 * SECOND - 100 * MS - 1)
+        until(lambda: waiting.reached)
+        assert clock.epoch == 1
+
+
 def test_newer_of_two_clock_publishers_is_followed(sessions):
     writer, reader = sessions
     with (
@@ -188,6 +204,17 @@ def test_newer_of_two_clock_publishers_is_followed(sessions):
         first.publish(3 * SECOND)
         until(lambda: clock.refused == {"second clock": 2})
         assert clock.now() == 50 * SECOND
+
+
+def test_older_clock_publisher_is_followed_after_two_seconds_without_the_newer_one(sessions):
+    with SimulatedClock(sessions[1]) as clock:
+        clock._real_time = real_time = ManualClock(domain=MONOTONIC)
+        assert clock._follows(1)
+        assert clock._follows(2)
+        real_time.set(2 * SECOND - 1)
+        assert not clock._follows(1)
+        real_time.set(2 * SECOND)
+        assert clock._follows(1)
 
 
 def test_invalid_clock_message_is_counted_and_changes_nothing(sessions):

@@ -54,6 +54,30 @@ def test_clock_that_is_set_back_is_followed():
     assert clock.waits == [101 * S, 52 * S]
 
 
+@pytest.mark.parametrize(
+    ("set_back", "next_wait"), [(100 * MS, 102 * S), (100 * MS + 1, 102 * S - 100 * MS - 1)]
+)
+def test_clock_that_is_behind_by_more_than_a_tenth_of_a_second_was_set_back(set_back: int, next_wait: int):
+    clock = SteppingClock(100 * S)
+    pace, stop = PlayerClock(clock, 1.0), threading.Event()
+    pace.start(0)
+    pace.wait(S, stop)
+    clock.stamp -= set_back
+    pace.wait(2 * S, stop)
+    assert clock.waits == [101 * S, next_wait]
+
+
+@pytest.mark.parametrize(("delay", "delays"), [(S, 0), (S + 1, 1)])
+def test_playback_that_is_more_than_a_second_late_continues_from_there(delay: int, delays: int):
+    clock = SteppingClock(0)
+    pace, stop = PlayerClock(clock, 1.0), threading.Event()
+    pace.start(0)
+    clock.stamp = S + delay
+    pace.wait(S, stop)
+    assert pace.delays == delays
+    assert pace.lateness(S) == (0 if delays else S)
+
+
 def test_infinite_rate_never_waits():
     clock = SteppingClock()
     pace = PlayerClock(clock, math.inf)

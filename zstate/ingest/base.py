@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
@@ -23,7 +22,7 @@ EARLY_BYTES = 4 * 2**20
 _EARLY_HISTORY = 20_000
 _EARLY_HISTORY_BYTES = 16 * 2**20
 
-SILENT_S = 2.0
+SILENT_NS = 2_000_000_000
 """A writer without a token that has sent nothing for this long no longer replaces an announced one."""
 
 # Of the last sessions; each may have 16 MB.
@@ -75,8 +74,8 @@ class StreamIngest(ABC):
         self._writers: BoundedDict[int, str] = BoundedDict()
         self._session: int | None = None
         self._ended_sessions: BoundedDict[int, None] = BoundedDict()
-        # The sample that was expected next, and when [s], since a replaced writer was first refused.
-        self._silence: tuple[int | None, float] = None, 0.0
+        # The sample that was expected next, and when, since a replaced writer was first refused.
+        self._silence: tuple[int | None, int] = None, 0
         self._next_seq: int | None = None
         self._newest: int | None = None
         self._newest_recalled_seq = -1
@@ -402,7 +401,7 @@ class StreamIngest(ABC):
             self._clear_early_history()
             self._missing = MissingSamples()
             self._next_seq = None
-            self._silence = None, 0.0
+            self._silence = None, 0
             self._last_late = self._newest = None
             self._newest_recalled_seq = -1
             if self._update_domain():
@@ -414,12 +413,12 @@ class StreamIngest(ABC):
 
     def _is_unannounced_and_silent(self) -> bool:
         """Whether the current writer has no token, and its samples have ended: called for those of others."""
-        now_s = time.monotonic()
+        now = self._ownership.clock.now()
         if self._session in self._writers:
             return False
         if self._silence[0] != self._next_seq:
-            self._silence = self._next_seq, now_s
-        return now_s - self._silence[1] >= SILENT_S
+            self._silence = self._next_seq, now
+        return now - self._silence[1] >= SILENT_NS
 
     def _replace_session(self, sample: Sample) -> None:
         """Handle the first sample of another writer, which begins a new epoch."""

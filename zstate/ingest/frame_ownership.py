@@ -33,6 +33,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
+from zstate.clock import Clock, MonotonicClock
 from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
 from zstate.model.robot import RobotModel
@@ -118,7 +119,8 @@ class FrameOwnership:
     ``is_shared`` means that all writers share all frames, as in ROS: no frame belongs to a robot, and moving
     edges that a model in the buffer has too are left out, because the model computes them. ``placers`` are
     the robots whose writers may place other robots' roots, None: all. If an edge is refused because of
-    another writer, ``on_conflict(stream, source, refusal)`` is called; not for moving edges in ROS.
+    another writer, ``on_conflict(stream, source, refusal)`` is called; not for moving edges in ROS. The
+    ingests measure the silence of writers by ``clock``.
     """
 
     def __init__(
@@ -129,9 +131,11 @@ class FrameOwnership:
         is_shared: bool = False,
         placers: Collection[str] | None = None,
         on_conflict: Callable[[Stream, EdgeSource, InsertRefused], None] | None = None,
+        clock: Clock | None = None,
     ) -> None:
         self.buffer = buffer
         self.counters = counters
+        self.clock = MonotonicClock() if clock is None else clock
         self.version = 0
         """Increases when the set of accepted moving edges may have changed."""
         self.live: dict[tuple[str, int], str] = {}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import secrets
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 
@@ -13,7 +12,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate._util.refusals import Refusals
-from zstate.clock import SIMULATED, check_stamp, wait_interruptible
+from zstate.clock import SET_BACK_NS, SIMULATED, Clock, MonotonicClock, check_stamp, wait_interruptible
 from zstate.errors import Closed, MessageError, NoClock, format_duration
 from zstate.net.presence import local_writer
 from zstate.net.session import Session
@@ -26,11 +25,8 @@ from zstate.wire.ros2.topics import SHARED
 
 _LOG = logging.getLogger("zstate")
 
-SET_BACK_NS = 100_000_000
-"""A larger step back ends all waits; a smaller one lengthens them a little."""
-
 # After this long without a stamp from the newest publisher an older one is followed again.
-_SILENT_S = 2.0
+_SILENT_NS = 2_000_000_000
 
 # A wait cannot be notified by its stop event, so it checks it this often in real time.
 _STOP_WITHIN_S = 0.05
@@ -93,7 +89,8 @@ class SimulatedClock(Closeable):
         self._now: int | None = None
         self._session: int | None = None
         self._ended_sessions: BoundedDict[int, None] = BoundedDict()
-        self._received_s = 0.0
+        self._received_at = 0
+        self._real_time: Clock = MonotonicClock()
         self._has_time = fork_safe(threading.Event())
         self._lock = fork_safe_lock()
         self._waits: list[tuple[int, threading.Event]] = []
@@ -168,15 +165,15 @@ class SimulatedClock(Closeable):
 
     def _follows(self, session: int) -> bool:
         """Whether ``session`` is the one to follow: the newest to appear, while it is active."""
-        now_s = time.monotonic()
-        if session in self._ended_sessions and now_s - self._received_s < _SILENT_S:
+        now = self._real_time.now()
+        if session in self._ended_sessions and now - self._received_at < _SILENT_NS:
             return False
         if session != self._session:
             if self._session is not None:
                 self._ended_sessions[self._session] = None
             self._ended_sessions.pop(session, None)
             self._session = session
-        self._received_s = now_s
+        self._received_at = now
         return True
 
     def _set(self, stamp: int) -> None:

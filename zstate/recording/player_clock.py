@@ -7,14 +7,12 @@ import threading
 
 import numpy as np
 
-from zstate.clock import Clock
+from zstate.clock import SET_BACK_NS, Clock
 from zstate.errors import InvalidInput
 
 # A playback that was held up (a suspended laptop, a debugger) or cannot keep its rate continues from where it
 # is, without a burst of what it missed; shorter delays are caught up.
 _LONGEST_DELAY_NS = 1_000_000_000
-# A system clock that was set back would make the playback wait for it.
-_SET_BACK_NS = 100_000_000
 
 _REMEMBERED = 1 << 16
 
@@ -66,7 +64,7 @@ class PlayerClock:
             return not stop.is_set()
         now = self._clock.now()
         set_back, delay = self._deadline(self._last) - now, now - self._deadline(log_time)
-        if set_back > _SET_BACK_NS:
+        if set_back > SET_BACK_NS:  # else playback would wait for the clock
             self._start -= set_back
         elif delay > _LONGEST_DELAY_NS:
             self._start += delay
