@@ -33,6 +33,7 @@ from zstate.wire.messages import JointTrajectory, MotionCancel, Release, to_bloc
 LIMITS = Limits(RRBOT.joint_names, [-1.0, -2.0], [1.0, 2.0], [2.0, 0.5], [50.0, np.inf])
 PERIOD_NS = 2_000_000
 TTL_NS = 20_000_000
+MS_NS = 1_000_000
 EXACT = 1e-9  # rounding, in units of the bound
 AT_ZERO = np.array([0], dtype=np.intp), np.zeros(1)
 
@@ -421,3 +422,18 @@ def test_no_joint_is_faster_than_its_limit_after_a_late_tick():
     stamps = np.array([one.stamp for one in driver.setpoints]) * 1e-9
     speeds = np.diff([one.positions[0] for one in driver.setpoints]) / np.diff(stamps)
     assert speeds.max() == pytest.approx(LIMITS.velocity[0])
+
+
+@pytest.mark.parametrize("ttl_ns", [6 * MS_NS, 14 * MS_NS])
+def test_a_command_moves_joints_until_its_own_ttl_ends(ttl_ns: int):
+    bench = scripted(Scripted())
+    drive(bench, 10)
+    bench.seq += 1
+    now = bench.clock.now()
+    bench.waiting.append(Command(1, bench.seq, AT_ZERO[0], np.array([0.2]), now, now + ttl_ns))
+    assert bench.loop.state.name == "active"
+    for instant, is_active in ((now + ttl_ns - 1, True), (now + ttl_ns, False)):
+        bench.clock.set(instant)
+        bench.driver.allowed_s = 1.0
+        bench.loop.tick(instant, lambda _since, _now: 0.002)
+        assert (bench.loop.state.name == "active") == is_active

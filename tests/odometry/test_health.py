@@ -2,7 +2,15 @@
 
 import pytest
 
-from zstate.odometry.health import Fate, Outcome, SourceHealth, SourceRecord, chi_square_quantile, nis_band
+from zstate.odometry.health import (
+    Fate,
+    Outcome,
+    SourceHealth,
+    SourceRecord,
+    chi_square_quantile,
+    gate,
+    nis_band,
+)
 
 
 @pytest.mark.parametrize(
@@ -13,6 +21,11 @@ from zstate.odometry.health import Fate, Outcome, SourceHealth, SourceRecord, ch
 )  # fmt: skip
 def test_quantiles_are_those_of_the_table(probability: float, degrees: int, value: float):
     assert chi_square_quantile(probability, degrees) == pytest.approx(value, rel=1e-4)
+
+
+@pytest.mark.parametrize(("dimension", "nis"), [(1, 10.828), (3, 16.266), (6, 22.458)])
+def test_the_gate_lets_pass_99_9_percent_of_the_readings_by_the_table(dimension: int, nis: float):
+    assert gate(dimension) == pytest.approx(nis, rel=1e-4)
 
 
 def test_the_band_of_a_mean_narrows_with_the_root_of_the_count():
