@@ -261,7 +261,7 @@ READER = """
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
 def test_listener_imports_neither_pinocchio_nor_the_view(sessions, spawn, follow):
-    reader: Child = spawn(READER, follow)
+    reader: Child = spawn(READER, follow, is_forked=False)
     assert reader.line() == "ready"
     writer = sessions[0]
     with StatePublisher(writer, RRBOT, "r1") as publisher:

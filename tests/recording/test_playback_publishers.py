@@ -98,6 +98,7 @@ def test_static_edges_of_an_active_writer_are_played_only_with_takeover(
 ):
     with StaticPublisher(sessions[0], "cart", name, program="calibration") as live:
         live.set(CAMERA)
+        until(lambda: current_tokens(sessions[1], "zstate/cart/@edge/**", 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], cart)
         assert (raised.value.edge, raised.value.first.program) == (edge, "calibration")
@@ -229,12 +230,14 @@ def test_covariances_are_played_with_their_samples(sessions, tmp_path: Path):
 
 def test_transforms_of_an_active_writer_are_played_only_with_takeover(sessions, tracked: Path):
     with TransformPublisher(sessions[0], "cart", "odometry", program="driver") as live:
+        until(lambda: current_tokens(sessions[1], writer_expression("cart"), 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], tracked)
         assert (raised.value.edge, raised.value.first.program) == (None, "driver")
         assert replay(sessions[1], tracked, takeover=True) == 2 * COUNT
     with TransformPublisher(sessions[0], "cart", "other", program="driver") as live:
         live.publish([Transform("odom", "base", [0, 0, 0], [0, 0, 0, 1])])
+        until(lambda: current_tokens(sessions[1], "zstate/cart/@edge/**", 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], tracked)
         assert raised.value.edge == ("cart/odom", "cart/base")

@@ -76,7 +76,7 @@ def test_slow_reader_loses_samples_and_a_fast_reader_loses_neither_samples_nor_t
     fast = start("reader", session=client(endpoint))
     assert fast.query("after", "r1", 0)
     alone = statistics.median(fast.query("latencies", "r1", 250))
-    slow = start("reader", session=client(endpoint), robot="r1", busy_ms=10.0)
+    slow = start("reader", session=client(endpoint), robot="r1", busy_ms=50.0)
     with_slow = statistics.median(fast.query("latencies", "r1", 250))
     until(lambda: slow.query("stats")["dropped"] > 0)
     publisher.query("pause")
