@@ -11,11 +11,14 @@ import pytest
 
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.ingest.counters import Counters
-from zstate.ingest.stamp_checks import LagDetector
+from zstate.ingest.stamp_checks import LagDetector, likely_cause
 from zstate.wire.messages import JointState
 
 MS = 1_000_000
 S = 1_000 * MS
+MINUTE = 60 * S
+HOUR = 60 * MINUTE
+NOW = 1_700_000_000 * S
 
 
 def warning_count(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float = 0.2) -> int:
@@ -91,3 +94,18 @@ def test_threads_share_the_checks(monkeypatch: pytest.MonkeyPatch):
                 done.result()
     finally:
         sys.setswitchinterval(interval)
+
+
+@pytest.mark.parametrize(
+    "zone_ns", [HOUR, -HOUR, -3 * HOUR - HOUR // 2, 5 * HOUR + HOUR // 2, 14 * HOUR, -12 * HOUR]
+)
+@pytest.mark.parametrize("off_ns", [-MINUTE, -50 * S, 0, 50 * S, MINUTE - 1])
+def test_stamp_off_by_a_time_zone_within_a_minute_is_local_time(zone_ns: int, off_ns: int):
+    assert "local time for UTC" in likely_cause(NOW + zone_ns + off_ns, NOW)
+
+
+@pytest.mark.parametrize(
+    "offset_ns", [HOUR + MINUTE, HOUR - MINUTE - 1, HOUR + HOUR // 4, 15 * HOUR, -15 * HOUR]
+)
+def test_stamp_off_by_no_time_zone_is_that_of_a_clock_never_set(offset_ns: int):
+    assert "never set" in likely_cause(NOW + offset_ns, NOW)
