@@ -230,6 +230,15 @@ def test_the_constructor_refuses_nan_zero_and_reversed_limits(values, text):
         one(**values)
 
 
+@pytest.mark.parametrize("effort", [-5.0, math.nan])
+def test_the_constructor_refuses_efforts_that_are_negative_or_nan(effort: float):
+    one_joint = np.ones(1)
+    with pytest.raises(
+        InvalidInput, match=f"effort limit of 'elbow' is {effort:g}; it must not be below zero"
+    ):
+        Limits(("elbow",), -one_joint, one_joint, one_joint, one_joint, effort=np.array([effort]))
+
+
 def test_the_constructor_refuses_other_counts_and_units():
     two = np.ones(2)
     with pytest.raises(InvalidInput, match=r"lower limits of 1 joints have shape \(1,\); got \(2,\)"):
