@@ -220,7 +220,7 @@ RULES = (imports_that_look_up, libraries_out_of_place, impurities, buffer_intern
 def test_every_file_keeps_the_rule(rule):
     files = sorted(PACKAGE.rglob("*.py"))
     sources = [Source(path.relative_to(PACKAGE).as_posix(), path.read_text()) for path in files]
-    assert len(sources) > 20
+    assert sources
     assert [offence for source in sources for offence in rule(source)] == []
 
 
@@ -284,14 +284,6 @@ def test_each_imported_library_is_declared_and_each_declared_one_imported():
     assert {DISTRIBUTIONS.get(name, name.replace("_", "-")) for name in foreign} == declared - WITHOUT_IMPORTS
 
 
-# Rules of the source
-
-BANNED_METHODS = frozenset(
-    ["take", "note", "tell", "say", "said", "hear", "look", "begin", "end", "learn", "hang", "wear"]
-)
-OF_MCAP = {("recording.mcap.writer", "tell")}  # a method of files, which mcap calls
-
-
 @cache
 def modules() -> dict[str, Source]:
     """Every module of the package by its dotted name; a package's name stands for its ``__init__``."""
@@ -326,24 +318,6 @@ def strings(source: Source) -> Iterator[str]:
     for node in source.nodes():
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.value
-
-
-def methods(source: Source) -> Iterator[str]:
-    for one in source.nodes():
-        if isinstance(one, ast.ClassDef):
-            functions = (
-                node for node in one.body if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-            )
-            yield from (function.name for function in functions)
-
-
-def test_no_method_has_a_name_that_explains_nothing():
-    found = {
-        (name.removeprefix("zstate."), method)
-        for name, source in modules().items()
-        for method in methods(source)
-    }
-    assert {(name, method) for name, method in found - OF_MCAP if method in BANNED_METHODS} == set()
 
 
 def test_no_module_imports_itself_through_others():

@@ -52,18 +52,6 @@ def test_publisher_and_lookup_connect_from_two_processes(
     assert lookup.wait() == 0, lookup.stderr
 
 
-def test_a_newcomer_reads_at_most_180_lines() -> None:
-    assert len(TEXT.splitlines()) <= 180
-
-
-def test_publisher_has_twelve_lines_and_lookup_five() -> None:
-    def lines_of(name: str) -> int:
-        return sum(1 for line in PROGRAMS[name].splitlines() if line.strip() and not line.startswith("#"))
-
-    assert lines_of("publish.py") <= 12
-    assert lines_of("lookup.py") <= 5
-
-
 def test_buffer_works_without_a_network(spawn: Callable[..., Child]) -> None:
     buffer = spawn(PROGRAMS["buffer.py"])
     assert "500.0 ms after the newest sample of 'map' -> 'base'" in buffer.line()

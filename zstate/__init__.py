@@ -40,12 +40,13 @@ if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
     from zstate.net.presence import discover
     from zstate.net.session import connect
-    from zstate.nodes.clock import SimulatedClock
+    from zstate.nodes.clock import ClockPublisher, SimulatedClock
     from zstate.nodes.listener import TransformListener
     from zstate.nodes.partial_publisher import PartialStatePublisher
     from zstate.nodes.publisher import StatePublisher
     from zstate.nodes.static_publisher import StaticPublisher
     from zstate.nodes.transform_publisher import TransformPublisher
+    from zstate.recording.recorder import Recorder
     from zstate.recording.recording import Recording
     from zstate.sources import JointReading, JointStateListener, SineSource
     from zstate.transform import Transform, Twist
@@ -56,6 +57,7 @@ __all__ = [
     "AccessDenied",
     "AmbiguousFrame",
     "ClockMismatch",
+    "ClockPublisher",
     "Closed",
     "Disconnected",
     "InFuture",
@@ -69,6 +71,7 @@ __all__ = [
     "ModelError",
     "NoData",
     "PartialStatePublisher",
+    "Recorder",
     "Recording",
     "RecordingError",
     "RobotModel",
@@ -93,10 +96,12 @@ __all__ = [
 ]
 
 _HOMES = {
+    "ClockPublisher": "nodes.clock",
     "JointReading": "sources",
     "JointStateListener": "sources",
     "Kinematics": "model.kinematics",
     "PartialStatePublisher": "nodes.partial_publisher",
+    "Recorder": "recording.recorder",
     "Recording": "recording.recording",
     "RobotModel": "model.robot",
     "SimulatedClock": "nodes.clock",
