@@ -93,7 +93,9 @@ def test_the_forms_of_static_transform_publisher_are_translated(given: str, writ
 
 def test_unknown_option_gets_a_suggestion_only_if_one_is_similar():
     assert "Did you mean '--connect'?" in failure("ls", "--conect", code=2)
-    assert failure("ls", "--nonsense", code=2).startswith("zstate: No such option '--nonsense'.\n")
+    message = failure("ls", "--nonsense", code=2)
+    assert "--nonsense" in message
+    assert "Did you mean" not in message
 
 
 def test_wrong_usage_exits_with_code_2_and_a_message():

@@ -80,7 +80,7 @@ def test_sliders_do_not_move_a_robot_with_another_writer_and_name_it(spawn):
         (["nowhere.mcap"], 1, "nowhere.mcap"),
         (["--rate", "0"], 2, "a rate is above 0"),
         (["--host", "nowhere.invalid"], 1, "cannot listen at 'nowhere.invalid'"),
-        (["pandda", "--sliders"], 1, "panda"),
+        (["rrbott", "--sliders"], 1, "did you mean 'rrbot'"),
         (["--port", "99999"], 2, "99999"),
         (["--camera", "1,2"], 2, "'1,2' is not three numbers with commas between"),
         (["--camera", "1,2,nan"], 2, "'1,2,nan' is not three numbers"),

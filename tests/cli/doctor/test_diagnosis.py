@@ -91,6 +91,7 @@ def test_working_robots_among_several_take_one_line():
     assert lines[-1].startswith("next: zstate joints FILE --name right")
 
 
+@pytest.mark.robots
 def test_without_robots_the_next_command_starts_one():
     found = broken_link()
     assert (found["name"], found["next"]) == ("robots", "zstate publish panda --source sine")
