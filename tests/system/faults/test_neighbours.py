@@ -78,7 +78,7 @@ def test_slow_reader_loses_samples_and_a_fast_reader_loses_neither_samples_nor_t
     alone = statistics.median(fast.query("latencies", "r1", 250))
     slow = start("reader", session=client(endpoint), robot="r1", busy_ms=50.0)
     with_slow = statistics.median(fast.query("latencies", "r1", 250))
-    until(lambda: slow.query("stats")["dropped"] > 0)
+    until(lambda: slow.query("stats")["dropped"] > 0, 60.0)  # buffers of the system are full
     publisher.query("pause")
     slow_stats, fast_stats = slow.query("stats"), fast.query("stats")
     print(f"a slow reader: median latency of the fast one {alone / 1e3:.0f} us, now {with_slow / 1e3:.0f} us")

@@ -68,12 +68,13 @@ def bridge_command(
         robots = [robot] if robot else None
         if not robots and not is_for_all:
             robots = [info.name for info in discover(native)] or None
+        names = " and ".join(map(repr, robots)) if robots else "every robot"
+        # Before the first robot is carried, which a thread of the bridge prints.
+        print_wrapped(f"bridging {names} between native and {wire} at {ros}")
         with (
             Bridge(native, session, wire, robots, on_change=print_change) as bridge,
             serve_metrics(metrics, bridge_collector(bridge)),
         ):
-            names = " and ".join(map(repr, robots)) if robots else "every robot"
-            print_wrapped(f"bridging {names} between native and {wire} at {ros}")
             print_status("a robot is carried once its robot_description arrives")
             wait_interruptible(threading.Event())
 
