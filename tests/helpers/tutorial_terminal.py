@@ -30,7 +30,7 @@ _MASKS = {
     r"\b\d{10}\.\d{9}\b|\b\d{19}\b": "STAMP",
     r"(/\S+)+/arm\.urdf": "PATH/arm.urdf",
     r"-USR1 \d+": "-USR1 N",
-    r"router [0-9a-f]{32}": "router ID",
+    r"router [0-9a-f]{1,32}": "router ID",
     r"(ahead of|behind) this": "BESIDE this",
     r"that of [\w-]+@": "that of WRITER@",
     # An unplugged cable is noticed while the driver reads, or while it writes.

@@ -98,7 +98,6 @@ def test_static_edges_of_an_active_writer_are_played_only_with_takeover(
 ):
     with StaticPublisher(sessions[0], "cart", name, program="calibration") as live:
         live.set(CAMERA)
-        until(lambda: current_tokens(sessions[1], "zstate/cart/@edge/**", 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], cart)
         assert (raised.value.edge, raised.value.first.program) == (edge, "calibration")
