@@ -190,9 +190,12 @@ def test_laser_of_the_arm_sweeps_a_room(spawn: Spawn):
     demo.line()
     address = re.search(r"--connect (\S+);", demo.stderr)
     assert address
-    robots = json.loads(run_cli("ls", "--json", "--connect", address[1]).stdout)
-    streams = {(robot["robot"], one["stream"]) for robot in robots for one in robot["writers"]}
-    assert {("rrbot", "scan"), ("rrbot", "joint_states"), ("room", "map")} <= streams
+
+    def streams() -> set[tuple[str, str]]:
+        robots = json.loads(run_cli("ls", "--json", "--connect", address[1]).stdout)
+        return {(robot["robot"], one["stream"]) for robot in robots for one in robot["writers"]}
+
+    until(lambda: {("rrbot", "scan"), ("rrbot", "joint_states"), ("room", "map")} <= streams())
     interrupted(demo)
     summary = (
         r"[1-9]\d* scans? with [1-9]\d* points? placed in world, each point by the pose at its own instant; "

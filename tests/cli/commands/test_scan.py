@@ -78,7 +78,7 @@ def test_simulated_scans_hit_the_walls_while_the_robot_drives(spawn: Spawn, hall
     ):
         child = started(spawn, "scan", "r1", "--frame", "laser", "--simulate", hall)
         assert child.line() == "r1: scans in laser, 30 Hz, on zstate/r1/scan/scan"
-        assert "the map stands in r1/odom" in child.stderr
+        until(lambda: "the map stands in r1/odom" in child.stderr)
         until(lambda: len(scans) >= 10)
         placed = list(islice(scans, 10))
     for one in placed:
