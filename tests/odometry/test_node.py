@@ -176,18 +176,20 @@ def _is_silent(rover: Rover, node: OdometryNode) -> bool:
 
 
 def test_rate_limits_the_samples_of_a_faster_imu():
-    """Of an IMU at 200 Hz, every tenth sample; of a machine that stalls, the next one after that."""
+    """Of an IMU at 200 Hz, every tenth sample; after a stall the next one, and then on the same grid."""
     stamps: list[int] = []
 
     def on_odometry(received: list[Received]) -> None:
         stamps.extend(one.message.stamp for one in received)
 
-    with rover_with_odometry(rate_hz=20.0) as (_, _, _, session):
-        with subscribe(session, get_wire("native"), "r1", "odometry", on_odometry):
-            until(lambda: len(stamps) >= 20)
+    with (
+        rover_with_odometry(rate_hz=20.0) as (_, _, _, session),
+        subscribe(session, get_wire("native"), "r1", "odometry", on_odometry),
+    ):
+        until(lambda: len(stamps) >= 20)
     gaps_s = np.diff(stamps) * 1e-9
-    assert gaps_s.min() > 0.04
     assert np.median(gaps_s) == pytest.approx(0.05, abs=0.006)
+    assert gaps_s.sum() > 0.05 * (len(gaps_s) - 1)
 
 
 def test_sentences_on_the_sources_are_in_the_status_of_the_writer_and_logged_once(caplog):
