@@ -117,8 +117,8 @@ def wait_until_under_way(motion: Motion) -> None:
 
 def test_a_motion_follows_its_trajectory_and_reaches_the_last_point(sessions):
     driver = Written()
-    # The motion has at most 7.5 rad/s^2. After late ticks, of which a busy machine has several in a row, shorter
-    # steps may change the velocity by what the acceleration limit permits in that step only.
+    # The motion has at most 7.5 rad/s^2. After late ticks, of which a busy machine has several in a row,
+    # shorter steps may change the velocity by what the acceleration limit permits in that step only.
     ample = Limits.of(RRBOT, velocity=2.0, acceleration=1000.0)
     with arm_of(sessions, driver, limits=ample) as arm:
         motion = arm.move({"elbow": [0.2, 0.1]}, [0.4, 0.8])
