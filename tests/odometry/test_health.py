@@ -1,5 +1,7 @@
 """Health: quantiles of the chi-square distribution, and sentences on sources."""
 
+import math
+
 import pytest
 
 from zstate.odometry.health import (
@@ -52,6 +54,19 @@ def test_sigmas_that_are_right_need_no_sentence():
     assert found.rate_hz == pytest.approx(50.0)
     assert found.age_s == pytest.approx(0.02)
     assert found.nis_band[0] < found.nis_mean < found.nis_band[1]
+
+
+def test_wheels_that_bridged_a_pause_are_judged_by_what_they_measured_before():
+    record = SourceRecord()
+    bridged = Outcome("accepted", math.nan, 0)
+    only = record.health("wheels", 0, [bridged], "", history_s=1.0)
+    assert (only.accepted, only.dimension, only.sentence) == (1, 0, "")
+    assert math.isnan(only.nis_mean)
+    for _ in range(100):
+        record.keep(Outcome("accepted", 3.1, 3))
+    found = record.health("wheels", 0, [bridged], "", history_s=1.0)
+    assert (found.accepted, found.dimension, found.sentence) == (101, 3, "")
+    assert found.nis_mean == pytest.approx(3.1)
 
 
 def test_sigmas_that_are_too_small_are_reported_with_their_factor():

@@ -38,7 +38,7 @@ Fate = Literal["accepted", "rejected", "reacquired"]
 
 
 class Outcome(NamedTuple):
-    """What the filter did with a reading of ``dimension`` numbers, and its NIS.
+    """What the filter did with a reading of ``dimension`` numbers, and its NIS, NaN of none.
 
     ``failure`` is why a rejected reading could not be used at all; its NIS is NaN then.
     """
@@ -115,7 +115,8 @@ class SourceRecord:
         fates = self.fates + Counter(outcome.fate for outcome in recent)
         newest_outcomes = [*self.outcomes, *recent][-WINDOW:]
         failures = [outcome.failure for outcome in newest_outcomes if outcome.failure]
-        window = [outcome for outcome in newest_outcomes if not outcome.failure]
+        # Wheels that bridged a pause are of dimension 0: they measure nothing.
+        window = [outcome for outcome in newest_outcomes if outcome.dimension and not outcome.failure]
         dimension = window[-1].dimension if window else 0
         window = [outcome for outcome in window if outcome.dimension == dimension]
         mean = sum(outcome.nis for outcome in window) / len(window) if window else math.nan
