@@ -105,7 +105,8 @@ def test_history_and_live_samples_join_without_a_gap(sessions: tuple[Session, Se
         thread = threading.Thread(target=write)
         thread.start()
         until(lambda: len(stamps) > 300)
-        with TransformListener(reader, "r1", follow=follow) as late:
+        # Its own session: on the way to that of the other listener are samples, which it would receive.
+        with connect() as joining, TransformListener(joining, "r1", follow=follow) as late:
             until(lambda: late.buffer.can_lookup(model.root, "palm", None))
             first, seen = stamps[0], len(stamps)
             moving = next(joint for joint in model.joints if joint.type != "fixed")
