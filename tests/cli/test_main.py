@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, run_process, started
-from helpers.processes import SOON_S
+from helpers.processes import ZENOH_CLOSE_S
 
 from zstate import connect, load_model
 from zstate.cli import main
@@ -158,7 +158,7 @@ def test_sigterm_ends_in_order(spawn: Spawn, number: signal.Signals):
     began = time.monotonic()
     child.process.send_signal(number)
     assert child.wait() == 128 + number
-    assert time.monotonic() - began < SOON_S
+    assert time.monotonic() - began < ZENOH_CLOSE_S
     assert " samples; commanded 100 Hz" in child.line()
     assert "Traceback" not in child.stderr
 

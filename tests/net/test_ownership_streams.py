@@ -130,13 +130,12 @@ def test_new_session_sees_existing_writers():
 
 def test_claim_needs_no_thread_and_a_check_is_cheaper_than_a_claim(sessions):
     before = threading.active_count()
-    until(lambda: time.monotonic() - sessions[0].opened_at > 0.05)
-    began = time.perf_counter()
+    began = time.thread_time()
     claims = [WriterClaim(sessions[0], [announcement(SECOND, robot=f"r{number}")]) for number in range(100)]
-    opened = time.perf_counter()
+    opened = time.thread_time()
     for claim in claims:
         claim.check()
-    checked = time.perf_counter()
+    checked = time.thread_time()
     assert threading.active_count() == before
     assert checked - opened < opened - began
     for claim in claims:

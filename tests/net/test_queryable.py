@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from collections.abc import Iterable
 from concurrent.futures import Future
 from contextlib import ExitStack
@@ -26,8 +25,8 @@ def peer_is_linked(session: Session, zid: str) -> bool:
     return zid in map(str, session.zenoh.info.peers_zid())
 
 
-def replies(session: Session, selector: str, timeout_s: float = 5.0) -> list[tuple[bool, bytes, str]]:
-    """The replies: whether it is no error, the payload and its encoding."""
+def replies(session: Session, selector: str, timeout_s: float = DEADLINE_S) -> list[tuple[bool, bytes, str]]:
+    """The replies: whether it is no error, the payload and its encoding. A timeout is an error, "Timeout"."""
     found = []
     for reply in session.zenoh.get(selector, timeout=timeout_s):
         value = reply.ok or reply.err
@@ -69,17 +68,14 @@ def test_a_query_ends_with_its_replies_after_one_of_two_equal_queryables_and_its
                 until(lambda: bool(replies(sessions[1], KEY)) and service.answered > 0)
             until(lambda: [payload for _, payload, _ in replies(sessions[1], KEY)] == [b"other"])
         until(lambda: not peer_is_linked(sessions[1], first.zid))
-        start = time.monotonic()
-        assert [payload for _, payload, _ in replies(sessions[1], KEY, timeout_s=30.0)] == [b"other"]
-        assert time.monotonic() - start < 15.0
+        # Of a query that ends by its timeout Zenoh's error is a reply.
+        assert [payload for _, payload, _ in replies(sessions[1], KEY)] == [b"other"]
 
 
-def test_query_without_a_reply_ends_at_once(sessions: tuple[Session, Session]):
+def test_query_without_a_reply_ends_before_its_timeout(sessions: tuple[Session, Session]):
     with Queryable(sessions[0], KEY, lambda parameters: Reply(b"x", "") if parameters else None):
         answered(sessions[1], f"{KEY}?a=1")
-        start = time.monotonic()
-        assert replies(sessions[1], KEY, timeout_s=30.0) == []
-        assert time.monotonic() - start < 15.0
+        assert replies(sessions[1], KEY) == []  # nor Zenoh's error of a timeout
 
 
 def test_a_request_whose_answer_is_not_done_delays_no_other_one(sessions: tuple[Session, Session]):
@@ -251,9 +247,7 @@ def test_answer_may_close_its_own_queryable(sessions: tuple[Session, Session]):
 
     service = Queryable(sessions[0], KEY, answer)
     answered(sessions[1], KEY)
-    start = time.monotonic()
-    list(sessions[1].zenoh.get(f"{KEY}?close", timeout=30.0))
-    assert time.monotonic() - start < 15.0
+    assert (False, b"Timeout") not in [one[:2] for one in replies(sessions[1], f"{KEY}?close")]
     assert replies(sessions[1], KEY) == []
     until(lambda: query_threads() == 0)
 

@@ -14,7 +14,7 @@ from xmlrpc.client import ServerProxy
 
 import numpy as np
 import pytest
-from helpers.processes import DEADLINE_S, Child, until
+from helpers.processes import Child, until
 from helpers.ros1_processes import (
     BRIDGE,
     DEBIAN_PACKAGES,
@@ -71,10 +71,8 @@ def assert_same_pose(a: Sequence[float], b: Sequence[float], tolerance: float) -
 
 
 def interrupted(child: Child) -> None:
-    began = time.monotonic()
     child.process.send_signal(signal.SIGINT)
     assert child.wait() == 130, child.stderr
-    assert time.monotonic() - began < DEADLINE_S
     assert "Traceback" not in child.stderr
 
 

@@ -52,7 +52,7 @@ FORKING = """
                         errors.append(str(failed))
             return (
                 len(errors) == 4
-                and time.monotonic() - began < 30.0
+                and time.monotonic() - began < 60.0  # the timeout of each
                 and all(f"belongs to process {os.getppid()} and does not run after" in one for one in errors)
                 and not any("wait for it" in one for one in errors)
             )
