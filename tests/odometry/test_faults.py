@@ -400,11 +400,10 @@ def findings(fault: Fault, found: Run) -> list[str]:
 def test_a_fault_leaves_the_estimate_inside_its_claim_or_is_named(name: str):
     found = played(FAULTS[name])
     assert findings(FAULTS[name], found) == []
-    assert name != "none" or found.sentences == {}
 
 
 def test_a_base_without_faults_has_no_sentence():
-    for seed in range(1, 3):  # the first row of the faults has drive 0
+    for seed in range(3):
         assert played(FAULTS["none"], seed).sentences == {}
 
 

@@ -273,10 +273,20 @@ def png(width: int, height: int, rows: bytes = b"") -> bytes:
     return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-@pytest.mark.parametrize("size", [(16_384, 16_384), (12_000, 12_000), (2**31 - 1, 2**31 - 1), (0, 10)])
-def test_an_image_of_a_hostile_size_is_refused_before_it_is_decoded(tmp_path: Path, size: tuple[int, int]):
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [
+        ((16_384, 16_384), f"{MAX_CELLS} cells"),
+        ((12_000, 12_000), f"{MAX_CELLS} cells"),
+        ((2**31 - 1, 2**31 - 1), f"{MAX_CELLS} cells"),
+        ((0, 10), "not an image"),
+    ],
+)
+def test_an_image_of_a_hostile_size_is_refused_before_it_is_decoded(
+    tmp_path: Path, size: tuple[int, int], message: str
+):
     (tmp_path / "hall.png").write_bytes(png(*size))
-    with pytest.raises(InvalidInput, match=f"{MAX_CELLS} cells|not an image|cannot be decoded"):
+    with pytest.raises(InvalidInput, match=message):
         load_map(write_yaml(tmp_path))
 
 

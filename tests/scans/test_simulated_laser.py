@@ -166,9 +166,16 @@ def test_a_tilted_grid_is_refused():
         laser(Grid(room(), 0.1, Transform.from_rpy("map", "corner", (0, 0, 0), (0.1, 0, 0))))
 
 
-@pytest.mark.parametrize("x", [math.nan, [1.0, 2.0], "here"])
-def test_a_pose_that_is_none_is_refused(x: Any):
-    with pytest.raises(InvalidInput, match=r"x of a laser is one finite number, or 4|x must be real numbers"):
+@pytest.mark.parametrize(
+    ("x", "message"),
+    [
+        (math.nan, "x of a laser is one finite number, or 4"),
+        ([1.0, 2.0], "x of a laser is one finite number, or 4"),
+        ("here", "x must be real numbers"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(x: Any, message: str):
+    with pytest.raises(InvalidInput, match=message):
         laser().ranges(x, 0.0, 0.0)
 
 

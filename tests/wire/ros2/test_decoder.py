@@ -119,15 +119,15 @@ def test_a_multi_array_is_its_numbers_whatever_its_layout_is(labels, little_endi
         assert decode_numbers(payload).tolist() == numbers
         if little_endian:
             for length in range(len(payload)):
-                with pytest.raises(MessageError, match=r"cut off|encapsulation") as caught:
+                with pytest.raises(MessageError) as caught:
                     decode_numbers(payload[:length])
-                assert caught.value.reason in ("truncated", "malformed")
+                assert caught.value.reason == "truncated"
 
 
 def test_a_multi_array_of_more_dimensions_than_bytes_is_refused():
     with pytest.raises(MessageError) as caught:
         decode_numbers(rosbags_numbers([0.5]).replace(bytes(4), b"\xff" * 4, 1))
-    assert caught.value.reason in ("truncated", "malformed")
+    assert caught.value.reason == "malformed"
 
 
 NAMES = ("shoulder", "elbow")
@@ -143,7 +143,7 @@ def test_a_trajectory_is_a_motion_from_its_stamp_or_its_arrival(little_endian: b
         for length in range(4, len(payload), 5):
             with pytest.raises(MessageError) as caught:
                 decode_trajectory(payload[:length], 77, 5)
-            assert caught.value.reason in ("truncated", "malformed")
+            assert caught.value.reason == "truncated"
 
 
 def test_a_trajectory_without_points_is_no_motion():
