@@ -1,7 +1,7 @@
 """Other implementations that the tests compare zstate's ros2 wire with, each with its own interpreter.
 
-``python oracles.py NAME FOLDER`` creates the environment of one of them in FOLDER and prints the path of its
-interpreter, which is the value of the environment variable that the tests read:
+``python oracles.py NAME FOLDER`` creates the environment of one of them in FOLDER with uv, which the extra
+``lint`` installs, and prints the path of its interpreter, the value of the environment variable that the tests read:
 
 =========  ==========================  ============================================================
 NAME       variable                    implementation
@@ -80,10 +80,10 @@ _PACKAGE = """\
 
 def make(name: str, folder: Path) -> Path:
     """Creates the environment ``name`` in ``folder``; returns its interpreter."""
-    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
-    python = folder / "bin" / "python"
-    pip = [str(python), "-m", "pip", "install", "-q", "--disable-pip-version-check"]
-    subprocess.run([*pip, *ORACLES[name].packages], check=True, stdout=sys.stderr)
+    uv, python = [sys.executable, "-m", "uv"], folder / "bin" / "python"
+    subprocess.run([*uv, "venv", "-q", "--python", sys.executable, str(folder)], check=True)
+    install = [*uv, "pip", "install", "-q", "--python", str(python), *ORACLES[name].packages]
+    subprocess.run(install, check=True, stdout=sys.stderr)
     finish = {"kilted": _build_tf2_msgs, "pyzeros": _compile_attachment}.get(name)
     if finish:
         finish(folder, python)
