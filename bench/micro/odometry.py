@@ -107,7 +107,9 @@ def husky() -> None:
     for as_joints, has_compass in product((False, True), repeat=2):
         calls = recordings.calls_of(data, as_joints=as_joints, has_compass=has_compass)
         start = time.process_time()
-        track = recordings.played(data, calls, wheels=recordings.WHEELS if as_joints else None)
+        track = recordings.played(
+            data, calls, wheels=recordings.WHEELS if as_joints else None, reads_live=True
+        )
         share = 100.0 * (time.process_time() - start) / float(data.imu[-1, 0])
         found = recordings.score(data, track)
         name = f"husky, {'joints' if as_joints else 'velocity'}{', bad compass' if has_compass else ''}"
