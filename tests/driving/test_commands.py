@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 import pytest
+from helpers.processes import until
 
-from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
+from zstate._util.refusals import Refusals
+from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, CommandReceiver, Targets
 from zstate.driving.driver import Mode
 from zstate.driving.limits import Limits
 from zstate.driving.setpoint_limiter import Limited, Rate, SetpointLimiter
+from zstate.driving.transit import CommandAdmission, CommandAges
 from zstate.errors import InvalidInput, MessageError
+from zstate.net.session import Session
+from zstate.wire.joint_order import order_digest
+from zstate.wire.messages import JointCommand, to_block
+from zstate.wire.native import ENCODINGS, encode
 
 DT = 0.004
 TICK = 4_000_000
@@ -196,3 +205,46 @@ def test_a_commander_without_a_token_that_still_sends_after_a_while_stays_the_on
     _send(targets, 1, 302 * MS, ttl_ns)
     with pytest.raises(MessageError, match="while commands of 1 are valid"):
         _send(targets, 2, 600 * MS)
+
+
+Receive = Callable[..., Command | str]
+
+
+@pytest.fixture
+def receive(sessions: tuple[Session, Session]) -> Iterator[Receive]:
+    """``receive(ttl)`` sends a command of that ttl [ns] to a driver that grants 250 ms.
+
+    It returns the command as received, or the reason of its refusal.
+    """
+    session, refusals = sessions[0], Refusals()
+    admission = CommandAdmission(CommandAges(5, 250 * MS))
+    admission.set_announced(7, alive=True, now=0)
+    with CommandReceiver(
+        *(session, "arm", ("elbow",), 250 * MS, refusals), admission=admission, modes=("position",)
+    ) as receiver:
+
+        def receive(ttl: int) -> Command | str:
+            names = ("elbow",)
+            message = JointCommand(0, 0, 7, order_digest(names), to_block([0.1]), names=names, ttl=ttl)
+            session.zenoh.put("zstate/arm/joint_commands", encode(message), encoding=ENCODINGS[JointCommand])
+            found: list[Command] = []
+            until(lambda: found.extend(receiver.drain()) or found or refusals.counts)
+            return found[0] if found else next(iter(refusals.counts))
+
+        yield receive
+
+
+@pytest.mark.parametrize(("ttl", "valid"), [(0, 250 * MS), (60 * MS, 60 * MS), (250 * MS, 250 * MS)])
+def test_a_command_moves_its_joints_until_its_own_ttl_has_passed_or_without_one_that_of_the_driver(
+    receive: Receive, ttl: int, valid: int
+):
+    command = receive(ttl)
+    assert isinstance(command, Command)
+    targets = Targets(1)
+    targets.accept(command)
+    assert targets.is_live(command.arrived + valid - 1)
+    assert not targets.is_live(command.arrived + valid)
+
+
+def test_a_ttl_that_is_longer_than_the_driver_grants_is_refused(receive: Receive):
+    assert receive(250 * MS + 1) == "ttl"

@@ -256,31 +256,33 @@ def in_modes(
 
 @pytest.mark.parametrize("acceleration", [4.0, 50.0, math.inf])
 @pytest.mark.parametrize("lag_s", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_velocity_towards_a_limit_ends_there_at_rest_also_if_the_joint_follows_with_a_lag(
-    acceleration: float, lag_s: float
+    acceleration: float, lag_s: float, side: float
 ):
     limiter, _ = in_modes(acceleration=acceleration, velocity=2.0)
     position = velocity = 0.0
     path: list[float] = []
     for tick in range(3_000):
         limiter.observe(np.array([position]), None, tick * 2_000_000)
-        setpoint = limiter.step([0.0], DT, rates={0: Rate("velocity", 5.0)}).velocities[0]
-        assert setpoint <= 2.0
+        setpoint = limiter.step([0.0], DT, rates={0: Rate("velocity", 5.0 * side)}).velocities[0]
+        assert 0.0 <= side * setpoint <= 2.0
         assert abs(setpoint - velocity) <= acceleration * DT * (1 + EXACT) or lag_s
         velocity = setpoint + (velocity - setpoint) * math.exp(-DT / lag_s) if lag_s else setpoint
         position += velocity * DT
-        path.append(position)
+        path.append(side * position)
     assert max(path) <= 2.0 + 1e-9
     assert path[-1] == pytest.approx(2.0, abs=1e-3)
     assert abs(velocity) < 1e-3
 
 
-def test_a_joint_outside_its_limits_turns_inwards_only():
-    limiter, _ = in_modes(position=2.1, acceleration=math.inf)
-    limiter.observe(np.array([2.1]), None, 0)
-    outwards = limiter.step([0.0], DT, rates={0: Rate("velocity", 1.0)})
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_joint_outside_its_limits_turns_inwards_only(side: float):
+    limiter, _ = in_modes(position=side * 2.1, acceleration=math.inf)
+    limiter.observe(np.array([side * 2.1]), None, 0)
+    outwards = limiter.step([0.0], DT, rates={0: Rate("velocity", side)})
     assert (outwards.velocities[0], outwards.limited) == (0.0, ("elbow",))
-    assert limiter.step([0.0], DT, rates={0: Rate("velocity", -1.0)}).velocities[0] == -1.0
+    assert limiter.step([0.0], DT, rates={0: Rate("velocity", -side)}).velocities[0] == -side
 
 
 def test_after_a_velocity_the_joint_brakes_in_that_mode_and_then_holds_its_position():
