@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -207,38 +208,41 @@ def test_a_commander_without_a_token_that_still_sends_after_a_while_stays_the_on
         _send(targets, 2, 600 * MS)
 
 
-Receive = Callable[..., Command | str]
+class Receiver:
+    """The receiver of a driver that grants 250 ms, and a program of session 7 that sends it commands."""
+
+    def __init__(self, session: Session, receiver: CommandReceiver, refusals: Refusals) -> None:
+        self._session, self._receiver, self._refusals = session, receiver, refusals
+
+    def receive(self, payload: bytes) -> Command | str:
+        """A command as it is received, or the reason of its refusal."""
+        self._session.zenoh.put("zstate/arm/joint_commands", payload, encoding=ENCODINGS[JointCommand])
+        found: list[Command] = []
+        until(lambda: found.extend(self._receiver.drain()) or found or self._refusals.counts)
+        return found[0] if found else next(iter(self._refusals.counts))
 
 
-@pytest.fixture
-def receive(sessions: tuple[Session, Session]) -> Iterator[Receive]:
-    """``receive(ttl)`` sends a command of that ttl [ns] to a driver that grants 250 ms.
-
-    It returns the command as received, or the reason of its refusal.
-    """
-    session, refusals = sessions[0], Refusals()
-    admission = CommandAdmission(CommandAges(5, 250 * MS))
+@contextmanager
+def receiving(session: Session, joint_names: Sequence[str]) -> Iterator[Receiver]:
+    refusals, admission = Refusals(), CommandAdmission(CommandAges(5, 250 * MS))
     admission.set_announced(7, alive=True, now=0)
-    with CommandReceiver(
-        *(session, "arm", ("elbow",), 250 * MS, refusals), admission=admission, modes=("position",)
-    ) as receiver:
+    options = {"admission": admission, "modes": ("position",)}
+    with CommandReceiver(session, "arm", joint_names, 250 * MS, refusals, **options) as receiver:
+        yield Receiver(session, receiver, refusals)
 
-        def receive(ttl: int) -> Command | str:
-            names = ("elbow",)
-            message = JointCommand(0, 0, 7, order_digest(names), to_block([0.1]), names=names, ttl=ttl)
-            session.zenoh.put("zstate/arm/joint_commands", encode(message), encoding=ENCODINGS[JointCommand])
-            found: list[Command] = []
-            until(lambda: found.extend(receiver.drain()) or found or refusals.counts)
-            return found[0] if found else next(iter(refusals.counts))
 
-        yield receive
+def command_of(joint_names: Sequence[str], ttl: int = 0) -> bytes:
+    names = tuple(joint_names)
+    block = to_block([0.1] * len(names))
+    return encode(JointCommand(0, 0, 7, order_digest(names), block, names=names, ttl=ttl))
 
 
 @pytest.mark.parametrize(("ttl", "valid"), [(0, 250 * MS), (60 * MS, 60 * MS), (250 * MS, 250 * MS)])
 def test_a_command_moves_its_joints_until_its_own_ttl_has_passed_or_without_one_that_of_the_driver(
-    receive: Receive, ttl: int, valid: int
+    sessions: tuple[Session, Session], ttl: int, valid: int
 ):
-    command = receive(ttl)
+    with receiving(sessions[0], ("elbow",)) as receiver:
+        command = receiver.receive(command_of(("elbow",), ttl))
     assert isinstance(command, Command)
     targets = Targets(1)
     targets.accept(command)
@@ -246,5 +250,20 @@ def test_a_command_moves_its_joints_until_its_own_ttl_has_passed_or_without_one_
     assert not targets.is_live(command.arrived + valid)
 
 
-def test_a_ttl_that_is_longer_than_the_driver_grants_is_refused(receive: Receive):
-    assert receive(250 * MS + 1) == "ttl"
+def test_a_ttl_that_is_longer_than_the_driver_grants_is_refused(sessions: tuple[Session, Session]):
+    with receiving(sessions[0], ("elbow",)) as receiver:
+        assert receiver.receive(command_of(("elbow",), 250 * MS + 1)) == "ttl"
+
+
+@pytest.mark.parametrize("joint_names", [("elbow",), ("shoulder", "größe", "wrist")])
+def test_a_command_has_1024_bytes_100_for_each_joint_and_two_for_each_of_their_names(
+    sessions: tuple[Session, Session], joint_names: tuple[str, ...]
+):
+    most = 1024 + 100 * len(joint_names) + 2 * len(", ".join(joint_names).encode())
+    payload = command_of(joint_names)
+    # One further element of the array, which readers ignore: a bin with its length in two bytes.
+    filler = most - len(payload) - 3
+    largest = bytes([payload[0] + 1]) + payload[1:] + b"\xc5" + filler.to_bytes(2) + bytes(filler)
+    with receiving(sessions[0], joint_names) as receiver:
+        assert isinstance(receiver.receive(largest), Command)
+        assert receiver.receive(largest + b"\0") == "too large"

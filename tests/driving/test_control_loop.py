@@ -437,3 +437,13 @@ def test_a_command_moves_joints_until_its_own_ttl_ends(ttl_ns: int):
         bench.driver.allowed_s = 1.0
         bench.loop.tick(instant, lambda _since, _now: 0.002)
         assert (bench.loop.state.name == "active") == is_active
+
+
+def test_the_outcomes_of_the_last_sixteen_motions_are_kept():
+    bench = scripted(Scripted())
+    drive(bench, 10)
+    for seq in range(100, 118):  # each but the last is replaced by the next
+        now = bench.clock.now()
+        request = JointTrajectory(now, seq, 1, ("elbow",), to_block([5.0]), to_block([0.1]))
+        bench.loop.motions.start(plan(request, LIMITS, bench.loop.present(), now), now)
+    assert [one.seq for one in bench.loop.motions.outcomes] == list(range(101, 117))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
@@ -38,7 +38,7 @@ from zstate.wire.keys import (
     stop_expressions,
     stop_key,
 )
-from zstate.wire.messages import DriverState, Release, Stop
+from zstate.wire.messages import DriverState, Release, Stop, stop_text
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
 
@@ -429,6 +429,53 @@ def test_a_flood_of_one_program_displaces_only_its_own_stops_and_none_without_a_
     assert register.current.stops == ()
 
 
+def kept_with(stops: Iterable[tuple[int, int]]) -> tuple[list[tuple[int, int]], int]:
+    """The stops that are kept of those of ``stops``, by session and number, and how many are of the host."""
+    register = StopRegister(HOST)
+    for session, number in stops:
+        register.add(ActiveStop(session, number, "hold", str(number), "desk"))
+    kept = [one.id for one in register.current.stops]
+    others = [one for one in kept if one[0] != HOST.session]
+    return others, len(kept) - len(others)
+
+
+def test_eight_stops_of_a_program_are_kept_and_one_of_the_host_stands_for_the_oldest_of_more():
+    numbers = [(1, number) for number in range(9)]
+    assert kept_with(numbers[:8]) == (numbers[:8], 0)
+    assert kept_with(numbers) == (numbers[1:], 1)
+
+
+def test_256_stops_are_kept_one_of_which_stands_for_the_oldest_of_more():
+    numbers = [(1000 + session, 0) for session in range(257)]
+    assert kept_with(numbers[:255]) == (numbers[:255], 0)
+    assert kept_with(numbers[:256]) == (numbers[1:256], 1)
+    assert kept_with(numbers) == (numbers[2:], 1)
+
+
+def is_forgotten(register: StopRegister, session: int, number: int) -> bool:
+    """Whether a stop that was released stops once more."""
+    register.add(ActiveStop(session, number, "hold", "from a cache", "desk"))
+    return (session, number) in [one.id for one in register.current.stops]
+
+
+def test_the_last_32_releases_of_a_program_are_remembered():
+    register = StopRegister(HOST)
+    for number in range(33):
+        register.add(ActiveStop(1, number, "hold", "", "desk"))
+        register.release(Release(0, number, 8, ((1, number),)))
+    assert not is_forgotten(register, 1, 1)
+    assert is_forgotten(register, 1, 0)
+
+
+def test_releases_of_256_programs_are_remembered():
+    register = StopRegister(HOST)
+    for session in range(1000, 1257):
+        register.add(ActiveStop(session, 0, "hold", "", "desk"))
+        register.release(Release(0, session, 8, ((session, 0),)))
+    assert not is_forgotten(register, 1001, 0)
+    assert is_forgotten(register, 1000, 0)
+
+
 def test_a_stop_that_is_repeated_replaces_the_last_one_and_an_earlier_release_does_not_end_it():
     register = StopRegister(HOST)
     register.add(ActiveStop(1, 0, "hold", "door open", "desk"))
@@ -553,6 +600,11 @@ def test_a_stop_never_fails_because_of_its_text(sessions, reason):
         state = stop(sessions[1], "arm", reason, timeout_s=DEADLINE_S)
         assert state.state == "stopped"
         assert str(reason)[:1].replace("\udcff", "\\udcff") in state.reason
+
+
+def test_the_reason_of_a_stop_is_cut_after_1000_characters():
+    assert stop_text("x" * 1000) == "x" * 1000
+    assert stop_text("x" * 1001) == "x" * 997 + "..."
 
 
 @pytest.mark.parametrize(

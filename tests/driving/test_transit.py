@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from zstate.driving.transit import CommandAges, CommandWindow, DriverClock
+from zstate.driving.transit import CommandAdmission, CommandAges, CommandWindow, DriverClock
 from zstate.errors import MessageError
 from zstate.wire.messages import DriverState
 
@@ -95,6 +95,47 @@ def test_a_command_that_answers_another_host_or_a_later_instant_is_refused():
     assert caught.value.reason == "late"
     with pytest.raises(MessageError, match=r"its echo is 1\.0 ms ahead"):
         link.ages.excess(1, 0, START, (HOST, START + MS))
+
+
+def test_an_echo_is_less_by_a_thousandth_of_the_time_since_the_state_has_arrived():
+    clock = DriverClock()
+    clock.update(state(START), 0)
+    assert clock.at(0) == (HOST, START)
+    assert clock.at(10 * S) == (HOST, START + 10 * S - 10 * MS)
+
+
+@pytest.mark.parametrize(("later", "way"), [(10 * S, 0), (10 * S + 1, 20 * MS)])
+def test_the_state_that_was_fastest_is_used_for_ten_seconds(later: int, way: int):
+    clock = DriverClock()
+    clock.update(state(START), 0)
+    clock.update(state(START + later - 20 * MS), later)  # it was under way for 20 ms, the first one for 0
+    drift = 0 if way else later // 1000
+    assert clock.at(later) == (HOST, START + later - way - drift)
+
+
+def deadline(admission: CommandAdmission, arrived: int, seq: int = 0) -> int:
+    return admission.deadline((arrived, seq, 1), TTL, arrived)
+
+
+def test_commands_of_a_session_without_a_token_count_for_half_a_second_after_the_first():
+    admission = CommandAdmission(CommandAges(HOST, TTL))
+    for arrived in (START, START + 500 * MS):
+        assert deadline(admission, arrived) == arrived + TTL
+    with pytest.raises(MessageError, match="not announced as a commander") as caught:
+        deadline(admission, START + 500 * MS + 1)
+    assert caught.value.reason == "no claim"
+    admission.set_announced(1, alive=True, now=START + 600 * MS)
+    assert deadline(admission, START + 600 * MS) == START + 600 * MS + TTL
+
+
+def test_commands_of_a_session_count_for_half_a_second_after_the_loss_of_its_token():
+    admission = CommandAdmission(CommandAges(HOST, TTL))
+    admission.set_announced(1, alive=True, now=START)
+    deadline(admission, START + 60 * S)
+    admission.set_announced(1, alive=False, now=START + 61 * S)
+    deadline(admission, START + 61 * S + 500 * MS)
+    with pytest.raises(MessageError, match="not announced as a commander"):
+        deadline(admission, START + 61 * S + 500 * MS + 1)
 
 
 def test_steps_of_the_system_clock_of_a_commander_do_not_matter():
