@@ -14,10 +14,6 @@ from hypothesis import strategies as st
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.sample_history import (
-    MAX_CACHE_BYTES,
-    MAX_PAGE_BYTES,
-    PAGE_BYTES,
-    PAGE_SAMPLES,
     CachedSample,
     HistoryReader,
     ReferenceRing,
@@ -107,7 +103,7 @@ def test_cache_size_is_bounded_for_any_stamps():
         append(cache, state(seq, STAMP, numbers=1))
     kept = seqs(cache.since(0))
     assert kept == list(range(100 - len(kept), 100))
-    assert 1 <= len(kept) <= MAX_CACHE_BYTES // 800_000
+    assert len(kept) == 9  # of 800 kB of numbers, and their headers: ten exceed 8 MB
 
 
 @settings(deadline=None)
@@ -156,13 +152,13 @@ def wait_for_queryable(session: Session) -> None:
 
 def test_reader_receives_every_sample_as_sent_newest_page_first(sessions: tuple[Session, Session]):
     writer, reader = sessions
-    cache = cache_of(PAGE_SAMPLES + 3)
+    cache = cache_of(256 + 3)
     received = Pages(reader)
     with serve_history(writer, "r1", "joint_states", cache), received.reader:
         wait_for_queryable(reader)
         received.reader.request(KEY, 7)
         until(lambda: len(received.pages) == 2)
-    assert received.seqs() == [list(range(3, PAGE_SAMPLES + 3)), [0, 1, 2]]
+    assert received.seqs() == [list(range(3, 256 + 3)), [0, 1, 2]]
     assert received.pages[1] == [
         SerializedSample(KEY, encode(state(seq)), ENCODINGS[JointState]) for seq in range(3)
     ]
@@ -178,8 +174,8 @@ def test_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Sess
             received.reader.request(KEY, 7)
             until(lambda received=received: len(received.pages) == 3)
         sizes = [sum(len(one.payload) for one in page) for page in received.pages]
-        assert all(size <= PAGE_BYTES for size in sizes) if numbers == 100 else sizes[0] > PAGE_BYTES
-        assert len(received.pages[0]) == (PAGE_BYTES // len(received.pages[0][0].payload) or 1)
+        assert all(size <= 32_000 for size in sizes) if numbers == 100 else sizes[0] > 32_000
+        assert len(received.pages[0]) == (32_000 // len(received.pages[0][0].payload) or 1)
         newest_first = [seq for page in received.seqs() for seq in reversed(page)]
         assert newest_first == list(range(99, 99 - len(newest_first), -1))
 
@@ -319,7 +315,7 @@ def test_silent_writers_of_one_robot_do_not_delay_the_history_of_another(session
     kept: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(10_000)
     silent = writer.zenoh.declare_queryable("zstate/r2/joint_states", kept)
     received = Pages(reader)
-    with serve_history(writer, "r1", "joint_states", cache_of(PAGE_SAMPLES + 3)), received.reader:
+    with serve_history(writer, "r1", "joint_states", cache_of(256 + 3)), received.reader:
         wait_for_queryable(reader)
         for session in range(500):
             received.reader.request("zstate/r2/joint_states", session)
@@ -366,15 +362,19 @@ def test_first_of_many_replies_on_the_key_is_the_page(sessions):
     queryable.undeclare()
 
 
-def test_page_that_is_too_large_is_refused(sessions):
+@pytest.mark.parametrize(("size", "reason"), [(524_288, ""), (524_289, "too large")])
+def test_page_of_more_than_524288_bytes_is_refused(sessions, size: int, reason: str):
     writer, reader = sessions
-    page = encode(HistoryPage(ENCODINGS[JointState], (bytes(MAX_PAGE_BYTES),)))
+    others = len(encode(HistoryPage(ENCODINGS[JointState], (bytes(2**16),)))) - 2**16
+    page = encode(HistoryPage(ENCODINGS[JointState], (bytes(size - others),)))
+    assert len(page) == size
     received = Pages(reader)
     with Queryable(writer, KEY, lambda _: Reply(page, ENCODINGS[HistoryPage])), received.reader:
         wait_for_queryable(reader)
         received.reader.request(KEY, 7)
-        until(lambda: received.errors)
-    assert (received.errors[0].reason, received.pages) == ("too large", [])
+        until(lambda: received.errors or received.pages)
+    assert [error.reason for error in received.errors] == [reason] * bool(reason)
+    assert bool(received.pages) != bool(reason)
 
 
 def test_failing_page_callback_does_not_end_other_requests(sessions, monkeypatch):

@@ -96,8 +96,16 @@ def test_name_lengths_are_limited_as_in_file_systems():
     assert keys.check_robot("a" * 255) == "a" * 255
     with pytest.raises(InvalidInput, match="256 characters, more than 255"):
         keys.check_robot("a" * 256)
+    assert keys.full_name("r1", "a" * 1024) == "r1/" + "a" * 1024
     with pytest.raises(InvalidInput, match="more than 1024"):
         keys.full_name("r1", "a" * 1025)
+
+
+def test_keys_have_at_most_16384_characters():
+    writer = "a" * (16_384 - len("zstate/r1/@edge/b/c/"))
+    assert keys.parse_edge_key(f"zstate/r1/@edge/b/c/{writer}") == ("r1", ("c", "b"), writer)
+    with pytest.raises(InvalidInput, match="@edge"):
+        keys.parse_edge_key(f"zstate/r1/@edge/b/c/{writer}a")
 
 
 def test_no_robot_has_the_name_of_the_clock_whose_key_would_be_below_its_own():

@@ -402,6 +402,12 @@ def test_arrays_nested_without_end_are_malformed():
     assert reason(bomb, ENCODINGS[JointState]) == "malformed"
 
 
+def test_a_further_element_of_100_nested_arrays_is_ignored():
+    message = MESSAGES[0]
+    nested = b"\x99" + encode(message)[1:] + b"\x91" * 100 + b"\xc0"
+    assert decode(nested, ENCODINGS[JointState], JointState) == message
+
+
 def large_grid(side: int) -> OccupancyGrid:
     cells = np.random.default_rng(1).integers(-1, 101, side * side, np.int8).tobytes()
     return OccupancyGrid(1, 2, "map", 0.05, side, side, to_block([0, 0, 0, 0, 0, 0, 1]), cells)
