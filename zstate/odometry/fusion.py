@@ -113,14 +113,14 @@ _PLACE_RATE, _YAW_RATE = 0.2, 0.05
 
 MOST_BIAS = 0.03
 """[rad/s] A gyro that measures more while wheels stand is turned: it may be carried, or on a turntable."""
-_TILTED, _TILT_SHARE = math.radians(4.0), 0.01
-"""[rad] A base that is tilted by more in all directions is not; the mean of so many readings is taken."""
+_TILTED, _SECTORS_TILTED, _TILT_SHARE = math.radians(4.0), 8, 0.01
+"""[rad] A base that is tilted by more in so many directions is not; the mean of many readings is taken."""
 
 _DEVIATION_S = 20.0
 _UNPROVEN, _SECTORS = 0.5, 12
 """[rad] The standard deviation of a compass at first, and in how many directions it is proven."""
-_PROVEN, _SECTORS_PROVEN = 0.1, 8
-"""[rad] One that is wrong by less in so many directions measures the bias of the gyro, and turns the pose."""
+_PROVEN = 0.1
+"""[rad] One that may be off by less, from ten directions on, measures the gyro's bias and turns the pose."""
 _SAMPLED_S, _SAMPLED_GAIN, _SLOWEST_NS = 0.01, 0.05, 350_000_000
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
@@ -470,8 +470,7 @@ class Fusion:
             noise = np.array([[variance * floor / (variance - floor)]])
             measurement = measurement._replace(covariance=noise)
             found = innovation(estimate.state, measurement)
-            is_proven = len(sectors) >= _SECTORS_PROVEN and deviation < _PROVEN * _PROVEN
-            if is_proven:
+            if deviation < _PROVEN * _PROVEN:
                 estimate = estimate._replace(offset=estimate.offset._replace(is_turned=True))
             else:
                 found = _without_yaw_bias(found, estimate.state.rotation[2])
@@ -739,7 +738,7 @@ def odom_pose(estimate: Estimate, imu_from_frame: Floats) -> tuple[Floats, Float
 def imu_remarks(estimate: Estimate) -> list[str]:
     """What the IMU, and the prediction from it, have come to, in sentences."""
     found = [disagreement(estimate.turning)]
-    if len(estimate.tilts) >= _SECTORS_PROVEN:
+    if len(estimate.tilts) >= _SECTORS_TILTED:
         tilt = np.mean(list(estimate.tilts.values()), axis=0)
         if float(tilt @ tilt) > _TILTED * _TILTED:
             found.append(
