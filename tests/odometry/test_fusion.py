@@ -1,4 +1,4 @@
-"""When a source that the gate rejects is followed, and how far a compass is believed."""
+"""The numbers of the guide: when a source is followed, what is rest or shock, how fast the pose moves."""
 
 from __future__ import annotations
 
@@ -8,8 +8,26 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from zstate.odometry.fusion import Estimate, Fusion, Heading, Reading, started
-from zstate.odometry.invariant_filter import VELOCITY, ImuNoise, Measurement, initial_state
+from zstate.odometry.fusion import (
+    Estimate,
+    Fusion,
+    Heading,
+    Inertia,
+    Pause,
+    Reading,
+    imu_remarks,
+    is_still,
+    odom_pose,
+    started,
+)
+from zstate.odometry.invariant_filter import (
+    POSITION,
+    ROTATION,
+    VELOCITY,
+    ImuNoise,
+    Measurement,
+    initial_state,
+)
 from zstate.odometry.rotations import rotation_exp
 
 S = 1_000_000_000
@@ -17,9 +35,9 @@ WRONG, RIGHT = 50.0, 0.0
 FUSION = Fusion(ImuNoise(gyro=1e-3, accel=1e-2, gyro_bias=1e-5, accel_bias=1e-4))
 
 
-def at_rest(yaw: float = 0.0, yaw_sigma: float = 0.01) -> Estimate:
+def at_rest(yaw: float = 0.0, yaw_sigma: float = 0.01, sigma: float = 0.01) -> Estimate:
     zero = np.zeros(3)
-    covariance = 1e-4 * np.eye(15)
+    covariance = sigma**2 * np.eye(15)
     covariance[2, 2] = yaw_sigma**2
     state = initial_state(
         rotation=rotation_exp(np.array([0.0, 0.0, yaw])),
@@ -97,3 +115,119 @@ def test_a_compass_that_stays_while_the_base_turns_by_more_than_it_may_be_off_is
     sigma = math.hypot(SIGMA, SIGMA, SIGMA, 0.5 * 11 / 12)
     of_99_9_percent = NormalDist().inv_cdf(1.0 - 0.001 / 2)
     assert read(first, 0.1 + part * of_99_9_percent * sigma, 0.1)[1] == fate
+
+
+@pytest.mark.parametrize(("directions", "is_turned"), [(9, False), (10, True)])
+def test_the_pose_follows_a_compass_that_was_right_in_ten_of_twelve_directions(
+    directions: int, is_turned: bool
+):
+    estimate = at_rest()
+    for number in range(directions):
+        yaw = (number + 0.5) * math.tau / 12
+        estimate, _ = read(estimate, yaw, yaw, yaw_sigma=1.0 if number else SIGMA)
+    assert estimate.offset.is_turned == is_turned
+
+
+UPWARDS = np.array([0.0, 0.0, 9.80665])
+SAMPLE = S // 200
+
+
+def sampled(estimate: Estimate, count: int, gyro: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Estimate:
+    """The estimate after samples of an IMU of 200 Hz."""
+    for _ in range(count):
+        sample = Inertia(estimate.stamp + SAMPLE, np.array(gyro), UPWARDS)
+        estimate, _ = FUSION.after_inertia(estimate, sample)
+    return estimate
+
+
+@pytest.mark.parametrize(("silent", "is_coasting"), [(S // 10, False), (S // 10 + 1, True)])
+def test_the_base_coasts_if_its_imu_is_silent_for_more_than_a_tenth_of_a_second(
+    silent: int, is_coasting: bool
+):
+    estimate = sampled(at_rest(), 100)
+    assert FUSION.predicted(estimate, estimate.stamp + silent, None).is_coasting == is_coasting
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_base_stands_up_to_5_mm_per_s_and_0_02_rad_per_s(axis: int):
+    zero, one = np.zeros(3), np.eye(3)[axis]
+    assert is_still(0.005 * one, zero)
+    assert not is_still(0.00501 * one, zero)
+    assert is_still(zero, 0.02 * one)
+    assert not is_still(zero, 0.02001 * one)
+
+
+@pytest.mark.parametrize(("rate", "is_turned"), [(0.0299, False), (0.0301, True)])
+def test_a_gyro_that_reads_more_than_0_03_rad_per_s_while_wheels_stand_is_turned(
+    rate: float, is_turned: bool
+):
+    standing = at_rest()._replace(wheels_at=0, moved_at=-S)
+    remarks = imu_remarks(sampled(standing, 20, (0.0, 0.0, rate)))  # an interval of 0.1 s
+    assert any("while the wheels stand" in remark for remark in remarks) == is_turned
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel", "is_integrated"),
+    [(9.99, 49.9, (True, True)), (10.01, 49.9, (False, True)), (9.99, 50.1, (True, False))],
+)
+def test_a_sample_that_jumps_by_more_than_10_rad_per_s_or_50_m_per_s2_is_not_integrated(
+    gyro: float, accel: float, is_integrated: tuple[bool, bool]
+):
+    before = sampled(at_rest(), 2)
+    jump = Inertia(before.stamp + SAMPLE, np.array([gyro, 0.0, 0.0]), UPWARDS + np.array([accel, 0.0, 0.0]))
+    after, _ = FUSION.after_inertia(before, jump)
+    assert (after.rate[0] == gyro, after.force[0] == accel) == is_integrated
+
+
+def test_the_noise_of_the_imu_is_a_mean_of_a_second():
+    before = sampled(at_rest(), 2)
+    assert before.vibration is not None
+    before = before._replace(vibration=before.vibration._replace(averaged=10_000))
+    bend = 0.3
+    after, _ = FUSION.after_inertia(before, Inertia(before.stamp + SAMPLE, np.array([bend, 0, 0]), UPWARDS))
+    assert after.vibration is not None
+    # The second difference of white noise has six times its variance; a sample is 5 ms of the second.
+    assert after.vibration.variance[0] == pytest.approx(0.005 * bend**2 / 6.0)
+
+
+@pytest.mark.parametrize(("later", "is_told"), [(30 * S - 1, True), (30 * S, False)])
+def test_a_pause_is_a_sentence_for_30_seconds(later: int, is_told: bool):
+    remarks = imu_remarks(at_rest()._replace(stamp=S + later, pause=Pause(S, 3.2, is_bridged=True)))
+    assert remarks == ["all data paused for 3.2 s: wheels measured the way"] * is_told
+
+
+@pytest.mark.parametrize(
+    ("degrees", "directions", "is_told"), [(3.99, 8, False), (4.01, 8, True), (4.01, 7, False)]
+)
+def test_a_tilt_of_more_than_four_degrees_in_eight_directions_is_that_of_the_mount(
+    degrees: float, directions: int, is_told: bool
+):
+    tilts = {sector: np.array([math.radians(degrees), 0.0, 0.0]) for sector in range(directions)}
+    assert bool(imu_remarks(at_rest()._replace(tilts=tilts))) == is_told
+
+
+def pose_after(rows: slice, axis: int, *, is_position: bool) -> np.ndarray:
+    """The continuous pose half a second later, when a measurement moves the estimate by 0.5 (m or rad)."""
+    estimate = at_rest(yaw_sigma=1.0, sigma=1.0)._replace(stamp=S // 2)
+    jacobian = np.zeros((1, 15))
+    jacobian[0, rows.start + axis] = 1.0
+    measured = Measurement(np.array([0.5]), jacobian, np.array([[1e-8]]))
+    reading = Reading(S // 2, lambda _state, _rate: measured, is_position=is_position)
+    after, outcome = FUSION.after_reading(estimate, "source", reading, None)
+    assert outcome.fate == "accepted"
+    return odom_pose(after, np.eye(4))[0]
+
+
+def test_the_pose_follows_measured_poses_at_0_2_m_per_s_and_0_05_rad_per_s():
+    assert pose_after(POSITION, 0, is_position=True)[:3, 3] == pytest.approx([0.5 * 0.2, 0.0, 0.0], abs=1e-6)
+    turned = pose_after(ROTATION, 2, is_position=True)
+    assert math.atan2(turned[1, 0], turned[0, 0]) == pytest.approx(0.5 * 0.05)
+
+
+def test_the_pose_is_levelled_at_0_05_rad_per_s():
+    tilted = pose_after(ROTATION, 0, is_position=False)
+    assert math.atan2(tilted[2, 1], tilted[2, 2]) == pytest.approx(0.5 * 0.05)
+
+
+def test_velocities_move_the_pose_only_from_then_on():
+    assert (pose_after(VELOCITY, 0, is_position=False) == np.eye(4)).all()

@@ -1,6 +1,7 @@
 """Health: quantiles of the chi-square distribution, and sentences on sources."""
 
 import math
+from collections.abc import Sequence
 
 import pytest
 
@@ -85,3 +86,32 @@ def test_rejections_are_reported():
     found = health(3.0, fate="rejected", count=20)
     assert (found.accepted, found.rejected) == (0, 20)
     assert "20 of its last 20 readings were rejected" in found.sentence
+
+
+def kept(fates: Sequence[Fate]) -> str:
+    """The sentence on a source whose readings, with the right NIS, became that."""
+    record = SourceRecord()
+    for fate in fates:
+        record.keep(Outcome(fate, 3.0, 3))
+    return record.health("wheels", 0, [], "", history_s=1.0).sentence
+
+
+def test_more_than_a_tenth_of_the_last_200_readings_must_be_rejected_to_be_reported():
+    assert kept(["rejected"] * 20 + ["accepted"] * 180) == ""
+    assert "21 of its last 200 readings were rejected" in kept(["rejected"] * 21 + ["accepted"] * 179)
+    assert kept(["rejected"] * 1000 + ["accepted"] * 180) == ""
+
+
+@pytest.mark.parametrize(
+    ("nis", "text"),
+    [(3.0 * 1.499**2, ""), (3.0 * 1.501**2, "too small"), (3.0 / 3.99**2, ""), (3.0 / 4.01**2, "too large")],
+)
+def test_sigmas_are_named_that_are_1_5_times_too_small_or_four_times_too_large(nis: float, text: str):
+    sentence = health(nis).sentence
+    assert text in sentence
+    assert bool(sentence) == bool(text)
+
+
+def test_fewer_than_ten_readings_are_no_evidence_on_sigmas():
+    assert health(12.0, count=9).sentence == ""
+    assert "too small" in health(12.0, count=10).sentence
