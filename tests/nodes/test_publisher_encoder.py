@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from zstate.errors import InvalidInput
 from zstate.extension import kernel
 from zstate.model.load import load_model
-from zstate.model.robot import NORM_TOLERANCE, RobotModel
+from zstate.model.robot import RobotModel
 from zstate.nodes.publisher import RobotEncoder
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import decode_joint_state, encode
@@ -160,7 +160,7 @@ def test_refused_arrays_raise_the_error_of_the_reference(arguments: tuple[Any, .
 def test_quaternions_near_and_far_from_unit_length_are_decided_by_the_reference(excess: float):
     positions = random_positions(EVERY_JOINT, 3)
     start = EVERY_JOINT.columns["zz body"] + 3
-    positions[start : start + 4] *= 1.0 + excess * NORM_TOLERANCE
+    positions[start : start + 4] *= 1.0 + excess * 1e-3
     encoder = RobotEncoder(EVERY_JOINT, "r1", 7)
     if excess > 1.0:
         with pytest.raises(InvalidInput, match=r"'zz body' .*quaternion of length"):

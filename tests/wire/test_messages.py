@@ -7,9 +7,8 @@ import pytest
 
 from zstate.errors import InvalidInput
 from zstate.wire.messages import (
-    GRID_CELLS,
     MAX_BYTES,
-    SCAN_RAYS,
+    DriverState,
     Imu,
     JointState,
     JointTrajectory,
@@ -32,6 +31,7 @@ from zstate.wire.messages import (
     to_block,
     to_float32_block,
     with_full_names,
+    with_short_texts,
 )
 from zstate.wire.native import encode
 
@@ -120,11 +120,11 @@ def test_a_block_of_ranges_is_little_endian_float32():
 
 
 def test_a_scan_has_at_most_100000_rays():
-    ranges = bytes(4 * SCAN_RAYS)
+    ranges = bytes(4 * 100_000)
     largest = scan(ranges=ranges, intensities=ranges, frame="\U0001f916" * 1024)
     assert len(encode(largest)) <= MAX_BYTES["scan"]
     with pytest.raises(InvalidInput, match="100001 rays, where 100000 are allowed"):
-        scan(ranges=bytes(4 * SCAN_RAYS + 4))
+        scan(ranges=bytes(4 * 100_000 + 4))
 
 
 def test_ranges_that_are_no_measurements_are_part_of_a_scan():
@@ -217,6 +217,42 @@ def test_a_measurement_with_impossible_numbers_cannot_be_made(
         make(**changed)
 
 
+@pytest.mark.parametrize(
+    ("make", "field", "most", "others"),
+    [
+        (imu, "gyro", 1e3, []),
+        (imu, "accel", 1e5, []),
+        (velocity, "linear", 1e4, []),
+        (velocity, "angular", 1e3, []),
+        (pose, "pose", 1e8, [0.0, 0.0, 0.0, 1.0]),
+    ],
+)
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_number_of_a_measurement_that_no_sensor_has_is_refused(
+    make: Callable[..., Message], field: str, most: float, others: list[float], axis: int
+):
+    for number in (most, -most):
+        numbers = np.zeros(3)
+        numbers[axis] = number
+        assert make(**{field: to_block([*numbers, *others])})
+        with pytest.raises(InvalidInput, match="at most"):
+            make(**{field: to_block([*(1.000001 * numbers), *others])})
+
+
+@pytest.mark.parametrize(
+    ("length", "is_unit"), [(0.9991, True), (1.0009, True), (0.9989, False), (1.0011, False)]
+)
+def test_the_length_of_a_quaternion_is_within_a_thousandth_of_1(length: float, is_unit: bool):
+    quaternion = [0.6 * length, 0.0, 0.0, 0.8 * length]
+    for make, changed in ((imu, {"orientation": quaternion}), (pose, {"pose": [1.0, 2.0, 3.0, *quaternion]})):
+        blocks = {name: to_block(numbers) for name, numbers in changed.items()}
+        if is_unit:
+            assert make(**blocks)
+        else:
+            with pytest.raises(InvalidInput, match=f"length 1, not {length:g}"):
+                make(**blocks)
+
+
 def test_messages_of_sensors_and_odometry_fit_the_limit_of_their_streams():
     frame, six = "\U0001f916" * 1024, bytes(21 * 8)
     edge = ((frame, frame),)
@@ -262,7 +298,7 @@ def test_row_0_of_the_cells_is_the_first_width_cells():
         ({"width": -3, "height": -2}, "-3 x -2 needs"),
         ({"cells": bytes([0, 0, 0, 0, 0, 101])}, "not 0 to 101"),
         ({"cells": bytes([0, 0, 0, 0, 0, 254])}, "not -2 to 0"),
-        ({"width": GRID_CELLS + 1, "height": 1, "cells": bytes(GRID_CELLS + 1)}, "16777216 are allowed"),
+        ({"width": 16_777_216 + 1, "height": 1, "cells": bytes(16_777_216 + 1)}, "16777216 are allowed"),
     ],
 )
 def test_a_grid_with_impossible_geometry_or_cells_cannot_be_made(changed: dict[str, Any], text: str):
@@ -282,3 +318,29 @@ def test_a_motion_without_tolerances_above_zero_is_refused(tolerances: tuple[flo
         JointTrajectory(
             0, 0, 7, ("elbow",), to_block([1.0]), to_block([0.0]), None, None, None, False, *tolerances
         )
+
+
+def motion_of(count: int) -> JointTrajectory:
+    return JointTrajectory(0, 0, 7, ("elbow",), to_block(range(count)), to_block([0.0] * count))
+
+
+def test_a_motion_has_1_to_10000_points():
+    assert motion_of(1)
+    assert motion_of(10_000)
+    for count in (0, 10_001):
+        with pytest.raises(InvalidInput, match=f"a motion has 1 to 10000 points, not {count}"):
+            motion_of(count)
+
+
+@pytest.mark.parametrize("field", ["program", "reason", "commander", "last_refusal"])
+def test_a_text_of_a_driver_state_is_cut_after_2000_characters(field: str):
+    texts = {"program": "host", "reason": ""}
+
+    def shortened(length: int) -> str:
+        state = DriverState(
+            0, 5, state="ready", joint_names=("elbow",), ttl=1, **{**texts, field: "x" * length}
+        )
+        return getattr(with_short_texts(state), field)
+
+    assert shortened(2000) == "x" * 2000
+    assert shortened(2001) == "x" * 2000 + "... and 1 more characters"
