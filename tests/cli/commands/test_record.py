@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import time
 from datetime import datetime
 from pathlib import Path
@@ -11,8 +12,11 @@ from helpers.processes import mounted_disk
 
 from zstate import StatePublisher, connect, load_model
 from zstate.cli.commands import record
+from zstate.cli.commands.record import DiskForecast
+from zstate.clock import MONOTONIC, ManualClock
 from zstate.recording.info import read_info
 from zstate.recording.reader import RecordingReader
+from zstate.recording.recorder import RecorderStats
 
 
 @pytest.mark.processes
@@ -118,8 +122,25 @@ def test_invalid_limits_and_names_are_refused(tmp_path: Path):
 @pytest.fixture
 def short_window(monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk is checked every second, not every ten."""
-    assert record._DISK_WINDOW_S == 10.0
-    monkeypatch.setattr(record, "_DISK_WINDOW_S", 0.9)
+    monkeypatch.setattr(record, "_DISK_WINDOW_NS", 900_000_000)
+
+
+@pytest.mark.parametrize(("part_of_a_day", "is_warned"), [(0.8, True), (1.25, False)])
+def test_a_disk_that_is_full_within_a_day_at_the_rate_of_ten_seconds_is_a_single_warning(
+    tmp_path: Path, part_of_a_day: float, is_warned: bool
+):
+    clock, written = ManualClock(0, MONOTONIC), 0
+    forecast = DiskForecast(
+        lambda: RecorderStats({}, written, (tmp_path / "run.mcap",), 0, 0, {}, 0), None, clock
+    )
+    written = round(10.0 * shutil.disk_usage(tmp_path).free / (part_of_a_day * 86_400.0))
+    clock.set(10_000_000_000 - 1)
+    assert forecast.warning() == ""
+    clock.set(10_000_000_000)
+    assert ("is full in" in forecast.warning()) == is_warned
+    written *= 2
+    clock.set(20_000_000_000)
+    assert not is_warned or forecast.warning() == ""
 
 
 @pytest.mark.disk

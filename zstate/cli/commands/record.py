@@ -24,6 +24,7 @@ from zstate.cli.output.console import (
 )
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
+from zstate.clock import Clock, MonotonicClock
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ _INDEX_WITHIN_S = 10.0
 # Discovery takes less.
 _DISCOVERY_S = 0.5
 # The model and the static edges are written once in this time.
-_DISK_WINDOW_S = 10.0
+_DISK_WINDOW_NS = 10_000_000_000
 _DAY_S = 86_400.0
 _DEFAULT_FILE = "rec-%Y%m%d-%H%M%S.mcap"
 
@@ -242,7 +243,7 @@ class RecordProgress:
     ) -> None:
         self._recorder, self._directory, self._robots = recorder, directory, robots
         self._retention, self._retained_at = retention, 0
-        self._disk = DiskForecast(recorder, retention)
+        self._disk = DiskForecast(lambda: recorder.stats, retention, MonotonicClock())
         self._listed: set[tuple[str, str]] = set()
         self._waiting = ""
         self._start = time.monotonic()
@@ -314,19 +315,19 @@ class RecordProgress:
 class DiskForecast:
     """Warns once if the disk of a recording would be full within a day at the rate of the last 10 s."""
 
-    def __init__(self, recorder: Recorder, retention: Retention | None) -> None:
-        self._recorder, self._retention = recorder, retention
-        self._start, self._bytes = time.monotonic(), 0
+    def __init__(self, stats: Callable[[], RecorderStats], retention: Retention | None, clock: Clock) -> None:
+        self._stats, self._retention, self._clock = stats, retention, clock
+        self._start, self._bytes = clock.now(), 0
         self._has_warned = False
 
     def warning(self) -> str:
         """The warning, or an empty text; computed every 10 s, so it may be called at any rate."""
-        now = time.monotonic()
-        elapsed = now - self._start
-        if self._has_warned or elapsed < _DISK_WINDOW_S:
+        now = self._clock.now()
+        elapsed_ns = now - self._start
+        if self._has_warned or elapsed_ns < _DISK_WINDOW_NS:
             return ""
-        stats = self._recorder.stats
-        rate = (stats.bytes - self._bytes) / elapsed
+        stats = self._stats()
+        rate = (stats.bytes - self._bytes) / (elapsed_ns * 1e-9)
         self._start, self._bytes = now, stats.bytes
         growth = rate * _DAY_S if self._retention is None else self._retention.growth(rate, _DAY_S)
         file = stats.files[-1]
