@@ -98,7 +98,11 @@ def test_legs_have_feet_noise_and_the_thresholds_of_contacts(tmp_path: Path):
     )
     legs = read_settings(written(tmp_path, by_speed)).legs
     assert legs is not None
-    assert legs.speed == SpeedThresholds(0.2, 0.3)
+    assert legs.detection == SpeedThresholds(0.2, 0.3)
+
+
+def test_contacts_are_detected_by_0_1_and_0_2_m_per_s_where_nothing_is_stated():
+    assert LegSettings(feet=("foot",)).detection == SpeedThresholds(touchdown=0.1, liftoff=0.2)
 
 
 @pytest.mark.parametrize(

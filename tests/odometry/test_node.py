@@ -356,6 +356,33 @@ def test_stamps_of_the_future_are_refused_and_the_odometry_goes_on(sessions):
         assert node.state().stamp < STAMP + 500_000_000
 
 
+def test_a_stamp_is_of_the_future_from_half_a_second_after_the_time_of_the_clock_on(sessions):
+    with imu_to_node(sessions, clock=ManualClock(STAMP)) as (imu, node):
+
+        def publish(stamp: int) -> None:
+            imu.publish([0, 0, 0], [0, 0, 9.80665], stamp)
+
+        until(lambda: publish(STAMP + 500_000_000) or node.base.newest == STAMP + 500_000_000)
+        assert node.refused == {}
+        until(lambda: publish(STAMP + 500_000_001) or node.refused)
+        assert node.base.newest == STAMP + 500_000_000
+
+
+@pytest.mark.parametrize(("silent_ns", "count"), [(100_000_000, 1), (100_000_001, 2)])
+def test_readings_of_other_sources_are_published_once_the_imu_is_silent_for_more_than_a_tenth_of_a_second(
+    sessions, silent_ns: int, count: int
+):
+    flow_noise = {"flow": VelocityNoise(sigma=(0.1, 0.1, 0.1))}
+    with (
+        imu_to_node(sessions, clock=ManualClock(STAMP), velocities=flow_noise) as (imu, node),
+        VelocityPublisher(sessions[0], "r1", "flow", frame="base_footprint") as flow,
+    ):
+        until(lambda: imu.publish([0, 0, 0], [0, 0, 9.80665], STAMP) or node.published)
+        until(lambda: flow.publish([0, 0, 0], stamp=STAMP + silent_ns) or node.base.newest > STAMP)
+        node.health()  # after that reading
+        assert node.published == count
+
+
 def test_time_that_goes_back_is_published_from_there_on(sessions):
     with imu_to_node(sessions, clock=ManualClock(STAMP)) as (imu, node):
         for _ in range(2):

@@ -66,8 +66,12 @@ class LegSettings:
 
     def legs(self, model: RobotModel, imu: str) -> Legs:
         """The legs of ``model``, with its IMU on the link ``imu``. Raises InvalidInput as Legs."""
-        detection = self.force or self.speed or DEFAULT_SPEEDS
-        return Legs(model, self.feet, imu=imu, noise=self.noise, detection=detection)
+        return Legs(model, self.feet, imu=imu, noise=self.noise, detection=self.detection)
+
+    @property
+    def detection(self) -> ForceThresholds | SpeedThresholds:
+        """The thresholds of contacts: those of the speed, by default, where none are stated."""
+        return self.force or self.speed or DEFAULT_SPEEDS
 
 
 @dataclass(frozen=True, kw_only=True)
