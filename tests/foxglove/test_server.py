@@ -17,7 +17,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from zstate.errors import InvalidInput
-from zstate.foxglove.server import BACKLOG, FoxgloveServer, ServedChannel, ServedMessage
+from zstate.foxglove.server import FoxgloveServer, ServedChannel, ServedMessage, _Client
 from zstate.wire.ros2.types import STRING, TF_MESSAGE
 
 TF = ServedChannel(1, "/tf", TF_MESSAGE)
@@ -100,8 +100,21 @@ def server() -> Iterator[FoxgloveServer]:
         yield opened
 
 
+@pytest.mark.parametrize(("size", "kept"), [(100, 1024), (2**20, 32)], ids=["1024", "32 MiB"])
+def test_the_queue_of_a_client_has_1024_messages_and_32_mib_at_most(
+    server: FoxgloveServer, size: int, kept: int
+):
+    with connect(server.url, subprotocols=["foxglove.sdk.v1"]) as websocket:
+        client = _Client(websocket)  # of which nothing is sent
+        for stamp in range(kept):
+            client.put(ServedMessage(TF.number, bytes(size), stamp))
+        assert client.dropped == 0
+        client.put(ServedMessage(TF.number, b"1", kept))
+        assert client.dropped == 1
+
+
 def test_a_slow_client_loses_its_oldest_messages_and_delays_no_other(server: FoxgloveServer):
-    payload, total = bytes(40_000), 3 * BACKLOG
+    payload, total = bytes(40_000), 3 * 1024
     # A client that does not read: its socket has room for a few hundred of these messages.
     with FoxgloveClient(server.url) as fast, FoxgloveClient(server.url, max_queue=1) as slow:
         for client in (fast, slow):
@@ -114,7 +127,7 @@ def test_a_slow_client_loses_its_oldest_messages_and_delays_no_other(server: Fox
                 fast.until(lambda k=k: len(fast.frames.get("/tf", ())) == k + 1)
         assert [stamp for stamp, _ in fast.frames["/tf"]] == list(range(total))
         dropped = server.stats.dropped
-        assert dropped > total - 2 * BACKLOG
+        assert dropped > total - 2 * 1024
         slow.until(lambda: slow.frames.get("/tf", [(0, b"")])[-1][0] == total - 1)
         assert len(slow.frames["/tf"]) == total - dropped
         assert slow.frames["/text"][-1][1] == b"%d" % (total - 1)

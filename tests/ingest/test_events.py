@@ -9,7 +9,7 @@ from helpers.processes import until
 
 from zstate._util.bounded import MAX_ENTRIES
 from zstate.errors import InsertRefused
-from zstate.ingest.events import KEPT, EventLog, StaticEdgeOwners, WriterEvent
+from zstate.ingest.events import EventLog, StaticEdgeOwners, WriterEvent
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream
@@ -216,7 +216,7 @@ def test_memory_is_bounded_for_any_number_of_writers():
             events.on_writer(one, alive=True)
             events.set_static_children("r1", one.name, frozenset({"r1/camera"}))
             events.on_writer(one, alive=False)
-        assert len(events.recent()) == KEPT
+        assert len(events.recent()) == 1024
         sizes = {name: len(value) for name, value in vars(events).items() if isinstance(value, dict)}
     assert sizes == {"_alive": 0, "_former": MAX_ENTRIES, "_gone": MAX_ENTRIES, "_conflicts": 0}
 

@@ -13,6 +13,7 @@ import pytest
 from helpers.processes import Child, find_free_port, until
 
 from zstate.errors import ConfigError, InvalidInput
+from zstate.net.config import default_config
 from zstate.net.security.certificates import issue_identities
 from zstate.net.session import connect
 
@@ -51,6 +52,13 @@ def test_loopback_accepts_endpoints_of_this_host(free_port: int, tmp_path):
     here = [f"tcp/127.0.3.4:{free_port}", f"tcp/localhost:{free_port}", f"unixsock-stream/{tmp_path}/s"]
     with connect(mode="loopback", endpoints=[*here, f"tcp/[::1]:{free_port}"], listen=here[0]):
         pass
+
+
+def test_the_lease_of_a_link_is_three_seconds_and_1000_connections_may_be_pending_for_as_long():
+    settings = default_config("peer", (), ()).get_json
+    assert settings("transport/link/tx/lease") == "3000"
+    assert settings("transport/unicast/accept_pending") == "1000"
+    assert settings("transport/unicast/accept_timeout") == "3000"
 
 
 def test_loopback_discovers_processes_of_this_host():

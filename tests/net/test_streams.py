@@ -6,7 +6,7 @@ from helpers.processes import DEADLINE_S, until
 
 from zstate.errors import Closed
 from zstate.net.session import connect
-from zstate.net.streams import StreamInbox, StreamPublisher, StreamSubscriber
+from zstate.net.streams import StreamInbox, StreamPublisher, StreamSubscriber, capacity_for
 from zstate.wire.protocol import SerializedSample
 
 KEY = "zstate/r/joint_states"
@@ -73,6 +73,12 @@ def test_has_readers_follows_the_subscribers(sessions):
         with StreamSubscriber(sessions[1], KEY, lambda samples: None):
             until(lambda: publisher.has_readers)
         until(lambda: not publisher.has_readers)
+
+
+def test_8192_samples_wait_for_a_reader_of_several_keys_and_1024_for_that_of_one():
+    assert capacity_for(("zstate/*/joint_states",)) == 8192
+    assert capacity_for(("zstate/r1/joint_states", "zstate/r2/joint_states")) == 8192
+    assert capacity_for(("zstate/r1/joint_states",)) == 1024
 
 
 def test_slow_reader_receives_the_newest_samples_and_full_batches_are_counted(sessions):

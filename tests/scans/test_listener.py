@@ -121,6 +121,7 @@ def test_scans_lost_for_newer_ones_are_counted(sessions, stamp: int):
         with ScanPublisher(writer, "r1", "laser", **GEOMETRY) as publisher:
             until(lambda: [publisher.publish([1.0], stamp) for _ in range(50)] and scans.dropped)
         assert set(scans.dropped) == {"Overflow"}
+        assert len(scans) == (256 if stamp < 3 * MS else 0)
 
 
 @pytest.mark.parametrize(
