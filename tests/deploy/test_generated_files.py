@@ -51,3 +51,11 @@ def test_site_router_configuration_is_generated_by_the_readme_command(certs: Pat
 def test_other_commands_of_the_readme_exist():
     for words in commands_in_the_readme():
         output(words[1], "--help")
+
+
+def test_the_rules_of_the_firewall_have_the_limits_of_the_readme():
+    """20 connections of an address, 10 at once and then one every 2 s; of IPv6 each network of 64 bits."""
+    rules = (DEPLOY / "router.nft").read_text()
+    assert re.findall(r"ct count over (\d+)", rules) == ["20"] * 2
+    assert re.findall(r"limit rate over (\d+)/minute burst (\d+) packets", rules) == [("30", "10")] * 2
+    assert re.findall(r"ip6 saddr & (\S+)", rules) == ["ffff:ffff:ffff:ffff::"] * 2

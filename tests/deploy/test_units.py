@@ -47,6 +47,17 @@ def test_unit_restarts_and_has_few_permissions(name: str):
     assert service["NoNewPrivileges"] == "true"
 
 
+@pytest.mark.parametrize(
+    "name", ["zstate-router.service", "zstate-publish@.service", "zstate-drive@.service"]
+)
+def test_a_program_that_exits_is_restarted_after_one_second(name: str):
+    assert unit(name)["Service"]["RestartSec"] == "1"
+
+
+def test_a_recording_has_a_part_every_500_mb():
+    assert "--split-size 500 " in unit("zstate-record.service")["Service"]["ExecStart"]
+
+
 def test_the_unit_of_a_driver_may_open_devices_and_keeps_the_stops():
     service = unit("zstate-drive@.service")["Service"]
     assert service["PrivateDevices"] == "false"

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import (
     MAX_BYTES,
     DriverState,
@@ -33,7 +33,7 @@ from zstate.wire.messages import (
     with_full_names,
     with_short_texts,
 )
-from zstate.wire.native import encode
+from zstate.wire.native import ENCODINGS, decode, encode
 
 EDGES = (("base", "arm"), ("arm", "hand"))
 
@@ -344,3 +344,18 @@ def test_a_text_of_a_driver_state_is_cut_after_2000_characters(field: str):
 
     assert shortened(2000) == "x" * 2000
     assert shortened(2001) == "x" * 2000 + "... and 1 more characters"
+
+
+@pytest.mark.parametrize(("field", "least", "most"), [("rate_hz", 0.0, 1e9), ("progress", 0.0, 1.0)])
+def test_numbers_of_a_driver_state_outside_of_their_ranges_are_malformed(
+    field: str, least: float, most: float
+):
+    def received(number: float) -> DriverState:
+        state = DriverState(0, 5, "host", "ready", "", ("elbow",), 1, **{field: number})
+        return decode(encode(state), ENCODINGS[DriverState], DriverState)
+
+    assert [getattr(received(number), field) for number in (least, most)] == [least, most]
+    for number in (np.nextafter(least, -1.0), np.nextafter(most, np.inf)):
+        with pytest.raises(MessageError) as caught:
+            received(float(number))
+        assert caught.value.reason == "malformed"
