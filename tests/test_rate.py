@@ -65,6 +65,18 @@ def test_after_a_long_delay_the_ticks_that_passed_are_skipped_and_counted():
     assert (rate.report().ticks, rate.report().skipped) == (20, 10)
 
 
+@pytest.mark.parametrize(("domain", "longest"), [("system", SECOND // 10), ("sim", SECOND)])
+def test_ticks_of_the_past_are_skipped_after_a_delay_of_more_than_0_1_s_and_of_simulated_time_1_s(
+    domain: str, longest: int
+):
+    for delay, skipped in ((longest, 0), (longest + 1, longest * 100 // SECOND)):
+        clock = SteppingClock(0, lateness={2: delay})
+        clock.domain = domain
+        rate = Rate(100.0, clock, threading.Event(), 2.0)
+        assert len(list(rate)) == 200 - skipped
+        assert rate.report().skipped == skipped
+
+
 def test_ticks_and_skipped_ticks_add_up():
     rate = Rate(10.0, SteppingClock(0, lateness={1: 100 * SECOND}), threading.Event(), 3.0)
     list(rate)

@@ -66,6 +66,20 @@ def test_reply_on_another_key_is_ignored(sessions: tuple[Session, Session]):
     forged.undeclare()
 
 
+@pytest.mark.parametrize("size", [256_000, 256_001])
+def test_reply_of_more_than_256000_bytes_is_ignored(sessions: tuple[Session, Session], size: int):
+    transform = Transform("world", "tool", (9.0, 0.0, 0.0), UPRIGHT)
+    reply = to_json(transform).ljust(size)
+    large = sessions[0].zenoh.declare_queryable(KEY, lambda query: query.reply(KEY, reply))
+    until(lambda: [reply.ok for reply in sessions[1].zenoh.get(KEY, timeout=5.0)])
+    if size == 256_000:
+        assert query_lookup(sessions[1], "r1", "world", "tool", timeout_s=5.0) == transform
+    else:
+        with pytest.raises(Unreachable):
+            query_lookup(sessions[1], "r1", "world", "tool")
+    large.undeclare()
+
+
 def test_replies_equal_lookups_in_the_buffer(sessions: tuple[Session, Session]):
     buffer = TransformBuffer()
     track = buffer.add_robot(RRBOT, "r1")

@@ -7,7 +7,6 @@ import zenoh
 from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, wait_for_reader
 
-from zstate.ingest.base import EARLY_BYTES
 from zstate.model.load import load_model
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
@@ -155,7 +154,7 @@ def test_samples_that_wait_for_the_model_are_bounded_in_bytes(sessions):
     large = joint_state([0.0] * (size // 8))
     with JointStateListener(reader, "r1") as source:
         wait_for_reader(writer, KEY)
-        for payload in (*[large] * (2 * EARLY_BYTES // size), joint_state([1.0, 2.0])):
+        for payload in (*[large] * (2 * 2**22 // size), joint_state([1.0, 2.0])):
             writer.zenoh.put(
                 KEY,
                 payload,
@@ -170,7 +169,22 @@ def test_samples_that_wait_for_the_model_are_bounded_in_bytes(sessions):
         until(last_is_waiting)
         with StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]):
             assert next(iter(source)).positions.tolist() == [1.0, 2.0]
-        assert 0 < source.refused["bad numbers"] <= EARLY_BYTES // size
+        assert 0 < source.refused["bad numbers"] <= 2**22 // size
+
+
+def test_the_newest_1024_readings_wait_for_their_reader(sessions):
+    writer, reader = sessions
+    block, order = to_block([1.0, 2.0]), order_digest(RRBOT.joint_names)
+    with JointStateListener(reader, "r1", RRBOT) as source:
+        wait_for_reader(writer, KEY)
+        with StreamPublisher(writer, KEY, ENCODINGS[JointState]) as stream:
+            for batch in range(11):  # each ends with a message whose refusal shows that it was received
+                for seq in range(100 * batch, 100 * batch + 100):
+                    stream.put(encode(JointState(seq, seq, 1, order, block)))
+                stream.put(b"end of a batch")
+                until(lambda batch=batch: source.refused["malformed"] == batch + 1)
+        source.close()
+        assert [reading.stamp for reading in source] == list(range(1100 - 1024, 1100))
 
 
 def test_a_floating_joint_without_a_unit_quaternion_is_refused_before_republishing(sessions):
