@@ -148,6 +148,13 @@ def test_the_base_coasts_if_its_imu_is_silent_for_more_than_a_tenth_of_a_second(
     assert FUSION.predicted(estimate, estimate.stamp + silent, None).is_coasting == is_coasting
 
 
+@pytest.mark.parametrize(("silent", "is_pause"), [(S // 2, False), (S // 2 + 1, True)])
+def test_a_silence_of_all_for_more_than_half_a_second_is_a_pause(silent: int, is_pause: bool):
+    estimate = sampled(at_rest(), 100)
+    paused = FUSION.predicted(estimate, estimate.stamp + silent, None)
+    assert (paused.pause is not None) == is_pause
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_base_stands_up_to_5_mm_per_s_and_0_02_rad_per_s(axis: int):
     zero, one = np.zeros(3), np.eye(3)[axis]
