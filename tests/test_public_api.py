@@ -4,6 +4,7 @@ import inspect
 import subprocess
 import sys
 from importlib import metadata, resources
+from pkgutil import resolve_name
 
 import pytest
 from helpers.processes import DEADLINE_S
@@ -170,6 +171,25 @@ def test_every_name_is_listed_and_has_a_docstring():
 
 def test_signatures_are_the_contract():
     assert {path: signature_of(path) for path in SIGNATURES} == SIGNATURES
+
+
+@pytest.mark.parametrize(
+    ("path", "name", "value"),
+    [
+        ("driving:DriverHost", "rate_hz", 100.0),
+        ("driving:DriverHost", "ttl_s", 0.25),
+        ("driving:DriverHost", "faults_allowed", 3),
+        ("driving:DriverHost", "following_error", 0.2),
+        ("driving:Commander.move", "path_tolerance", 0.2),
+        ("driving:Commander.move", "goal_tolerance", 0.05),
+        ("driving:Commander.move", "goal_time_s", 1.0),
+        ("odometry:BaseEstimator", "history_s", 1.0),
+        ("odometry:VelocityNoise", "scale", 0.02),
+        ("scans:ScanListener", "timeout_s", 1.0),
+    ],
+)
+def test_defaults_are_those_that_the_guides_name(path: str, name: str, value: float):
+    assert inspect.signature(resolve_name(f"zstate.{path}")).parameters[name].default == value
 
 
 def test_errors_derive_from_what_a_caller_would_catch():

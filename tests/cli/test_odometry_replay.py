@@ -26,7 +26,15 @@ from zstate.cli.odometry_replay import (
 )
 from zstate.errors import InvalidInput
 from zstate.model.kinematics import Kinematics
-from zstate.odometry import BaseEstimator, DiffDrive, ImuNoise, PoseNoise, SimulatedRover, VelocityNoise
+from zstate.odometry import (
+    BaseEstimator,
+    DiffDrive,
+    ImuNoise,
+    PoseNoise,
+    SimulatedRover,
+    SourceHealth,
+    VelocityNoise,
+)
 from zstate.odometry.simulated_rover import ImuReading
 from zstate.sources.square_drive import WheelPair
 from zstate.wire.messages import Imu, Odometry, Pose, Velocity, order_digest, to_block
@@ -328,6 +336,18 @@ def test_report_explains_a_large_sigma_of_the_yaw(standstill: dict[str, Points],
     explanations = [text for text in report_lines(replayed(standstill)) if text.startswith("no rest")]
     assert [text.partition(", so ")[0] for text in explanations] == ([] if found is None else [found])
     assert all("begin a recording with 3 s at rest" in text for text in explanations)
+
+
+@pytest.mark.parametrize(
+    ("factor", "is_far"), [(1.49, False), (1.51, True), (1.0 / 1.49, False), (1.0 / 1.51, True)]
+)
+def test_sigmas_are_said_to_fit_that_are_wrong_by_more_than_a_factor_of_1_5(factor: float, is_far: bool):
+    found = replayed({"flow": [(float(second), 3.0 * factor**2, *BAND) for second in range(20)]})
+    nan_band = (math.nan, math.nan)
+    found.health = (SourceHealth("flow", 10.0, 0.0, 3.0 * factor**2, nan_band, 3, 200, 0, 0, 0, ""),)
+    found.sigmas = {"flow": np.full(3, 0.1)}
+    lines = [text for text in report_lines(found) if text.startswith("would fit: [velocity.flow]")]
+    assert bool(lines) == is_far
 
 
 @pytest.mark.parametrize(

@@ -179,6 +179,15 @@ def test_wheels_that_slip_are_rejected_and_reported():
     assert "were rejected" in wheels.sentence
 
 
+@pytest.mark.parametrize(("seconds", "is_lost"), [(1.02, False), (1.04, True)])
+def test_a_source_that_is_rejected_for_more_than_a_second_is_said_to_be_lost(seconds: float, is_lost: bool):
+    """The wheels are read each 20 ms, at first 10 ms after the begin of their slip."""
+    base = estimator()
+    t = drive(base, 3.0)
+    drive(base, seconds, start=t, slip=1.0)
+    assert ("s in a row: the estimate is lost" in health_of(base, "wheels").sentence) == is_lost
+
+
 def test_a_source_that_contradicts_for_seconds_is_followed_at_last():
     base = estimator()
     t = drive(base, 3.0)
