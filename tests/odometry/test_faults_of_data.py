@@ -90,6 +90,17 @@ def test_joints_from_before_the_first_contacts_are_rejected_with_their_reason():
     assert "could not be used: no velocity of" in health_of(base, "feet").sentence
 
 
+@pytest.mark.parametrize("sigma", [1e-9, 1e9])
+def test_sigmas_of_sensors_are_1e_9_to_1e9(sigma: float):
+    further = sigma**1.0001
+    estimator().heading(stamp_at(0.0), 0.1, sigma, source="compass")
+    estimator().velocity(stamp_at(0.0), [0, 0, 0], sigma=[sigma] * 3)
+    with pytest.raises(InvalidInput, match="'compass'"):
+        estimator().heading(stamp_at(0.0), 0.1, further, source="compass")
+    with pytest.raises(InvalidInput, match="'wheels'"):
+        estimator().velocity(stamp_at(0.0), [0, 0, 0], sigma=[further] * 3)
+
+
 @pytest.mark.parametrize("sigma", [1e300, 1e-300, 0.0, math.nan])
 def test_sigmas_that_no_sensor_has_are_refused(sigma: float):
     base = estimator()

@@ -117,10 +117,18 @@ def test_headings_differ_by_the_short_way_round():
     assert residual[0] == pytest.approx(2.0 * np.pi - 6.0)
 
 
-def test_an_axis_near_the_vertical_has_no_heading():
-    state = some_state(feet=0)._replace(rotation=rotation_exp(np.array([0.0, np.radians(87.0), 0.0])))
+def test_an_axis_within_six_degrees_of_the_vertical_has_no_heading():
+    def heading(degrees: float) -> Measurement:
+        turn = np.array([0.0, np.radians(degrees), 0.0])
+        return measurements.heading(
+            some_state(feet=0)._replace(rotation=rotation_exp(turn)), 0.0, 1.0, np.eye(4)
+        )
+
     with pytest.raises(InvalidInput, match="87 degrees from level"):
-        measurements.heading(state, 0.0, 1.0, np.eye(4))
+        heading(87.0)
+    with pytest.raises(InvalidInput, match="84 degrees from level"):
+        heading(84.001)
+    assert heading(83.999).residual == pytest.approx(0.0)
 
 
 def test_a_contact_that_is_not_there_is_refused_by_name():

@@ -126,6 +126,15 @@ def test_late_reader_of_the_imu_finds_the_same_readings():
     assert [one.gyro.tolist() for one in found] == [one.gyro.tolist() for one in expected]
 
 
+def test_readings_and_poses_of_the_last_two_seconds_are_kept():
+    rover = rover_at_rest()
+    rover.drive((4.0, 6.0))
+    readings = rover.imu(START + 5_000 * MS)
+    assert [readings[0].stamp, len(readings)] == [START + 3_000 * MS + 5 * MS // 2, 2000 // 5]
+    assert rover.has_poses_since(START + 3_000 * MS)
+    assert not rover.has_poses_since(START + 3_000 * MS - 1)
+
+
 def test_after_a_long_pause_the_rover_stands_and_poses_from_before_it_are_forgotten():
     rover = rover_at_rest()
     rover.drive((5.0, 5.0))

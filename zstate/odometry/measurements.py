@@ -30,7 +30,7 @@ from zstate.odometry.rotations import IDENTITY, skew
 MIN_SIGMA, MAX_SIGMA = 1e-9, 1e9
 """The bounds of standard deviations, in any unit. What is worse measures nothing; squares stay in range."""
 
-_LEVEL = 0.1
+_LEVEL = math.sin(math.radians(6.0))
 """The shortest level part of a unit vector that has a heading: 84 degrees of pitch."""
 
 
