@@ -1,4 +1,6 @@
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -107,3 +109,16 @@ def test_only_scans_are_best_effort_as_sensor_data_is():
     # rmw_qos_profile_sensor_data
     assert STREAM_QOS["scan"] == Qos("best_effort", "volatile", "keep_last", 5)
     assert {qos.reliability for stream, qos in STREAM_QOS.items() if stream != "scan"} == {"reliable"}
+
+
+def test_streams_have_the_qos_that_the_wire_specification_lists():
+    page = (Path(__file__).parents[3] / "docs" / "wire.md").read_text().partition("\n## ROS 2 wire\n")[2]
+    rows = re.findall(r"^\| (`.+?) \| .* \| ([a-z ]+), ([a-z ]+), depth (\d+) \|$", page, re.MULTILINE)
+    listed = {
+        stream: Qos(reliability.replace(" ", "_"), durability.replace(" ", "_"), "keep_last", int(depth))  # type: ignore[arg-type]
+        for streams, reliability, durability, depth in rows
+        for stream in re.findall(r"`(\w+)`", streams)
+    }
+    assert {stream: qos for stream, qos in listed.items() if stream in STREAM_QOS} == STREAM_QOS
+    assert listed["partial_joint_states"] == STREAM_QOS["joint_states"]
+    assert listed["transforms"] == STREAM_QOS["tf"]
