@@ -178,6 +178,23 @@ def test_a_stop_is_not_confirmed_before_the_driver_has_stopped(sessions):
         assert stop(sessions[1], "arm").state == "stopped"
 
 
+def test_a_stop_that_is_not_confirmed_is_sent_again_after_a_quarter_of_a_second_and_twice_as_long(sessions):
+    received: list[Stop] = []
+
+    def receive(sample: SerializedSample) -> None:
+        received.append(decode(sample.payload, sample.encoding, Stop))
+
+    with LatchedSubscriber(sessions[0], stop_expressions("arm"), receive):
+        with pytest.raises(Unreachable):
+            stop(sessions[1], "arm", timeout_s=3.0)
+        with pytest.raises(Unreachable):
+            stop(sessions[1], "arm", "the end", timeout_s=0.01)
+        until(lambda: received and received[-1].reason == "the end")
+    # At 0, 0.25, 0.75 and 1.75 s: the next pause is longer than what is left.
+    assert [one.reason for one in received] == [""] * 4 + ["the end"]
+    assert len({one.seq for one in received}) == 5
+
+
 def test_parallel_stops_of_one_session_are_all_confirmed(sessions):
     may_read = threading.Event()
     may_read.set()
