@@ -8,7 +8,7 @@ import pytest
 from helpers.processes import DEADLINE_S, Child, until
 
 from zstate.errors import ConfigError
-from zstate.net.rendezvous import RENDEZVOUS, rendezvous_addresses, silent_addresses
+from zstate.net.rendezvous import rendezvous_addresses, silent_addresses
 from zstate.net.session import Session, connect
 
 # Publishes its name on k/<name> until a line arrives on stdin; prints every name it receives.
@@ -169,9 +169,7 @@ def test_rendezvous_addresses_are_read_from_the_environment(monkeypatch: pytest.
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", "127.0.0.1:1 127.0.0.1:2")
     assert rendezvous_addresses() == (("127.0.0.1", 1), ("127.0.0.1", 2))
     monkeypatch.delenv("ZSTATE_RENDEZVOUS")
-    assert rendezvous_addresses() == tuple(
-        ("127.0.0.1", int(address.split(":")[1])) for address in RENDEZVOUS.split()
-    )
+    assert rendezvous_addresses() == tuple(("127.0.0.1", port) for port in (7450, 7451, 7452))
 
 
 @pytest.mark.parametrize(
