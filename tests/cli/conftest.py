@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, started
+from helpers.programs import router
 
 from zstate.cli import session
 from zstate.cli.commands import view
@@ -17,14 +18,14 @@ def state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def ros_router(spawn: Spawn, free_port: int, monkeypatch: pytest.MonkeyPatch) -> str:
+def ros_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Where it listens; the commands of the test connect there, and speak to ROS."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--ros2", "--listen", endpoint).line()
-    monkeypatch.setenv("ZSTATE_CONNECT", endpoint)
-    monkeypatch.setenv("ZSTATE_WIRE", "ros2")
-    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
-    return endpoint
+    with router(endpoint, ros2=True):
+        monkeypatch.setenv("ZSTATE_CONNECT", endpoint)
+        monkeypatch.setenv("ZSTATE_WIRE", "ros2")
+        monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+        yield endpoint
 
 
 @pytest.fixture

@@ -19,7 +19,6 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 BASE_FROM_LOWER = (0.7 * math.sin(SHOULDER), 0.1 + 0.07, 1.05 + 0.7 * math.cos(SHOULDER))
 
 
-@pytest.mark.processes
 def test_tf_needs_no_model_and_calls_frames_as_ros_does(ros_router: str):
     with published_robot(wire="ros2", router=ros_router, streams=("tf", "tf_static")):
         answer = json.loads(run_cli("tf", "base", "lower", "--once", "--json").stdout)
@@ -42,7 +41,6 @@ def test_tf_reports_missing_topics_in_ros_terms(spawn: Spawn, ros_router: str):
         assert unknown_to_ros not in command.stderr
 
 
-@pytest.mark.processes
 def test_tf_between_two_trees_names_the_command_that_joins_them(ros_router: str):
     with (
         published_robot(wire="ros2", router=ros_router),
@@ -54,7 +52,6 @@ def test_tf_between_two_trees_names_the_command_that_joins_them(ros_router: str)
     assert "`zstate static --wire ros2 map world --xyz ...`" in message
 
 
-@pytest.mark.processes
 def test_tree_shows_frames_by_their_ros_names_with_the_nodes_that_write_them(ros_router: str):
     wire = "ros2:namespace=r1,frame_prefix=r1/,node=driver"
     with published_robot("r1", wire=wire, router=ros_router):
@@ -68,7 +65,6 @@ def test_tree_shows_frames_by_their_ros_names_with_the_nodes_that_write_them(ros
     assert tool.split()[-2:] == ["static", "/r1/driver"]
 
 
-@pytest.mark.processes
 def test_tree_names_a_node_that_sends_nothing(ros_router: str):
     with (
         published_robot(wire="ros2", router=ros_router, streams=("tf_static",)),
@@ -81,12 +77,10 @@ def test_tree_names_a_node_that_sends_nothing(ros_router: str):
     assert "tool" in ended.stdout
 
 
-@pytest.mark.processes
 def test_tree_without_robots_is_a_failure(ros_router: str):
     assert "no node publishes /tf in domain 5" in failure("tree", "--wire", "ros2:domain=5")
 
 
-@pytest.mark.processes
 def test_echo_needs_no_robot_and_no_description(ros_router: str):
     with published_robot(wire="ros2", router=ros_router, streams=("joint_states",)):
         document = json.loads(run_cli("echo", "--once", "--json").stdout)
@@ -110,7 +104,6 @@ def test_unmeasured_values_are_null_in_json(spawn: Spawn, ros_router: str):
     assert document["efforts"] == {"a": None}
 
 
-@pytest.mark.processes
 def test_echo_reads_one_namespace_or_the_selected_robot(ros_router: str):
     with (
         published_robot("r1", wire="ros2:namespace=*", router=ros_router),
@@ -122,14 +115,12 @@ def test_echo_reads_one_namespace_or_the_selected_robot(ros_router: str):
     assert float(second.stdout) == 0.25
 
 
-@pytest.mark.processes
 def test_missing_robot_argument_is_reported(ros_router: str):
     assert "no robot is announced" in failure("echo", "--wire", "native")
     message = failure("hz", "--wire", "ros2:namespace=*", code=2)
     assert "each robot has a namespace of its name" in message
 
 
-@pytest.mark.processes
 def test_hz_measures_all_nodes_of_a_topic_together(ros_router: str):
     with published_robot(wire="ros2", router=ros_router), published_robot(wire="ros2", router=ros_router):
         for stream in ("tf", "joint_states"):

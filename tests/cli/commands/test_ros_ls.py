@@ -2,15 +2,12 @@ from __future__ import annotations
 
 import json
 
-import pytest
 from helpers.cli_runner import published_robot, run_cli
 
 from zstate import connect
 from zstate.wire.ros2.graph import EndpointToken, NodeToken
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.types import STRING, TF_MESSAGE
-
-pytestmark = pytest.mark.processes
 
 
 def test_each_topic_is_listed_with_its_publishers_and_their_qos(ros_router: str):

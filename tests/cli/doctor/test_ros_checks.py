@@ -48,7 +48,6 @@ class Found:
         assert "ros/" not in ended.stdout
 
 
-@pytest.mark.processes
 def test_nodes_of_one_robot_are_sound_under_any_name(ros_router: str):
     with published_robot(wire="ros2", router=ros_router):
         for name in ((), ("ros",), ("rrbot",)):
@@ -59,7 +58,6 @@ def test_nodes_of_one_robot_are_sound_under_any_name(ros_router: str):
     assert other.texts["model"].startswith("/robot_description carries 'rrbot', not 'ur5'")
 
 
-@pytest.mark.processes
 def test_joints_of_other_models_on_the_topic_are_ok(ros_router: str, gripper: str):
     with ExitStack() as nodes:
         nodes.enter_context(published_robot(wire="ros2", router=ros_router))
@@ -73,7 +71,6 @@ def test_joints_of_other_models_on_the_topic_are_ok(ros_router: str, gripper: st
     assert found.texts["joint_states"].endswith("; 2 joints outside the model: 'grip_shoulder', 'grip_elbow'")
 
 
-@pytest.mark.processes
 def test_joint_published_by_two_nodes_is_a_warning(ros_router: str):
     with ExitStack() as nodes:
         nodes.enter_context(published_robot(wire="ros2", router=ros_router))
@@ -87,7 +84,6 @@ def test_joint_published_by_two_nodes_is_a_warning(ros_router: str):
     assert found.next["joint_states"] == f"zstate ls --wire ros2 --connect {ros_router}  # stop one of them"
 
 
-@pytest.mark.processes
 def test_two_robots_in_one_namespace_are_a_warning(ros_router: str, gripper: str):
     with ExitStack() as nodes:
         nodes.enter_context(published_robot(wire="ros2", router=ros_router))
@@ -99,7 +95,6 @@ def test_two_robots_in_one_namespace_are_a_warning(ros_router: str, gripper: str
     assert found.next["poses"].startswith("zstate static grip_world world --xyz 0 0 0 --wire ros2 --connect ")
 
 
-@pytest.mark.processes
 def test_driver_of_other_joints_is_distinguished_from_a_missing_one(ros_router: str, gripper: str):
     with ExitStack() as nodes:
         only: tuple[Stream, ...] = ("joint_states",)
@@ -113,7 +108,6 @@ def test_driver_of_other_joints_is_distinguished_from_a_missing_one(ros_router: 
     assert text in found.first_broken["text"]
 
 
-@pytest.mark.processes
 def test_missing_driver_and_missing_model_are_reported(ros_router: str):
     with published_robot(wire="ros2", router=ros_router, streams=("tf_static", "robot_description")):
         lacking = Found(code=1).first_broken
@@ -126,7 +120,6 @@ def test_missing_driver_and_missing_model_are_reported(ros_router: str):
     assert lacking["next"] == f"zstate publish FILE --wire ros2 --connect {ros_router}"
 
 
-@pytest.mark.processes
 def test_without_nodes_the_domain_is_reported(ros_router: str):
     found = Found(code=1).first_broken
     assert (found["name"], found["text"]) == ("robots", "no node publishes the state of a robot in domain 0")
@@ -153,7 +146,6 @@ def test_next_command_has_the_endpoints_and_wire_of_doctor():
         assert with_same_options(whole, network, "ros2") == whole
 
 
-@pytest.mark.processes
 def test_degrees_on_the_topic_are_a_warning(ros_router: str, tmp_path: Path):
     text = Path(RRBOT).read_text().replace('type="continuous"', 'type="revolute"')
     limit = '<limit lower="-2" upper="2" effort="1" velocity="1"/>'
@@ -181,7 +173,6 @@ def scanning(router: str, frame: str) -> Iterator[None]:
         yield
 
 
-@pytest.mark.processes
 def test_scans_and_maps_of_nodes_are_sound_if_they_have_a_frame(ros_router: str):
     with published_robot(wire="ros2", router=ros_router), scanning(ros_router, "tool"):
         found = Found()
@@ -190,7 +181,6 @@ def test_scans_and_maps_of_nodes_are_sound_if_they_have_a_frame(ros_router: str)
     assert found.texts["map"].startswith("'map': 2 x 1 cells of 0.5 m in 'world', from ")
 
 
-@pytest.mark.processes
 def test_scans_of_nodes_in_a_frame_that_no_node_places_are_broken(ros_router: str):
     with published_robot(wire="ros2", router=ros_router), scanning(ros_router, "tol"):
         found = Found(code=1)
