@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -107,11 +108,10 @@ def test_bridge_serves_the_carried_robots(spawn: Spawn, ros_router: str, monkeyp
     interrupted(command)
 
 
-@pytest.mark.processes
-def test_busy_port_and_invalid_address_are_reported(spawn: Spawn):
-    command = started(spawn, "joints", RRBOT, "--metrics", "0")
-    port = url_of(command).split(":")[2].split("/")[0]
-    assert "or 0 for a free one" in failure("joints", RRBOT, "--name", "other", "--metrics", port)
+def test_busy_port_and_invalid_address_are_reported():
+    with socket.create_server(("127.0.0.1", 0)) as busy:
+        port = str(busy.getsockname()[1])
+        assert "or 0 for a free one" in failure("joints", RRBOT, "--metrics", port)
     assert "for instance 9100" in failure("joints", RRBOT, "--metrics", "here", code=2)
 
 

@@ -3,47 +3,53 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, run_cli, started
+from helpers.cli_runner import RRBOT, failure, run_cli
+from helpers.processes import repeated
+from helpers.programs import router
 
-from zstate import connect
+from zstate import StatePublisher, connect, load_model
 from zstate.net.security.credentials import Credentials
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.protocol import SerializedSample
 
 
 @pytest.fixture
-def router(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def fleet(free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """The endpoint of the fleet's router; ZSTATE_PASSWORD is right for every user."""
     acl, users = tmp_path / "acl.json5", tmp_path / "users.txt"
     acl.write_text(run_cli("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
     users.write_text("r1:secret\nr2:secret\ndesk:secret\n")
     users.chmod(0o600)
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--listen", endpoint, "--acl", str(acl), "--users", str(users)).line()
-    monkeypatch.setenv("ZSTATE_CONNECT", endpoint)
-    monkeypatch.setenv("ZSTATE_PASSWORD", "secret")
-    return endpoint
+    with router(f"tcp/127.0.0.1:{free_port}", users=users, acl=acl) as endpoint:
+        monkeypatch.setenv("ZSTATE_CONNECT", endpoint)
+        monkeypatch.setenv("ZSTATE_PASSWORD", "secret")
+        yield endpoint
 
 
-@pytest.mark.processes
-def test_late_viewer_receives_the_poses_of_the_robot(spawn: Spawn, router: str):
-    started(spawn, "publish", RRBOT, "--name", "r1", "--source", "sine", "--user", "r1").line()
-    seen = run_cli("tf", "base", "lower", "--once", "--json", "--user", "desk")
+def test_late_viewer_receives_the_poses_of_the_robot(fleet: str):
+    with (
+        connect(
+            mode="client", endpoints=fleet, credentials=Credentials(user="r1", password="secret")
+        ) as session,
+        StatePublisher(session, load_model(RRBOT), "r1") as publisher,
+        repeated(lambda: publisher.publish([0.0, 0.0])),
+    ):
+        seen = run_cli("tf", "base", "lower", "--once", "--json", "--user", "desk")
+        (robot,) = json.loads(run_cli("ls", "--json", "--user", "desk").stdout)
     assert seen.code == 0, seen.stderr
     assert json.loads(seen.stdout)["target"] == "base"
-    (robot,) = json.loads(run_cli("ls", "--json", "--user", "desk").stdout)
     assert robot["robot"] == "r1"
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize("user", ["r2", "desk"])
-def test_other_user_cannot_write_the_robot_and_the_error_names_the_reason(router: str, user: str):
+def test_other_user_cannot_write_the_robot_and_the_error_names_the_reason(fleet: str, user: str):
     credentials = Credentials(user="desk", password="secret")
     received: list[SerializedSample] = []
-    with connect(mode="client", endpoints=router, credentials=credentials) as session:
+    with connect(mode="client", endpoints=fleet, credentials=credentials) as session:
         subscriber = StreamSubscriber(session, "zstate/r1/**", received.extend)
         message = failure("publish", RRBOT, "--name", "r1", "--source", "sine", "--user", user)
         subscriber.close()
@@ -52,8 +58,7 @@ def test_other_user_cannot_write_the_robot_and_the_error_names_the_reason(router
     assert received == []
 
 
-@pytest.mark.processes
-def test_a_viewer_that_releases_stops_is_told_that_only_commanders_do(router: str):
+def test_a_viewer_that_releases_stops_is_told_that_only_commanders_do(fleet: str):
     message = failure("stop", "r1", "--release", "--user", "desk")
     assert "Only commanders command a robot and release its stops" in message
     assert "`zstate acl --robot r1 --commander NAME`" in message

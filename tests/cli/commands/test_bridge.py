@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started
+from helpers.programs import router
 
 from zstate import TransformListener, connect, load_model
 from zstate.model.kinematics import Kinematics
@@ -10,11 +13,10 @@ EACH = "ros2:namespace=*"
 
 
 @pytest.fixture
-def ros(spawn: Spawn, free_port: int) -> str:
+def ros(free_port: int) -> Iterator[str]:
     """The endpoint of the router on ROS's side."""
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--listen", endpoint).line()
-    return endpoint
+    with router(f"tcp/127.0.0.1:{free_port}") as endpoint:
+        yield endpoint
 
 
 @pytest.mark.processes
@@ -43,15 +45,13 @@ def test_native_robot_is_carried_to_ros_with_a_line_at_start_and_end(
 def test_ros_robot_is_carried_to_native(spawn: Spawn, ros: str):
     command = started(spawn, "bridge", "arm", "--ros", ros)
     command.line()
-    client = ("--mode", "client", "--connect", ros, "--wire", "ros2")
-    started(spawn, "publish", "rrbot", "--source", "sine", *client).line()
-    assert command.line() == "carrying 'arm': ROS to native"
-    with connect() as session, TransformListener(session, "arm") as listener:
-        assert listener.buffer.wait("world", "tool", timeout_s=10.0).kind == "exact"
-    interrupted(command)
+    with published_robot(wire="ros2", router=ros), connect() as session:
+        assert command.line() == "carrying 'arm': ROS to native"
+        with TransformListener(session, "arm") as listener:
+            assert listener.buffer.wait("world", "tool", timeout_s=10.0).kind == "exact"
+        interrupted(command)
 
 
-@pytest.mark.processes
 def test_several_robots_do_not_share_the_root_namespace(ros: str):
     with published_robot("left"), published_robot("right"):
         message = failure("bridge", "--ros", ros)
@@ -60,7 +60,6 @@ def test_several_robots_do_not_share_the_root_namespace(ros: str):
     assert EACH in message
 
 
-@pytest.mark.processes
 def test_bridge_without_a_robot_prints_how_to_name_one(ros: str):
     assert "zstate bridge panda" in failure("bridge", "--ros", ros)
 

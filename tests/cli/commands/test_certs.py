@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import find_free_port
+from helpers.programs import router
 
 from zstate import connect
 from zstate.errors import AccessDenied
@@ -46,35 +47,33 @@ def test_commands_with_identities_connect_through_a_router_that_requires_them(
     folder = str(tmp_path)
     run_cli("certs", folder, *("--identity", "router"), *("--identity", "r1"), *("--identity", "viewer"))
     endpoint = f"tls/127.0.0.1:{free_port}"
-    router = started(spawn, "router", "--listen", endpoint, "--certs", folder, "--identity", "router")
-    assert endpoint in router.line()
+    required = started(spawn, "router", "--listen", endpoint, "--certs", folder, "--identity", "router")
+    assert endpoint in required.line()
     robot = ("--connect", endpoint, "--certs", folder, "--identity", "r1")
     started(spawn, "publish", RRBOT, "--source", "sine", *robot).line()
     viewer = ("--connect", endpoint, "--certs", folder, "--identity", "viewer")
     done = run_cli("tf", "base", "lower", "--once", *viewer)
     assert done.code == 0, done.stderr
-    interrupted(router)
+    interrupted(required)
 
 
-@pytest.mark.processes
 def test_a_password_comes_from_the_environment_or_a_file(
-    spawn: Spawn, tmp_path: Path, free_port: int, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, free_port: int, monkeypatch: pytest.MonkeyPatch
 ):
     users, password = tmp_path / "users", tmp_path / "password"
     for file, text in ((users, "alice:wonder\n"), (password, "wonder\n")):
         file.touch(0o600)
         file.write_text(text)
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--listen", endpoint, "--users", str(users)).line()
-    alice = ("ls", "--connect", endpoint, "--user", "alice")
-    assert "ZSTATE_PASSWORD" in failure(*alice, code=2)
-    assert run_cli(*alice, "--password-file", str(password)).code == 0
-    password.chmod(0o644)
-    assert "chmod 600" in failure(*alice, "--password-file", str(password))
-    monkeypatch.setenv("ZSTATE_PASSWORD", "wander")
-    assert "the user 'alice' or the password" in failure(*alice)
-    monkeypatch.setenv("ZSTATE_PASSWORD", "wonder")
-    assert run_cli(*alice).code == 0
+    with router(f"tcp/127.0.0.1:{free_port}", users=users) as endpoint:
+        alice = ("ls", "--connect", endpoint, "--user", "alice")
+        assert "ZSTATE_PASSWORD" in failure(*alice, code=2)
+        assert run_cli(*alice, "--password-file", str(password)).code == 0
+        password.chmod(0o644)
+        assert "chmod 600" in failure(*alice, "--password-file", str(password))
+        monkeypatch.setenv("ZSTATE_PASSWORD", "wander")
+        assert "the user 'alice' or the password" in failure(*alice)
+        monkeypatch.setenv("ZSTATE_PASSWORD", "wonder")
+        assert run_cli(*alice).code == 0
 
 
 @pytest.mark.parametrize(

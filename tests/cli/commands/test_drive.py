@@ -9,8 +9,9 @@ import signal
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import DEADLINE_S, Child, until
+from helpers.programs import driver
 from helpers.raw_ros_nodes import COMMANDS, announced_publisher
 
 from zstate import JointReading, TransformListener, connect, load_model
@@ -164,13 +165,11 @@ def test_driver_of_a_file_gets_its_parameters_and_is_closed_at_the_end(
     assert log.read_text() == "shoulder elbow closed"
 
 
-@pytest.mark.processes
-def test_parameters_have_the_types_that_the_driver_annotates(spawn: Spawn, arm: str, tmp_path: Path):
+def test_parameters_have_the_types_that_the_driver_annotates(arm: str, tmp_path: Path):
     log = tmp_path / "log.txt"
     given = [f"--param={one}" for one in (f"log={log}", "ids=[1, 2]", "serial=0042")]
-    child = started(spawn, "drive", f"{arm}:Servos", "rrbot", *given)
-    line_with(child, "ready")
-    assert log.read_text() == "[1, 2] '0042'"
+    assert run_cli("drive", f"{arm}:Servos", "rrbot", *given, "--seconds", "0.05").code == 0
+    assert log.read_text() == "[1, 2] '0042'closed"
 
 
 @pytest.mark.processes
@@ -193,28 +192,24 @@ def test_ros_nodes_command_the_joints_as_a_controller_and_receive_them(spawn: Sp
     assert "active, commanded by /teleop" in line_with(child, "active")
 
 
-@pytest.mark.processes
-def test_device_sets_the_pace_of_the_loop(spawn: Spawn, arm: str, tmp_path: Path):
+def test_device_sets_the_pace_of_the_loop(arm: str, tmp_path: Path):
     given = ("drive", f"{arm}:Paced", "rrbot", "--param", f"log={tmp_path / 'log.txt'}")
-    child = started(spawn, *given, "--rate", "device", "--seconds", "0.5")
-    assert " at the pace of the device; " in child.line()
-    assert child.wait() == 0
-    assert re.match(r"\d+ samples at the pace of the device, [\d.]+ Hz$", line_with(child, "samples"))
+    ended = run_cli(*given, "--rate", "device", "--seconds", "0.5")
+    assert ended.code == 0
+    assert " at the pace of the device; " in ended.stdout.splitlines()[0]
+    assert re.search(r"^\d+ samples at the pace of the device, [\d.]+ Hz$", ended.stdout, re.MULTILINE)
 
 
-@pytest.mark.processes
-def test_driver_that_fails_three_times_in_a_row_ends_the_command_stopped(
-    spawn: Spawn, arm: str, tmp_path: Path
-):
+def test_driver_that_fails_three_times_in_a_row_ends_the_command_stopped(arm: str, tmp_path: Path):
     given = ("drive", f"{arm}:Arm", "rrbot", "--param", f"log={tmp_path / 'log.txt'}")
-    child = started(spawn, *given, "--param", "failures=true")
-    assert child.wait() == 1
-    assert "'rrbot' is stopped: the driver failed in 3 ticks in a row" in child.stderr
-    assert "no reply from servo 3" in child.stderr
-    assert line_with(child, "failures of the driver").startswith("0 setpoints written, 3 failures")
+    ended = run_cli(*given, "--param", "failures=true")
+    assert ended.code == 1
+    assert "'rrbot' is stopped: the driver failed in 3 ticks in a row" in ended.stderr
+    assert "no reply from servo 3" in ended.stderr
+    assert re.search(r"^0 setpoints written, 3 failures of the driver", ended.stdout, re.MULTILINE)
     # The stop is kept for the next host.
-    again = started(spawn, *given)
-    line_with(again, "stopped by zstate-drive@")
+    again = run_cli(*given, "--seconds", "0.5")
+    assert re.search(r"^stopped by zstate-drive@", again.stdout, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
@@ -262,12 +257,10 @@ def test_joint_without_a_velocity_limit_needs_one(tmp_path: Path):
     assert "no limit for the velocity of turn; give one, such as --velocity turn=1.0" in message
 
 
-@pytest.mark.processes
-def test_second_host_of_a_robot_is_refused_with_the_name_of_the_first(spawn: Spawn):
-    child = started(spawn, "drive", "sim", "rrbot")
-    line_with(child, "ready")
-    message = failure("drive", "sim", "rrbot")
-    assert f"zstate-drive@{os.uname().nodename} pid {child.process.pid}" in message
+def test_second_host_of_a_robot_is_refused_with_the_name_of_the_first():
+    with driver():
+        message = failure("drive", "sim", "rrbot")
+    assert f"@{os.uname().nodename} pid {os.getpid()}" in message
 
 
 @pytest.mark.processes

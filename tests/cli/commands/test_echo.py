@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import DEADLINE_S, repeated, until
+from helpers.programs import moving_edge
 from helpers.robots import SampleCollector, wait_for_reader
 
 from zstate import Transform, connect
@@ -60,10 +61,9 @@ def test_setpoints_of_a_robot_without_a_driver_host_are_explained():
     assert "'rrbot' has no driver host; start the program with its zstate.driving.DriverHost" in message
 
 
-@pytest.mark.processes
-def test_transforms_are_documents_of_poses_by_edge(spawn: Spawn):
-    started(spawn, "transform", "odom", "base", "--xyz", "1", "2", "3", "--robot", "r1").line()
-    document = json.loads(run_cli("echo", "r1", "--stream", "transforms", "--once", "--json").stdout)
+def test_transforms_are_documents_of_poses_by_edge():
+    with moving_edge("r1", "odom", "base", (1.0, 2.0, 3.0)):
+        document = json.loads(run_cli("echo", "r1", "--stream", "transforms", "--once", "--json").stdout)
     pose = {"translation": [1.0, 2.0, 3.0], "rotation": [0.0, 0.0, 0.0, 1.0]}
     assert document["transforms"] == {"odom -> base": pose}
     assert document["stamp"] > 0

@@ -5,8 +5,7 @@ import os
 import socket
 from xml.etree import ElementTree
 
-import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, published_robot, run_cli, started
+from helpers.cli_runner import failure, published_robot, run_cli
 from helpers.processes import until
 
 from zstate import StaticPublisher, TransformListener, connect, discover
@@ -14,6 +13,8 @@ from zstate.cli.commands.graph import graph_drawing, graph_text
 from zstate.cli.output.drawing import dot, mermaid, svg
 from zstate.driving import Commander
 from zstate.net.graph import Graph, StreamUse
+from zstate.net.presence import announce, local_writer
+from zstate.wire.keys import reader_key
 
 DRIVER, PUBLISH, VIEWER = "driver@jetson pid 4", "zstate-publish@nuc pid 5", "viewer@desk pid 6"
 
@@ -65,12 +66,10 @@ def test_writers_and_readers_of_a_robot_are_seen_with_rates():
     assert all(streams[name]["rate_hz"] > 0.0 for name in ("joint_states", "tf"))
 
 
-@pytest.mark.processes
-def test_stream_with_readers_but_no_writer_is_marked(spawn: Spawn):
-    started(spawn, "publish", RRBOT).line()
-    with connect() as session:
-        until(lambda: discover(session))
-    lines = run_cli("graph").stdout.splitlines()
+def test_stream_with_readers_but_no_writer_is_marked():
+    identity = local_writer(7, "zstate-publish").identity
+    with connect() as session, announce(session, reader_key("rrbot", "joint_states", identity)):
+        lines = run_cli("graph").stdout.splitlines()
     assert lines[:2] == ["rrbot: joint_states", "  written by  none"]
     assert lines[2].startswith("  read by     zstate-publish@")
 
@@ -95,7 +94,6 @@ def test_unknown_robot_is_an_error_but_an_empty_network_is_not():
     assert "no robot is announced" in ended.stderr
 
 
-@pytest.mark.processes
 def test_on_ros_side_topics_have_the_nodes_at_their_ends(ros_router: str):
     with published_robot(wire="ros2", router=ros_router):
         text = run_cli("graph").stdout

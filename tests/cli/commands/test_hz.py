@@ -6,6 +6,7 @@ import re
 import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import until
+from helpers.programs import moving_edge
 
 
 @pytest.mark.processes
@@ -38,12 +39,9 @@ def test_json_has_the_numbers_of_either_stream(stream: str):
     assert measured["missed"] == 0
 
 
-@pytest.mark.processes
-def test_transforms_of_several_writers_are_measured_together(spawn: Spawn):
-    for child in ("base_link", "ball"):
-        options = ("--xyz", "0", "0", "0", "--rate", "50", "--robot", "r1")
-        started(spawn, "transform", "odom", child, *options).line()
-    measured = json.loads(run_cli("hz", "r1", "--stream", "transforms", "--once", "--json").stdout)
+def test_transforms_of_several_writers_are_measured_together():
+    with moving_edge("r1", "odom", "base_link"), moving_edge("r1", "odom", "ball"):
+        measured = json.loads(run_cli("hz", "r1", "--stream", "transforms", "--once", "--json").stdout)
     # Two writers of 50 Hz each.
     assert measured["rate_hz"] == pytest.approx(100.0, rel=0.2)
     assert measured["missed"] == 0

@@ -6,12 +6,11 @@ import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, started
 from helpers.processes import SOON_S, until
 
-from zstate import TransformListener, connect
+from zstate import PartialStatePublisher, TransformListener, connect, load_model
 from zstate.net.presence import discover
 
-pytestmark = pytest.mark.processes
 
-
+@pytest.mark.processes
 def test_two_drivers_move_one_robot_and_publish_merges_them(spawn: Spawn):
     arm = started(spawn, "joints", "rrbot", "--only", "shoulder")
     on_stream = "rrbot: a sine on shoulder, 100 Hz, on zstate/rrbot/partial_joint_states/zstate-joints."
@@ -37,9 +36,9 @@ def test_two_drivers_move_one_robot_and_publish_merges_them(spawn: Spawn):
         interrupted(child)
 
 
-def test_joint_that_has_a_driver_is_refused_with_its_name(spawn: Spawn):
-    started(spawn, "joints", "rrbot", "--only", "elbow").line()
-    reason = failure("joints", "rrbot", "--only", "shoulder", "--only", "elbow")
+def test_joint_that_has_a_driver_is_refused_with_its_name():
+    with connect() as session, PartialStatePublisher(session, load_model("rrbot"), ["elbow"]):
+        reason = failure("joints", "rrbot", "--only", "shoulder", "--only", "elbow")
     assert "already publishes the joint 'elbow' of 'rrbot'" in reason
     assert "unknown joint 'wrist'" in failure("joints", "rrbot", "--only", "wrist")
     assert "--takeover is for all joints" in failure(

@@ -17,6 +17,7 @@ from helpers.cli_runner import (
     started,
 )
 from helpers.processes import find_free_port, until
+from helpers.programs import moving_edge
 
 from zstate import StaticPublisher, connect
 from zstate.cli.commands.ls import robots_text
@@ -136,16 +137,16 @@ def test_on_ros_side_the_list_is_watched_too(ros_router: str, spawn: Spawn):
     interrupted(command)
 
 
-@pytest.mark.processes
-def test_writers_of_transforms_have_their_names_and_rates(spawn: Spawn):
-    options = ("--xyz", "0", "0", "0", "--robot", "r1", "--writer", "odometry")
-    started(spawn, "transform", "odom", "base", *options).line()
-    (robot,) = json.loads(run_cli("ls", "--json").stdout)
+def test_writers_of_transforms_have_their_names_and_rates():
+    with moving_edge("r1", "odom", "base", writer="odometry"):
+        (robot,) = json.loads(run_cli("ls", "--json").stdout)
+        text, graph = run_cli("ls").stdout, run_cli("graph").stdout
+        edges = json.loads(run_cli("monitor", "--once", "--json").stdout)["edges"]
+        robots = run_cli("monitor", "--robots", "--once").stdout
     (writer,) = robot["writers"]
     assert (robot["robot"], writer["stream"], writer["names"]) == ("r1", "transforms", ["odometry"])
     assert writer["rate_hz"] == pytest.approx(50.0, rel=0.2)
-    assert "transforms/odometry" in run_cli("ls").stdout
-    assert "r1: transforms/odometry (" in run_cli("graph").stdout
-    edges = json.loads(run_cli("monitor", "--once", "--json").stdout)["edges"]
+    assert "transforms/odometry" in text
+    assert "r1: transforms/odometry (" in graph
     assert [edge["rate_hz"] for edge in edges] == [pytest.approx(50.0, rel=0.2)]
-    assert run_cli("monitor", "--robots", "--once").stdout.startswith("r1  ")
+    assert robots.startswith("r1  ")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, run_cli, started
 
-from zstate.scans import Grid
+from zstate import connect
+from zstate.scans import Grid, MapPublisher, load_map
 
 # Two rows of three cells: two occupied, three free, one unknown.
 CELLS = [[100, 0, 0], [-1, 0, 100]]
@@ -55,10 +56,9 @@ def test_name_of_a_file_becomes_that_of_a_place(spawn: Spawn, hall: str):
     assert started(spawn, "map", str(path)).line().startswith("floor_2_home: ")
 
 
-@pytest.mark.processes
-def test_place_with_nothing_but_a_map_is_sound(spawn: Spawn, hall: str):
-    started(spawn, "map", hall).line()
-    ended = run_cli("doctor", "hall", "--json")
+def test_place_with_nothing_but_a_map_is_sound(hall: str):
+    with connect() as session, MapPublisher(session, "hall", load_map(hall)):
+        ended = run_cli("doctor", "hall", "--json")
     checks = {one["name"]: one for one in json.loads(ended.stdout)["checks"] if one["robot"] == "hall"}
     assert ended.code == 0
     assert {name: one["state"] for name, one in checks.items()} == {
@@ -69,10 +69,9 @@ def test_place_with_nothing_but_a_map_is_sound(spawn: Spawn, hall: str):
     assert "3 x 2 cells of 0.5 m in 'hall/map'" in checks["map"]["text"]
 
 
-@pytest.mark.processes
-def test_second_map_of_a_place_is_refused_with_the_first(spawn: Spawn, hall: str):
-    started(spawn, "map", hall).line()
-    assert "'hall'" in failure("map", hall)
+def test_second_map_of_a_place_is_refused_with_the_first(hall: str):
+    with connect() as session, MapPublisher(session, "hall", load_map(hall)):
+        assert "'hall'" in failure("map", hall)
 
 
 def test_bad_file_is_reported_with_every_line(hall: str):

@@ -17,10 +17,16 @@ import numpy as np
 import pytest
 from helpers.cli_runner import ROVER, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import DEADLINE_S, Child, repeated, until
+from helpers.programs import driver
 
 from zstate import JointReading, TransformListener, connect
 from zstate.driving import Commander
+from zstate.net.latched import LatchedSubscriber
 from zstate.sources import JointStateListener
+from zstate.wire.keys import driver_key
+from zstate.wire.messages import DriverState, state_text
+from zstate.wire.native import decode
+from zstate.wire.protocol import SerializedSample
 
 
 def driven(spawn: Spawn, name: str = "rrbot") -> Child:
@@ -30,6 +36,25 @@ def driven(spawn: Spawn, name: str = "rrbot") -> Child:
     assert child.line().startswith(f"driving {name!r}")
     line_with(child, "ready")
     return child
+
+
+@contextmanager
+def states_of(robot: str) -> Generator[list[str]]:
+    """The states of a driver as `zstate drive` prints them, as they come."""
+    lines: list[str] = []
+
+    def on_value(sample: SerializedSample) -> None:
+        lines.append(state_text(decode(sample.payload, sample.encoding, DriverState)))
+
+    with connect() as session, LatchedSubscriber(session, driver_key(robot), on_value):
+        yield lines
+
+
+@pytest.fixture
+def a_driver() -> Generator[None]:
+    """That of rrbot."""
+    with driver():
+        yield
 
 
 def line_with(child: Child, text: str) -> str:
@@ -44,19 +69,17 @@ def printed(*arguments: str) -> str:
     return ended.stdout
 
 
-@pytest.mark.processes
-def test_joints_are_moved_and_the_outcome_is_awaited(spawn: Spawn):
-    host = driven(spawn)
-    assert re.fullmatch(r"reached in \d+\.\d s\n", printed("move", "rrbot", "shoulder=0.3", "elbow=-0.2"))
-    assert host.line().startswith("active, commanded by zstate-move@")
-    with connect() as session, TransformListener(session, "rrbot") as listener:
-        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
-        until(lambda: np.allclose(listener.buffer.joint_positions("rrbot")[0], [0.3, -0.2], atol=0.02))
+def test_joints_are_moved_and_the_outcome_is_awaited():
+    with driver(), states_of("rrbot") as lines, connect() as session:
+        reached = printed("move", "rrbot", "shoulder=0.3", "elbow=-0.2")
+        assert re.fullmatch(r"reached in \d+\.\d s\n", reached)
+        until(lambda: any(line.startswith("active, commanded by zstate-move@") for line in lines))
+        with TransformListener(session, "rrbot") as listener:
+            listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
+            until(lambda: np.allclose(listener.buffer.joint_positions("rrbot")[0], [0.3, -0.2], atol=0.02))
 
 
-@pytest.mark.processes
-def test_motion_beyond_the_limits_is_refused_with_all_findings_and_stretched_on_request(spawn: Spawn):
-    driven(spawn)
+def test_motion_beyond_the_limits_is_refused_with_all_findings_and_stretched_on_request(a_driver: None):
     fast = ("move", "rrbot", "shoulder=1", "elbow=-1", "--seconds", "0.3")
     # A cubic at rest at both ends has its largest speed, 1.5 times the mean, half-way: 1.5 * 1 / 0.3.
     # Its acceleration is 6 * 1 / 0.3^2 at both ends, and the limits are reached in 0.2 s by default.
@@ -72,14 +95,16 @@ def test_motion_beyond_the_limits_is_refused_with_all_findings_and_stretched_on_
     assert json.loads(printed(*fast, "--stretch", "--json"))["outcome"] == "reached"
 
 
-@pytest.mark.processes
-def test_degrees_are_converted_on_request_and_guessed_in_a_refusal(spawn: Spawn):
-    line_with(started(spawn, "drive", "sim", "gripper", "--ttl", "10"), "ready")
-    text = failure("move", "gripper", "thumb_joint=60")
-    assert "'thumb_joint' at 60 rad is outside 0 to 1.2" in text
-    assert "s after the start; this looks like degrees" in text
-    assert "--deg takes numbers in degrees" in text
-    with connect() as session, JointStateListener(session, "gripper") as joints:
+def test_degrees_are_converted_on_request_and_guessed_in_a_refusal():
+    with (
+        driver("gripper"),
+        connect() as session,
+        JointStateListener(session, "gripper") as joints,
+    ):
+        text = failure("move", "gripper", "thumb_joint=60")
+        assert "'thumb_joint' at 60 rad is outside 0 to 1.2" in text
+        assert "s after the start; this looks like degrees" in text
+        assert "--deg takes numbers in degrees" in text
         newest: list[JointReading] = []
 
         def is_there(positions: list[float]) -> bool:
@@ -91,9 +116,7 @@ def test_degrees_are_converted_on_request_and_guessed_in_a_refusal(spawn: Spawn)
         until(lambda: is_there([0.03, np.pi / 3]))
 
 
-@pytest.mark.processes
-def test_points_of_a_file_are_followed(spawn: Spawn, tmp_path: Path):
-    driven(spawn)
+def test_points_of_a_file_are_followed(a_driver: None, tmp_path: Path):
     points = tmp_path / "wave.csv"
     points.write_text("time, elbow\n0.4, 0.2\n0.8, -0.1\n")
     assert printed("move", "rrbot", "--file", str(points)).startswith("reached in ")
@@ -107,20 +130,23 @@ def test_points_of_a_file_are_followed(spawn: Spawn, tmp_path: Path):
     )
 
 
-@pytest.mark.processes
-def test_wheels_keep_a_velocity_for_some_seconds_and_brake(spawn: Spawn):
-    host = driven(spawn, "diffbot")
+def test_wheels_keep_a_velocity_for_some_seconds_and_brake():
     turned: list[JointReading] = []
-    with connect() as session, JointStateListener(session, "diffbot", on_reading=turned.append) as joints:
+    with (
+        driver("diffbot"),
+        states_of("diffbot") as lines,
+        connect() as session,
+        JointStateListener(session, "diffbot", on_reading=turned.append) as joints,
+    ):
         until(lambda: joints.read(0) is not None)
         assert printed("move", "diffbot", "--velocity", "left_wheel_joint=2", "--seconds", "0.5") == ""
-        assert host.line().startswith("active, commanded by zstate-move@")
+        until(lambda: any(line.startswith("active, commanded by zstate-move@") for line in lines))
         until(lambda: turned[-1].velocities[0] == pytest.approx(0.0, abs=1e-3))
+        assert "limits" not in failure("move", "diffbot", "--velocity", "left_wheel=2")
     assert max(one.velocities[0] for one in turned) == pytest.approx(2.0, abs=0.01)
     left, right = turned[-1].positions
     assert left > 0.4 * 2.0
     assert right == 0.0
-    assert "limits" not in failure("move", "diffbot", "--velocity", "left_wheel=2")
 
 
 @pytest.mark.processes
@@ -183,19 +209,15 @@ def test_stop_is_latched_over_a_restart_of_the_driver_until_the_release(spawn: S
     line_with(again, "ready: released by zstate-stop@")
 
 
-@pytest.mark.processes
-def test_all_drivers_are_stopped_and_reported_as_json(spawn: Spawn):
-    for name in ("left", "right"):
-        driven(spawn, name)
-    documents = [json.loads(line) for line in printed("stop", "--all", "--json").splitlines()]
+def test_all_drivers_are_stopped_and_reported_as_json():
+    with driver(name="left"), driver(name="right"):
+        documents = [json.loads(line) for line in printed("stop", "--all", "--json").splitlines()]
     assert [document["robot"] for document in documents] == ["left", "right"]
     for document in documents:
         assert (document["state"], document["is_stopped"], document["error"]) == ("stopped", True, None)
 
 
-@pytest.mark.processes
-def test_release_while_another_program_commands_is_refused_with_its_name(spawn: Spawn):
-    driven(spawn)
+def test_release_while_another_program_commands_is_refused_with_its_name(a_driver: None):
     with connect() as session, Commander(session, "rrbot", program="teleop") as commander:
         commander.wait_for_driver(DEADLINE_S)
         assert "teleop@" in failure("stop", "rrbot", "--release")

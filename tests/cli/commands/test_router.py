@@ -8,6 +8,7 @@ import pytest
 import zenoh
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
 from helpers.processes import until
+from helpers.programs import router
 from helpers.robots import SampleCollector
 
 from zstate import TransformListener, connect
@@ -18,8 +19,8 @@ from zstate.net.session import Session
 @pytest.mark.processes
 def test_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    router = started(spawn, "router", "--listen", endpoint)
-    assert router.line().endswith(f" listens at {endpoint}")
+    child = started(spawn, "router", "--listen", endpoint)
+    assert child.line().endswith(f" listens at {endpoint}")
     client = ("--mode", "client", "--connect", endpoint)
     started(spawn, "publish", RRBOT, "--source", "sine", *client).line()
     with (
@@ -27,14 +28,12 @@ def test_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
         TransformListener(session, "rrbot") as listener,
     ):
         assert listener.buffer.wait("base", "lower", timeout_s=10.0).kind == "exact"
-    interrupted(router)
+    interrupted(child)
 
 
-@pytest.mark.processes
-def test_busy_port_is_reported_at_once(spawn: Spawn, free_port: int):
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--listen", endpoint).line()
-    assert f"another program listens at '{endpoint}'" in failure("router", "--listen", endpoint)
+def test_busy_port_is_reported_at_once(free_port: int):
+    with router(f"tcp/127.0.0.1:{free_port}") as endpoint:
+        assert f"another program listens at '{endpoint}'" in failure("router", "--listen", endpoint)
 
 
 def ros_node(port: int) -> zenoh.Session:
@@ -56,8 +55,8 @@ def ros_node(port: int) -> zenoh.Session:
 @pytest.mark.processes
 def test_ros_nodes_and_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    router = started(spawn, "router", "--ros2", "--listen", endpoint)
-    assert router.line().endswith(f" listens at {endpoint}")
+    child = started(spawn, "router", "--ros2", "--listen", endpoint)
+    assert child.line().endswith(f" listens at {endpoint}")
     received: set[tuple[str, str]] = set()
     with ExitStack() as opened:
         sessions = {name: opened.enter_context(ros_node(free_port)) for name in ("node", "other")}
@@ -75,7 +74,7 @@ def test_ros_nodes_and_clients_communicate_through_the_router(spawn: Spawn, free
             return len(received) == len(sessions) ** 2
 
         until(all_received_all)
-    interrupted(router)
+    interrupted(child)
 
 
 def test_its_settings_for_ros_and_a_file_exclude_each_other(tmp_path):

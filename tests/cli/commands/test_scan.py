@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
 from helpers.processes import SOON_S, repeated, until
+from helpers.programs import scanner
 
 from zstate import StaticPublisher, Transform, TransformPublisher, connect
 from zstate.scans import Grid, ScanListener
@@ -49,13 +50,12 @@ def test_dummy_scans_have_the_pattern_of_dummy_laser(spawn: Spawn):
     assert "commanded 30 Hz" in child.line()
 
 
-@pytest.mark.processes
-def test_summary_of_a_scan_has_no_ranges(spawn: Spawn):
-    started(spawn, "scan", "r1", "--frame", "laser", "--dummy").line()
-    text = run_cli("echo", "r1", "--stream", "scan", "--once").stdout
+def test_summary_of_a_scan_has_no_ranges():
+    with scanner("r1", "laser"):
+        text = run_cli("echo", "r1", "--stream", "scan", "--once").stdout
+        changed = run_cli("echo", "r1", "--stream", "scan", "--once", "--changed").stdout
     assert "rays: 1081\nvalid: 1081\nnearest: " in text
     assert "ranges" not in text
-    changed = run_cli("echo", "r1", "--stream", "scan", "--once", "--changed").stdout
     assert 'frame: "r1/laser"' in changed
 
 
@@ -131,10 +131,8 @@ def test_simulated_scan_waits_for_the_robot_and_its_frame(spawn: Spawn, hall: st
     assert "no scan in 1 s: robot 'r9' is not announced" in message
 
 
-@pytest.mark.processes
-def test_scans_in_a_frame_that_no_robot_places_are_a_finding(spawn: Spawn):
-    with published_robot():
-        started(spawn, "scan", "rrbot", "--frame", "baze", "--dummy", "--sensor", "front").line()
+def test_scans_in_a_frame_that_no_robot_places_are_a_finding():
+    with published_robot(), scanner("rrbot", "baze", "front"):
         ended = run_cli("doctor", "rrbot", "--json")
     assert ended.code == 1
     first = json.loads(ended.stdout)["first_broken"]
@@ -142,10 +140,8 @@ def test_scans_in_a_frame_that_no_robot_places_are_a_finding(spawn: Spawn):
     assert "the scans of 'front' are in 'rrbot/baze', which no writer places; 'base'" in first["text"]
 
 
-@pytest.mark.processes
-def test_commands_that_look_show_scans(spawn: Spawn):
-    with published_robot():
-        started(spawn, "scan", "rrbot", "--frame", "base", "--dummy", "--sensor", "front").line()
+def test_commands_that_look_show_scans():
+    with published_robot(), scanner("rrbot", "base", "front"):
         (robot,) = json.loads(run_cli("ls", "--json").stdout)
         (writer,) = [one for one in robot["writers"] if one["stream"] == "scan"]
         assert writer["names"] == ["front"]

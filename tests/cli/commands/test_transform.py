@@ -6,6 +6,7 @@ import signal
 import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, run_cli, started
 from helpers.processes import SOON_S, until
+from helpers.programs import moving_edge
 
 from zstate import Transform, TransformListener, connect
 
@@ -74,12 +75,11 @@ def test_robot_is_that_of_a_full_name(spawn: Spawn):
     assert "zstate/r7/transforms/" in child.line()
 
 
-@pytest.mark.processes
-def test_second_writer_of_an_edge_is_refused_with_the_first(spawn: Spawn):
+def test_second_writer_of_an_edge_is_refused_with_the_first():
     edge = ("odom", "base", "--xyz", "0", "0", "0", "--robot", "r1")
-    started(spawn, "transform", *edge, "--writer", "wheels").line()
-    assert "'wheels'" in failure("transform", *edge, "--writer", "lidar")
-    assert "'wheels'" in failure("static", *edge, "--writer", "lidar")
+    with moving_edge("r1", "odom", "base", writer="wheels"):
+        assert "'wheels'" in failure("transform", *edge, "--writer", "lidar")
+        assert "'wheels'" in failure("static", *edge, "--writer", "lidar")
 
 
 @pytest.mark.processes

@@ -16,18 +16,21 @@ from typing import Any
 import pytest
 from helpers.cli_runner import ALL_STREAMS, RRBOT, Spawn, failure, published_robot, run_cli, started
 from helpers.processes import DEADLINE_S, find_free_port, repeated, until
+from helpers.programs import router
 
 from zstate import PartialStatePublisher, StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.cli.doctor.robot_probe import RobotProbe, StreamCollector
 from zstate.clock import ManualClock, SystemClock
 from zstate.driving import Commander, stop
 from zstate.net.presence import announce, discover, discover_readers, local_writer
+from zstate.net.security.credentials import Credentials
 from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import ImuPublisher, OdometryPublisher, SensorListener
 from zstate.sources import JointStateListener
-from zstate.wire.keys import Stream, writer_key
+from zstate.wire.identity import WriterId
+from zstate.wire.keys import Stream, reader_key, writer_key
 from zstate.wire.messages import JointState, order_digest
 from zstate.wire.native import ENCODINGS, encode
 
@@ -105,11 +108,8 @@ def test_missing_robot_is_reported_with_the_announced_ones():
     assert found["next"] == "zstate doctor rrbot"
 
 
-@pytest.mark.processes
-def test_robots_that_an_option_hides_are_found(spawn: Spawn, free_port: int):
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--listen", endpoint).line()
-    with published_robot():
+def test_robots_that_an_option_hides_are_found(free_port: int):
+    with router(f"tcp/127.0.0.1:{free_port}") as endpoint, published_robot():
         found = broken_link("--connect", endpoint)
     assert "'rrbot'" in found["text"]
     assert found["next"] == "zstate doctor rrbot"
@@ -275,17 +275,17 @@ def test_odometry_whose_driver_has_ended_names_the_streams_that_it_waits_for():
     assert first["next"].startswith("zstate ls  # start ")
 
 
-@pytest.mark.processes
-def test_readers_of_other_programs_wait_for_nothing_that_a_robot_lacks(spawn: Spawn):
+def test_readers_of_other_programs_wait_for_nothing_that_a_robot_lacks():
     """Such as `zstate echo` of a stream that the robot does not have."""
     edge = Transform("odom", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     with (
         connect() as session,
         OdometryPublisher(session, "cart", "odometry") as odometry,
         TransformListener(session, "cart"),
+        connect() as other,
+        announce(other, reader_key("cart", "imu", WriterId("zstate-echo", "desk", 9, 1, 7).identity)),
         repeated(lambda: odometry.publish(edge, [0, 0, 0], [0, 0, 0])),
     ):
-        started(spawn, "echo", "cart", "--stream", "imu")
         until(lambda: any(one.stream == "imu" for one in discover_readers(session)))
         assert diagnosed("cart", code=0)["sound"]
 
@@ -459,11 +459,8 @@ def test_warning_of_a_writer_of_transforms_is_reported_though_it_keeps_its_rate(
     assert re.fullmatch(rf"odometry@\S+ pid {os.getpid()} reports: {re.escape(text)}", found)
 
 
-@pytest.mark.processes
-def test_disconnected_frames_are_a_warning(spawn: Spawn):
-    child = started(spawn, "static", "rrbot/map", "rrbot/odom", "--xyz", "0", "0", "1")
-    child.line()
-    with published_robot():
+def test_disconnected_frames_are_a_warning():
+    with published_robot(), static_edges(("rrbot", "rrbot/map", "rrbot/odom")):
         assert "in 2 trees" in warnings("rrbot")["poses"]
 
 
@@ -515,7 +512,6 @@ def test_unknown_host_name_is_distinguished_from_a_refusing_host():
     assert "the host name 'no-such-host.invalid' is unknown" in found["text"]
 
 
-@pytest.mark.processes
 def test_another_program_at_the_rendezvous_address_is_detected(monkeypatch: pytest.MonkeyPatch):
     with socket.create_server(("127.0.0.1", find_free_port())) as server:
         monkeypatch.setenv("ZSTATE_RENDEZVOUS", "{}:{}".format(*server.getsockname()))
@@ -547,26 +543,29 @@ def test_stopped_program_that_blocks_the_rendezvous_is_reported(
 
 
 @pytest.fixture
-def guarded(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def guarded(free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A router that lets r1 and r2 write, desk read, and r3 connect only; r1 is published behind it."""
     acl, users = tmp_path / "acl.json5", tmp_path / "users.txt"
     acl.write_text(run_cli("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
     users.write_text("".join(f"{name}:secret\n" for name in ("r1", "r2", "r3", "desk")))
     users.chmod(0o600)
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--listen", endpoint, "--acl", str(acl), "--users", str(users)).line()
-    monkeypatch.setenv("ZSTATE_CONNECT", endpoint)
-    monkeypatch.setenv("ZSTATE_PASSWORD", "secret")
-    started(spawn, "publish", RRBOT, "--name", "r1", "--source", "sine", "--user", "r1").line()
-    return endpoint
+    with (
+        router(f"tcp/127.0.0.1:{free_port}", users=users, acl=acl) as endpoint,
+        connect(
+            mode="client", endpoints=endpoint, credentials=Credentials(user="r1", password="secret")
+        ) as session,
+        StatePublisher(session, load_model(RRBOT), "r1") as publisher,
+        repeated(lambda: publisher.publish([0.0, 0.0])),
+    ):
+        monkeypatch.setenv("ZSTATE_CONNECT", endpoint)
+        monkeypatch.setenv("ZSTATE_PASSWORD", "secret")
+        yield endpoint
 
 
-@pytest.mark.processes
 def test_viewer_behind_a_router_finds_everything_sound(guarded: str):
     assert diagnosed("r1", "--user", "desk", code=0)["sound"]
 
 
-@pytest.mark.processes
 def test_identity_without_read_permission_is_reported_with_its_name(guarded: str):
     found = broken_link("r1", "--user", "r2")
     assert found["name"] == "access"
@@ -574,13 +573,11 @@ def test_identity_without_read_permission_is_reported_with_its_name(guarded: str
     assert found["next"].startswith("zstate acl --viewer")
 
 
-@pytest.mark.processes
 def test_identity_that_may_not_write_as_its_robot_gets_the_missing_rule(guarded: str):
     found = broken_link("r3", "--user", "r3")
     assert (found["name"], found["next"]) == ("access", "zstate acl --robot r3")
 
 
-@pytest.mark.processes
 def test_missing_credentials_lead_to_the_option_that_sets_them(guarded: str):
     found = broken_link()
     assert found["name"] == "network"
@@ -591,14 +588,11 @@ def test_a_file_argument_is_refused_with_the_check_command():
     assert "`zstate check arm.urdf`" in failure("doctor", "arm.urdf", code=2)
 
 
-@pytest.mark.processes
-def test_ros_robots_are_found_when_there_are_no_native_ones(spawn: Spawn, free_port: int):
+def test_ros_robots_are_found_when_there_are_no_native_ones(free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--ros2", "--listen", endpoint).line()
-    ros = ("--wire", "ros2", "--connect", endpoint)
-    started(spawn, "publish", RRBOT, "--source", "sine", *ros).line()
-    assert broken_link("--connect", endpoint)["next"] == f"zstate doctor --wire ros2 --connect {endpoint}"
-    assert diagnosed(*ros, code=0)["sound"]
+    with router(endpoint, ros2=True), published_robot(wire="ros2", router=endpoint):
+        assert broken_link("--connect", endpoint)["next"] == f"zstate doctor --wire ros2 --connect {endpoint}"
+        assert diagnosed("--wire", "ros2", "--connect", endpoint, code=0)["sound"]
 
 
 @pytest.mark.usefixtures("impatient")
