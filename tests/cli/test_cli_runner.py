@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, in_terminal, missing_library, run_cli, run_process
+from helpers.cli_runner import RRBOT, Spawn, in_terminal, missing_library, run_cli, run_process, run_until
 from helpers.processes import DEADLINE_S
 
 from zstate.cli.main import group
@@ -43,6 +43,19 @@ def test_a_command_in_process_leaves_the_process_as_it_was(arguments: tuple[str,
     ended = run_cli(*arguments)
     assert ended.stdout + ended.stderr
     assert state() == before
+
+
+def test_a_command_that_is_interrupted_in_process_leaves_it_as_it_was():
+    before = state()
+    ended, pid = run_until(os.getpid, "joints", RRBOT, after="on zstate/rrbot/joint_states")
+    assert (ended.code, pid) == (130, os.getpid())
+    assert ended.stdout.startswith("rrbot: a sine on 2 joints, 100 Hz, on zstate/rrbot/joint_states\n")
+    assert state() == before
+
+
+def test_a_failure_of_what_an_interrupted_command_waits_for_ends_it():
+    with pytest.raises(ZeroDivisionError):
+        run_until(lambda: 1 / 0, "joints", RRBOT)
 
 
 @pytest.mark.processes

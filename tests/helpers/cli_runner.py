@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import TypeVar
 
 import click.formatting
 import pytest
@@ -26,8 +27,8 @@ from click.testing import CliRunner
 from helpers.fork_server import ForkedProcess, server
 from helpers.processes import DEADLINE_S, ZENOH_CLOSE_S, Child
 
-from zstate import StatePublisher, connect, load_model
-from zstate.cli.main import run
+from zstate import StatePublisher, Transform, TransformListener, connect, load_model
+from zstate.cli.main import _end, run
 from zstate.cli.output import logs
 from zstate.clock import Clock
 from zstate.wire.keys import Stream
@@ -52,6 +53,7 @@ _IMPORTS = {"view": ("zstate.view.server",), "foxglove": ("zstate.foxglove.serve
 """What takes a second to import, by command."""
 
 Spawn = Callable[..., Child]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,11 @@ def run_cli(*arguments: str, stdin: bytes = b"") -> Ended:
     Standard input and output are no terminals, whatever those of the tests are. For the main thread, as
     commands are. What the command has written is in the notes of an exception that it does not handle.
     """
+    return _run(arguments, stdin, lambda _: None)
+
+
+def _run(arguments: Sequence[str], stdin: bytes, on_start: Callable[[Callable[[], str]], object]) -> Ended:
+    """``on_start`` is called before the command with what returns all that it has written so far."""
     assert threading.current_thread() is threading.main_thread(), "one command at a time; see run_process"
     library = logging.getLogger("zstate")
     before = library.handlers.copy(), library.level, library.propagate
@@ -90,6 +97,7 @@ def run_cli(*arguments: str, stdin: bytes = b"") -> Ended:
 
         try:
             logs.use_environment_format()
+            on_start(lambda: stdout.getvalue().decode() + stderr.getvalue().decode())
             code = run(arguments)
         except BaseException as error:
             error.add_note(f"zstate {shlex.join(arguments)} wrote:\n{written(stdout)}{written(stderr)}")
@@ -100,6 +108,53 @@ def run_cli(*arguments: str, stdin: bytes = b"") -> Ended:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
         return Ended(int(code), written(stdout), written(stderr))
+
+
+def run_until(find: Callable[[], T | None], *arguments: str, after: str = "\n") -> tuple[Ended, T]:
+    """Run a command that goes on until Ctrl-C, in this process; it gets that once ``find()`` returns a value.
+
+    Returns the end of the command, whose exit code must be 130, and the value. ``find`` is called in another
+    thread, once the command has written ``after``, by default a line.
+    """
+    is_over, found, written = threading.Event(), list[T](), list[Callable[[], str]]()
+    failures: list[Exception] = []
+
+    def look() -> None:
+        deadline = time.monotonic() + DEADLINE_S
+        while not found and time.monotonic() < deadline and not is_over.wait(0.005):
+            has_begun = bool(written) and after in written[0]()
+            if has_begun and (value := find()) is not None:
+                found.append(value)
+
+    def interrupt() -> None:
+        try:
+            look()
+        except Exception as failure:
+            failures.append(failure)
+        if not is_over.is_set():
+            os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, _end)  # as in main()
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    try:
+        ended = _run(arguments, b"", written.append)
+    finally:
+        is_over.set()
+        thread.join()
+        signal.signal(signal.SIGINT, before)
+    if failures:
+        raise failures[0]
+    assert found, f"nothing within {DEADLINE_S} s: {ended}"
+    assert ended.code == 130, ended
+    assert "Traceback" not in ended.stderr
+    return ended, found[0]
+
+
+def found_pose(listener: TransformListener, target: str, source: str) -> Transform | None:
+    """The newest pose, if the listener has one."""
+    is_known = listener.buffer.can_lookup(target, source)
+    return listener.buffer.lookup(target, source) if is_known else None
 
 
 def run_process(*arguments: str, stdin: bytes = b"") -> Ended:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, run_cli, started
+from helpers.cli_runner import Spawn, failure, interrupted, run_cli, run_until, started
 
 from zstate import connect
 from zstate.scans import Grid, MapPublisher, load_map
@@ -50,10 +50,10 @@ def test_name_frame_and_writer_are_those_given(spawn: Spawn, hall: str):
     assert "r1: map/slam" in run_cli("graph").stdout
 
 
-@pytest.mark.processes
-def test_name_of_a_file_becomes_that_of_a_place(spawn: Spawn, hall: str):
+def test_name_of_a_file_becomes_that_of_a_place(hall: str):
     path = Path(hall).rename(Path(hall).with_name("floor 2 @home.yaml"))
-    assert started(spawn, "map", str(path)).line().startswith("floor_2_home: ")
+    ended, _ = run_until(lambda: True, "map", str(path))
+    assert ended.stdout.startswith("floor_2_home: ")
 
 
 def test_place_with_nothing_but_a_map_is_sound(hall: str):

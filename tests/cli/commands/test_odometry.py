@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import ROVER, Spawn, failure, interrupted, run_cli, started
-from helpers.processes import DEADLINE_S, until
+from helpers.cli_runner import ROVER, Spawn, failure, found_pose, interrupted, run_cli, run_until, started
+from helpers.processes import DEADLINE_S, repeated, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
 from zstate.net.session import Session
@@ -87,80 +87,61 @@ def walker(session: Session) -> Generator[threading.Event]:
             thread.join()
 
 
-@pytest.mark.processes
-def test_feet_that_slide_back_under_a_walker_move_it_ahead(spawn: Spawn):
-    live = started(spawn, "odometry", "walker", "--feet", "foot1,foot2")
+def test_feet_that_slide_back_under_a_walker_move_it_ahead():
     with connect() as session, TransformListener(session, "walker") as listener, walker(session) as walks:
-        assert live.line().endswith("from its IMU 'imu', its feet")
-        listener.buffer.wait("odom", "base", timeout_s=DEADLINE_S)
-        walks.set()
-        until(lambda: listener.buffer.lookup("odom", "base").translation[0] > 0.19)
-    interrupted(live)
+
+        def is_ahead() -> bool | None:
+            pose = found_pose(listener, "odom", "base")
+            if pose is not None:
+                walks.set()
+            return True if pose is not None and pose.translation[0] > 0.19 else None
+
+        ended, _ = run_until(is_ahead, "odometry", "walker", "--feet", "foot1,foot2", after="its feet")
+    assert ended.stdout.splitlines()[0].endswith("from its IMU 'imu', its feet")
 
 
-@pytest.mark.processes
-def test_what_is_missing_is_printed_while_it_waits(spawn: Spawn):
-    waiting = started(spawn, "odometry", "rover", "--file", SETTINGS)
-    until(lambda: "waiting: 'rover' has no message on imu/imu" in waiting.stderr)
-    interrupted(waiting)
+def test_what_is_missing_is_printed_while_it_waits():
+    waiting = "waiting: 'rover' has no message on imu/imu"
+    run_until(lambda: True, "odometry", "rover", "--file", SETTINGS, after=waiting)
 
 
-@pytest.mark.processes
-def test_sensor_that_no_driver_publishes_is_named_with_those_that_there_are(spawn: Spawn):
-    live = started(spawn, "odometry", "walker", "--velocity", "flwo:sigma=0.05", "--base", "base")
+def test_sensor_that_no_driver_publishes_is_named_with_those_that_there_are():
+    command = ("odometry", "walker", "--velocity", "flwo:sigma=0.05", "--base", "base")
+    named = "no message on velocity/flwo; there is 'flow'; did you mean 'flow'?"
     with (
         connect() as session,
         walker(session),
         VelocityPublisher(session, "walker", "flow", frame="base") as flow,
+        repeated(lambda: flow.publish([0.0, 0.0, 0.0])),
     ):
-
-        def is_named() -> bool:
-            flow.publish([0.0, 0.0, 0.0])
-            return "no message on velocity/flwo; there is 'flow'; did you mean 'flow'?" in live.stderr
-
-        until(is_named)
-        interrupted(live)
+        run_until(lambda: True, *command, after=named)
 
 
-@pytest.mark.processes
-def test_velocities_without_noise_end_the_command_with_the_key_that_states_it(spawn: Spawn):
-    live = started(spawn, "odometry", "walker", "--velocity", "flow", "--base", "base")
+def test_velocities_without_noise_end_the_command_with_the_key_that_states_it():
     with (
         connect() as session,
         walker(session),
         VelocityPublisher(session, "walker", "flow", frame="base") as flow,
+        repeated(lambda: flow.publish([0.0, 0.0, 0.0])),
     ):
-
-        def has_ended() -> bool:
-            flow.publish([0.0, 0.0, 0.0])
-            return live.process.poll() is not None
-
-        until(has_ended)
-    assert live.wait() == 1
-    assert (
-        "velocities of 'flow' have no covariance: state their noise by `--velocity flow:sigma=" in live.stderr
-    )
+        message = failure("odometry", "walker", "--velocity", "flow", "--base", "base")
+    assert "velocities of 'flow' have no covariance: state their noise by `--velocity flow:sigma=" in message
 
 
-@pytest.mark.processes
-def test_stated_noise_and_initial_pose_place_the_base_where_it_starts(spawn: Spawn):
+def test_stated_noise_and_initial_pose_place_the_base_where_it_starts():
     start = ("--initial-pose", "2", "1", "90")
-    live = started(spawn, "odometry", "walker", "--velocity", "flow:sigma=0.05", "--base", "base", *start)
     with (
         connect() as session,
         TransformListener(session, "walker") as listener,
         walker(session),
         VelocityPublisher(session, "walker", "flow", frame="base") as flow,
+        repeated(lambda: flow.publish([0.0, 0.0, 0.0])),
     ):
-
-        def is_placed() -> bool:
-            flow.publish([0.0, 0.0, 0.0])
-            return listener.buffer.can_lookup("odom", "base")
-
-        until(is_placed)
-        pose = listener.buffer.lookup("odom", "base")
-        assert [*pose.translation[:2], pose.rpy[2]] == pytest.approx([2.0, 1.0, math.pi / 2], abs=0.05)
-    interrupted(live)
+        _, pose = run_until(
+            lambda: found_pose(listener, "odom", "base"),
+            *("odometry", "walker", "--velocity", "flow:sigma=0.05", "--base", "base", *start),
+        )
+    assert [*pose.translation[:2], pose.rpy[2]] == pytest.approx([2.0, 1.0, math.pi / 2], abs=0.05)
 
 
 @pytest.mark.processes

@@ -1,108 +1,93 @@
 from __future__ import annotations
 
+import itertools
 import math
+import os
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
-from helpers.processes import DEADLINE_S, until
+from helpers.cli_runner import RRBOT, Ended, failure, found_pose, published_robot, run_cli, run_until
+from helpers.processes import DEADLINE_S, repeated
 from helpers.recording_builder import MS, START, RecordingBuilder, swing_positions
 
 from zstate import NoData, StatePublisher, Transform, TransformListener, connect, discover, load_model
 from zstate.errors import Unreachable
 from zstate.net.queryable import query_lookup
+from zstate.wire.identity import WriterId
 
 DERIVED = {"robot_description", "tf_static", "tf"}
 
 
-def streams_of(robot: str) -> set[str]:
+def writers_of(*arguments: str, after: str) -> tuple[Ended, dict[str, WriterId]]:
+    """A command and the writers of rrbot by stream, once it has written ``after``."""
     with connect() as session:
-        return {stream for info in discover(session) if info.name == robot for stream, _ in info.writers}
+
+        def found() -> dict[str, WriterId] | None:
+            return next((dict(one.writers) for one in discover(session) if one.name == "rrbot"), None)
+
+        return run_until(found, *arguments, after=after)
 
 
-@pytest.mark.processes
-def test_joints_writes_joint_states_and_nothing_else(spawn: Spawn):
-    started(spawn, "joints", RRBOT).line()
-    assert streams_of("rrbot") == {"joint_states"}
+def test_joints_writes_joint_states_and_nothing_else():
+    _, writers = writers_of("joints", RRBOT, after="rrbot: ")
+    assert writers.keys() == {"joint_states"}
+    writer = writers["joint_states"]
+    assert (writer.program, writer.pid) == ("zstate-joints", os.getpid())
 
 
-@pytest.mark.processes
-def test_publish_follows_joint_states_and_writes_the_rest(spawn: Spawn):
-    assert started(spawn, "publish", RRBOT).line() == (
-        "publishing 'rrbot' (7 links, 2 joints) on zstate/rrbot/{robot_description,tf_static,tf}"
-    )
-    assert streams_of("rrbot") == DERIVED
+def test_publish_follows_joint_states_and_writes_the_rest():
+    sentence = "publishing 'rrbot' (7 links, 2 joints) on zstate/rrbot/{robot_description,tf_static,tf}\n"
+    ended, writers = writers_of("publish", RRBOT, after=sentence)
+    assert ended.stdout.startswith(sentence)
+    assert writers.keys() == DERIVED
 
 
-@pytest.mark.processes
-def test_publish_with_its_own_source_writes_joint_states_too(spawn: Spawn):
-    started(spawn, "publish", RRBOT, "--source", "sine").line()
-    assert streams_of("rrbot") == DERIVED | {"joint_states"}
+def test_publish_with_its_own_source_writes_joint_states_too():
+    _, writers = writers_of("publish", RRBOT, "--source", "sine", after="publishing 'rrbot'")
+    assert writers.keys() == DERIVED | {"joint_states"}
 
 
-@pytest.mark.processes
-def test_writers_have_the_name_of_their_command(spawn: Spawn):
-    child = started(spawn, "joints", RRBOT)
-    child.line()
-    with connect() as session:
-        ((_, writer),) = discover(session)[0].writers
-    assert (writer.program, writer.pid) == ("zstate-joints", child.process.pid)
-
-
-@pytest.mark.processes
-def test_every_joint_state_becomes_transforms_of_the_same_stamp(spawn: Spawn):
-    child = started(spawn, "publish", RRBOT)
-    child.line()
+def test_every_joint_state_becomes_transforms_of_the_same_stamp():
+    stamps = itertools.count(1_000, 1_000)
     model = load_model(RRBOT)
     with (
         connect() as session,
         StatePublisher(session, model, "rrbot", streams=("joint_states",)) as joints,
         TransformListener(session, "rrbot", follow="tf") as listener,
+        repeated(lambda: joints.publish([0.5, 0.0], stamp=next(stamps))),
     ):
-        stamp = 0
-
-        def moved() -> bool:
-            nonlocal stamp
-            stamp += 1_000
-            joints.publish([0.5, 0.0], stamp=stamp)
-            return listener.buffer.can_lookup("base", "upper")
-
-        until(moved)
-        newest = listener.buffer.lookup("base", "upper")
-        assert newest.stamp is not None
-        assert newest.stamp % 1_000 == 0
-        # The shoulder turns about y.
-        assert math.isclose(newest.rpy[1], 0.5, abs_tol=1e-12)
-    interrupted(child)
-    assert " published, " in child.line()
-    assert "receiving zstate/rrbot/joint_states: 2 positions" in child.stderr
+        ended, newest = run_until(
+            lambda: found_pose(listener, "base", "upper"),
+            *("publish", RRBOT),
+            after="receiving zstate/rrbot/joint_states: 2 positions",
+        )
+    assert newest.stamp is not None
+    assert newest.stamp % 1_000 == 0
+    # The shoulder turns about y.
+    assert math.isclose(newest.rpy[1], 0.5, abs_tol=1e-12)
+    assert " published, " in ended.stdout.splitlines()[1]
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize("source", ["joints", "sine"])
-def test_publish_answers_lookups_for_devices_without_a_buffer(spawn: Spawn, source: str):
-    publisher = started(spawn, "publish", RRBOT, "--source", source)
-    publisher.line()
-    if source == "joints":
-        started(spawn, "joints", RRBOT).line()
-
-    answers: list[Transform] = []
-
-    def has_reply_in_buffer() -> bool:
+def test_publish_answers_lookups_for_devices_without_a_buffer(source: str):
+    def reply_and_lookup() -> tuple[Transform, Transform] | None:
         try:
-            answers.append(query_lookup(session, "rrbot", "world", "tool"))
+            reply = query_lookup(session, "rrbot", "world", "tool")
         except (NoData, Unreachable):  # not discovered yet, or without a sample
-            return False
-        return listener.buffer.can_lookup("world", "tool", answers[-1].stamp)
+            return None
+        is_known = listener.buffer.can_lookup("world", "tool", reply.stamp)
+        return (reply, listener.buffer.lookup("world", "tool", reply.stamp)) if is_known else None
 
-    with connect() as session, TransformListener(session, "rrbot") as listener:
-        until(has_reply_in_buffer)
-        reply = answers[-1]
-        expected = listener.buffer.lookup("world", "tool", reply.stamp)
-        assert np.allclose(reply.pose7, expected.pose7, rtol=0.0, atol=1e-12)
-    interrupted(publisher)
+    with (
+        published_robot(streams=("joint_states",)) if source == "joints" else nullcontext(),
+        connect() as session,
+        TransformListener(session, "rrbot") as listener,
+    ):
+        _, (reply, expected) = run_until(reply_and_lookup, "publish", RRBOT, "--source", source)
+    assert np.allclose(reply.pose7, expected.pose7, rtol=0.0, atol=1e-12)
 
 
 def test_publish_at_a_rate_reports_the_achieved_rate():
@@ -117,18 +102,14 @@ def test_missing_joint_states_are_a_failure_with_a_hint():
     assert "received nothing on zstate/rrbot/joint_states in 0.3 s; `zstate ls`" in message
 
 
-@pytest.mark.processes
-def test_joint_states_of_another_model_are_reported(spawn: Spawn):
-    child = started(spawn, "publish", RRBOT)
-    child.line()
+def test_joint_states_of_another_model_are_reported():
     gripper = load_model("gripper")
-    with connect() as session, StatePublisher(session, gripper, "rrbot", streams=("joint_states",)) as other:
-
-        def refused() -> bool:
-            other.publish(gripper.neutral)
-            return "joint_states refused" in child.stderr
-
-        until(refused)
+    with (
+        connect() as session,
+        StatePublisher(session, gripper, "rrbot", streams=("joint_states",)) as other,
+        repeated(lambda: other.publish(gripper.neutral)),
+    ):
+        run_until(lambda: True, "publish", RRBOT, after="joint_states refused")
 
 
 def test_unknown_wire_error_lists_known_wires():

@@ -1,9 +1,10 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started
+from helpers.cli_runner import Spawn, failure, found_pose, interrupted, published_robot, run_until, started
 from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect
@@ -13,34 +14,35 @@ from zstate.cli.up.cell import StaticSection
 POSE = ("--xyz", "0.1", "0", "-0.2", "--rpy-deg", "0", "0", "90")
 
 
-@pytest.mark.processes
-def test_edge_is_published_until_ctrl_c_and_then_withdrawn(spawn: Spawn):
+def test_edge_is_published_until_ctrl_c_and_then_withdrawn():
+    edge = ("lower", "flange")
     with published_robot(), connect() as session, TransformListener(session, "rrbot") as listener:
-        child = started(spawn, "static", "lower", "flange", *POSE)
-        sentence = child.line()
-        assert sentence.startswith(
-            "pose of flange in lower: xyz [0.1, 0, -0.2] m, rpy [0, 0, 90] deg, until Ctrl-C (robot 'rrbot'"
+        ended, placed = run_until(
+            lambda: found_pose(listener, *edge), "static", *edge, *POSE, after="pose of flange"
         )
-        placed = listener.buffer.wait("lower", "flange", timeout_s=10.0)
-        # A quarter turn about z takes x to y: half the angle is 45 degrees.
-        assert placed.translation.tolist() == [0.1, 0.0, -0.2]
-        assert abs(placed.rotation - [0.0, 0.0, 0.5**0.5, 0.5**0.5]).max() < 1e-12
-        interrupted(child)
-        until(lambda: not listener.buffer.can_lookup("lower", "flange"))
+        until(lambda: not listener.buffer.can_lookup(*edge))
+    assert ended.stdout.startswith(
+        "pose of flange in lower: xyz [0.1, 0, -0.2] m, rpy [0, 0, 90] deg, until Ctrl-C (robot 'rrbot'"
+    )
+    # A quarter turn about z takes x to y: half the angle is 45 degrees.
+    assert placed.translation.tolist() == [0.1, 0.0, -0.2]
+    assert abs(placed.rotation - [0.0, 0.0, 0.5**0.5, 0.5**0.5]).max() < 1e-12
 
 
-@pytest.mark.processes
-def test_several_writers_coexist_and_a_full_name_needs_no_robot(spawn: Spawn):
-    started(spawn, "static", "fleet/map", "r1/odom", *POSE).line()
-    started(spawn, "static", "r1/odom", "beacon", *POSE).line()
-    with connect() as session, TransformListener(session) as listener:
-        both = listener.buffer.wait("fleet/map", "r1/beacon", timeout_s=10.0)
+def test_several_writers_coexist_and_a_full_name_needs_no_robot():
+    with (
+        connect() as session,
+        StaticPublisher(session, "r1", "other") as other,
+        TransformListener(session) as listener,
+    ):
+        other.set(Transform.from_rpy("fleet/map", "r1/odom", (0.1, 0.0, -0.2), (0.0, 0.0, math.pi / 2)))
+        edge = ("r1/odom", "beacon")
+        _, both = run_until(lambda: found_pose(listener, "fleet/map", "r1/beacon"), "static", *edge, *POSE)
     # The second offset is turned by the first: x goes to y.
     assert abs(both.translation - [0.1, 0.1, -0.4]).max() < 1e-12
 
 
-@pytest.mark.processes
-def test_a_file_places_all_its_edges(spawn: Spawn, tmp_path: Path):
+def test_a_file_places_all_its_edges(tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text(
         """
@@ -56,20 +58,26 @@ def test_a_file_places_all_its_edges(spawn: Spawn, tmp_path: Path):
         xyz = [0, 0, 2]
         """
     )
-    child = started(spawn, "static", "--file", str(file))
-    child.line()
-    child.line()
     with connect() as session, TransformListener(session) as listener:
-        lens = listener.buffer.wait("r1/base", "r1/lens", timeout_s=10.0)
+        ended, lens = run_until(
+            lambda: found_pose(listener, "r1/base", "r1/lens"),
+            "static",
+            "--file",
+            str(file),
+            after="pose of lens",
+        )
+    assert len(ended.stdout.splitlines()) == 2
     assert lens.translation.tolist() == [1.0, 0.0, 2.0]
 
 
-@pytest.mark.processes
-def test_edge_belongs_to_the_selected_robot(spawn: Spawn):
+def test_edge_belongs_to_the_selected_robot():
     with published_robot(), connect() as session, TransformListener(session, placers=["site"]) as listener:
-        child = started(spawn, "static", "site/map", "rrbot/world", "--xyz", "1", "0", "0", "--robot", "site")
-        assert "(robot 'site'" in child.line()
-        assert listener.buffer.wait("site/map", "rrbot/base", timeout_s=10.0).kind == "static"
+        edge = ("site/map", "rrbot/world", "--xyz", "1", "0", "0", "--robot", "site")
+        ended, pose = run_until(
+            lambda: found_pose(listener, "site/map", "rrbot/base"), "static", *edge, after="(robot 'site'"
+        )
+        assert "(robot 'site'" in ended.stdout
+        assert pose.kind == "static"
         edge = ("rrbot/base", "rrbot/camera", "--xyz", "1", "0", "0", "--robot", "site")
         assert "'rrbot/camera' is a frame of robot 'rrbot'" in failure("static", *edge)
         edge = ("lower", "world", "--xyz", "1", "0", "0", "--robot", "rrbot")
@@ -95,13 +103,12 @@ def test_invalid_pose_error_names_the_reason():
     assert "itself" in failure("static", "r/a", "r/a", *POSE)
 
 
-@pytest.mark.processes
-def test_omitted_rotation_or_translation_is_zero(spawn: Spawn):
-    placed, turned = "r/a", "r/b"
-    sentence = started(spawn, "static", "r/base", placed, "--xyz", "1", "2", "3").line()
-    assert "xyz [1, 2, 3] m, rpy [0, 0, 0] deg" in sentence
-    sentence = started(spawn, "static", "r/base", turned, "--rpy-deg", "0", "0", "90").line()
-    assert "xyz [0, 0, 0] m, rpy [0, 0, 90] deg" in sentence
+def test_omitted_rotation_or_translation_is_zero():
+    for given, sentence in (
+        (("--xyz", "1", "2", "3"), "xyz [1, 2, 3] m, rpy [0, 0, 0] deg"),
+        (("--rpy-deg", "0", "0", "90"), "xyz [0, 0, 0] m, rpy [0, 0, 90] deg"),
+    ):
+        run_until(lambda: True, "static", "r/base", "r/camera", *given, after=sentence)
 
 
 def test_half_an_edge_is_wrong_usage():
@@ -109,44 +116,43 @@ def test_half_an_edge_is_wrong_usage():
     assert "TARGET" in failure("static", "--xyz", "0", "0", "0", code=2)
 
 
-@pytest.mark.processes
-def test_edge_of_a_file_is_published_on_each_of_its_wires(spawn: Spawn, ros_router: str, tmp_path: Path):
+def test_edge_of_a_file_is_published_on_each_of_its_wires(ros_router: str, tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text(
         '[parameters]\nheight = 1.0\n[[static]]\nrobot = "arm"\ntarget = "tool"\nsource = "camera"\n'
         'xyz = [0, 0, "${height}"]\nwires = ["native", "ros2"]\n'
     )
-    child = started(spawn, "static", "--file", str(file), "--set", "height=2.5")
-    line = child.line()
-    assert "xyz [0, 0, 2.5] m" in line
-    assert "also on ROS 2 topic /tf_static" in line
-    with connect(mode="client", endpoints=ros_router) as session:
-        for wire in ("native", "ros2"):
-            with TransformListener(session, wire=wire) as listener:
-                assert listener.buffer.wait("tool", "camera", timeout_s=10.0).translation[2] == 2.5
+    with (
+        connect(mode="client", endpoints=ros_router) as session,
+        TransformListener(session) as native,
+        TransformListener(session, wire="ros2") as ros,
+    ):
+
+        def found() -> list[Transform] | None:
+            poses = [found_pose(listener, "tool", "camera") for listener in (native, ros)]
+            return [pose for pose in poses if pose] if all(poses) else None
+
+        ended, poses = run_until(
+            found, "static", "--file", str(file), "--set", "height=2.5", after="topic /tf_static"
+        )
+    assert "xyz [0, 0, 2.5] m" in ended.stdout
+    assert "also on ROS 2 topic /tf_static" in ended.stdout
+    assert [pose.translation[2] for pose in poses] == [2.5, 2.5]
 
 
-@pytest.mark.processes
-def test_target_similar_to_a_frame_of_the_robot_gets_a_warning(spawn: Spawn):
+def test_target_similar_to_a_frame_of_the_robot_gets_a_warning():
     with published_robot():
-        child = started(spawn, "static", "lowr", "flange", *POSE)
-        child.line()
-        until(lambda: "did you mean" in child.stderr)
-        interrupted(child)
-    assert "'rrbot' has no frame 'lowr'; did you mean 'lower'" in child.stderr
+        ended, _ = run_until(lambda: True, "static", "lowr", "flange", *POSE, after="did you mean")
+    assert "'rrbot' has no frame 'lowr'; did you mean 'lower'" in ended.stderr
 
 
-@pytest.mark.processes
-def test_new_target_above_the_robot_is_advised_to_be_a_shared_frame(spawn: Spawn):
+def test_new_target_above_the_robot_is_advised_to_be_a_shared_frame():
     with published_robot():
-        child = started(spawn, "static", "map", "world", *POSE)
-        child.line()
-        until(lambda: "warning" in child.stderr)
-        interrupted(child)
+        ended, _ = run_until(lambda: True, "static", "map", "world", *POSE, after="for instance fleet/map")
+    assert "warning" in ended.stderr
     assert (
-        "'rrbot/map' is a new frame of 'rrbot' alone; name a frame that robots share in full" in child.stderr
+        "'rrbot/map' is a new frame of 'rrbot' alone; name a frame that robots share in full" in ended.stderr
     )
-    assert "for instance fleet/map" in child.stderr
 
 
 @pytest.mark.processes

@@ -3,7 +3,7 @@ from __future__ import annotations
 import os
 
 import pytest
-from helpers.cli_runner import Spawn, failure, published_robot, run_cli, started
+from helpers.cli_runner import failure, published_robot, run_cli, run_until
 
 from zstate import StaticPublisher, Transform, connect
 
@@ -19,12 +19,11 @@ def test_stream_with_a_writer_needs_takeover(command):
         ended = run_cli(*command, "--takeover", "--seconds", "0.1")
     assert ended.code == 0, ended.stderr
     assert "rrbot" in ended.stdout.splitlines()[0]
-    assert " samples; commanded 100 Hz" in ended.stdout
+    assert "; commanded 100 Hz" in ended.stdout
 
 
-@pytest.mark.processes
-def test_static_edge_with_a_writer_needs_takeover(spawn: Spawn):
+def test_static_edge_with_a_writer_needs_takeover():
     with connect() as session, StaticPublisher(session, "r", "mount") as mount:
         mount.set(Transform("base", "camera", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
         assert "as 'mount' of 'r'" in failure("static", "r/base", "r/camera", *POSE)
-        assert "r/camera" in started(spawn, "static", "r/base", "r/camera", *POSE, "--takeover").line()
+        run_until(lambda: True, "static", "r/base", "r/camera", *POSE, "--takeover", after="r/camera")

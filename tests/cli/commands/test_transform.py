@@ -4,8 +4,8 @@ import json
 import signal
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, run_cli, started
-from helpers.processes import SOON_S, until
+from helpers.cli_runner import Spawn, failure, found_pose, run_cli, run_until, started
+from helpers.processes import SOON_S
 from helpers.programs import moving_edge
 
 from zstate import Transform, TransformListener, connect
@@ -16,23 +16,26 @@ def line(target: str, source: str, x: float = 0.0, **others: object) -> str:
     return json.dumps({"target": target, "source": source, **pose, **others})
 
 
-@pytest.mark.processes
-def test_pose_is_published_at_the_rate_as_a_moving_edge(spawn: Spawn):
+def test_pose_is_published_at_the_rate_as_a_moving_edge():
     with connect() as session, TransformListener(session, "r1") as listener:
         options = ("--xyz", "1", "2", "0", "--rpy-deg", "0", "0", "90", "--rate", "200", "--robot", "r1")
-        child = started(spawn, "transform", "odom", "base_link", *options, "--writer", "odometry")
-        assert child.line() == (
-            "pose of base_link in odom: xyz [1, 2, 0] m, rpy [0, 0, 90] deg, 200 Hz, "
-            "on zstate/r1/transforms/odometry, until Ctrl-C"
+
+        def find() -> Transform | None:
+            return found_pose(listener, "odom", "base_link") if listener.stats.received > 20 else None
+
+        ended, found = run_until(
+            find, "transform", "odom", "base_link", *options, "--writer", "odometry", after="until Ctrl-C"
         )
-        until(lambda: listener.stats.received > 20)
-        found = listener.buffer.wait("odom", "base_link", timeout_s=SOON_S)
-        assert found.translation.tolist() == [1.0, 2.0, 0.0]
-        # A quarter turn about z: half the angle is 45 degrees.
-        assert abs(found.rotation - [0.0, 0.0, 0.5**0.5, 0.5**0.5]).max() < 1e-12
-        assert found.stamp is not None
-        interrupted(child)
-    assert "commanded 200 Hz" in child.line()
+    assert found.translation.tolist() == [1.0, 2.0, 0.0]
+    # A quarter turn about z: half the angle is 45 degrees.
+    assert abs(found.rotation - [0.0, 0.0, 0.5**0.5, 0.5**0.5]).max() < 1e-12
+    assert found.stamp is not None
+    first, last, *_ = ended.stdout.splitlines()
+    assert first == (
+        "pose of base_link in odom: xyz [1, 2, 0] m, rpy [0, 0, 90] deg, 200 Hz, "
+        "on zstate/r1/transforms/odometry, until Ctrl-C"
+    )
+    assert "commanded 200 Hz" in last
 
 
 @pytest.mark.processes
@@ -69,10 +72,9 @@ def test_output_of_tf_is_an_input(spawn: Spawn):
         assert listener.buffer.wait("odom", "base_link", 5, timeout_s=2 * SOON_S).translation[2] == 3.0
 
 
-@pytest.mark.processes
-def test_robot_is_that_of_a_full_name(spawn: Spawn):
-    child = started(spawn, "transform", "fleet/map", "r7/odom", "--xyz", "0", "0", "0")
-    assert "zstate/r7/transforms/" in child.line()
+def test_robot_is_that_of_a_full_name():
+    edge = ("fleet/map", "r7/odom", "--xyz", "0", "0", "0")
+    run_until(lambda: True, "transform", *edge, after="zstate/r7/transforms/")
 
 
 def test_second_writer_of_an_edge_is_refused_with_the_first():
