@@ -1,7 +1,7 @@
 """Other implementations that the tests compare zstate's ros2 wire with, each with its own interpreter.
 
 ``python oracles.py NAME FOLDER`` creates the environment of one of them in FOLDER with uv, which the extra
-``lint`` installs, and prints the path of its interpreter, the value of the environment variable that the tests read:
+``lint`` installs. It prints the path of the interpreter: the value of the variable that the tests read.
 
 =========  ==========================  ============================================================
 NAME       variable                    implementation
