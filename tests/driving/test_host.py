@@ -9,14 +9,14 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 
 import numpy as np
 import pytest
 from helpers.manual_cdr import rosbags_numbers
-from helpers.processes import DEADLINE_S, repeated, take, until
+from helpers.processes import DEADLINE_S, Child, repeated, take, until
 from helpers.raw_ros_nodes import COMMANDS, RosNode, RosPublisher, announced_publisher, attachment
 from helpers.robots import RRBOT, SampleCollector, wait_for_reader
 
@@ -164,17 +164,17 @@ COMMANDER = """
 # A death is told by the token of the commander's session, long before 2 s have passed.
 @pytest.mark.parametrize(
     ("end", "ttl_s", "reason"),
-    [(signal.SIGKILL, 2.0, "{} has ended"), (signal.SIGSTOP, 0.2, r"nothing from {} for [0-9.]+ m?s")],
+    [(Child.kill, 2.0, "{} has ended"), (Child.freeze, 0.2, r"nothing from {} for [0-9.]+ m?s")],
 )
 def test_a_dead_or_frozen_commander_leaves_the_joints_held_within_ttl_and_one_tick(
-    sessions, spawn, end: signal.Signals, ttl_s: float, reason: str
+    sessions, spawn, end: Callable[[Child], None], ttl_s: float, reason: str
 ):
     driver = RecordingDriver()
     with running(sessions[0], driver, ttl_s=ttl_s) as host:
         killed = spawn(COMMANDER)
         killed.line()
         until(lambda: len(driver.written()) > 20)
-        killed.process.send_signal(end)
+        end(killed)
         dead_at = time.monotonic_ns()
         until(lambda: host.state == "holding")
         until(lambda: len(driver.written()) and (driver.written()[-5:] == driver.written()[-1]).all())

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
 import pytest
 from helpers.access_routers import join, router_with_users
 from helpers.manual_cdr import rosbags_trajectory
-from helpers.processes import DEADLINE_S, take, until
+from helpers.processes import DEADLINE_S, Child, take, until
 from helpers.raw_ros_nodes import COMMANDS, TRAJECTORY, RosPublisher, announced_publisher, tokens
 from helpers.robots import RRBOT, wait_for_reader
 
@@ -304,14 +303,16 @@ MOVER = """
 """
 
 
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_motion_of_a_dead_or_frozen_commander_is_braked_and_held(sessions, spawn, end: signal.Signals):
+@pytest.mark.parametrize("end", [Child.kill, Child.freeze])
+def test_a_motion_of_a_dead_or_frozen_commander_is_braked_and_held(
+    sessions, spawn, end: Callable[[Child], None]
+):
     driver = Written()
     with hosted(sessions[0], driver, ttl_s=0.5) as host:
         mover = spawn(MOVER)
         assert mover.line() == "moving"
         until(lambda: len(driver.setpoints) > RATE_HZ)  # twice as long as without renewals
-        mover.process.send_signal(end)
+        end(mover)
         dead_at = time.monotonic_ns()
         until(lambda: host.state == "holding")
         until(lambda: len(driver.path) > 5 and (driver.path[-5:] == driver.path[-1]).all())
@@ -319,8 +320,7 @@ def test_a_motion_of_a_dead_or_frozen_commander_is_braked_and_held(sessions, spa
         moved = np.flatnonzero(np.diff(driver.path[:, 1]))[-1]
         worst_tick_ns = host.report().lateness_us.max * 1e3 + 1e9 / RATE_HZ
         assert driver.written_at[moved] - dead_at <= 0.5e9 + worst_tick_ns
-        if end == signal.SIGSTOP:
-            mover.kill()
+        mover.kill()
         with Commander(sessions[1], "arm") as late:
             (outcome,) = late.wait_for_driver(DEADLINE_S).outcomes
             assert outcome.name == "aborted"

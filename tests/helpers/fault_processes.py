@@ -50,6 +50,9 @@ class FaultProcess:
     def signal(self, number: int) -> None:
         self.child.process.send_signal(number)
 
+    def freeze(self) -> None:
+        self.child.freeze()
+
     def kill(self) -> None:
         self.child.kill()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import queue
+import signal
 import socket
 import subprocess
 import sys
@@ -164,6 +165,16 @@ class Child:
         assert self.process.stdin
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
+
+    def freeze(self) -> None:
+        """Stops the process, as Ctrl-Z does. It runs on for a moment: until a thread of it has the signal."""
+        self.process.send_signal(signal.SIGSTOP)
+        until(lambda: all(state in "Tt" for state in self._thread_states()))
+
+    def _thread_states(self) -> Iterator[str]:
+        for file in Path(f"/proc/{self.process.pid}/task").glob("*/stat"):
+            with suppress(FileNotFoundError):  # a thread that has just ended
+                yield file.read_text().rpartition(")")[2].split()[0]
 
     def kill(self) -> None:
         """Kills the process, as ``kill -9`` does."""

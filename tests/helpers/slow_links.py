@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import mmap
 import os
-import signal
 import struct
 import sys
 import tempfile
@@ -128,8 +127,10 @@ def trial(bytes_per_s: float, command_hz: float, fault: Fault, drive_s: float) -
             failed_at = time.monotonic()
             if fault == "cut":
                 relay.is_cut = True
+            elif fault == "killed":
+                commander.kill()
             else:
-                commander.process.send_signal(signal.SIGKILL if fault == "killed" else signal.SIGSTOP)
+                commander.freeze()
             last, number = sent()
             if fault == "cut":
                 until(lambda: sent()[1] >= number + _CUT_S * command_hz, _MOST_S)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -245,7 +244,7 @@ def test_exit_with_a_frozen_reader_does_not_wait_until_zenoh_gives_it_up(spawn):
     reader.line()
     child: Child = spawn(WITH_A_FROZEN_READER)
     assert child.line() == "matched"
-    os.kill(reader.process.pid, signal.SIGSTOP)
+    reader.freeze()
     child.send_line()
     assert child.line() == "ending"
     began = time.monotonic()

@@ -69,7 +69,7 @@ def test_discovery_without_the_whole_reply_is_an_error(spawn, free_port, monkeyp
         announce(theirs, TOKEN),
     ):
         assert [robot.name for robot in discover(ours)] == ["r1"]
-        os.kill(router.process.pid, signal.SIGSTOP)
+        router.freeze()
         with pytest.raises(Unreachable, match=r"discovery is incomplete: [01] announcements in 0.3 s"):
             discover(ours, 0.3)
         os.kill(router.process.pid, signal.SIGCONT)

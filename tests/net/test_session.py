@@ -1,6 +1,5 @@
 import json
 import os
-import signal
 import time
 
 import pytest
@@ -133,7 +132,7 @@ def test_close_with_a_frozen_reader_does_not_wait_until_zenoh_gives_it_up(spawn)
     session = connect()
     publisher = session.zenoh.declare_publisher("k", congestion_control=zenoh.CongestionControl.DROP)
     until(lambda: publisher.matching_status.matching)
-    os.kill(reader.process.pid, signal.SIGSTOP)
+    reader.freeze()
     for _ in range(2000):
         publisher.put(bytes(10_000))
     started = time.monotonic()

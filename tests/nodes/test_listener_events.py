@@ -88,7 +88,7 @@ def test_killed_writer_has_left_and_is_restarted(collector, spawn):
 def test_frozen_writer_is_stale_then_resumed(collector, spawn):
     writer = spawn(WRITER)
     collector.await_samples()
-    writer.process.send_signal(signal.SIGSTOP)
+    writer.freeze()
     stale = collector.await_kinds("joined", "stale")
     assert "driver@" in stale.text
     assert stale.writer.pid == writer.process.pid
@@ -123,7 +123,7 @@ def test_frozen_writer_of_transforms_is_stale_on_its_own_stream(sessions):
 def test_writer_frozen_for_longer_than_its_lease_is_cut_off_then_back(collector, spawn):
     writer = spawn(WRITER)
     collector.await_samples()
-    writer.process.send_signal(signal.SIGSTOP)
+    writer.freeze()
     cut_off = collector.await_kinds("joined", "stale", "cut off")
     assert "fell silent" in cut_off.text
     writer.process.send_signal(signal.SIGCONT)

@@ -207,7 +207,7 @@ def test_frozen_process_does_not_block_others(spawn, frozen: str):
     listener = started(spawn(LISTENER, PEER))
     ask(listener)
     children = {"publisher": publisher, "listener": listener}
-    children.pop(frozen).process.send_signal(signal.SIGSTOP)
+    children.pop(frozen).freeze()
     (other,) = children.values()
     interrupt(other)
 

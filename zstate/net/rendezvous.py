@@ -42,6 +42,7 @@ _REGISTRATION_POLL_S = 0.01
 PROBE_PERIOD_S = 0.2
 JOIN_WITHIN_S = 0.3
 _DISCOVERY_TIMEOUT_S = 3.0
+_ANSWER_WITHIN_S = 10.0  # on a busy machine an attempt to register takes several seconds
 _DISCOVERY_POLL_S = 0.002  # nothing reports a port that becomes free
 
 
@@ -150,7 +151,11 @@ class Rendezvous:
         )
         join_at_exit(watcher).start()
         self._watcher = watcher
-        deadline = time.monotonic() + _DISCOVERY_TIMEOUT_S
+        self.wait(_DISCOVERY_TIMEOUT_S)
+
+    def wait(self, within_s: float) -> None:
+        """Wait until a rendezvous peer has answered, or none does; at most ``within_s`` [s]."""
+        deadline = time.monotonic() + within_s
         while not any(place.is_registered for place in self._places) and time.monotonic() < deadline:
             if self._places[0].is_free or all(place.is_silent for place in self._places):
                 return  # the port is being taken over; or no peer answers
@@ -182,7 +187,12 @@ _OPEN: weakref.WeakSet[Rendezvous] = weakref.WeakSet()
 
 
 def silent_addresses() -> tuple[tuple[str, int], ...]:
-    """The rendezvous addresses where sessions of this process get no answer from the program that listens."""
+    """The rendezvous addresses where sessions of this process get no answer from the program that listens.
+
+    Waits for up to 10 s for sessions that have just been opened and do not know yet.
+    """
+    for rendezvous in tuple(_OPEN):
+        rendezvous.wait(_ANSWER_WITHIN_S)
     return tuple(sorted({address for rendezvous in tuple(_OPEN) for address in rendezvous.silent}))
 
 

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import socket
 
 import pytest
@@ -72,7 +71,7 @@ def test_no_robot_beside_a_stopped_program_is_no_empty_fleet(
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", addresses)
     owner = started(spawn, "publish", RRBOT, "--source", "sine")
     owner.line()
-    os.kill(owner.process.pid, signal.SIGSTOP)
+    owner.freeze()
     message = failure(*command)
     assert "no robot is found, and discovery is incomplete" in message
     assert f"process {owner.process.pid} " in message

@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import socket
 import threading
 import time
@@ -168,7 +167,7 @@ def test_stopped_writer_is_distinguished_from_a_closed_one(spawn: Spawn, free_po
     child = started(spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint)
     child.line()
     assert run_cli("wait", "robot", "rrbot", "--connect", endpoint).code == 0
-    os.kill(child.process.pid, signal.SIGSTOP)
+    child.freeze()
     found = broken_link("rrbot", "--connect", endpoint)
     assert found["name"] == "writers"
     assert "stopped" in found["text"]
@@ -525,7 +524,7 @@ def test_stopped_program_that_blocks_the_rendezvous_is_reported(
 ):
     keeper = spawn("import sys, zstate; s = zstate.connect(); print(s.zid); sys.stdin.readline()")
     keeper.line()
-    os.kill(keeper.process.pid, signal.SIGSTOP)
+    keeper.freeze()
     process = f"process {keeper.process.pid} ("
     reason = f"has the rendezvous port {rendezvous} and does not answer: it is stopped, as by Ctrl-Z"
     found = broken_link()

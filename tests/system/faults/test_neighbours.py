@@ -30,7 +30,7 @@ def test_writer_frozen_for_3_s_is_stale_and_recovers(start: Start, endpoint: str
     reader = start("reader", session=client(endpoint))
     assert reader.query("after", "r1", 0)
     reader.query("watch", "r1")
-    publisher.signal(signal.SIGSTOP)
+    publisher.freeze()
     pass_time(FROZEN_S)
     publisher.signal(signal.SIGCONT)
     thawed_at = time.time_ns()
@@ -56,7 +56,7 @@ def test_frozen_reader_blocks_neither_the_writer_nor_other_readers(start: Start,
     for reader in (frozen, other):
         assert reader.query("after", "r1", 0)
     other.query("watch", "r1")
-    frozen.signal(signal.SIGSTOP)
+    frozen.freeze()
     pass_time(FROZEN_S)
     watched, stats = other.query("watched", "r1"), other.query("stats")
     closing_s = publisher.query("leave")
