@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
-from typing import Generic, TypeVar
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Generic, Self, TypeVar
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -16,15 +17,35 @@ MAX_ENTRIES = 4096
 class BoundedDict(dict[K, V]):
     """A dict of the 4096 newest entries. Assigning to a key makes its entry the newest.
 
-    Threads that assign at the same time need a lock. Reading needs none.
+    Safe from any thread without a lock; while a key is assigned again, readers may find no entry of it.
     """
 
     def __setitem__(self, key: K, value: V) -> None:
         if key in self:
-            del self[key]
+            self.pop(key, None)
         elif len(self) >= MAX_ENTRIES:
-            del self[next(iter(self))]
+            self._drop_oldest()
         dict.__setitem__(self, key, value)  # pyright: ignore[reportUnknownMemberType]  # faster than super()
+
+    def setdefault(self, key: K, default: V) -> V:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The value of ``key``, which is ``default`` if there was none. All threads get the same one."""
+        if key not in self and len(self) >= MAX_ENTRIES:
+            self._drop_oldest()
+        return super().setdefault(key, default)
+
+    def update(self, entries: Mapping[K, V]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Assign each of ``entries``."""
+        for key, value in entries.items():
+            self[key] = value
+
+    def __ior__(self, entries: Mapping[K, V]) -> Self:  # pyright: ignore[reportIncompatibleMethodOverride]
+        self.update(entries)
+        return self
+
+    def _drop_oldest(self) -> None:
+        while len(self) >= MAX_ENTRIES:
+            with suppress(KeyError, RuntimeError, StopIteration):  # another thread was faster
+                del self[next(iter(self))]
 
 
 class BoundedQueue(Generic[T]):
