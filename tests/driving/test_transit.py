@@ -181,6 +181,74 @@ def test_without_an_echo_a_clock_without_ntp_is_followed_over_an_hour_without_co
     assert ages.excess(1, round(3600 * S * (1 - drift)), START + 3600 * S) == 0
 
 
+class Admission:
+    """The commands of a host, with clocks in common."""
+
+    def __init__(self) -> None:
+        self.admission = CommandAdmission(CommandAges(HOST, TTL))
+
+    def is_valid(self, session: int, arrived: int) -> bool:
+        """Whether a command of ``session`` counts that takes no time to arrive."""
+        try:
+            deadline = self.admission.deadline((arrived, 0, session), TTL, arrived, (HOST, arrived))
+        except MessageError as error:
+            assert error.reason == "no claim"
+            return False
+        assert deadline == arrived + TTL
+        return True
+
+
+@pytest.mark.parametrize("changes_after", [1, 40, 50, 10**6], ids=lambda every: f"{every} commands")
+def test_sessions_without_a_token_command_for_half_a_second_however_often_they_change(changes_after: int):
+    host = Admission()
+    times = [START + number * 10 * MS for number in range(6000)]
+    valid = [now for number, now in enumerate(times) if host.is_valid(100 + number // changes_after, now)]
+    assert valid == [now for now in times if now <= START + 500 * MS]
+
+
+def test_a_commander_whose_token_arrives_after_its_first_commands_is_not_interrupted():
+    host = Admission()
+    for session, start in ((1, START), (2, START + S), (3, START + 2 * S)):
+        for number in range(80):
+            now = start + number * 10 * MS
+            if number == 40:
+                host.admission.set_announced(session, True, now)
+            assert host.is_valid(session, now)
+        host.admission.set_announced(session, False, start + S)
+
+
+def test_a_commander_is_valid_from_its_token_while_others_without_one_send():
+    host = Admission()
+    for number in range(200):
+        host.is_valid(100 + number, START + number * 10 * MS)
+    now = START + 2 * S
+    assert not host.is_valid(1, now)
+    host.admission.set_announced(1, True, now + MS)
+    assert host.is_valid(1, now + 2 * MS)
+
+
+def test_sessions_without_a_token_command_again_after_ten_seconds_without_any_of_them():
+    host = Admission()
+    for now in range(START, START + 5 * S, 10 * MS):
+        host.is_valid(100, now)
+    refused_at = START + 5 * S
+    assert not host.is_valid(101, refused_at)
+    assert not host.is_valid(101, refused_at + 9 * S)
+    assert host.is_valid(101, refused_at + 20 * S)
+
+
+def test_a_session_that_has_lost_its_token_goes_on_for_half_a_second_while_others_send_without_one():
+    host = Admission()
+    host.admission.set_announced(1, True, START)
+    for now in range(START, START + 5 * S, 10 * MS):
+        host.is_valid(100, now)
+        assert host.is_valid(1, now)
+    lost_at = START + 5 * S
+    host.admission.set_announced(1, False, lost_at)
+    assert host.is_valid(1, lost_at + 500 * MS)
+    assert not host.is_valid(1, lost_at + 501 * MS)
+
+
 class Queue:
     """A link that carries ``per_s`` commands, one after the other, in simulated time."""
 

@@ -44,6 +44,9 @@ _MOST_UNCONFIRMED = 1024
 _TOKEN_WITHIN_NS = 500_000_000
 """The token of a commander may arrive so much later than its first command."""
 
+_QUIET_NS = 10_000_000_000
+"""After so long without commands of sessions that are not announced, the next may be a new commander's."""
+
 REQUEST_TTL_NS = 1_000_000_000
 """A request for a motion that has not started so long after its sending starts no more."""
 
@@ -123,25 +126,33 @@ class Received(NamedTuple):
 class CommandAdmission:
     """Which commands count, and until when: those of announced sessions, from their sending for their ttl.
 
-    Commands of a session that is not announced count for half a second, in which its token may be under way.
+    A token may arrive after the first commands of its session, or be lost for a moment, as with a router. So
+    commands count for half a second after their session has lost its token. Those of sessions without one
+    count for half a second in all, whichever these are: after that all of them are refused until a session is
+    announced, or until none has sent any for ten seconds.
     """
 
     def __init__(self, ages: CommandAges) -> None:
         self._ages = ages
+        self._lock = fork_safe_lock()
         self._announced: set[int] = set()
-        self._unannounced: BoundedDict[int, int] = BoundedDict()
-        """Since when sessions without a token send commands, or have lost it [ns, monotonic]."""
+        self._lost: BoundedDict[int, int] = BoundedDict()
+        """When sessions have lost their tokens [ns, monotonic]."""
+        self._unannounced: tuple[int, int] | None = None
+        """When sessions that had no token began to send commands, and sent the last one [ns, monotonic]."""
         self.newest: Received | None = None
         """The newest command of an announced session, also if it was refused; may be read from any thread."""
 
     def set_announced(self, session: int, alive: bool, now: int) -> None:
         """The commander or ROS node of ``session`` is announced, or not any more; for any thread."""
-        if alive:
-            self._announced.add(session)
-            self._unannounced.pop(session, None)
-        elif session in self._announced:
-            self._unannounced[session] = now
-            self._announced.discard(session)
+        with self._lock:
+            if alive:
+                self._announced.add(session)
+                self._lost.pop(session, None)
+                self._unannounced = None
+            elif session in self._announced:
+                self._announced.discard(session)
+                self._lost[session] = now
 
     def deadline(
         self, head: tuple[int, int, int], ttl: int, arrived: int, echo: tuple[int, int] | None = None
@@ -151,15 +162,26 @@ class CommandAdmission:
         Raises MessageError for one that is too old, or whose session is not announced.
         """
         stamp, seq, session = head
-        if session not in self._announced:
-            since = self._unannounced.setdefault(session, arrived)
-            if arrived - since > _TOKEN_WITHIN_NS:
-                text = f"a command of session {session:x}, which is not announced as a commander"
-                raise MessageError(text, reason="no claim")
+        if not self._is_admitted(session, arrived):
+            text = f"a command of session {session:x}, which is not announced as a commander"
+            raise MessageError(text, reason="no claim")
         excess = self._ages.excess(session, stamp, arrived, echo)
         self.newest = Received(session, seq, excess, arrived)
         check_waited(excess, ttl, has_echo=echo is not None)
         return arrived - excess + ttl
+
+    def _is_admitted(self, session: int, arrived: int) -> bool:
+        """Whether ``session`` is announced, or its token may be under way."""
+        with self._lock:
+            if session in self._announced:
+                return True
+            since = self._lost.get(session)
+            if since is None:
+                since, last = self._unannounced or (arrived, arrived)
+                if arrived - last > _QUIET_NS:
+                    since = arrived
+                self._unannounced = since, arrived
+            return arrived - since <= _TOKEN_WITHIN_NS
 
 
 class DriverClock:
