@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import threading
@@ -15,6 +16,7 @@ from helpers.access_routers import join, router_with_users
 from helpers.processes import DEADLINE_S, repeated, until
 from helpers.robots import RRBOT, wait_for_reader
 from msgspec.structs import replace
+from zenoh import CongestionControl
 
 from zstate import JointReading
 from zstate._util.refusals import Refusals
@@ -27,7 +29,7 @@ from zstate.errors import AccessDenied, ConfigError, SecondWriter, Unreachable
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.presence import local_writer
 from zstate.net.security.acl import AclRoles
-from zstate.net.session import Session
+from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher, StreamSubscriber
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import (
@@ -513,6 +515,88 @@ def test_stops_of_many_programs_are_bounded_and_a_release_ends_those_that_it_nam
     register.add(ActiveStop(1000, 0, "hold", "from a cache", "desk"))
     register.release(Release(0, 1, 8, ((1000, 0),)))
     assert register.current.stops == ()
+
+
+def test_a_stop_that_many_others_displace_is_reported_as_obeyed_until_its_release():
+    register = StopRegister(HOST)
+    register.add(ActiveStop(1, 5, "relax", "honest", "desk"))
+    for session in range(1000, 1400):
+        register.add(ActiveStop(session, 0, "hold", "", "flood"))
+    seen = register.current
+    assert (1, 5) not in [one.id for one in seen.stops]
+    assert (1, 5) in seen.ids
+    assert len(seen.ids) == len(set(seen.ids)) <= 512
+    assert "relax" in [one.how for one in seen.stops]
+    register.add(ActiveStop(2000, 0, "hold", "displaces another one after the release was sent", "flood"))
+    register.release(Release(0, 0, 8, seen.ids))
+    left = register.current
+    assert set(left.ids).isdisjoint(seen.ids)
+    assert len(left.stops) == 2
+    register.release(Release(0, 1, 8, left.ids))
+    assert register.current.ids == ()
+
+
+def test_a_stop_that_others_displace_within_one_tick_is_confirmed(sessions):
+    may_read = threading.Event()
+    may_read.set()
+
+    class Slow(SimulatedDriver):
+        def read(self, stamp: int) -> JointReading:
+            assert may_read.wait(DEADLINE_S)
+            return super().read(stamp)
+
+    honest = local_writer(1)
+    with (
+        hosted(sessions[0], Slow(RRBOT)) as host,
+        Commander(sessions[1], "arm") as arm,
+        ExitStack() as opened,
+    ):
+        arm.wait_for_driver()
+        opened.callback(may_read.set)
+        send = opened.enter_context(forger(sessions[1], stop_key("arm", honest.identity)))
+        may_read.clear()
+        send(Stop(0, 3, honest.session, "hold", "honest"))
+        until(lambda: any(one.session == honest.session for one in host._stops.latched))
+        for session in range(1000, 1400):
+            put_stop(sessions[1], session, 0)
+        until(lambda: host._stops.current.arrived == 401)
+        may_read.set()
+        until(lambda: arm.wait_for_driver().state == "stopped" and arm.wait_for_driver().stops)
+        assert (honest.session, 3) in arm.wait_for_driver().stops
+        assert arm.release(DEADLINE_S).state == "ready"
+
+
+def put_stop(session: Session, number: int, seq: int) -> None:
+    """A stop of the session with that number, which is not cached for late joiners."""
+    payload = encode(Stop(0, seq, number, "hold", f"flood {seq}"))
+    key = stop_key("arm", WriterId("flood", "desk", 1, 1, number).identity)
+    session.zenoh.put(key, payload, encoding=ENCODINGS[Stop], congestion_control=CongestionControl.BLOCK)
+
+
+@pytest.mark.parametrize("kind", ["rising", "distinct"])
+def test_a_flood_of_stops_of_hundreds_of_sessions_leaves_an_honest_one_confirmed(sessions, kind):
+    """Of 400 sessions that count up, or of new sessions all the time."""
+    has_ended, sent = threading.Event(), itertools.count()
+
+    def flood() -> None:
+        for number in sent:
+            put_stop(sessions[1], 1000 + (number % 400 if kind == "rising" else number), number)
+            if has_ended.is_set():
+                return
+
+    with hosted(sessions[0]) as host, connect() as third, Commander(third, "arm") as arm:
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            until(lambda: "further stops" in host._loop.state.reason)
+            for number in range(3):
+                before = next(sent)
+                assert stop(third, "arm", f"honest {number}", timeout_s=DEADLINE_S).state == "stopped"
+                until(lambda before=before: next(sent) > before + 400)
+        finally:
+            has_ended.set()
+            thread.join()
+        until(lambda: not arm.release(DEADLINE_S).stops and host.state == "ready")
 
 
 def test_many_stops_that_arrive_together_are_written_to_the_file_at_once(sessions, monkeypatch):

@@ -339,7 +339,7 @@ class DriverHost(Closeable):
             loop.faults,
             dict(self._refusals.counts),
             str(self._refusals.newest),
-            tuple((one.session, one.seq) for one in obeyed.stops),
+            obeyed.ids,
             motion,
             progress,
             loop.motions.outcomes,

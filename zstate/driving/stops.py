@@ -11,8 +11,10 @@ import secrets
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
+from functools import lru_cache
 from typing import NamedTuple
 
 from zstate._util.closeable import Closeable
@@ -55,8 +57,11 @@ _LOG = logging.getLogger("zstate")
 _CACHES_WITHIN_S = 0.5
 _MOST_STOPS = 256
 _MOST_OF_SESSION = 8
+_MOST_DISPLACED = 256
 _MOST_RELEASED = 32
 _MOST_SENT = 64
+_MOST_WAITING = 1024
+"""Of the stops that arrive; in a flood the newest waits for as many others."""
 
 _STEP_BITS = 32
 _REPEAT_S = 0.25
@@ -195,15 +200,29 @@ def wait_for_state(
     return found[0] if found else None
 
 
+@lru_cache(4096)  # called for each stop of a flood
+def _parse_key(key: str) -> tuple[WriterId, str]:
+    """The writer of a stop, and whether its key is that of a "stop" or "relax"."""
+    _, identity, stream = parse_stop_key(key)
+    return WriterId.parse(identity), stream
+
+
 class LatchedStops(NamedTuple):
     """The ``stops`` that are not released, and how many have ``arrived`` until now, the ``newest`` last.
 
-    A stop that is released before the next tick is known by these two.
+    A stop that is released before the next tick is known by these two. ``displaced`` are the last stops for
+    which the substitute stands.
     """
 
     stops: tuple[ActiveStop, ...] = ()
     arrived: int = 0
     newest: ActiveStop | None = None
+    displaced: tuple[StopId, ...] = ()
+
+    @property
+    def ids(self) -> tuple[StopId, ...]:
+        """What a driver reports as obeyed: also a displaced stop is confirmed to its program."""
+        return (*(one.id for one in self.stops), *self.displaced)
 
 
 class StopRegister:
@@ -222,9 +241,11 @@ class StopRegister:
         """The numbers of the last released stops of each session, which its program may still cache."""
         self._is_unsaved = False
         self._own_seq = -1
-        self._displaced = 0
         self._substitute: ActiveStop | None = None
         """The stop in place of those that were displaced."""
+        self._displaced = 0
+        """How many these are."""
+        self._displaced_ids: deque[StopId] = deque(maxlen=_MOST_DISPLACED)
         self.current = LatchedStops()
         """Another object after each change."""
         self.released_by = (0, 0)
@@ -254,23 +275,32 @@ class StopRegister:
             has_ended = False
             for release in releases:
                 ended = [one for stop_id in release.stops if (one := self._active.pop(stop_id, None))]
-                for one in ended:
-                    self._keep_released(one)
-                has_ended |= bool(ended)
+                has_ended |= bool(ended) or not set(release.stops).isdisjoint(self._displaced_ids)
+                self._keep_released(ended, release.stops)
                 if ended or not (release.stops or self._active):
                     self.released_by = (release.session, release.seq)
             if has_ended:
                 self._save()  # first: a release that is confirmed holds for the next host as well
-                self.current = self.current._replace(stops=tuple(self._active.values()))
+                stops = tuple(self._active.values())
+                self.current = self.current._replace(stops=stops, displaced=tuple(self._displaced_ids))
 
-    def _keep_released(self, one: ActiveStop) -> None:
-        """Keep that ``one`` is released. A cached stop whose release is forgotten stops once more."""
-        seqs = self._released.pop(one.session, [])
-        self._released[one.session] = [*seqs[1 - _MOST_RELEASED :], one.seq]  # newest last
+    def _keep_released(self, ended: Sequence[ActiveStop], named: Sequence[StopId]) -> None:
+        """Keep that ``ended`` are released. A cached stop whose release is forgotten stops once more.
+
+        Displaced stops that are ``named`` are no longer reported, also if the substitute stays for others.
+        """
+        for one in ended:
+            seqs = self._released.pop(one.session, [])
+            self._released[one.session] = [*seqs[1 - _MOST_RELEASED :], one.seq]  # newest last
         while len(self._released) > _MOST_STOPS:
             del self._released[next(iter(self._released))]
-        if self._substitute is not None and one.id == self._substitute.id:
+        if self._substitute in ended:
             self._substitute, self._displaced = None, 0
+            self._displaced_ids.clear()
+        elif self._displaced_ids:
+            released = set(named)
+            kept = (stop_id for stop_id in self._displaced_ids if stop_id not in released)
+            self._displaced_ids = deque(kept, _MOST_DISPLACED)
 
     def _own_stop(self, reason: str, how: StopMode) -> ActiveStop:
         self._own_seq += 1
@@ -288,7 +318,8 @@ class StopRegister:
             self._displace(self._active.values())
         self._active[one.id] = one
         self._is_unsaved = True
-        self.current = LatchedStops(tuple(self._active.values()), self.current.arrived + 1, one)
+        stops, displaced = tuple(self._active.values()), tuple(self._displaced_ids)
+        self.current = LatchedStops(stops, self.current.arrived + 1, one, displaced)
 
     def _displace(self, stops: Iterable[ActiveStop]) -> None:
         """Let the substitute stand for the oldest of ``stops``. If it keeps the torque off, so does that."""
@@ -296,6 +327,7 @@ class StopRegister:
         ended = [self._active.pop(one.id) for one in (oldest, self._substitute) if one is not None]
         how: StopMode = "relax" if any(one.how == "relax" for one in ended) else "hold"
         self._displaced += 1
+        self._displaced_ids.append(oldest.id)
         reason = f"further stops ({self._displaced}), the last one {oldest}"
         self._substitute = self._own_stop(reason, how)
         self._active[self._substitute.id] = self._substitute
@@ -329,7 +361,9 @@ class StopLatch(StopRegister, Closeable):
             for keyexpr in expressions:
                 call_for_each(cached_values(session, keyexpr, _CACHES_WITHIN_S), self._on_stop)
             self.save()
-            stops = LatchedSubscriber(session, expressions, self._on_stop, on_batch_end=self.save)
+            stops = LatchedSubscriber(
+                session, expressions, self._on_stop, on_batch_end=self.save, capacity=_MOST_WAITING
+            )
             opening.enter_context(stops)
             releases = StreamSubscriber(session, release_expression(robot), self._on_releases)
             opening.enter_context(releases)
@@ -348,8 +382,7 @@ class StopLatch(StopRegister, Closeable):
         if not sample.payload:
             return  # the program has ended; its stop has not
         try:
-            _, identity, stream = parse_stop_key(sample.key)
-            writer = WriterId.parse(identity)
+            writer, stream = _parse_key(sample.key)
             message = decode(sample.payload, sample.encoding, Stop)
         except (MessageError, InvalidInput) as error:
             self._refusals.count(getattr(error, "reason", "foreign"), error)

@@ -170,7 +170,7 @@ class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
 
     ``on_value(sample)`` is called from one thread of this subscriber, for several key expressions too; the
     payload is empty if the value was withdrawn. ``on_batch_end()`` is called after those that have arrived
-    together. ``Receiver`` describes slow and failing callbacks.
+    together. ``Receiver`` describes slow and failing callbacks; ``capacity`` values wait at most.
 
     In ROS each message of a writer of /tf_static adds to the ones before, and its cache has the last one: so
     a cached value is not handled before the live samples that arrived earlier.
@@ -183,6 +183,7 @@ class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
         on_value: Callable[[SerializedSample], None],
         *,
         on_batch_end: Callable[[], object] | None = None,
+        capacity: int = CAPACITY,
     ) -> None:
         self._on_value = on_value
         self._on_batch_end = on_batch_end
@@ -191,10 +192,10 @@ class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
         recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
         declare = partial(zenoh.ext.declare_advanced_subscriber, session.zenoh, recovery=recovery)
         live: SharedSubscription[zenoh.Sample | _CachedValue] = SharedSubscription(
-            keyexprs, CAPACITY, declare
+            keyexprs, capacity, declare
         )
         self._arrived = live.handler
-        super().__init__(session, live, CAPACITY)
+        super().__init__(session, live, capacity)
         try:
             # After subscribing, so that no change falls between a cached value and the live ones.
             self._cached = _CachedValues(session, keyexprs, self._add_cached)
