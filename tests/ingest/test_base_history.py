@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers.robots import RRBOT, STAMP, assert_pose
 
@@ -13,7 +14,15 @@ from zstate.buffer.history import History, HistoryView
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
-from zstate.wire.messages import JointState, RobotDescription, order_digest, to_block
+from zstate.ingest.transforms import TransformIngest
+from zstate.wire.messages import (
+    COVARIANCE_NUMBERS,
+    JointState,
+    RobotDescription,
+    WriterTransforms,
+    order_digest,
+    to_block,
+)
 
 PERIOD = 10_000_000
 ORDER = order_digest(RRBOT.joint_names)
@@ -136,7 +145,7 @@ def test_unusable_history_is_counted_once_per_page():
 def single_inserts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The stamps of samples that were inserted one by one: among others, each copies the history."""
     stamps: list[int] = []
-    for name in ("insert", "try_insert"):
+    for name in ("insert", "try_insert", "try_insert_poses"):
         insert = getattr(History, name)
 
         def counted(history: History, stamp: int, *numbers: object, insert: Any = insert) -> object:
@@ -183,6 +192,122 @@ def test_samples_of_a_gap_are_not_inserted_one_by_one(
     assert view.kept_stamps().tolist() == [STAMP + seq * PERIOD for seq in range(110 + size)]
     assert view.kept_rows()[:, 0].tolist() == [0.01 * seq for seq in range(110 + size)]
     assert before.kept_stamps().tolist() == stamps
+
+
+# Moving edges, which are in the same stream as others of their writer
+
+
+EDGES = (("odom", "base"), ("base", "camera"))
+
+
+def moving(seq: int, *edges: tuple[str, str], variance: float | None = None) -> WriterTransforms:
+    """Sample ``seq``; the x of each edge identifies it."""
+    pose = [0.01 * seq, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    covariances = None if variance is None else to_block([variance] * COVARIANCE_NUMBERS * len(edges))
+    head = (STAMP + seq * PERIOD, seq, 7, order_digest(edges))
+    return WriterTransforms(*head, to_block(pose * len(edges)), edges, covariances)
+
+
+class MovingHistory:
+    """Moving edges in a buffer of 1e6 s."""
+
+    def __init__(self) -> None:
+        self.buffer = TransformBuffer(1e6)
+        self.counters = Counters()
+        self.ingest = TransformIngest("r1", FrameOwnership(self.buffer, self.counters))
+
+    def receive(self, samples: list[WriterTransforms]) -> None:
+        for sample in samples:
+            self.ingest.insert_sample(sample, overflowed=False)
+
+    def fill(self, samples: list[WriterTransforms], page: int = 100) -> None:
+        """They come from the cache, the newest page first."""
+        for start in range(len(samples) - page, -1, -page):
+            self.ingest.insert_history(samples[start : start + page])
+
+    def view(self, child: str) -> HistoryView:
+        edge = self.buffer.edge_of(child)
+        assert edge is not None
+        assert edge.track is not None
+        return edge.track.history.view
+
+    def known(self, child: str) -> list[int]:
+        """The numbers of the samples that place a frame."""
+        view = self.view(child)
+        numbers = [(stamp - STAMP) // PERIOD for stamp in view.kept_stamps().tolist()]
+        assert view.kept_rows()[:, 0].tolist() == [0.01 * number for number in numbers]
+        return numbers
+
+
+@pytest.mark.parametrize("shows_first", [True, False])
+@pytest.mark.parametrize("size", [1000, 10_000])
+def test_samples_of_a_gap_of_moving_edges_are_not_inserted_one_by_one(
+    single_inserts: list[int], size: int, shows_first: bool
+):
+    """Whether the writer sends its edges together, in turns, or with covariances."""
+    for edges_of, variance in (
+        (lambda _: EDGES, None),
+        (lambda _: EDGES, 0.5),
+        (lambda seq: EDGES[seq % 2 : seq % 2 + 1], None),
+    ):
+        samples = [moving(seq, *edges_of(seq), variance=variance) for seq in range(110 + size)]
+        history = MovingHistory()
+        history.receive(samples[:100])
+        if shows_first:
+            history.receive(samples[100 + size :])
+        before = history.view("r1/base")
+        stamps = before.kept_stamps().tolist()
+        single_inserts.clear()
+        history.fill(samples[: 100 + size])
+        assert single_inserts == []
+        if not shows_first:
+            history.receive(samples[100 + size :])
+        for _, child in EDGES:
+            known = [sample.seq for sample in samples if child in dict(map(reversed, sample.edges or ()))]
+            assert history.known(f"r1/{child}") == known
+        assert history.counters.stats().recalled == size
+        assert before.kept_stamps().tolist() == stamps
+
+
+def test_past_of_moving_edges_before_all_that_is_known_is_inserted():
+    history = MovingHistory()
+    samples = [moving(seq, *EDGES) for seq in range(500)]
+    history.receive(samples[400:])
+    history.fill(samples[:400])
+    assert history.known("r1/camera") == list(range(500))
+
+
+def test_samples_of_a_gap_of_moving_edges_end_at_one_that_cannot_be_used():
+    history = MovingHistory()
+    samples = [moving(seq, *EDGES) for seq in range(51)]
+    history.receive([*samples[:5], samples[50]])
+    page = samples[5:50]
+    bad = to_block([math.nan] * 14)
+    page[20] = WriterTransforms(page[20].stamp, page[20].seq, 7, page[20].order, bad, EDGES)
+    history.fill(page, len(page))
+    assert history.known("r1/base") == [*range(5), *range(26, 51)]
+    assert history.counters.stats().refused == {"not a pose": 1}
+
+
+def test_a_gap_in_which_the_edges_of_a_writer_change_is_filled():
+    """Two edges become one, the other one, three and two again; some have covariances."""
+    history = MovingHistory()
+    samples = [
+        *(moving(seq, *EDGES) for seq in range(40)),
+        *(moving(seq, EDGES[0]) for seq in range(40, 60)),
+        *(moving(seq, EDGES[1], variance=0.5) for seq in range(60, 80)),
+        *(moving(seq, *EDGES, ("base", "lidar")) for seq in range(80, 100)),
+        *(moving(seq, *EDGES) for seq in range(100, 120)),
+    ]
+    history.receive([*samples[:5], samples[119]])
+    history.fill(samples[5:119], 57)
+    assert history.known("r1/base") == [*range(60), *range(80, 120)]
+    assert history.known("r1/camera") == [*range(40), *range(60, 120)]
+    assert history.known("r1/lidar") == list(range(80, 100))
+    triangles = history.view("r1/camera").kept_rows()[:, 7:]
+    assert np.isfinite(triangles).all(axis=1).tolist() == [
+        60 <= seq < 80 for seq in [*range(40), *range(60, 120)]
+    ]
 
 
 def test_gap_is_filled_no_further_than_the_buffer_reaches():

@@ -25,6 +25,7 @@ from zstate.buffer.pose_tracks import (
     TooOld,
     check_covariances,
     check_poses,
+    checked_rows,
     second_writer,
 )
 from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack, Track, TrackOwner
@@ -48,6 +49,14 @@ class CachedPath(NamedTuple):
     version: int
     path: TransformPath
     dependencies: PathDependencies
+
+
+class _PastPoses(NamedTuple):
+    """Instants of the edges of one track, newest first."""
+
+    stamps: list[int]
+    poses: list[Poses]
+    covariances: list[NDArray[np.float64] | None]
 
 
 class BufferCore:
@@ -291,6 +300,52 @@ class BufferCore:
             self._tree.invalidate(track)
         self._waiters.notify(track)
         return len(stamps)
+
+    def insert_past_poses(
+        self,
+        samples: Iterable[tuple[tuple[EdgeNames, ...], int, Poses, NDArray[np.float64] | None]],
+        writer: str | None = None,
+    ) -> int:
+        """Insert instants of moving edges, newest first, all of them with one copy of each history.
+
+        An instant is edges, a stamp [ns], poses (N, 7) and covariances (N, 21), as for ``insert_many``.
+
+        Returns how many were inserted: those before the first one that ``insert_many`` has to handle, as it
+        is not older than the one before it of its edges, or because the row has no columns for it, or its
+        edges are in several tracks. None is inserted if all that the tracks have is newer. Raises
+        InvalidInput if one is not usable; then none is inserted.
+        """
+        past: dict[PoseTrack, _PastPoses] = {}
+        count = 0
+        with self._lock:
+            version = self._tree.version
+            for edges, stamp, poses, covariances in () if self._has_own_inserts() else samples:
+                try:
+                    (track, rows), *others = self._pose_tracks.track_rows(edges, stamp, writer)
+                except TooOld:
+                    break
+                if others or (covariances is not None and not track.has_covariances):
+                    break
+                of_track = past.get(track) or _PastPoses([], [], [])
+                stamps = of_track.stamps
+                if stamps and not stamps[0] - track.history.span_ns <= stamp < stamps[-1]:
+                    break
+                past[track] = of_track
+                stamps.append(stamp)
+                of_track.poses.append(poses[rows])
+                of_track.covariances.append(None if covariances is None else covariances[rows])
+                count += 1
+            oldest = {track: track.history.oldest for track in past}
+            is_between = any(at is not None and past[track].stamps[0] >= at for track, at in oldest.items())
+            if not is_between or self._tree.version != version:
+                return 0
+            blocks = {track: checked_rows(track, one.poses, one.covariances) for track, one in past.items()}
+            for track, one in past.items():
+                times = np.array(one.stamps[::-1], dtype=np.int64)
+                track.history = merged(track.history, times, blocks[track][::-1])
+                self._tree.invalidate(track)
+        self._waiters.notify(*past)
+        return count
 
     def fast_path(self, counts: dict[str, int], *sources: object) -> FastPath[Waiter]:
         """A fast path into this buffer for the messages of one writer, see ``FastPath``."""

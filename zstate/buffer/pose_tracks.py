@@ -185,3 +185,16 @@ def check_poses(edges: Sequence[EdgeNames], poses: ArrayLike) -> Poses:
         )
         raise InsertRefused(text, reason="not a pose", edge=(parent, child))
     return np.hstack((array[:, :3], array[:, 3:] / norms[:, None]))
+
+
+def checked_rows(
+    track: PoseTrack, poses: Sequence[Poses], covariances: Sequence[NDArray[np.float64] | None]
+) -> NDArray[np.float64]:
+    """Rows of the history of ``track``, of several instants of its edges. Raises InvalidInput."""
+    count, edges = len(poses), len(poses) * track.edges
+    rows = check_poses(edges, np.concatenate(poses)).reshape(count, -1)
+    if not track.has_covariances:
+        return rows
+    missing = np.full((len(track.edges), COVARIANCE_NUMBERS), np.nan)
+    triangles = np.concatenate([missing if known is None else known for known in covariances])
+    return np.hstack((rows, check_covariances(edges, triangles).reshape(count, -1)))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
 
 from zstate._util.bounded import BoundedDict
 from zstate.clock import SET_BACK_NS
@@ -126,6 +129,16 @@ class TransformIngest(StreamIngest):
         # The buffer holds a conflicting edge that was not compared yet.
         self._ownership.resolve_edges(edges)
         return self._insert_admitted(sample, edges, self._admit(source, edges))
+
+    def _insert_past(self, samples: Sequence[Sample]) -> int:
+        past: list[tuple[Edges, int, NDArray[np.float64], NDArray[np.float64] | None]] = []
+        for sample in samples:
+            assert isinstance(sample, TransformSample)
+            edges = self._all_admitted.get(sample.order) if self._version == self._ownership.version else None
+            if edges is None:
+                break
+            past.append((edges, sample.stamp, poses_from_block(sample.poses), covariances_of(sample)))
+        return self._buffer.insert_past_poses(past, self.writer)
 
     def _named_edges(self, names: Edges) -> Edges:
         edges = self._full_names.get(names)
