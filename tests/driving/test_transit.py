@@ -317,3 +317,18 @@ def test_commands_that_are_lost_do_not_close_the_window():
             window.sent(now, now)
             sent += 1
     assert 9 <= sent <= 12
+
+
+class ConfirmedMeanwhile(deque[tuple[int, int]]):
+    """Commands whose last one another thread takes out once this one has seen it."""
+
+    def __bool__(self) -> bool:
+        self.clear()
+        return True
+
+
+def test_a_command_that_is_confirmed_while_another_thread_asks_how_long_it_waits_raises_nothing():
+    window = CommandWindow()
+    assert window.waiting_ns(5 * MS) == 0
+    window._unconfirmed = ConfirmedMeanwhile([(0, 2 * MS)])
+    assert window.waiting_ns(5 * MS) in (0, 3 * MS)

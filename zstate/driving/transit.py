@@ -249,5 +249,8 @@ class CommandWindow:
         self._grows_at = self._last + self._size  # once as many have shown whether they wait
 
     def waiting_ns(self, now: int) -> int:
-        """For how long the oldest command waits for its confirmation; 0 without any."""
-        return now - self._unconfirmed[0][1] if self._unconfirmed else 0
+        """For how long the oldest command waits for its confirmation; 0 without any. For any thread."""
+        try:
+            return now - self._unconfirmed[0][1]
+        except IndexError:  # not asked before: another thread may take out the last one in between
+            return 0
