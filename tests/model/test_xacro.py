@@ -113,6 +113,18 @@ def test_an_expansion_has_limits_of_time_and_memory(inner: str, limit: str, word
         load_model(f'<robot name="r" {NAMESPACE}><xacro:if value="0"/>{inner}</robot>')
 
 
+@pytest.mark.parametrize(
+    "inner",
+    ["<link name=\"${'x' * 17000000}\"/>", "<link name=\"a\"/>${xacro.warning('x' * 17000000)}"],
+    ids=["text", "warning"],
+)
+def test_an_expansion_returns_no_more_text_than_a_model_may_have(inner: str):
+    pytest.importorskip("xacro")
+    with pytest.raises(ModelError, match="its expansion has more than 16777216 characters") as caught:
+        load_model(f'<robot name="r" {NAMESPACE}><xacro:if value="0"/>{inner}</robot>')
+    assert len(str(caught.value)) < 1000
+
+
 def test_the_environment_and_the_folder_add_no_modules_to_an_expansion(
     tmp_path: Path, arm: Path, monkeypatch
 ):

@@ -2,7 +2,7 @@
 
 The expressions in a file are Python, which xacro restricts: they read other files, and may take any time and
 memory. So the process ends after 30 s of CPU, 60 s in all, or 2 GiB of memory (not limited on macOS, whose
-kernel has no such limit).
+kernel has no such limit), and returns no more text than a URDF may have.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 
 from zstate._util.format import did_you_mean
 from zstate.model.findings import Finding, model_error
+from zstate.model.xml import MAX_BYTES
 
 _CPU_S = 30
 _WITHIN_S = 60.0
@@ -29,6 +30,7 @@ _MEMORY_BYTES = 2 << 30
 _MISSING = "this is a xacro file, which must be expanded: pip install 'zstate[xacro]'"
 _TOO_SLOW = f"its expansion has taken {_WITHIN_S:g} s, which is the limit"
 _TOO_LONG = f"its expansion takes more than {_CPU_S} s of CPU, which is the limit"
+_TOO_MUCH = f"its expansion has more than {MAX_BYTES} characters, which is the limit"
 _TOO_LARGE = f"its expansion needs more than {_MEMORY_BYTES >> 30} GiB of memory, which is the limit"
 # Isolated (-I): neither the folder it runs in nor the environment adds modules; those of this process do.
 _PROGRAM = """
@@ -110,6 +112,9 @@ def answer_request(text: str, path: str | None, args: dict[str, str]) -> None:
         if "package" in cause.lower() or "PackageNotFound" in type(error).__name__:
             hint = "; packages are found by ROS_PACKAGE_PATH, a sourced ROS, or a package.xml above the file"
         failure = _TOO_LARGE if _is_of_memory(error) else f"xacro could not expand it: {cause[:500]}{hint}"
+    if len(urdf) + sum(map(len, (*warnings, *used.used))) > MAX_BYTES:
+        # The process that waits for the answer reads all of it.
+        urdf, failure, warnings, used.used = "", _TOO_MUCH, Counter[str](), {}
     answer = {"urdf": urdf, "failure": failure, "warnings": warnings, "used": list(used.used)}
     with os.fdopen(output, "w", encoding="ascii") as file:
         json.dump(answer, file)
