@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from helpers.robots import RRBOT, SECOND, STAMP, UPRIGHT
@@ -118,3 +120,28 @@ def test_without_samples_nothing_is_measured():
     buffer = metered()
     measure = buffer.measure("r1")
     assert (measure.rate_hz, measure.latency_s, measure.age_s) == (0.0, None, None)
+
+
+def test_samples_that_several_streams_insert_at_the_same_time_are_all_counted():
+    """Each stream has a thread, and the first samples of a robot come from several."""
+    buffer, threads, robots = MeteredBuffer(ManualClock(NOW)), 4, 300
+    start = threading.Barrier(threads)
+
+    def insert(thread: int) -> None:
+        for number in range(robots):
+            edge = (f"r{number}/base", f"r{number}/tool{thread}")
+            start.wait()
+            for _ in range(3):
+                buffer.insert_many([edge], NOW, [[0.0, 0.0, 0.0, *UPRIGHT]])
+
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(insert, range(threads)))
+    finally:
+        sys.setswitchinterval(usual)
+    for number in range(robots):
+        robot = f"r{number}"
+        assert buffer.statistics_of(robot).count == 3 * threads
+        assert buffer.latency_of(robot).read()[0][-1] == ("+Inf", 3.0 * threads)

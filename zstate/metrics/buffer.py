@@ -156,16 +156,11 @@ class MeteredBuffer(InstrumentedBuffer):
         """
         if kind is None:
             kind = "joint_states" if (robot, "joint_states") in self._statistics else "transforms"
-        statistics = self._statistics.get((robot, kind))
-        if statistics is None:
-            statistics = self._statistics[robot, kind] = IntervalStatistics()
-        return statistics
+        known = self._statistics.get((robot, kind))
+        return known or self._statistics.setdefault((robot, kind), IntervalStatistics())
 
     def latency_of(self, robot: str) -> Histogram:
-        latency = self._latencies.get(robot)
-        if latency is None:
-            latency = self._latencies[robot] = Histogram(LATENCY_BOUNDS_S)
-        return latency
+        return self._latencies.get(robot) or self._latencies.setdefault(robot, Histogram(LATENCY_BOUNDS_S))
 
     def _on_sample(self, robot: str, kind: SampleKind, stamp: int) -> None:
         super()._on_sample(robot, kind, stamp)
@@ -173,7 +168,8 @@ class MeteredBuffer(InstrumentedBuffer):
         if self._is_comparable(robot):
             self.latency_of(robot).add(delay * 1e-9)
         statistics = self.statistics_of(robot, kind)
-        statistics.add(Received(time.monotonic_ns(), stamp, statistics.count, delay))
+        with self._counting:  # each stream has a thread
+            statistics.add(Received(time.monotonic_ns(), stamp, statistics.count, delay))
 
     def measure(self, robot: str, within_ns: int = _WINDOW_NS) -> RobotMeasure:
         """How the samples of ``robot`` arrived."""
