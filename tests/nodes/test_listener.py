@@ -288,6 +288,36 @@ def test_gaps_in_a_batch_that_filled_the_ring_count_as_dropped(sessions, monkeyp
         assert (listener.stats.dropped, listener.stats.missed) == (3, 1)
 
 
+def test_a_full_ring_counts_the_next_gap_of_writers_that_have_left_or_never_announced_themselves(
+    sessions, monkeypatch: pytest.MonkeyPatch
+):
+    stranger, departed, announced, other = range(7, 11)
+
+    def receive(*samples: tuple[int, int]) -> None:
+        """Samples by session and sequence number, which arrive together."""
+        arrived: list[SerializedSample] = []
+        for session, seq in samples:
+            edges = (("world", f"frame_{session}"),)
+            pose = to_block([0.0, 0.0, 0.0, *UPRIGHT])
+            message = WriterTransforms(STAMP + seq, seq, session, order_digest(edges), pose, edges)
+            key = f"zstate/r1/transforms/writer_{session}"
+            arrived.append(SerializedSample(key, encode(message), ENCODINGS[WriterTransforms]))
+        listener._on_samples(streams, arrived)
+
+    with TransformListener(sessions[0], "r1") as listener:
+        streams = listener._sample_streams["transforms"]
+        for session in (departed, announced):
+            streams.announce("r1", session, f"writer_{session}")
+        receive((stranger, 0), (departed, 0), (announced, 0), (other, 0))
+        streams.writer_left("r1", departed)
+        monkeypatch.setattr(streams, "capacity", 3)
+        receive((other, 1), (other, 2), (other, 3))
+        for gap, counts in ((10, (9 * 3, 0)), (20, (9 * 3, 9 * 3))):
+            for session in (stranger, departed, announced):
+                receive((session, gap))
+            assert (listener.stats.dropped, listener.stats.missed) == counts
+
+
 def test_key_without_a_robot_is_foreign_and_loses_no_sample(sessions):
     writer, reader = sessions
     strange = ("zstate/*/joint_states", "zstate/r$*/joint_states", "zstate/a b/joint_states")
