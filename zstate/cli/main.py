@@ -24,6 +24,7 @@ import click
 
 from zstate.cli.commands import load_command
 from zstate.cli.output import logs
+from zstate.cli.signals import SignalExit
 from zstate.errors import ZStateError
 
 if TYPE_CHECKING:
@@ -483,4 +484,4 @@ def _exit(code: str | int) -> NoReturn:
 def _end(number: int, _: FrameType | None) -> None:
     # An orderly exit takes well under a second; a second signal ends it at once.
     signal.signal(number, lambda number, _: os._exit(128 + number))
-    raise SystemExit(128 + number)
+    raise SignalExit(128 + number)

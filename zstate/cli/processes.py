@@ -15,6 +15,7 @@ from typing import IO, Generic, TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate.cli.output.logs import text_in
+from zstate.cli.signals import SignalExit
 from zstate.clock import wait_interruptible
 
 Result = TypeVar("Result")
@@ -93,7 +94,7 @@ class BackgroundCall(Generic[Result]):
 
 @contextmanager
 def orderly_exit(within_s: float = _PROGRAM_ENDS_WITHIN_S) -> Generator[Callable[[], None]]:
-    """A signal raises SystemExit in the block, once; later ones are ignored for ``within_s``.
+    """A signal raises SignalExit in the block, once; later ones are ignored for ``within_s``.
 
     After that time a signal ends the process at once. The block calls what is yielded before it stops what
     must not go on: from there no signal interrupts it. For the main thread.
@@ -107,7 +108,7 @@ def orderly_exit(within_s: float = _PROGRAM_ENDS_WITHIN_S) -> Generator[Callable
     def on_signal(number: int, _: object) -> None:
         if ends_at is None:
             begin_end()
-            raise SystemExit(128 + number)
+            raise SignalExit(128 + number)
         if time.monotonic() - ends_at > within_s:
             os._exit(128 + number)
 

@@ -20,6 +20,7 @@ from zstate.sources import JointStateListener
 
 ARM = """
 import socket
+import sys
 import time
 from pathlib import Path
 from zstate.driving import SimulatedDriver
@@ -62,6 +63,20 @@ class Leaving(Arm):
     def enable(self, on):
         self.log.write_text(f"{self.log.read_text()}enable {on} ")
         raise SystemExit(0)
+
+class LeavingAtOnce(Arm):
+    def __init__(self, model, joint_names):
+        sys.exit("no licence")
+
+class LeavingOpen(Arm):
+    def open(self):
+        sys.exit()
+
+class SlowToOpen(Arm):
+    def open(self):
+        self.log.write_text("opening")
+        while True:
+            time.sleep(0.002)
 
 class SlowToStop(Arm):
     def stop(self, how):
@@ -145,6 +160,42 @@ def test_a_driver_that_raises_system_exit_ends_the_command_with_the_cause(arm: s
     text = failure("drive", f"{arm}:Leaving", "rrbot", "--param", f"log={log}")
     assert f"the driver of 'rrbot' raised SystemExit(0) ({arm}, line {LEAVES})" in text
     assert log.read_text().endswith("enable False closed")
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "error"),
+    [
+        ("LeavingAtOnce", (), "LeavingAtOnce failed: SystemExit: no licence (ARM, line "),
+        ("LeavingOpen", ("--param", "log=/dev/null"), "LeavingOpen failed: SystemExit (ARM, line "),
+    ],
+)
+def test_a_driver_that_exits_before_the_loop_runs_ends_the_command_with_one_error(
+    arm: str, name: str, given: tuple[str, ...], error: str
+):
+    text = failure("drive", f"{arm}:{name}", "rrbot", *given)
+    assert error.replace("ARM", arm) in text
+    assert len(text.splitlines()) == 1
+
+
+@pytest.mark.parametrize("code", ["", "0", "3", "'no SDK'"])
+def test_a_driver_whose_file_exits_ends_the_command_with_one_error(tmp_path: Path, code: str):
+    file = tmp_path / "arm.py"
+    file.write_text(f"import sys\nsys.exit({code})\n")
+    what = f": {code.strip(chr(39))}" if code else ""
+    text = failure("drive", f"{file}:Arm", "rrbot")
+    assert text.strip() == f"zstate: {file} failed: SystemExit{what} ({file}, line 2)"
+
+
+@pytest.mark.processes
+def test_a_signal_while_a_driver_opens_ends_the_command_with_its_own_code(
+    spawn: Spawn, arm: str, tmp_path: Path
+):
+    log = tmp_path / "log"
+    child = started(spawn, "drive", f"{arm}:SlowToOpen", "rrbot", "--param", f"log={log}")
+    until(lambda: log.exists() and log.read_text() == "opening")
+    child.process.send_signal(signal.SIGTERM)
+    assert child.wait() == 128 + signal.SIGTERM
+    assert child.stderr == ""
 
 
 def _is_moved(commander: Commander) -> bool:

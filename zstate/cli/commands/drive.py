@@ -24,6 +24,7 @@ from zstate.cli import options
 from zstate.cli.options import load_robot
 from zstate.cli.output.console import count_text, fail, print_wrapped, report_text
 from zstate.cli.session import SessionOptions, open_session
+from zstate.cli.signals import SignalExit
 from zstate.errors import DriverFault, InvalidInput, MessageError, ZStateError, format_duration
 
 if TYPE_CHECKING:
@@ -502,16 +503,17 @@ def _driver_class(text: str) -> Callable[..., Any]:
 def _failures_of(driver: str) -> Generator[None]:
     """End the command for exceptions of a driver, with the line of its code instead of a traceback.
 
-    That is the last one in its own file: what it calls, such as the SDK of a vendor, may raise.
+    That is the last one in its own file: what it calls, such as the SDK of a vendor, may raise, or exit.
     """
     try:
         yield
-    except (ZStateError, click.ClickException):
+    except (ZStateError, click.ClickException, SignalExit):
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         frames = traceback.extract_tb(error.__traceback__)
         file = str(Path(driver.rpartition(":")[0] or driver).resolve())
         own = [frame for frame in frames if str(Path(frame.filename).resolve()) == file]
         place = (own or frames)[-1]
         at = f"{place.filename}, line {place.lineno}"
-        fail(f"{driver} failed: {type(error).__name__}: {error} ({at})")
+        what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        fail(f"{driver} failed: {what} ({at})")
