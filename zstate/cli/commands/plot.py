@@ -104,6 +104,8 @@ def plot_command(
         raise click.UsageError("--joint and --path exclude each other: they are different plots")
     if file is None and start is not None:
         raise click.UsageError("--start needs --file RECORDING")
+    if placers is not None and (file is not None or not frames):
+        raise click.UsageError("--placer is for --path A B of live robots")
     if file is not None:
         from zstate.recording.recording import Recording
 

@@ -167,14 +167,13 @@ def view_command(
     files = [Path(one) for one in models if Path(one).suffix in _RECORDINGS or Path(one).is_dir()]
     if files and len(models) > 1:
         raise click.UsageError(f"a recording must be the only argument; got {', '.join(models)}")
-    if files and sliders:
-        raise click.UsageError("--sliders moves live robots, not those of a recording")
-    named: list[NamedRobot] = []
-    if not files:
-        named = [
-            _load_named(one, xacro_args)[0] if xacro_args or is_path(one) else NamedRobot(one)
-            for one, xacro_args in models.items()
-        ]
+    if files and (sliders or placers is not None):
+        what = "--sliders moves" if sliders else "--placer is for"
+        raise click.UsageError(f"{what} live robots, not those of a recording")
+    named = [
+        _load_named(one, xacro_args)[0] if xacro_args or is_path(one) else NamedRobot(one)
+        for one, xacro_args in ({} if files else models).items()
+    ]
     with ExitStack() as opened:
         publishers: list[SliderPublisher] = []
         if files:
