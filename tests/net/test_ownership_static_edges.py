@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 from helpers.processes import Child, until
 from helpers.robots import RRBOT
+from helpers.tokens import current_tokens
 
 from zstate.errors import SecondWriter
-from zstate.net.presence import announce, current_tokens
+from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher

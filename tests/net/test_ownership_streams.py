@@ -11,10 +11,11 @@ from types import SimpleNamespace
 import pytest
 import zenoh
 from helpers.processes import until
+from helpers.tokens import current_tokens
 
 from zstate.errors import Closed, SecondWriter
 from zstate.net.ownership import TOKEN_EXPIRY_S, WriterClaim, check_edges
-from zstate.net.presence import announce, current_tokens
+from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 import zenoh
 from helpers.processes import DEADLINE_S, until
+from helpers.tokens import current_tokens
 
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net import queryable
 from zstate.net.presence import (
     RobotInfo,
     WriterWatch,
-    current_tokens,
     discover,
     discover_readers,
     local_writer,

@@ -13,9 +13,10 @@ import pytest
 import zenoh
 from helpers.fault_programs import resource_counts
 from helpers.processes import DEADLINE_S, until
+from helpers.tokens import current_tokens
 
 from zstate.errors import SecondWriter
-from zstate.net.presence import announce, current_tokens
+from zstate.net.presence import announce
 from zstate.net.session import Session
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher

@@ -9,11 +9,12 @@ from contextlib import ExitStack
 import pytest
 from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT
+from helpers.tokens import current_tokens
 from msgspec.structs import replace
 
 from zstate.errors import InvalidInput, SecondWriter
 from zstate.ingest.events import WriterEvent
-from zstate.net.presence import announce, current_tokens
+from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from helpers.processes import DEADLINE_S, find_free_port, until
 from helpers.robots import RRBOT, wait_for_reader
+from helpers.tokens import current_tokens
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
-from zstate.net.presence import announce, current_tokens, discover
+from zstate.net.presence import announce, discover
 from zstate.net.session import connect
 from zstate.net.status import StatusSubscriber
 from zstate.net.streams import StreamPublisher

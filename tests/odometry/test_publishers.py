@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from helpers.processes import DEADLINE_S, until
 from helpers.robots import wait_for_stream_readers
+from helpers.tokens import current_tokens
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput, LookupFailed, SecondWriter
-from zstate.net.presence import current_tokens, discover
+from zstate.net.presence import discover
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener

@@ -13,10 +13,10 @@ import pytest
 from helpers.processes import DEADLINE_S, until
 from helpers.recording_builder import MS, START, Bag, RecordingBuilder, S, pose, recorded_buffer
 from helpers.robots import RRBOT, SampleCollector, wait_for_reader, wait_for_stream_readers
+from helpers.tokens import current_tokens
 from msgspec import structs
 
 from zstate.errors import SecondWriter
-from zstate.net.presence import current_tokens
 from zstate.net.session import connect
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener

@@ -181,14 +181,6 @@ def discover_tokens(session: Session, expression: str, timeout_s: float = 1.0) -
     return found
 
 
-def current_tokens(session: Session, expression: str, timeout_s: float) -> frozenset[str]:
-    """The liveliness tokens known to the routers or peers of this session; waits up to ``timeout_s`` [s].
-
-    After a timeout these are only those that arrived.
-    """
-    return query_tokens(session.zenoh, expression, timeout_s).keys
-
-
 def confirmed_tokens(session: Session, expression: str) -> frozenset[str]:
     """The current liveliness tokens, queried a second time if the first reply has none."""
     return _confirmed(session, expression, ANSWER_WITHIN_S).keys

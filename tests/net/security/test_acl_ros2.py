@@ -12,10 +12,10 @@ from helpers import access_routers
 from helpers.access_routers import assert_only_allowed_writes_arrive, publish_and_check, replies
 from helpers.processes import Child, until
 from helpers.robots import RRBOT, UPRIGHT
+from helpers.tokens import current_tokens
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, discover
 from zstate.errors import AccessDenied, InvalidInput
-from zstate.net.presence import current_tokens
 from zstate.net.security.acl import AclRoles, access_control
 from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
