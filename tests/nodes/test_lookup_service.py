@@ -6,18 +6,17 @@ import json
 from collections.abc import Callable
 
 import pytest
+from helpers.lookup_client import query_lookup
 from helpers.processes import Child, until
 from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.errors import Disconnected, InFuture, InPast, InvalidInput, NoData, UnknownFrame, Unreachable
-from zstate.net.queryable import query_lookup
+from zstate.errors import Disconnected, InFuture, InPast, NoData, UnknownFrame, Unreachable
 from zstate.net.session import Session, connect
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher import StatePublisher
 from zstate.transform import Transform
 from zstate.wire.keys import Stream
-from zstate.wire.lookup_request import to_json
 
 PERIOD = 10_000_000
 KEY = "zstate/r1/lookup"
@@ -54,30 +53,6 @@ def two_robots() -> TransformBuffer:
     buffer.name_robot("r1")
     buffer.name_robot("r2")
     return buffer
-
-
-def test_reply_on_another_key_is_ignored(sessions: tuple[Session, Session]):
-    pose = to_json(Transform("world", "tool", (9.0, 0.0, 0.0), UPRIGHT))
-    wide = "zstate/*/lookup"
-    forged = sessions[0].zenoh.declare_queryable(wide, lambda query: query.reply(wide, pose))
-    until(lambda: [reply.ok for reply in sessions[1].zenoh.get(KEY, timeout=5.0)])
-    with pytest.raises(Unreachable):
-        query_lookup(sessions[1], "r1", "world", "tool")
-    forged.undeclare()
-
-
-@pytest.mark.parametrize("size", [256_000, 256_001])
-def test_reply_of_more_than_256000_bytes_is_ignored(sessions: tuple[Session, Session], size: int):
-    transform = Transform("world", "tool", (9.0, 0.0, 0.0), UPRIGHT)
-    reply = to_json(transform).ljust(size)
-    large = sessions[0].zenoh.declare_queryable(KEY, lambda query: query.reply(KEY, reply))
-    until(lambda: [reply.ok for reply in sessions[1].zenoh.get(KEY, timeout=5.0)])
-    if size == 256_000:
-        assert query_lookup(sessions[1], "r1", "world", "tool", timeout_s=5.0) == transform
-    else:
-        with pytest.raises(Unreachable):
-            query_lookup(sessions[1], "r1", "world", "tool")
-    large.undeclare()
 
 
 def test_replies_equal_lookups_in_the_buffer(sessions: tuple[Session, Session]):
@@ -132,14 +107,6 @@ def test_ambiguous_bare_name_means_the_robots_own_frame(sessions: tuple[Session,
             await_answers(sessions[1], robot)
             assert query_lookup(sessions[1], robot, "base", "tool").translation[2] == height
         assert query_lookup(sessions[1], "r1", "r2/base", "r2/tool").translation[2] == 2.0
-
-
-def test_missing_lookup_service_error_names_the_command_to_run(sessions: tuple[Session, Session]):
-    with pytest.raises(Unreachable, match=r"zstate/r1/lookup.*zstate publish r1") as caught:
-        query_lookup(sessions[1], "r1", "world", "tool")
-    assert caught.value.endpoints == (KEY,)
-    with pytest.raises(InvalidInput, match="timeout_s"):
-        query_lookup(sessions[1], "r1", "world", "tool", timeout_s=0.0)
 
 
 def test_every_publisher_answers_lookups_of_its_recent_samples(sessions: tuple[Session, Session]):

@@ -23,14 +23,11 @@ import zenoh
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
-from zstate.errors import InvalidInput, Unreachable, ZStateError
+from zstate.errors import InvalidInput
 from zstate.net.query_workers import QueryWorkers, leave_workers, use_workers
 from zstate.net.session import Session
 from zstate.net.streams import JOIN_WITHIN_S, call_for_each
-from zstate.transform import Transform
-from zstate.wire.keys import lookup_key, shortened
-from zstate.wire.lookup_request import LookupRequest, error_from_json, from_json
-from zstate.wire.messages import SAMPLE_BYTES
+from zstate.wire.keys import shortened
 
 MAX_REPLIES = 100_000
 """Limit of the replies to one query that are used. More are counted, and logged as a warning."""
@@ -318,31 +315,3 @@ def parse_parameters(text: str) -> dict[str, str]:
     """The parameters of a selector, ``name=value;name=value``, as Zenoh writes them after the ``?``."""
     pairs = (part.partition("=") for part in text.split(";") if part)
     return {name: value for name, _, value in pairs}
-
-
-def query_lookup(
-    session: Session, robot: str, target: str, source: str, at: int | None = None, *, timeout_s: float = 1.0
-) -> Transform:
-    """The pose of ``source`` in ``target`` at the stamp ``at`` [ns], or the newest one.
-
-    Queries a lookup service of ``robot``, for instance `zstate publish`; needs no buffer here. Raises the
-    error that ``TransformBuffer.lookup`` raised there, and Unreachable without a reply within ``timeout_s``.
-    """
-    check_timeout(timeout_s)
-    key = lookup_key(robot)
-    selector = f"{key}?{LookupRequest(target, source, at).parameters()}"
-    error: ZStateError = Unreachable(
-        f"no reply at {key!r} within {timeout_s:g} s; run `zstate publish {robot}`, or a LookupService",
-        endpoints=(key,),
-    )
-    # Without consolidation the first reply arrives before the end of the query.
-    for reply in query(session.zenoh, selector, timeout_s, consolidation=zenoh.ConsolidationMode.NONE):
-        value = reply.ok or reply.err
-        if value is None or len(value.payload) > SAMPLE_BYTES:
-            continue
-        # A reply on another key, such as one with a wildcard, is not from this robot.
-        if reply.ok is not None and str(reply.ok.key_expr) == key:
-            return from_json(reply.ok.payload.to_bytes())
-        if reply.err is not None and str(reply.err.encoding) == "application/json":
-            error = error_from_json(reply.err.payload.to_bytes())
-    raise error

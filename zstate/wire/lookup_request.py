@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, cast
 
 import msgspec
 
-import zstate.errors
 from zstate.clock import check_stamp
-from zstate.errors import InvalidInput, LookupFailed, MessageError, NetworkError, ZStateError
+from zstate.errors import InvalidInput, ZStateError
 from zstate.transform import Transform
 from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, shortened
 
@@ -47,14 +45,6 @@ class LookupRequest:
             )
         return cls(parameters["target"], parameters["source"], check_stamp(int(at)))
 
-    def parameters(self) -> str:
-        """The request as parameters of a selector. Raises InvalidInput for frames that cannot be in one."""
-        for frame in (self.target, self.source):
-            if not frame or ";" in frame:
-                raise InvalidInput(f"the frame name {frame!r} is empty or has a ';', and cannot be looked up")
-        text = f"target={self.target};source={self.source}"
-        return text if self.at is None else f"{text};at={check_stamp(self.at)}"
-
 
 def error_to_json(error: ZStateError) -> bytes:
     """``{"error": class name, "message": text, ...}``, with every attribute of the error."""
@@ -62,54 +52,6 @@ def error_to_json(error: ZStateError) -> bytes:
     return msgspec.json.encode({**facts, "error": type(error).__name__, "message": str(error)})
 
 
-def error_from_json(text: bytes) -> ZStateError:
-    """The error that ``error_to_json`` wrote; a NetworkError that quotes any other text."""
-    try:
-        facts = msgspec.json.decode(text, type=dict[str, object])
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return NetworkError(f"refused, for a reason that is not JSON: {text[:200]!r}")
-    kind = getattr(zstate.errors, str(facts.pop("error", "")), None)
-    message = str(facts.pop("message", ""))
-    if isinstance(kind, type) and issubclass(kind, ZStateError):
-        # Not by the constructor, which differs from error to error.
-        error = kind.__new__(kind)
-        error.args = (message,)
-        for name, value in facts.items():
-            error.__dict__[name] = tuple(cast("list[object]", value)) if isinstance(value, list) else value
-        if not issubclass(kind, LookupFailed):
-            return error
-        try:  # the text is made of the facts, which another program may have left out
-            if str(error):
-                return error
-        except Exception:  # any error that foreign facts lead to
-            pass
-    return NetworkError(f"refused: {message}")
-
-
-class TransformJson(msgspec.Struct, frozen=True):
-    """The fields of ``Transform.to_dict``, with their types. Further ones, of later versions, are ignored."""
-
-    target: str
-    source: str
-    translation: tuple[float, float, float]
-    rotation: tuple[float, float, float, float]
-    stamp: int | None = None
-    kind: Literal["static", "exact", "interpolated", "predicted"] | None = None
-    covariance: list[list[float]] | None = None
-
-
-_DECODER = msgspec.json.Decoder(TransformJson)
-
-
 def to_json(transform: Transform) -> bytes:
     """``{"target": ..., "source": ..., "translation": [x, y, z], "rotation": [x, y, z, w], ...}``."""
     return msgspec.json.encode(transform.to_dict())
-
-
-def from_json(text: bytes | str) -> Transform:
-    """The transform that ``to_json`` wrote. Raises MessageError with the field at fault, InvalidInput."""
-    try:
-        fields = _DECODER.decode(text)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MessageError(f"not a transform in JSON: {error}", reason="malformed") from None
-    return Transform.from_dict(msgspec.structs.asdict(fields))

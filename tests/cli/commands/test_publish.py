@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.cli_runner import RRBOT, Ended, failure, found_pose, published_robot, run_cli, run_until
+from helpers.lookup_client import query_lookup
 from helpers.processes import DEADLINE_S, repeated
 from helpers.recording_builder import MS, START, RecordingBuilder, swing_positions
 
 from zstate import NoData, StatePublisher, Transform, TransformListener, connect, discover, load_model
 from zstate.errors import Unreachable
-from zstate.net.queryable import query_lookup
 from zstate.wire.identity import WriterId
 
 DERIVED = {"robot_description", "tf_static", "tf"}
