@@ -104,8 +104,11 @@ else:
     from zstate._kernel import TransformFields
 
 
+COVARIANCE_NUMBERS = 21
+"""The upper triangle of a covariance of a pose, row by row."""
+
 UPPER_TRIANGLE = np.triu_indices(6)
-"""The places of the 21 numbers of a covariance, row by row."""
+"""The places of these numbers."""
 
 
 class Transform(TransformFields):

@@ -15,8 +15,8 @@ from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.transforms import TransformIngest
+from zstate.transform import COVARIANCE_NUMBERS
 from zstate.wire.messages import (
-    COVARIANCE_NUMBERS,
     JointState,
     RobotDescription,
     WriterTransforms,

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.frame_tree import Edge, FrameTree
-from zstate.buffer.tracks import COVARIANCE_NUMBERS, PoseTrack, TrackOwner
+from zstate.buffer.tracks import PoseTrack, TrackOwner
 from zstate.checks import real_numbers
 from zstate.errors import InsertRefused, InvalidInput
-from zstate.transform import QUATERNION_TOLERANCE
+from zstate.transform import COVARIANCE_NUMBERS, QUATERNION_TOLERANCE
 
 EdgeNames: TypeAlias = tuple[str, str]
 Poses: TypeAlias = NDArray[np.float64]

@@ -16,6 +16,7 @@ from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.joint_transforms import JointTransform, shared_transforms
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.transform import COVARIANCE_NUMBERS
 
 Interpolation = Literal["linear", "hermite"]
 ClockOffsets: TypeAlias = dict[str, Callable[[], ClockOffset | None]]
@@ -149,10 +150,6 @@ class JointTrack:
             positions,
             None if np.isnan(velocities).all() else velocities,
         )
-
-
-COVARIANCE_NUMBERS = 21
-"""The upper triangle of a covariance of a pose, row by row."""
 
 
 class PoseTrack:

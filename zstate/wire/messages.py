@@ -22,6 +22,7 @@ from msgspec import Meta, Struct
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput, MessageError, printable
+from zstate.transform import COVARIANCE_NUMBERS
 from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, Stream, full_name
 
 Edges = tuple[tuple[str, str], ...]
@@ -36,8 +37,6 @@ Mode = Literal["position", "velocity", "effort"]
 Level = Literal["ok", "warn", "error", "stale"]
 
 POSE_BYTES = 7 * 8
-COVARIANCE_NUMBERS = 21
-"""The upper triangle of a covariance of a pose."""
 _UNIT_TOLERANCE = 1e-3
 _UPPER_TRIANGLES = {size: np.triu_indices(size) for size in (3, 6)}
 _FLOAT64 = np.dtype("<f8")
