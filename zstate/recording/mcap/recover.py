@@ -35,10 +35,6 @@ class RecoverReport:
     def message_count(self) -> int:
         return sum(self.messages.values())
 
-    @property
-    def dropped_bytes(self) -> int:
-        return sum(loss.length for loss in self.losses)
-
 
 def recover(
     path: str | os.PathLike[str], target: str | os.PathLike[str], *, overwrite: bool = False
