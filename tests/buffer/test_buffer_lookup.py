@@ -193,7 +193,7 @@ def test_wait_for_a_silent_edge_ends_with_its_next_sample() -> None:
     buffer = silent()
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(buffer.wait, "odom", "arm", timeout_s=20.0)
-        until(lambda: buffer.waiter_count)
+        until(lambda: len(buffer._waiters))
         buffer.insert(moving("odom", "base", 40 * S, x=4.0))
         assert x_of(answer.result(20.0)) == 4.0
 
@@ -398,7 +398,7 @@ def test_wait_for_a_finite_result_ends_with_a_newer_sample() -> None:
     buffer = huge_moving()
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(buffer.wait, "a", "c", timeout_s=20.0)
-        until(lambda: buffer.waiter_count)
+        until(lambda: len(buffer._waiters))
         for edge in (("a", "b"), ("b", "c")):
             buffer.insert(moving(*edge, 3 * S, x=1.0))
         assert x_of(answer.result(20.0)) == 2.0

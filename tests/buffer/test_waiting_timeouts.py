@@ -35,10 +35,10 @@ class Waiting:
     def __init__(self, buffer: TransformBuffer, call: Callable[[], Transform]) -> None:
         self._buffer = buffer
         self.outcome: Transform | LookupFailed | None = None
-        seats = buffer.waiter_count
+        seats = len(buffer._waiters)
         self._thread = threading.Thread(target=self._run, args=(call,), daemon=True)
         self._thread.start()
-        until(lambda: buffer.waiter_count != seats or not self._thread.is_alive(), LONG_S)
+        until(lambda: len(buffer._waiters) != seats or not self._thread.is_alive(), LONG_S)
 
     def _run(self, call: Callable[[], Transform]) -> None:
         try:
@@ -274,13 +274,13 @@ def test_asyncio_wait_can_be_cancelled_and_leaves_no_waiter() -> None:
     async def cancel() -> None:
         task = asyncio.create_task(buffer.wait_async("a", "b", timeout_s=LONG_S))
         await asyncio.sleep(0)
-        assert buffer.waiter_count == 1
+        assert len(buffer._waiters) == 1
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await task
 
     asyncio.run(cancel())
-    assert buffer.waiter_count == 0
+    assert len(buffer._waiters) == 0
 
 
 def test_asyncio_waits_share_one_loop() -> None:

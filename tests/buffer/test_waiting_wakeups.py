@@ -236,4 +236,4 @@ def test_closed_waiter_is_not_listed_anywhere() -> None:
     buffer.insert_joints(track, S, ZERO)
     buffer.wait("base", "tool", S)
     assert watch.failures == 0
-    assert (buffer.waiter_count, buffer._waiters._by_track) == (0, {})
+    assert (len(buffer._waiters), buffer._waiters._by_track) == (0, {})

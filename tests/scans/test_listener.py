@@ -97,7 +97,7 @@ def test_scan_waits_for_the_pose_of_its_last_ray(sessions):
         ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=60.0) as scans,
         ScanPublisher(writer, "r1", "laser", ray_ns=MS, **GEOMETRY) as publisher,
     ):
-        until(lambda: publisher.publish([1.0, 1.0, 1.0], 2 * MS) or buffer.waiter_count)
+        until(lambda: publisher.publish([1.0, 1.0, 1.0], 2 * MS) or len(buffer._waiters))
         assert len(scans) == 0
         buffer.insert(pose_at(4 * MS, "r1/"))
         placed = next(iter(scans))
@@ -153,7 +153,7 @@ def test_scan_that_is_late_does_not_delay_another_sensor(sessions):
             ScanPublisher(writer, "r1", "waiting", frame="laser", **GEOMETRY) as waiting,
             ScanPublisher(writer, "r1", "sound", frame="laser", **GEOMETRY) as sound,
         ):
-            until(lambda: waiting.publish([1.0], 5 * MS) or scans.buffer.waiter_count)
+            until(lambda: waiting.publish([1.0], 5 * MS) or len(scans.buffer._waiters))
             until(lambda: sound.publish([1.0], 2 * MS) or len(scans) > 0)
         assert next(iter(scans)).sensor == "sound"
 
@@ -232,7 +232,7 @@ def test_thread_of_a_sensor_outlives_the_session_and_ends_with_the_listener(sess
     buffer = buffer_until(3 * MS)
     with ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=60.0) as scans:
         with ScanPublisher(writer, "r1", "outliving", frame="laser", **GEOMETRY) as publisher:
-            until(lambda: publisher.publish([1.0], 5 * MS) or buffer.waiter_count)
+            until(lambda: publisher.publish([1.0], 5 * MS) or len(buffer._waiters))
         reader.close()
         buffer.insert(pose_at(5 * MS, "r1/"))
         until(lambda: len(scans) > 0)
@@ -248,7 +248,7 @@ def test_scan_that_waits_for_its_pose_ends_with_the_listener(sessions):
         ScanListener(reader, "r1", "odom", buffer=buffer, timeout_s=3600.0) as scans,
         ScanPublisher(writer, "r1", "waiting_long", frame="laser", **GEOMETRY) as publisher,
     ):
-        until(lambda: publisher.publish([1.0], 5 * MS) or buffer.waiter_count)
+        until(lambda: publisher.publish([1.0], 5 * MS) or len(buffer._waiters))
     until(lambda: not is_placing("waiting_long"))
     assert len(scans) == 0
     assert not scans.dropped

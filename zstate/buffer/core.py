@@ -100,11 +100,6 @@ class BufferCore:
         """Grows whenever a frame is added, or the edge that places one changes."""
         return self._tree.version
 
-    @property
-    def waiter_count(self) -> int:
-        """The number of waiting threads and tasks, and of open watches."""
-        return len(self._waiters)
-
     def stop(self, reason: str) -> None:
         """No more samples will come: waits fail at once, and errors name the reason. Lookups go on."""
         self._stop_reason = self._stop_reason or reason
