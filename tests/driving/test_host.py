@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ from zstate import JointReading, StatePublisher, load_model
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.driving.driver import Setpoint, StopMode
 from zstate.driving.stops import stops_file, wait_for_state
-from zstate.errors import DriverFault, InvalidInput, MotionRefused, SecondWriter
+from zstate.errors import DriverFault, InvalidInput, MotionRefused, SecondWriter, Unreachable
 from zstate.net.presence import announce, confirmed_tokens, local_writer
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
@@ -715,7 +715,7 @@ def test_a_second_run_obeys_a_stop_that_is_still_latched(sessions):
         DriverHost(sessions[0], driver, RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS) as host,
         raw_commands(sessions) as put,
     ):
-        with pytest.raises(TimeoutError):
+        with suppress(Unreachable):  # unless the host, which is off, publishes its state within that
             stop(sessions[1], "arm", "door open", timeout_s=0.05)
         host.run(seconds=0.1)
         put(command(elbow=1.0))
@@ -831,7 +831,7 @@ def test_a_stop_is_confirmed_when_the_driver_has_stopped(sessions):
 
     driver = Slow()
     with running(sessions[0], driver), ThreadPoolExecutor(1) as pool:
-        asked = pool.submit(stop, sessions[1], "arm")
+        asked = pool.submit(stop, sessions[1], "arm", timeout_s=DEADLINE_S)
         assert driver.is_stopping.wait(DEADLINE_S)
         # A confirmation before the stop would have arrived before the replies to these queries.
         for _ in range(5):
@@ -1196,7 +1196,7 @@ def test_a_stop_that_is_released_before_the_next_tick_is_obeyed(sessions):
         wait_for_reader(sessions[1], key)
         send_until(arm, {"shoulder": 9.0}, lambda: len(driver.written()) > 3)
         may_read.clear()
-        with pytest.raises(TimeoutError):
+        with suppress(Unreachable):  # unless the host, which is off, publishes its state within that
             stop(sessions[1], "arm", "door open", timeout_s=0.05)
         until(stops_in_file)
         (stopped,) = stops_in_file()
