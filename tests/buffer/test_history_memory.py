@@ -108,3 +108,15 @@ def test_late_samples_need_no_more_memory_than_ordered_ones(late: int) -> None:
     view = buffer.tree_snapshot().edges["b"].track.history.view
     assert view.size == 1_001
     assert len(view.stamps) <= 2 * view.size
+
+
+def test_only_the_ends_and_the_samples_around_the_requested_stamps_are_kept() -> None:
+    buffer = TransformBuffer(history_s=1000.0)
+    for n in range(100):
+        buffer.insert(moving("odom", "base", n * S, x=n))
+    wanted = np.array([10 * S + 1, 20 * S, 99 * S])
+    before, _ = buffer.lookup_many("odom", "base", wanted)
+    buffer.keep_only_around(wanted)
+    kept = buffer.tree_snapshot().edges["base"].track.history.view.kept_stamps()
+    assert kept.tolist() == [0, 10 * S, 11 * S, 20 * S, 99 * S]
+    assert np.array_equal(buffer.lookup_many("odom", "base", wanted)[0], before)

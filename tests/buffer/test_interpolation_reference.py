@@ -9,6 +9,7 @@ from fractions import Fraction
 import helpers.exact_poses as exact
 import numpy as np
 import pytest
+from helpers import model_samples
 from helpers.buffers import EVERY_JOINT, NOW, S
 
 from zstate.buffer.buffer import TransformBuffer
@@ -118,8 +119,15 @@ def random_positions(rng: random.Random, track: JointTrack) -> np.ndarray:
     return numbers
 
 
+ROTATED_ORIGINS = pytest.param(model_samples.EVERY_JOINT, id="rotated origins")
+
+
 @pytest.mark.parametrize(
-    "name", ["rrbot", "diffbot", "gripper", EVERY_JOINT, pytest.param("panda", marks=pytest.mark.robots)]
+    "name",
+    [
+        *("rrbot", "diffbot", "gripper", EVERY_JOINT, ROTATED_ORIGINS),
+        pytest.param("panda", marks=pytest.mark.robots),
+    ],
 )
 def test_joint_tracks_agree_with_the_reference(name: str) -> None:
     rng = random.Random(name)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers import model_samples
 from helpers.buffers import MS, NOW, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
 
 from zstate import se3
@@ -13,6 +14,8 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InFuture, InPast, NoData
 from zstate.transform import Transform
+
+ROTATED_ORIGINS = model_samples.every_joint().model
 
 FREE = (0.3, -0.2, 0.5)
 SPIN = (0.1, 0.4, -0.3)
@@ -76,6 +79,19 @@ def test_without_velocities_the_rate_is_that_of_the_interpolated_pose(frame: str
     stamp = NOW + 200 * MS
     twist = buffer.twist(frame, "root", stamp)
     measured = difference(buffer, frame, "root", 10_000, stamp)
+    np.testing.assert_allclose((*twist.linear, *twist.angular), measured, atol=1e-6)
+
+
+@pytest.mark.parametrize("link", ROTATED_ORIGINS.links)
+def test_rates_behind_rotated_origins_are_those_of_the_pose(link: str) -> None:
+    buffer = TransformBuffer()
+    track = buffer.add_robot(ROTATED_ORIGINS)
+    for seed in (0, 1):
+        positions = model_samples.random_positions(ROTATED_ORIGINS, seed, spread=1.0)
+        buffer.insert_joints(track, NOW + seed * S, positions)
+    stamp = NOW + S // 3
+    twist = buffer.twist(link, "sole", stamp)
+    measured = difference(buffer, link, "sole", 10_000, stamp)
     np.testing.assert_allclose((*twist.linear, *twist.angular), measured, atol=1e-6)
 
 

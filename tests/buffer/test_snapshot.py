@@ -141,6 +141,14 @@ def test_snapshot_of_selected_robots_has_their_frames_and_those_above():
     assert buffer.snapshot(robots=["r1"]).tree is table
 
 
+def test_frame_tables_of_several_selections_stay_the_same_objects():
+    buffer = filled()
+    buffer.add_robot(RRBOT, "r2")
+    selections = ((), ("r1",), ("r2",), ("r1", "r2"))
+    tables = [buffer.frame_table(robots) for robots in selections]
+    assert [buffer.frame_table(robots) for robots in selections] == tables  # compared by identity
+
+
 def tree_of(*parents: int) -> FrameTable:
     names = tuple(f"f{row}" for row in range(len(parents)))
     kinds = tuple("root" if parent < 0 else "pose" for parent in parents)

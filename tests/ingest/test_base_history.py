@@ -194,6 +194,15 @@ def test_samples_of_a_gap_are_not_inserted_one_by_one(
     assert before.kept_stamps().tolist() == stamps
 
 
+def test_gap_and_what_is_older_than_all_samples_are_inserted_together(single_inserts: list[int]):
+    history = HistoryIngest()
+    history.receive(*states(20, 30), *states(50, 51))
+    single_inserts.clear()
+    assert not history.ingest.insert_history(states(0, 50))
+    assert single_inserts == []
+    assert history.stamps_known == list(range(51))
+
+
 # Moving edges, which are in the same stream as others of their writer
 
 

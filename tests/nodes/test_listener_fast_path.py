@@ -423,6 +423,31 @@ def test_listener_with_another_clock_takes_the_long_way(sessions):
         assert at_once(listener) == 0
 
 
+class CountingBuffer(TransformBuffer):
+    """A buffer that overrides an insert, as one that measures each sample does."""
+
+    counted = 0
+
+    def insert_joints(self, *arguments) -> bool:
+        self.counted += 1
+        return super().insert_joints(*arguments)
+
+
+def test_buffer_with_an_insert_of_its_own_gets_every_sample(sessions):
+    writer, reader = sessions
+    buffer = CountingBuffer()
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        TransformListener(reader, "r1", buffer, history_on_join=False) as listener,
+    ):
+        wait_for_stream_readers(writer, "r1")
+        until(lambda: buffer.domain.domain_of("r1") == "system")
+        for number in range(20):
+            publisher.publish([0.0, 0.0])
+            until(lambda number=number: listener.stats.received == number + 1)
+    assert buffer.counted == 20
+
+
 def test_removed_robot_is_refused_as_by_the_long_way(sessions):
     writer = Writer(0, "zstate/r1/joint_states", JointState, session=7)
     with pair(sessions[1], "r1", "joint_states") as receivers:

@@ -22,7 +22,7 @@ from helpers.recording_builder import (
 from helpers.recording_files import STORE
 from rosbags.rosbag2 import StoragePlugin
 
-from zstate import Recording, TransformBuffer, UnknownFrame
+from zstate import Recording, UnknownFrame
 from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
 from zstate.transform import Transform
 from zstate.wire.joint_order import SampleLayout
@@ -207,19 +207,6 @@ def test_lookup_many_memory_does_not_grow_with_the_recording(tmp_path: Path, spa
     child: Child = spawn(MEMORY, str(tmp_path / "small"), str(tmp_path / "large"), is_forked=False)
     small, large = int(child.line(60)), int(child.line(60))
     assert large - small < 20, (small, large)
-
-
-def test_buffer_keeps_samples_around_requested_stamps():
-    buffer = TransformBuffer(1000.0)
-    for n in range(100):
-        buffer.insert(Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1], n * S))
-    wanted = np.array([10 * S + 1, 20 * S, 99 * S])
-    before = buffer.lookup_many("odom", "base", wanted)[0]
-    buffer.keep_only_around(wanted)
-    (base,) = (frame for frame in buffer.frames() if frame.name == "base")
-    # The first, 10 and 11, 20, and the last, which is 99.
-    assert (base.count, base.oldest, base.newest) == (5, 0, 99 * S)
-    assert np.array_equal(buffer.lookup_many("odom", "base", wanted)[0], before)
 
 
 def test_lookup_before_the_recording_does_not_suggest_a_listener(tmp_path: Path):

@@ -1,4 +1,4 @@
-"""A writer's past arrives newest first: samples inserted before those that a history has."""
+"""Orders of samples: live ones ascend, a writer's past arrives newest first, late ones come in between."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ HISTORIES = pytest.mark.parametrize("make", list(dict.fromkeys([History, Referen
 
 
 @HISTORIES
-def test_past_is_not_copied_for_each_sample(make: type[History]):
+@pytest.mark.parametrize("stamps", [range(1, 10_001), range(10_000, 0, -1)], ids=["live", "past"])
+def test_live_samples_and_the_past_are_not_copied_for_each_sample(make: type[History], stamps: range):
     history, blocks = make(1, 10**12), []
-    for stamp in range(10_000, 0, -1):
+    for stamp in stamps:
         history.insert(stamp, np.array([float(stamp)]))
         start = history.view.stamps.ctypes.data
         if not blocks or blocks[-1] != start:
