@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from helpers.robots import RRBOT, SECOND
@@ -147,6 +149,29 @@ def test_frame_tables_of_several_selections_stay_the_same_objects():
     selections = ((), ("r1",), ("r2",), ("r1", "r2"))
     tables = [buffer.frame_table(robots) for robots in selections]
     assert [buffer.frame_table(robots) for robots in selections] == tables  # compared by identity
+
+
+class OvertakenBuffer(TransformBuffer):
+    """A buffer in which ``overtake`` is called once, just after samples were read."""
+
+    overtake: Callable[[], object] | None = None
+
+    def _read_views(self, tracks):
+        views = super()._read_views(tracks)
+        overtake, self.overtake = self.overtake, None
+        if overtake is not None:
+            overtake()
+        return views
+
+
+def test_first_velocities_of_a_robot_do_not_disturb_a_snapshot_of_the_samples_before():
+    buffer = OvertakenBuffer()
+    track = buffer.add_robot(RRBOT, "r1", interpolation="hermite")
+    for second in (0, 1):
+        buffer.insert_joints(track, second * SECOND, [float(second), 0.0])
+    before = buffer.snapshot(SECOND // 2)
+    buffer.overtake = lambda: buffer.insert_joints(track, 2 * SECOND, [2.0, 0.0], [0.0, 0.0])
+    assert buffer.snapshot(SECOND // 2).poses.tolist() == before.poses.tolist()
 
 
 def tree_of(*parents: int) -> FrameTable:

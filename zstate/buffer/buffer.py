@@ -79,8 +79,8 @@ class TransformBuffer(BufferCore):
     def __init__(self, history_s: float = DEFAULT_HISTORY_S, clock: Clock | None = None) -> None:
         super().__init__(history_s, clock)
         self._snapshot_readers: dict[frozenset[str], SnapshotReader] = {}
-        # Those of one version of the tree, by the track of the robot and whether they read that track alone.
-        self._joint_readers: tuple[int, dict[tuple[JointTrack, bool], RobotJoints]] = (-1, {})
+        # Those of one version of the tree, by the robot's track and the width of the rows that they read.
+        self._joint_readers: tuple[int, dict[tuple[JointTrack, int | None], RobotJoints]] = (0, {})
 
     def __repr__(self) -> str:
         robots = [repr(track.name) for track in list(self._tree.robots.values()) if track is not None]
@@ -465,19 +465,19 @@ class TransformBuffer(BufferCore):
             raise NotFinite(track.frame(track.model.root), track.frame(link), requested=stamp)
         return poses, stamp
 
-    def _robot_joints(self, robot: JointTrack, *, own: bool = False) -> RobotJoints:
+    def _robot_joints(self, robot: JointTrack, width: int | None = None) -> RobotJoints:
         # The version is read first: a reader newer than its version is made again, never kept.
         version = self._tree.version
         if self._joint_readers[0] != version:
             self._joint_readers = version, {}
         readers = self._joint_readers[1]
-        reader = readers.get((robot, own))
-        if reader is None or not reader.is_current():
-            reader = readers[robot, own] = RobotJoints(robot, self._read_views, own=own)
+        reader = readers.get((robot, width))
+        if reader is None:
+            reader = readers[robot, width] = RobotJoints(robot, self._read_views, width)
         return reader
 
     def _positions_in(self, view: HistoryView, track: JointTrack, at: int) -> NDArray[np.float64]:
-        return self._robot_joints(track, own=True).positions(at, (view,))[0]
+        return self._robot_joints(track, view.rows.shape[1]).positions(at, (view,))[0]
 
     def snapshot(
         self, at: int | None = None, *, robots: Collection[str] = (), hold_s: float = 0.0

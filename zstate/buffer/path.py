@@ -442,12 +442,12 @@ def _step(edge: Edge, uses: dict[Track, TrackUse]) -> Step:
     return JointStep(form, *place)
 
 
-def joint_interpolators(track: JointTrack, index: int) -> list[Interpolator]:
-    """What reads the positions of ``track.model.joints[index]``."""
+def joint_interpolators(track: JointTrack, index: int, width: int | None = None) -> list[Interpolator]:
+    """What reads the positions of ``track.model.joints[index]``, in rows of ``width``: now or of a view."""
     form = track.forms[index]
     column, velocity = form.column, -1
-    if track.has_velocities:
-        velocity = track.model.position_count + form.velocity_column
+    if (track.history.width if width is None else width) > track.position_count:
+        velocity = track.position_count + form.velocity_column
     cubic = track.interpolation == "hermite"
     if form.kind == "floating":
         return [PoseInterpolator(column, velocity)]

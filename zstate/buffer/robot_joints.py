@@ -19,27 +19,23 @@ Floats = NDArray[np.float64]
 class RobotJoints:
     """Reads the joints of ``robot``, each from the track that moves it, and interpolated as in lookups.
 
-    Positions are in the order of the robot's ``joint_names``. With ``own`` only the joints of this track
-    are read, though parts of the robot may move some of them.
+    Positions are in the order of the robot's ``joint_names``. With a ``width`` only the joints of this track
+    are read, in views with rows of that width, though parts of the robot may move some of them.
     """
 
-    def __init__(self, robot: JointTrack, read_views: ViewReader, *, own: bool = False) -> None:
+    def __init__(self, robot: JointTrack, read_views: ViewReader, width: int | None = None) -> None:
         self._robot = robot
-        parts: Mapping[str, JointTrack] = {} if own else robot.parts
+        parts: Mapping[str, JointTrack] = robot.parts if width is None else {}
         joints: dict[JointTrack, list[str]] = {}
         for name in robot.model.joint_names:
             joints.setdefault(parts.get(name, robot), []).append(name)
         self._tracks = tuple(joints)
-        self._widths = [track.history.width for track in self._tracks]
         root = robot.frame(robot.model.root)
-        uses = [_use(track, names) for track, names in joints.items()] or [TrackUse(robot, [], (root, root))]
+        at_root = TrackUse(robot, [], (root, root))
+        uses = [_use(track, names, width) for track, names in joints.items()] or [at_root]
         # A path without steps: it reads the values, and its errors name the limiting joint's edge.
         self._path = TransformPath(root, root, (), (), uses, read_views)
         self._columns = [_columns(robot, names) for names in joints.values()]
-
-    def is_current(self) -> bool:
-        """Whether the samples of its tracks have the same columns as when this was made."""
-        return self._widths == [track.history.width for track in self._tracks]
 
     def positions(self, at: int | None, views: Views | None = None) -> tuple[Floats, int]:
         """All positions (nq,) at a stamp [ns], and that stamp; by default the newest that all tracks reach.
@@ -108,8 +104,8 @@ def _columns(robot: JointTrack, names: list[str]) -> NDArray[np.intp]:
     return np.array(columns, dtype=np.intp)
 
 
-def _use(track: JointTrack, names: list[str]) -> TrackUse:
+def _use(track: JointTrack, names: list[str], width: int | None) -> TrackUse:
     """How a path reads these joints of a track; its errors name the edge of the first."""
     indices = {joint.name: index for index, joint in enumerate(track.model.joints)}
-    interpolators = [one for name in names for one in joint_interpolators(track, indices[name])]
+    interpolators = [one for name in names for one in joint_interpolators(track, indices[name], width)]
     return TrackUse(track, interpolators, track.edge(track.forms[indices[names[0]]]))
