@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 
 import pytest
@@ -9,6 +10,7 @@ from helpers.processes import until
 
 from zstate._util.bounded import MAX_ENTRIES
 from zstate.errors import InsertRefused
+from zstate.ingest.deadline import FLOOR_S
 from zstate.ingest.events import EventLog, StaticEdgeOwners, WriterEvent
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.wire.identity import Announcement, WriterId
@@ -163,17 +165,28 @@ def test_streams_that_are_not_subscribed_have_no_events():
         assert events.recent() == ()
 
 
+def silence_s(event: WriterEvent) -> float:
+    """How long the writer was silent, as the text of its event says."""
+    found = re.search(r"published nothing on joint_states for ([\d.]+) (ms|s)[,;]", event.text)
+    assert found is not None, event.text
+    return float(found[1]) * {"ms": 1e-3, "s": 1.0}[found[2]]
+
+
 def test_silence_is_reported_to_on_event_and_then_the_writer_is_cut_off():
     reported: list[WriterEvent] = []
+    started_s = time.monotonic()
     with EventLog(SUBSCRIBED, "joint_states", (), reported.append) as events:
         for stream in ("joint_states", "robot_description"):
             events.on_writer(announced(stream=stream), alive=True)
         for _ in range(3):
             events.on_sample("r1", DRIVER.session)
         until(lambda: [event.kind for event in reported] == ["joined", "joined", "stale"])
-        assert "published nothing on joint_states for" in reported[-1].text
+        rounding_s = 0.05
+        stale_s, elapsed_s = silence_s(reported[-1]), time.monotonic() - started_s
+        assert FLOOR_S <= stale_s <= elapsed_s + rounding_s
         events.on_sample("r1", DRIVER.session)
         until(lambda: reported[-1].kind == "resumed")
+        assert stale_s <= silence_s(reported[-1]) <= time.monotonic() - started_s + rounding_s
         until(lambda: reported[-1].kind == "stale")
         for stream in ("robot_description", "joint_states"):
             events.on_writer(announced(stream=stream), alive=False)

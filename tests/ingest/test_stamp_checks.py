@@ -1,4 +1,4 @@
-"""LagDetector: distinguishes a backlog from clock offsets and from the burst after a cut."""
+"""Stamps far from now; a LagDetector separates a backlog from clock offsets and from bursts after a cut."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.clock_domain import ClockDomain
+from zstate.clock import ManualClock
 from zstate.ingest.counters import Counters
-from zstate.ingest.stamp_checks import LagDetector, likely_cause
+from zstate.ingest.stamp_checks import LagDetector, StampCheck, likely_cause
 from zstate.wire.messages import JointState
 
 MS = 1_000_000
@@ -94,6 +96,15 @@ def test_threads_share_the_checks(monkeypatch: pytest.MonkeyPatch):
                 done.result()
     finally:
         sys.setswitchinterval(interval)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("off_ns", "counted"), [(MINUTE, 0), (MINUTE + 1, 1)])
+def test_stamps_more_than_a_minute_from_now_are_counted_as_off_clock(sign: int, off_ns: int, counted: int):
+    counters = Counters()
+    check = StampCheck(TransformBuffer(clock=ManualClock(NOW)), counters, is_described=False)
+    check.check("r1", "driver", JointState(NOW + sign * off_ns, 0, 7, b"order", b""))
+    assert counters.stats().off_clock == counted
 
 
 @pytest.mark.parametrize(

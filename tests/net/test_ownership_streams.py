@@ -6,6 +6,8 @@ import pickle
 import threading
 import time
 from collections import deque
+from dataclasses import replace
+from datetime import datetime, timedelta
 from types import SimpleNamespace
 
 import pytest
@@ -45,16 +47,19 @@ def edge(parent: str, child: str) -> Transform:
     return Transform(parent, child, [1, 0, 0], [0, 0, 0, 1])
 
 
-def test_second_writer_error_names_the_first_writer_and_takeover(sessions):
+def test_second_writer_error_names_the_first_writer_its_start_and_takeover(sessions):
     ours, theirs = sessions
-    with announced(theirs, announcement(FIRST)):
+    start = (datetime.now() - timedelta(days=3)).astimezone()
+    first = replace(FIRST, since=int(start.timestamp()) * 10**9)
+    with announced(theirs, announcement(first)):
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter, match="joint_states of 'r1'") as raised:
             WriterClaim(ours, [announcement(SECOND)])
-    assert "'driver@jetson pid 412', started 1970-01-01" in str(raised.value)
+    started = f"started {start:%Y-%m-%d %H:%M:%S} (3.0 days ago)"
+    assert f"'driver@jetson pid 412', {started}, already writes joint_states of 'r1'" in str(raised.value)
     assert "takeover=True" in str(raised.value)
     error = pickle.loads(pickle.dumps(raised.value))
-    assert (error.robot, error.stream, error.first, error.edge) == ("r1", "joint_states", FIRST, None)
+    assert (error.robot, error.stream, error.first, error.edge) == ("r1", "joint_states", first, None)
 
 
 def test_second_writer_is_refused_even_with_an_earlier_start_time(sessions):
