@@ -128,6 +128,17 @@ def test_a_range_of_a_follower_that_leaves_no_position_is_not_used_and_said_so()
     assert not unused_ranges(driven(limit), ["a"])
 
 
+@pytest.mark.parametrize(("lower", "upper", "is_said"), [(0.0, 0.5, False), (-1.0, 0.0, True)])
+def test_a_joint_of_one_position_keeps_it_whatever_range_its_follower_has(
+    lower: float, upper: float, is_said: bool
+):
+    follower = f'<limit lower="{lower}" upper="{upper}" velocity="5" effort="7"/><mimic joint="a"/>'
+    model = driven('lower="0.25" upper="0.25" velocity="5" effort="7"', follower)
+    assert (Limits.of(model).lower[0], Limits.of(model).upper[0]) == (0.25, 0.25)
+    text = "'a' is limited to 0.25 to 0.25, and not by 'b', which follows it: that would be -1 to 0"
+    assert unused_ranges(model, ["a"]) == (text,) * is_said
+
+
 def interface(kind: str, **parameters: object) -> str:
     numbers = "".join(f'<param name="{name}"> {value} </param>' for name, value in parameters.items())
     return f'<command_interface name="{kind}">{numbers}</command_interface>'

@@ -276,7 +276,8 @@ def _stated_limits(model: RobotModel, joint: Joint) -> tuple[JointLimits, list[s
             narrower.append((f"{follower.name!r}, which follows it", _through(mimic, limits)))
     for source, limits in narrower:
         both = found.narrowed(limits)
-        if found.lower < found.upper and not both.lower < both.upper:
+        is_narrower = (both.lower, both.upper) != (found.lower, found.upper)
+        if is_narrower and not both.lower < both.upper:
             texts.append(
                 f"{joint.name!r} is limited to {found.lower:g} to {found.upper:g}, and not by {source}: that "
                 f"would be {limits.lower:g} to {limits.upper:g}"
