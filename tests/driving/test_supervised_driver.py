@@ -16,7 +16,8 @@ SECOND = 1_000_000_000
 
 def written(positions: list[float], now: int = 10 * SECOND) -> FollowingCheck:
     check = FollowingCheck(LIMITS, 0.2, SECOND)
-    check.written(Limited(np.array(positions), np.zeros(len(positions)), ()), now)
+    modes = ("position",) * len(positions)
+    check.written(Limited(np.array(positions), np.zeros(len(positions)), (), None, modes), now)
     return check
 
 
@@ -121,6 +122,21 @@ def test_a_joint_is_compared_also_while_modes_change_and_in_slow_loops(modes, ti
         check.written(Limited(expected, np.array([0.0, 1.0]), (), None, now_in), tick * tick_ns)
         position += ratio * dt_s
     assert any("'elbow' has moved by" in text for text in texts) == is_found
+
+
+def test_a_joint_that_loses_power_after_ten_seconds_in_mode_velocity_is_noticed_within_two():
+    check = FollowingCheck(LIMITS, 0.2, SECOND)
+    position, found_at = 0.0, None
+    for tick in range(1500):
+        at, now = np.array([0.0, position]), tick * TICK
+        if check.deviation(at, now, now):
+            found_at = now
+            break
+        check.written(Limited(at, np.array([0.0, 1.0]), (), None, ("position", "velocity")), now)
+        position += 0.01 if now < 10 * SECOND else 0.0
+    # In the first second that begins without power it is 1 rad short; 0.2 + 1 / 4 + 0.1 are allowed.
+    assert found_at is not None
+    assert 10 * SECOND < found_at <= 12 * SECOND + 2 * TICK
 
 
 def test_what_a_joint_does_while_the_host_is_frozen_is_not_compared():

@@ -509,8 +509,8 @@ class Commander(Closeable):
         if self._driver_clock.session != state.session:
             self._window = CommandWindow()  # a host that has restarted confirms nothing from before
         self._driver_clock.update(state, arrived)
-        session, seq = state.received or (0, -1)
-        confirmed = seq if session == self._session_id else -1
+        received = state.received
+        confirmed = received[1] if received is not None and received[0] == self._session_id else -1
         self._window.update(confirmed, state.transit_excess or 0, state.ttl, arrived)
 
 

@@ -67,15 +67,15 @@ class Limited(NamedTuple):
     """The next setpoint: ``positions`` (n,) [rad] or [m] and ``velocities`` (n,) of the step, per s.
 
     ``limited`` are the joints that are short of their commands because a limit slowed them. ``efforts`` (n,)
-    [Nm] or [N] are None while no joint is in mode "effort"; ``modes`` has that of each joint, "position" if
-    empty. ``braked`` has a text for each joint that was taken out of mode "effort" by this step.
+    [Nm] or [N] are None while no joint is in mode "effort"; ``modes`` has that of each joint. ``braked`` has
+    a text for each joint that was taken out of mode "effort" by this step.
     """
 
     positions: Floats
     velocities: Floats
     limited: tuple[str, ...]
-    efforts: Floats | None = None
-    modes: tuple[Mode, ...] = ()
+    efforts: Floats | None
+    modes: tuple[Mode, ...]
     braked: tuple[str, ...] = ()
 
 

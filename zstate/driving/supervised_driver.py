@@ -240,7 +240,7 @@ class _Travel:
 
 def _in_mode(setpoint: Limited, mode: Mode) -> NDArray[np.bool_]:
     """Which joints are in ``mode``: (n,)."""
-    return np.array([one == mode for one in setpoint.modes or ("position",) * len(setpoint.positions)])
+    return np.array([one == mode for one in setpoint.modes])
 
 
 def check_arguments(
