@@ -85,6 +85,8 @@ class Bench:
     def __init__(self, generator: np.random.Generator) -> None:
         self.random = generator
         self.clock = ManualClock(10**9, MONOTONIC)
+        self.ahead_ns = 0
+        """Of the system clock ahead of ``clock``."""
         self.driver = Joints()
         self.stops = StopRegister(local_writer(99))
         self.refusals = Refusals()
@@ -127,7 +129,7 @@ class Bench:
         self.driver.allowed_s = elapsed * 1e-9
         before, is_stopped = self.driver.writes, bool(self.stops.current.stops)
         with suppress(DriverFault):
-            self.loop.tick(self.clock.now(), lambda _since, _now: elapsed * 1e-9)
+            self.loop.tick(self.clock.now() + self.ahead_ns, lambda _since, _now: elapsed * 1e-9)
             self.renew()
         assert not (is_stopped and self.driver.writes > before), "a setpoint after a stop"
         if self.loop.state.name == "fault":
@@ -402,6 +404,38 @@ def test_a_joint_that_is_read_far_outside_its_limits_once_it_has_power_is_stoppe
     drive(bench, 6)
     assert (driver.setpoints, bench.loop.state.name) == ([], "stopped")
     assert "0.5 rad outside -1 to 1" in bench.loop.state.reason
+
+
+def test_the_stamp_of_a_setpoint_is_the_instant_of_its_writing_by_the_system_clock():
+    bench = Bench(np.random.default_rng(0))
+
+    class Slow(Scripted):
+        def read(self, stamp: int) -> JointReading | None:
+            bench.clock.set(bench.clock.now() + MS_NS)
+            return super().read(stamp)
+
+    bench.driver = driver = Slow()
+    bench.loop = bench.opened()
+    bench.ahead_ns = 10**18 + 1
+    drive(bench, 10)
+    assert driver.setpoints[-1].stamp == bench.clock.now() + bench.ahead_ns
+
+
+def test_commands_from_before_a_release_are_those_of_its_commander_with_lower_numbers():
+    bench = scripted(Scripted())
+    latched = ActiveStop(200, 0, "hold", "", "desk")
+    bench.stops.add(latched)
+    bench.tick()
+    bench.stops.release(Release(0, 9, 1, (latched.id,)))
+    bench.tick()
+    accepted: list[tuple[int, int]] = []
+    for session, seq in ((1, 8), (2, 0), (1, 10)):
+        now = bench.clock.now()
+        bench.waiting.append(Command(session, seq, *AT_ZERO, now, now))  # makes way for the next commander
+        bench.tick()
+        accepted += [(session, seq)] if bench.loop.targets.session == session else []
+    assert accepted == [(2, 0), (1, 10)]
+    assert bench.refusals.counts == {"old": 1}
 
 
 def test_no_joint_is_faster_than_its_limit_after_a_late_tick():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -583,6 +584,28 @@ def test_a_part_of_the_robot_is_driven_beside_a_publisher_of_the_rest(sessions):
         assert report.rate.ticks + report.rate.skipped == 10
 
 
+@pytest.mark.parametrize("rates", [(np.array([3.0, 4.0]), np.array([5.0, 6.0])), (None, None)])
+def test_readings_are_published_in_the_order_of_the_model(sessions, rates):
+    class Reversed(RecordingDriver):
+        def __init__(self) -> None:
+            super().__init__()
+            self.joint_names = RRBOT.joint_names[::-1]
+
+        def read(self, stamp: int) -> JointReading:
+            return JointReading(np.array([1.0, 2.0]), *rates)
+
+    readings: list[JointReading] = []
+    with (
+        JointStateListener(sessions[1], "arm", RRBOT, on_reading=readings.append),
+        running(sessions[0], Reversed(), limits=Limits.of(RRBOT, RRBOT.joint_names[::-1], velocity=2.0)),
+    ):
+        until(lambda: readings)
+    found = readings[-1]
+    assert found.positions.tolist() == [2.0, 1.0]
+    for published, read in zip((found.velocities, found.efforts), rates, strict=True):
+        assert published is None if read is None else published.tolist() == read[::-1].tolist()
+
+
 def test_one_robot_has_one_host(sessions):
     with StatePublisher(sessions[0], RRBOT, "arm"):
         # A session that has just connected may discover the first later than it opens.
@@ -1156,6 +1179,7 @@ def test_a_command_from_before_the_release_that_arrives_after_it_is_refused(sess
     driver = RecordingDriver()
     releaser = local_writer(7)  # the session of ``command``
     key = release_key("arm", releaser.identity)
+    numbers = itertools.count()
     with (
         running(sessions[0], driver) as host,
         raw_commands(sessions) as put,
@@ -1163,11 +1187,11 @@ def test_a_command_from_before_the_release_that_arrives_after_it_is_refused(sess
     ):
         wait_for_reader(sessions[1], key)
         stopped = stop(sessions[1], "arm", timeout_s=DEADLINE_S)
-        releases.put(encode(Release(0, 5, 7, stopped.stops)))
+        releases.put(encode(Release(0, 10**6, 7, stopped.stops)))
         until(lambda: host.state == "ready")
-        # Until the host knows the token of the session, it has no claim.
-        until(lambda: put(command(4, elbow=1.0)) or host.report().refused.get("old"))
-        put(command(6, elbow=-0.1))
+        # Each is newer than the one before, and all are older than the release.
+        until(lambda: put(command(next(numbers), elbow=1.0)) or host.report().refused.get("old"))
+        put(command(10**6 + 1, elbow=-0.1))
         until(lambda: driver.written().size)
     assert driver.written().max() <= 0.0
 

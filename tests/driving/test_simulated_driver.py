@@ -159,6 +159,7 @@ def test_brakes_hold_joints_that_are_not_enabled():
     assert fallen < 0.9
     driver.enable(False)
     assert run(driver, 0.2)[-1, 0] == fallen
+    assert driver.read(201 * MS).velocities.tolist() == [0.0]
 
 
 def test_a_falling_joint_stops_at_the_end_of_its_range():
