@@ -712,6 +712,26 @@ def test_a_command_that_is_sent_before_the_first_state_of_the_driver_arrives_mov
         until(lambda: driver.written().size and driver.written()[-1, 1] == 0.1)
 
 
+def test_the_age_of_a_command_in_the_states_of_its_driver_is_counted_from_its_arrival(sessions):
+    with running(sessions[0], RecordingDriver()), Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver(DEADLINE_S)
+        sent_at = time.monotonic_ns()
+        arm.send({"elbow": 0.1})
+
+        def next_state(after: int) -> DriverState:
+            found = wait_for_state(
+                sessions[1], "arm", lambda one: one.commander and one.instant > after, DEADLINE_S
+            )
+            assert found is not None
+            return found
+
+        taken = next_state(after=0)  # perhaps built while the command is taken
+        first = next_state(after=taken.instant)
+        second = next_state(after=first.instant)
+        arrived = [one.instant - one.command_age for one in (first, second)]
+        assert sent_at < arrived[0] == arrived[1] < time.monotonic_ns()
+
+
 def test_waiting_for_a_driver_returns_the_state_that_ended_the_wait(sessions):
     """The state may be half a second old in the next moment."""
 

@@ -384,7 +384,7 @@ def test_a_request_for_more_than_the_joints_of_the_driver_is_refused(sessions):
     with hosted(sessions[0], Written()), announced(sessions[1]):
         for count, text in (
             (3, "a motion of 3 joints, where the driver has 2: shoulder, elbow"),
-            (70_000, "bytes, where motions of this driver take"),
+            (70_000, "bytes, where motions of this driver take 624000"),  # 64 kB more than the longest
         ):
             names = tuple(f"joint_{number}" for number in range(count))
             request = JointTrajectory(time.time_ns(), 0, 7, names, to_block([1.0]), to_block([0.0] * count))
@@ -396,6 +396,22 @@ def test_a_request_for_more_than_the_joints_of_the_driver_is_refused(sessions):
 
             until(is_answered)
             assert text in found[0].findings[0]
+
+
+def test_a_motion_has_10000_points_with_velocities_and_accelerations_of_all_joints(sessions):
+    times, zeros = np.arange(1, 10_001) * 1e-3, np.zeros((10_000, 2))
+    blocks = to_block(times), *[to_block(zeros)] * 3
+    request = JointTrajectory(time.time_ns(), 0, 7, RRBOT.joint_names, *blocks)
+    assert sum(map(len, blocks)) == 624_000 - 64_000
+    with hosted(sessions[0], Written()), announced(sessions[1]):
+        found: list[MotionReply] = []
+
+        def is_answered() -> bool:
+            found[:] = replies_to(sessions[1], "zstate/arm/@motion", request)
+            return bool(found)
+
+        until(is_answered)
+        assert found[0].findings == ()
 
 
 def test_a_repeated_request_is_the_same_motion_and_an_older_one_is_refused(sessions):

@@ -297,6 +297,16 @@ def test_after_a_velocity_the_joint_brakes_in_that_mode_and_then_holds_its_posit
     assert braking[-1].positions[0] == pytest.approx(braking[124].positions[0], abs=1e-12)
 
 
+def test_setpoints_that_could_not_be_written_are_no_time_at_rest():
+    limiter = SetpointLimiter(limits_of_elbow(), ("position", "velocity"))
+    last, at_rest = limiter.start([0.0]), {0: Rate("velocity", 0.0)}
+    for _ in range(200):  # 0.4 s; after 0.2 s at rest a position is held
+        limiter.step([0.0], DT, rates=at_rest)
+        limiter.resume(last, DT)
+    limiter.step([0.0], DT, rates=at_rest)
+    assert limiter.step([0.0], DT, rates={0: None}).modes == ("velocity",)
+
+
 @pytest.mark.parametrize("modes", [ALL_MODES, ("velocity",)])
 def test_a_wheel_has_zero_velocity_after_its_commands(modes: tuple[Mode, ...]):
     limiter, _ = in_modes(modes, lower=-math.inf, upper=math.inf)

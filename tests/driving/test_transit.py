@@ -319,6 +319,17 @@ def test_commands_that_are_lost_do_not_close_the_window():
     assert 9 <= sent <= 12
 
 
+@pytest.mark.parametrize(("excess", "is_halved"), [(TTL // 4, False), (TTL // 4 + 1, True)])
+def test_the_window_is_halved_if_the_newest_command_waited_for_more_than_a_quarter_of_the_ttl(
+    excess: int, is_halved: bool
+):
+    window = CommandWindow()
+    window.sent(0, 0)
+    window.update(0, excess, TTL, MS)
+    window.sent(1, MS)  # half of the one that was under way is one
+    assert window.has_room(MS) != is_halved
+
+
 class ConfirmedMeanwhile(deque[tuple[int, int]]):
     """Commands whose last one another thread takes out once this one has seen it."""
 
