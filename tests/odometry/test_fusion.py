@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
@@ -21,14 +22,17 @@ from zstate.odometry.fusion import (
     started,
 )
 from zstate.odometry.invariant_filter import (
+    GYRO_BIAS,
     POSITION,
     ROTATION,
     VELOCITY,
     ImuNoise,
     Measurement,
     initial_state,
+    white_noise,
 )
 from zstate.odometry.rotations import rotation_exp
+from zstate.odometry.turning import Turning
 
 S = 1_000_000_000
 WRONG, RIGHT = 50.0, 0.0
@@ -128,6 +132,29 @@ def test_the_pose_follows_a_compass_that_was_right_in_ten_of_twelve_directions(
     assert estimate.offset.is_turned == is_turned
 
 
+@pytest.mark.parametrize("north", [0.0, 1.0, -2.5])
+def test_a_compass_may_have_any_north(north: float):
+    estimate = at_rest()
+    for yaw in (0.1, 0.7, 1.3):  # in three of twelve directions
+        estimate, fate = read(estimate, yaw, yaw + north)
+        assert fate == "accepted"
+    assert estimate.compasses["compass"].deviation == 0.0
+
+
+@pytest.mark.parametrize("seconds", [0, 3])
+def test_a_compass_is_off_by_half_the_range_of_its_errors_less_its_noise_and_the_drift_of_the_gyro(
+    seconds: int,
+):
+    error, bias_sigma = 0.3, 0.01
+    estimate, _ = read(at_rest(), 0.1, 0.1)
+    for yaw, wrong, stamp in ((1.6, error, 0), (3.2, -error, seconds * S)):
+        estimate = at_rest(yaw, SIGMA, bias_sigma)._replace(stamp=stamp, compasses=estimate.compasses)
+        reading = Heading(stamp, yaw + wrong, SIGMA**2, np.eye(4))
+        estimate, _ = FUSION.after_heading(estimate, "compass", reading, None)
+    expected = error**2 - 2.0 * SIGMA**2 - (bias_sigma * seconds) ** 2
+    assert estimate.compasses["compass"].deviation == pytest.approx(expected)
+
+
 UPWARDS = np.array([0.0, 0.0, 9.80665])
 SAMPLE = S // 200
 
@@ -195,6 +222,82 @@ def test_the_noise_of_the_imu_is_a_mean_of_a_second():
     assert after.vibration is not None
     # The second difference of white noise has six times its variance; a sample is 5 ms of the second.
     assert after.vibration.variance[0] == pytest.approx(0.005 * bend**2 / 6.0)
+
+
+@pytest.mark.parametrize(("factor", "is_used"), [(1.49, False), (1.51, True)])
+def test_the_noise_of_the_samples_is_used_if_its_variance_is_1_5_times_that_which_is_stated(
+    factor: float, is_used: bool
+):
+    before = sampled(at_rest(), 100)
+    assert before.vibration is not None
+    stated = white_noise(FUSION.noise)
+    seen = np.full(6, 1.0)
+    seen[:3] = factor
+    # A sample has the variance of the density over its time; one more without noise takes 5 ms of a second.
+    vibration = before.vibration._replace(
+        averaged=10_000, variance=seen * stated / before.sampled_s / (1.0 - 0.005)
+    )
+    after = sampled(before._replace(vibration=vibration), 1)
+    assert after.vibration is not None
+    assert after.vibration.white == pytest.approx((seen if is_used else 1.0) * stated)
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(0.01, 0.0), (0.0, 0.002), (0.01, 0.002), (0.0, 0.0)])
+def test_the_scale_and_the_bias_of_a_gyro_are_errors_of_the_yaw_that_do_not_average_out(
+    scale: float, shift: float
+):
+    noise = replace(FUSION.noise, gyro_scale=scale, gyro_bias_shift=shift)
+    fusion, estimate, rate = Fusion(noise), at_rest(), 0.4
+    for stamp in range(0, 2 * S + 1, SAMPLE):
+        sample = Inertia(stamp, np.array([0.0, 0.0, rate]), UPWARDS)
+        estimate, _ = fusion.after_inertia(estimate, sample)
+    added = (fusion.settled(estimate).state.covariance - estimate.state.covariance)[2, 2]
+    assert added == pytest.approx((scale * rate * 2.0) ** 2 + (shift * 2.0) ** 2)
+
+
+def compared(apart: float, bias_sigma: float, *, was_at_rest: bool) -> Estimate:
+    """The estimate after ten seconds straight on, in which wheels turned by ``apart`` more than the gyro."""
+    estimate = sampled(at_rest(sigma=bias_sigma), 2)
+    turning = Turning(10.0, apart, 0.0, apart * apart, 0.0, 0.0)
+    estimate = estimate._replace(turning=turning, wheels_at=estimate.stamp - 1, was_at_rest=was_at_rest)
+    unsure = Measurement(np.zeros(3), np.eye(3, 15), 1e12 * np.eye(3))
+    reading = Reading(
+        estimate.stamp,
+        lambda _state, _rate: unsure,
+        is_still=False,
+        angular=np.array([0.0, 0.0, apart]),
+        upright=np.array([0.0, 0.0, 1.0]),
+    )
+    return FUSION.after_reading(estimate, "wheels", reading, None)[0]
+
+
+RADII = 0.004
+"""[rad/s] The standard deviation of the rate of wheels, whose radii differ."""
+
+
+@pytest.mark.parametrize(("part", "is_told"), [(2.99, False), (3.01, True), (-3.01, True)])
+@pytest.mark.parametrize(
+    ("was_at_rest", "sigma"),
+    # Of a bias that was measured its own standard deviation, of another that of gyros that are calibrated.
+    [(True, math.hypot(RADII, 0.005)), (False, math.hypot(RADII, 0.002))],
+)
+def test_wheels_and_gyro_that_are_three_sigmas_apart_contradict_each_other(
+    part: float, is_told: bool, was_at_rest: bool, sigma: float
+):
+    found = compared(part * sigma, 0.005 if was_at_rest else 0.05, was_at_rest=was_at_rest)
+    assert (
+        any("rates of gyro and wheels differ by a constant" in text for text in imu_remarks(found)) == is_told
+    )
+
+
+def test_a_measured_bias_that_wheels_contradict_is_as_unsure_as_the_difference_and_so_is_the_yaw():
+    apart, bias_sigma = 0.05, 0.005
+    before, found = (compared(one, bias_sigma, was_at_rest=True) for one in (0.0, apart))
+    added = np.diag(found.state.covariance - before.state.covariance)
+    expected = np.zeros(15)
+    expected[GYRO_BIAS.start + 2] = apart**2
+    expected[ROTATION.start + 2] = (apart * 10.0) ** 2
+    assert added == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize(("later", "is_told"), [(30 * S - 1, True), (30 * S, False)])

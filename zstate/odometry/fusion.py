@@ -447,7 +447,7 @@ class Fusion:
         turned = estimate.offset.rotation
         against_gyro = residual - math.atan2(float(turned[1, 0]), float(turned[0, 0]))
         if compass is None:
-            sectors = {_sector(reading.yaw): (reading.stamp, against_gyro)}
+            sectors = {_sector(reading.yaw): (reading.stamp, against_gyro - residual)}  # less the offset
             first = Compass(reading.stamp, reading.stamp, residual, variance, 0.0, 0.0, sectors)
             return _with_compass(estimate, source, first), Outcome("accepted", 1.0, 1)
         # The first reading has an error as well, and that of our yaw then is part of the present one.
