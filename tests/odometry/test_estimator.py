@@ -133,6 +133,22 @@ def test_the_order_of_arrival_does_not_matter_nor_when_states_are_read():
         np.testing.assert_allclose(one.twist, other.twist, atol=1e-9)
 
 
+def test_a_late_sample_of_the_rest_at_the_start_aligns_the_base_once_more():
+    _, calls = calls_of(1, 0.9)
+    late_one = next(call for call in calls if call[0] > 0.2 and call[1] == "imu")
+    in_order, aligned_before = estimator(tilted_mount()), estimator(tilted_mount())
+    feed(in_order, calls)
+    feed(aligned_before, [call for call in calls if call is not late_one])
+    without = aligned_before.state()
+    feed(aligned_before, [late_one])
+    expected, found = in_order.state(), aligned_before.state()
+    np.testing.assert_allclose(found.gyro_bias, expected.gyro_bias, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        found.odom_from_base.pose7, expected.odom_from_base.pose7, rtol=0.0, atol=1e-12
+    )
+    assert np.abs(without.gyro_bias - expected.gyro_bias).max() > 1e-9
+
+
 def test_events_older_than_the_history_are_counted_and_change_nothing():
     _, calls = calls_of(2, 3.0)
     base = estimator(tilted_mount(), history_s=0.5)

@@ -11,10 +11,13 @@ from zstate.model.urdf import parse_urdf
 from zstate.odometry import invariant_filter as iekf
 from zstate.odometry import legs
 from zstate.odometry.legs import (
+    Foot,
     ForceThresholds,
     LegNoise,
     Legs,
     SpeedThresholds,
+    Stance,
+    stance_after,
     updated_by_feet,
 )
 from zstate.odometry.rotations import Floats, rotation_exp, skew
@@ -106,6 +109,25 @@ def test_the_noise_of_encoders_reaches_a_foot_by_its_derivative():
     foot = legs.feet(POSITIONS)[0]
     np.testing.assert_allclose(foot.jacobian, by_joints, atol=1e-9)
     np.testing.assert_allclose(foot.covariance, by_joints @ by_joints.T * 1e-4 + np.eye(3) * 4e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(("part", "is_same"), [(0.99, True), (1.01, False)])
+def test_a_stance_ends_by_a_reading_that_is_further_from_its_mean_than_3_mm_and_four_sigmas(
+    part: float, is_same: bool
+):
+    mean, sigma, stance = np.array([0.2, -0.1, -0.4]), 0.002, None
+
+    def after(stance: Stance | None, step: int, x: float) -> Stance | None:
+        foot = Foot("foot", mean + np.array([x, 0.0, 0.0]), np.eye(3), np.zeros((3, 1)))
+        return stance_after(stance, step * 10_000_000, [foot], is_whole=True)
+
+    for step in range(51):  # half a second, whose readings are sigma in front of the mean or behind it
+        stance = after(stance, step, sigma * (-1) ** step)
+    assert stance is not None
+    assert stance.before == pytest.approx(mean[np.newaxis])
+    moved = after(stance, 51, part * (0.003 + 4.0 * sigma))
+    assert moved is not None
+    assert (moved.before is not None) == is_same
 
 
 def test_a_foot_touches_by_force_with_hysteresis():

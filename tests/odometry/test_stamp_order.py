@@ -58,6 +58,29 @@ def test_five_readings_of_half_a_second_confirm_a_jump_ahead_and_of_the_imu_the_
     assert confirmed("imu", stamps) == 2
 
 
+@pytest.mark.parametrize(
+    ("source", "other", "is_confirmed"),
+    [
+        ("imu", "wheels", True),
+        ("imu", "compass", True),
+        ("imu", "imu", False),
+        ("wheels", "imu", False),
+        ("wheels", "compass", False),
+        ("compass", "wheels", False),
+    ],
+)
+def test_a_reading_of_the_present_refutes_another_time_but_that_of_the_imu_only_if_it_is_of_the_imu(
+    source: str, other: str, is_confirmed: bool
+):
+    order, found = opened(), []
+    for stamp in (NOW + 40 * S + n * HALF // 4 for n in range(5)):
+        found.append(order.hold(Held(source, stamp, lambda: None), order.place(source, stamp)))
+        if found[-1] is not None:
+            break
+        assert order.place(other, NOW) == "present"
+    assert (found[-1] is not None) == is_confirmed
+
+
 def test_time_that_went_back_by_less_than_a_second_is_no_jump():
     order = opened(S // 5)
     for n in range(10):

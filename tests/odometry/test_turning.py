@@ -46,3 +46,27 @@ def test_the_track_is_wrong_from_a_factor_of_1_6_on(factor: float):
 def test_a_gyro_that_measures_less_than_a_fifth_of_the_turn_does_not_turn_with_the_base():
     assert "the gyro does not turn with the base" in disagreement(turning(0.5, 0.1 - EXACT))
     assert "the gyro does not turn with the base" not in disagreement(turning(0.5, 0.1 + EXACT))
+
+
+@pytest.mark.parametrize("gyro", [0.0, -0.01])
+def test_a_gyro_that_hardly_turns_does_not_turn_in_the_opposite_direction(gyro: float):
+    assert "the gyro does not turn with the base" in disagreement(turning(0.2, gyro))
+
+
+def test_rates_above_0_16_rad_per_s_that_are_not_alike_are_at_different_times():
+    def unlike(rate: float) -> Turning:
+        return Turning(10.0, 0.0, 0.0, rate * rate, rate * rate, product=0.0)
+
+    assert "at different times" in disagreement(unlike(0.16 + EXACT))
+    assert disagreement(unlike(0.16)) == ""
+
+
+def test_the_constant_by_which_wheels_turn_faster_is_that_of_the_line_through_both_rates():
+    """Half the time straight on with -0.1 rad/s, half with 0.3; wheels turn by 1.2 times that and 0.02."""
+    gyro, wheels = (-0.1, 0.3), (1.2 * -0.1 + 0.02, 1.2 * 0.3 + 0.02)
+    means = [sum(one) / 2 for one in (wheels, gyro)]
+    squares = [sum(rate * rate for rate in one) / 2 for one in (wheels, gyro)]
+    product = sum(one * other for one, other in zip(wheels, gyro, strict=True)) / 2
+    found = constant_difference(Turning(10.0, *means, *squares, product))
+    # Both are on the line: what is left is 0.004 rad/s, for radii that differ.
+    assert found == pytest.approx((0.02, 0.004))

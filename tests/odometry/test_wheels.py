@@ -71,5 +71,8 @@ def test_impossible_geometry_and_noise_are_refused():
         DiffDrive("left", "right", radius=0.0, track=0.5)
     with pytest.raises(InvalidInput, match="'left', 'left'"):
         DiffDrive("left", "left", radius=0.1, track=0.5)
-    with pytest.raises(InvalidInput, match="'lateral'"):
+    with pytest.raises(InvalidInput, match=r"'lateral' of wheels is finite and above 0; got 0\.0"):
         WheelNoise(lateral=0.0)
+    WheelNoise(slip=0.0, scale=0.0, lateral=1e-300)
+    with pytest.raises(InvalidInput, match=r"'slip' of wheels is finite and 0 or more; got -0\.1"):
+        WheelNoise(slip=-0.1)

@@ -50,9 +50,9 @@ class WheelNoise:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            least = 0.0 if field.name in {"slip", "scale"} else math.ulp(0.0)
-            if not least <= value < math.inf:
-                bound = "0 or more" if least == 0.0 else "above 0"
+            may_be_zero = field.name in {"slip", "scale"}
+            if not 0.0 <= value < math.inf or (value == 0.0 and not may_be_zero):
+                bound = "0 or more" if may_be_zero else "above 0"
                 raise InvalidInput(f"the noise {field.name!r} of wheels is finite and {bound}; got {value!r}")
 
     def covariance(self, along: float, across: float = 0.0, *, has_lateral: bool = True) -> Floats:
