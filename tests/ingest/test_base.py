@@ -27,6 +27,7 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
+from zstate.wire.native import ENCODINGS, decode, encode
 
 LONGER = load_model(RRBOT.urdf.replace('xyz="0 0 0.6"', 'xyz="0 0 0.9"'))
 SWAPPED = load_model(RRBOT.urdf.replace('name="shoulder"', 'name="aa"'))
@@ -342,6 +343,15 @@ def test_changed_model_replaces_the_robot_and_its_history():
     case.receive(case.sample(1, [0.3, 0.4]))
     assert case.elbow_is([0.3, 0.4])
     assert case.counters.stats().refused == {}
+
+
+def test_repeated_description_leaves_the_history(case: IngestCase):
+    payload = encode(description())
+    case.ingest.describe(decode(payload, ENCODINGS[RobotDescription], RobotDescription))
+    case.receive(case.sample(0, [0.1, 0.2]), case.sample(1, [0.3, 0.4]))
+    case.ingest.describe(decode(payload, ENCODINGS[RobotDescription], RobotDescription))
+    assert case.elbow_is([0.1, 0.2], at=0)
+    assert case.elbow_is([0.3, 0.4], at=1)
 
 
 def test_another_joint_order_than_the_models_is_refused():

@@ -265,6 +265,17 @@ def test_robot_that_places_nothing_yet_may_be_placed_by_any_frame():
     assert network.edges == {("r2/map", "r1/laser"), ("r1/laser", "r1/mirror")}
 
 
+def test_robots_own_frames_are_compared_with_every_remaining_edge_after_another_was_withdrawn():
+    network = Network()
+    network.ownership.add_robot("r1")
+    network.statics("r2", "site", ("map", "r1/laser"))
+    network.statics("r3", "shelf", ("map", "r1/lamp"))
+    network.writer("r3", "shelf").withdraw()
+    network.statics("r1", "mount", ("base", "camera"))
+    assert network.edges == {("r1/base", "r1/camera")}
+    assert network.refused == {"foreign frame": 1}
+
+
 def test_other_writers_may_place_the_root_in_their_frames_and_in_unowned_ones():
     for network in in_every_order(
         set_statics("cell", "site", ("map", "r1/world")),
