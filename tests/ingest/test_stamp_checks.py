@@ -71,8 +71,9 @@ def test_lag_that_grows_by_less_than_a_second_is_not_logged(caplog, ages_s):
     assert warning_count(caplog, ages_s) == 0
 
 
-def test_backlog_after_a_pause_starts_with_its_own_least_age(caplog):
-    assert warning_count(caplog, [1.0, 4.0, 7.0], every_s=2.5) == 0
+@pytest.mark.parametrize(("pause_s", "expected"), [(2.0, 1), (2.001, 0)])
+def test_backlog_after_more_than_two_seconds_starts_with_its_own_least_age(caplog, pause_s, expected):
+    assert warning_count(caplog, [1.0, 2.9], every_s=pause_s) == expected
 
 
 def test_threads_share_the_checks(monkeypatch: pytest.MonkeyPatch):

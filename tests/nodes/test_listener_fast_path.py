@@ -467,6 +467,24 @@ def test_removed_robot_is_refused_as_by_the_long_way(sessions):
             assert (stats.received, stats.refused) == (4, {"removed robot": 2})
 
 
+def test_clock_that_is_set_back_starts_a_new_epoch_as_by_the_long_way(sessions):
+    writer = Writer(0, "zstate/r1/joint_states", JointState, session=7)
+    with pair(sessions[1], "r1", "joint_states") as receivers:
+        for receiver in receivers:
+            ingest = receiver.listener._ingest_for(receiver.listener._samples, "r1", 7)
+            ingest.describe(description())
+        stamps = list[int]()
+        for period_ms in (1, 1, 1, -500, 1, 1):
+            message = writer.after(period_ms * MILLISECOND)
+            stamps.append(writer.stamp)
+            for receiver in receivers:
+                receiver.receive("joint_states", [message])
+        # Two samples show that the clock was set back; the second one is the first of the new epoch.
+        for receiver in receivers:
+            assert receiver.listener.buffer.joint_states("r1").stamps.tolist() == stamps[-2:]
+            assert [event.kind for event in receiver.listener.events()] == ["set back"]
+
+
 @pytest.mark.parametrize("round_number", range(8))
 def test_no_sample_is_lost_to_other_threads(sessions, round_number):
     """History arrives, the writer is announced, and its track is split, while samples are inserted."""
