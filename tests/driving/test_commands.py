@@ -178,6 +178,17 @@ def _send(targets: Targets, session: int, arrived: int, ttl_ns: int = TTL) -> No
     targets.accept(Command(session, arrived, at, np.zeros(1), arrived, arrived + ttl_ns))
 
 
+def test_a_velocity_whose_command_has_expired_ends_while_another_joint_is_commanded():
+    targets, turning = Targets(2), Rate("velocity", 0.5)
+    targets.accept(Command(1, 0, NO_COLUMNS, NO_POSITIONS, 0, TTL, rates={1: turning}))
+    targets.accept(Command(1, 1, np.array([0]), np.zeros(1), 0, 2 * TTL))
+    targets.current(TTL - 1, lambda: np.zeros(2))
+    assert targets.rates == {1: turning}
+    targets.current(TTL, lambda: np.zeros(2))
+    assert targets.rates == {1: None}
+    assert targets.is_live(TTL)
+
+
 def test_a_commander_whose_token_vanishes_for_a_moment_stays_the_only_one_while_it_sends():
     targets = Targets(1)
     _send(targets, 1, TICK)

@@ -12,6 +12,7 @@ from zstate.wire.messages import DriverState
 def test_a_driver_that_has_sent_no_state_for_half_a_second_is_gone_or_frozen(age_s: float, is_live: bool):
     state = DriverState(0, 5, "host", "ready", "", ("elbow",), 250_000_000)
     assert ReceivedState(state, age_s).is_live == is_live
+    assert str(ReceivedState(state, age_s)) == ("ready" if is_live else "silent for 500.0 ms, was ready")
 
 
 def test_durations_are_reported_in_microseconds():

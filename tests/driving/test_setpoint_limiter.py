@@ -277,6 +277,18 @@ def test_a_velocity_towards_a_limit_ends_there_at_rest_also_if_the_joint_follows
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
+def test_near_a_limit_the_velocity_is_that_which_takes_0_2625_s_and_a_step_for_the_room(side: float):
+    limiter, _ = in_modes(acceleration=math.inf, velocity=2.0)
+    room = 0.05
+    limiter.observe(np.array([side * (2.0 - room)]), None, 0)
+    limiter.step([0.0], DT, rates={0: Rate("velocity", side)})  # enters the mode
+    limiter.observe(np.array([side * (2.0 - room)]), None, 1)
+    found = limiter.step([0.0], DT, rates={0: Rate("velocity", 2.0 * side)})
+    # T = 0.2 s of the approach, and s = 0.05 s (1 + 0.05 s / T) of a lag.
+    assert found.velocities[0] == pytest.approx(side * room / (DT + 0.0625 + 0.2))
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_joint_outside_its_limits_turns_inwards_only(side: float):
     limiter, _ = in_modes(position=side * 2.1, acceleration=math.inf)
     limiter.observe(np.array([side * 2.1]), None, 0)
@@ -295,6 +307,16 @@ def test_after_a_velocity_the_joint_brakes_in_that_mode_and_then_holds_its_posit
     assert [one.modes[0] for one in braking].index("position") == pytest.approx(225, abs=2)
     assert braking[124].velocities[0] == pytest.approx(0.0, abs=1e-12)
     assert braking[-1].positions[0] == pytest.approx(braking[124].positions[0], abs=1e-12)
+
+
+def test_a_joint_in_mode_velocity_has_moved_on_while_a_setpoint_could_not_be_written():
+    limiter, _ = in_modes(acceleration=math.inf)
+    turning = {0: Rate("velocity", 0.5)}
+    last = limiter.step([0.0], DT, rates=turning)
+    limiter.step([0.0], DT, rates=turning)
+    limiter.resume(last, 0.1)
+    found = limiter.step([0.0], DT, rates=turning)
+    assert found.positions[0] == pytest.approx(last.positions[0] + 0.5 * (0.1 + DT))
 
 
 def test_setpoints_that_could_not_be_written_are_no_time_at_rest():

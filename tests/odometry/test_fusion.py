@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from zstate.odometry.fusion import (
+    Displacement,
     Estimate,
     Fusion,
     Heading,
@@ -182,6 +183,29 @@ def test_a_silence_of_all_for_more_than_half_a_second_is_a_pause(silent: int, is
     assert (paused.pause is not None) == is_pause
 
 
+def test_in_a_pause_the_base_may_turn_by_0_5_rad_per_s_and_drive_at_2_m_per_s():
+    estimate = sampled(at_rest(), 100)
+    coasted = FUSION.predicted(estimate, estimate.stamp + S // 2, None)
+    paused = FUSION.predicted(estimate, estimate.stamp + S // 2 + 2 * S, None)
+    added = np.diag(paused.state.covariance - coasted.state.covariance)
+    assert added[ROTATION] == pytest.approx([0.0, 0.0, (0.5 * 2.0) ** 2])
+    assert added[POSITION] == pytest.approx([(2.0 * 2.0) ** 2] * 3)
+    assert added[GYRO_BIAS] == pytest.approx([1e-5**2 * 2.0] * 3)
+
+
+def test_a_way_of_wheels_over_a_pause_is_unsure_by_a_part_of_it():
+    before = sampled(at_rest(), 100)
+    paused = FUSION.predicted(before, before.stamp + 3 * S, None)
+    way, turn = 2.0, 0.5
+    reading = Displacement(paused.stamp, before.stamp, np.array([way, 0.0, 0.0]), turn, np.eye(4))
+    after, outcome = FUSION.after_pause(paused, reading, None)
+    assert outcome is not None
+    added = np.diag(after.state.covariance - before.state.covariance)
+    # The place along the way, which the turns before the pause do not move.
+    assert added[POSITION][0] == pytest.approx((0.02 + 0.3 * way) ** 2)
+    assert added[ROTATION] == pytest.approx([0.02**2, 0.02**2, (0.02 + 0.3 * turn) ** 2])
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_base_stands_up_to_5_mm_per_s_and_0_02_rad_per_s(axis: int):
     zero, one = np.zeros(3), np.eye(3)[axis]
@@ -269,6 +293,26 @@ def compared(apart: float, bias_sigma: float, *, was_at_rest: bool) -> Estimate:
         upright=np.array([0.0, 0.0, 1.0]),
     )
     return FUSION.after_reading(estimate, "wheels", reading, None)[0]
+
+
+def test_the_tilt_of_a_mount_is_told_in_degrees():
+    tilts: dict[int, np.ndarray] = {}
+    for sector in range(8):
+        estimate = at_rest((sector + 0.5) * math.tau / 12)._replace(tilts=tilts)
+        upright = rotation_exp(np.array([0.0, math.radians(5.0), 0.0]))[2]
+        unsure = Measurement(np.zeros(3), np.eye(3, 15), 1e12 * np.eye(3))
+        reading = Reading(0, lambda _state, _rate, unsure=unsure: unsure, is_still=False, upright=upright)
+        tilts = FUSION.after_reading(estimate, "wheels", reading, None)[0].tilts
+    (remark,) = imu_remarks(at_rest()._replace(tilts=tilts))
+    assert remark.startswith("the base is tilted by 5 degrees whichever way it heads")
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.003, 0.006])
+def test_a_bias_that_wheels_agree_with_is_as_sure_as_that_of_calibrated_gyros_or_as_they_agree(apart: float):
+    found = compared(apart, 0.05, was_at_rest=False)
+    variance = 0.002**2 + max(0.0, apart**2 - RADII**2)
+    row = GYRO_BIAS.start + 2
+    assert found.state.covariance[row, row] == pytest.approx(variance, rel=1e-3)
 
 
 RADII = 0.004

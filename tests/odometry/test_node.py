@@ -384,17 +384,24 @@ def test_readings_of_other_sources_are_published_once_the_imu_is_silent_for_more
 
 
 def test_time_that_goes_back_is_published_from_there_on(sessions):
-    with imu_to_node(sessions, clock=ManualClock(STAMP)) as (imu, node):
+    stamps: list[int] = []
+    first = STAMP - 10**11
+    with (
+        imu_to_node(sessions, clock=ManualClock(STAMP)) as (imu, node),
+        subscribe(sessions[0], get_wire("native"), "r1", "odometry", _stamps_into(stamps)),
+    ):
         for _ in range(2):
-            ticks = iter(range(STAMP - 10**11, STAMP, 10_000_000))
-            published = node.published
+            ticks = iter(range(first, STAMP, 10_000_000))
+            count = len(stamps)
 
             def publish() -> None:
                 imu.publish([0, 0, 0], [0, 0, 9.80665], next(ticks))  # noqa: B023
 
-            until(lambda: publish() or node.published > published + 300)  # noqa: B023
+            until(lambda: publish() or len(stamps) > count + 300)  # noqa: B023
         assert node.base.epoch == 1
-        assert node.state().stamp < STAMP - 10**11 + 99 * 10**9
+        assert node.state().stamp < first + 99 * 10**9
+    (back,) = [later for earlier, later in itertools.pairwise(stamps) if later < earlier]
+    assert first < back < first + 10**10  # half a second of readings confirms it
 
 
 def test_exceptions_of_a_callback_are_counted_and_the_next_messages_arrive(sessions):

@@ -43,6 +43,12 @@ def test_a_car_on_a_circle_has_its_inner_front_wheel_steered_more():
     assert angles["sr"] == pytest.approx(math.atan(2.5 / (10.0 + 0.7)))
 
 
+def test_mecanum_wheels_turn_a_base_in_place_by_half_of_track_and_wheelbase():
+    rates = MECANUM.joint_velocities((0.0, 0.0, 0.0), (0.0, 0.0, 0.4))
+    rim = 0.5 * (0.5 + 0.6) * 0.4 / 0.1
+    assert rates == pytest.approx({"fl": -rim, "fr": rim, "rl": -rim, "rr": rim})
+
+
 def test_positions_that_wrap_at_a_half_turn_are_short_rotations():
     before, after = {"left": 3.1, "right": 3.1}, {"left": -3.1, "right": -3.1}
     measured = DIFF.velocity(before, after, 1.0)
