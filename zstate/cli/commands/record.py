@@ -24,10 +24,10 @@ from zstate.cli.output.console import (
 )
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
-from zstate.clock import Clock, MonotonicClock
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
+    from zstate.clock import Clock
     from zstate.errors import RecordingError
     from zstate.metrics.endpoint import BindAddress
     from zstate.recording.recorder import Recorder, RecorderStats
@@ -241,6 +241,8 @@ class RecordProgress:
         robots: Sequence[str],
         retention: Retention | None = None,
     ) -> None:
+        from zstate.clock import MonotonicClock
+
         self._recorder, self._directory, self._robots = recorder, directory, robots
         self._retention, self._retained_at = retention, 0
         self._disk = DiskForecast(lambda: recorder.stats, retention, MonotonicClock())
