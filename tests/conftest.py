@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from helpers.processes import Child, find_free_port, until
 from helpers.requirements import REQUIREMENTS
+from helpers.tokens import have_met
 from hypothesis import settings
 
 from zstate.net.session import Session, connect
@@ -121,8 +122,9 @@ def rendezvous(monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture
 def sessions() -> Iterator[tuple[Session, Session]]:
-    """A session for publishers and a session for readers."""
+    """A session for publishers and a session for readers, which have met."""
     with connect() as writer, connect() as reader:
+        until(lambda: have_met(writer, reader) and have_met(reader, writer))
         yield writer, reader
 
 

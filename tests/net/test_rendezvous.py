@@ -6,6 +6,7 @@ import time
 
 import pytest
 from helpers.processes import DEADLINE_S, Child, until
+from helpers.tokens import have_met
 
 from zstate.errors import ConfigError
 from zstate.net.rendezvous import rendezvous_addresses, silent_addresses
@@ -73,10 +74,6 @@ def test_rendezvous_port_is_taken_over_when_its_session_closes():
     with connect() as newcomer:
         until(lambda: heir.zid in [str(zid) for zid in newcomer.zenoh.info.peers_zid()])
     heir.close()
-
-
-def have_met(one: Session, other: Session) -> bool:
-    return other.zid in [str(zid) for zid in one.zenoh.info.peers_zid()]
 
 
 def connect_while_closing(owner: Session, delay_s: float) -> Session:
