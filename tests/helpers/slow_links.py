@@ -7,6 +7,7 @@ second, "killed", "frozen" or "cut", number of trials.
 from __future__ import annotations
 
 import json
+import math
 import mmap
 import os
 import struct
@@ -106,7 +107,7 @@ def trial(bytes_per_s: float, command_hz: float, fault: Fault, drive_s: float) -
             "arm",
             rate_hz=RATE_HZ,
             ttl_s=TTL_S,
-            limits=Limits.of(RRBOT, velocity=2.0),
+            limits=Limits.of(RRBOT, velocity=2.0, acceleration=math.inf),  # at rest without time to brake
         ) as host,
     ):
         file.write(bytes(16))
