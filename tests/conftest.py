@@ -1,12 +1,15 @@
 """What runs, and what every test has: a rendezvous, free ports, sessions, processes that end with it.
 
-``pytest`` runs the tests that need pip's packages only. ``--system`` adds those that need more, each with the
-marker of its requirement (helpers/requirements.py); ``--soak`` adds long trials.
+``pytest`` runs the tests that need pip's packages only, and little time. ``--system`` adds those that need more,
+each with the marker of its requirement (helpers/requirements.py); ``--long`` those that compute for seconds, as
+on a whole recording; ``--soak`` trials by the hundred.
 """
 
 from __future__ import annotations
 
+import gc
 import os
+import signal
 import sys
 import threading
 from collections import Counter
@@ -41,24 +44,37 @@ settings.load_profile("zstate")
 
 LEFT_OUT = pytest.StashKey[Counter[str]]()
 SYSTEM = "need system packages, root, a browser or other interpreters; `pytest --system` runs them"
-SOAK = "are long trials; `pytest --soak` runs them"
+LONG = "compute for seconds each; `pytest --long` runs them"
+SOAK = "are trials by the hundred; `pytest --soak` runs them"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--system", action="store_true", help="also tests that need more than pip's packages")
-    parser.addoption("--soak", action="store_true", help="also long trials")
+    parser.addoption("--long", action="store_true", help="also tests that compute for seconds each")
+    parser.addoption("--soak", action="store_true", help="also trials by the hundred")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[LEFT_OUT] = Counter()
+    # Collection makes 100,000 objects that stay: searching them for garbage takes a third of its time.
+    gc.disable()
+    # Processes of tests would inherit what nohup and shells make of a program in the background.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
     for name, requirement in REQUIREMENTS.items():
         config.addinivalue_line("markers", f"{name}: runs with --system; {requirement.install}")
     config.addinivalue_line("markers", "system: has one of those markers")
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    if any(item.get_closest_marker(name) for name in REQUIREMENTS):
+    if not REQUIREMENTS.keys().isdisjoint(marker.name for marker in item.iter_markers()):
         item.add_marker("system")
+
+
+def pytest_collection_finish() -> None:
+    gc.enable()
+    gc.freeze()
 
 
 @cache
@@ -67,13 +83,16 @@ def is_met(requirement: str) -> bool:
 
 
 def reason_to_leave_out(item: pytest.Item) -> str | None:
-    if item.get_closest_marker("soak") and not item.config.getoption("--soak"):
+    markers = {marker.name for marker in item.iter_markers()}
+    if "soak" in markers and not item.config.getoption("--soak"):
         return SOAK
-    needed = [name for name in REQUIREMENTS if item.get_closest_marker(name)]
+    needed = [name for name in REQUIREMENTS if name in markers]
     if needed and not item.config.getoption("--system"):
         return SYSTEM
     missing = next((name for name in needed if not is_met(name)), None)
-    return f"need what the marker {missing!r} names: {REQUIREMENTS[missing].install}" if missing else None
+    if missing:
+        return f"need what the marker {missing!r} names: {REQUIREMENTS[missing].install}"
+    return LONG if "long" in markers and not item.config.getoption("--long") else None
 
 
 @pytest.hookimpl(trylast=True)  # after -m and -k

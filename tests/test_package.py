@@ -62,6 +62,7 @@ def wheel(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build("wheel", source, tmp_path_factory.mktemp("wheel"))
 
 
+@pytest.mark.long
 def test_wheel_holds_only_the_code_and_the_robots(wheel: Path):
     code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "zstate").rglob("*.py")}
     robots = {f"zstate/models/{path.name}" for path in (ROOT / "models").iterdir() if path.is_file()}
@@ -69,6 +70,7 @@ def test_wheel_holds_only_the_code_and_the_robots(wheel: Path):
     assert shipped == code | robots | {"zstate/py.typed", "zstate/_kernel.pyi"}
 
 
+@pytest.mark.long
 def test_wheel_metadata_names_licence_and_command(wheel: Path):
     with zipfile.ZipFile(wheel) as archive:
         texts = {
@@ -79,12 +81,14 @@ def test_wheel_metadata_names_licence_and_command(wheel: Path):
     assert texts["LICENSE"] == (ROOT / "LICENSE").read_text()
 
 
+@pytest.mark.long
 def test_wheel_built_from_the_sdist_is_the_same(wheel: Path, sdist: Path, tmp_path: Path):
     shutil.unpack_archive(sdist, tmp_path / "source")
     (source,) = (tmp_path / "source").iterdir()
     assert names_in(build("wheel", source, tmp_path / "wheel")) == names_in(wheel)
 
 
+@pytest.mark.long
 def test_wheel_without_a_compiler_lacks_only_the_extension(
     source: Path, wheel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -95,6 +99,7 @@ def test_wheel_without_a_compiler_lacks_only_the_extension(
     assert names_in(made) == names_in(wheel) - extension(wheel)
 
 
+@pytest.mark.long
 def test_sdist_holds_every_file_of_the_repository(source: Path, sdist: Path):
     with tarfile.open(sdist) as archive:
         shipped = {one.name.partition("/")[2] for one in archive if one.isfile()}

@@ -142,6 +142,7 @@ def test_table_has_used_rejected_nis_sigma_and_delay_of_each_source(tmp_path: Pa
     assert rows["imu"].endswith("-")
 
 
+@pytest.mark.long
 def test_sigma_that_would_fit_is_that_of_the_sensor(tmp_path: Path):
     """A sensor of x alone, in time: its y and z are exact, so that the mean of three numbers is 1/3 of x."""
     settings = replace(
@@ -157,7 +158,7 @@ def test_sigma_that_would_fit_is_that_of_the_sensor(tmp_path: Path):
     assert fitting == pytest.approx([factor * 0.2 * FLOW_SIGMA, factor, factor], rel=0.05)
 
 
-@pytest.mark.parametrize("stream", ["pose/mocap", "odometry/laser"])
+@pytest.mark.parametrize("stream", ["pose/mocap", pytest.param("odometry/laser", marks=pytest.mark.long)])
 def test_reference_gives_ate_error_at_the_end_and_nees(tmp_path: Path, stream: str):
     path = str(recorded(tmp_path / "r.mcap"))
     name = ReferenceName(*stream.split("/"), sigma=MOCAP_SIGMA)
@@ -180,6 +181,7 @@ def test_reference_gives_ate_error_at_the_end_and_nees(tmp_path: Path, stream: s
     assert re.search(r"error at the end \d.\d sigma .*; NEES of x y \d.\d\d \(2 is right", text)
 
 
+@pytest.mark.long
 def test_bag_of_ros_has_sources_and_references_by_the_names_of_their_topics(tmp_path: Path):
     """/imu/data, /wheels/twist without covariance, and nav_msgs/Odometry of a reference."""
     types = STORE.types
@@ -221,6 +223,7 @@ def test_bag_of_ros_has_sources_and_references_by_the_names_of_their_topics(tmp_
     assert replayed.delays["wheels_twist"].delay_s == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.long
 def test_reference_without_noise_has_no_errors_in_sigmas(tmp_path: Path):
     path = str(recorded(tmp_path / "r.mcap"))
     replayed = replay(path, "r1", SETTINGS, ReferenceName("pose", "mocap"))

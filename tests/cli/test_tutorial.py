@@ -108,10 +108,12 @@ def test_the_pages_show_the_files_of_their_folder(page: str, files: dict[str, st
         assert blocks(language, (FOLDER / page).read_text()) == [(FOLDER / name).read_text()]
 
 
+@pytest.mark.long
 def test_the_terminal_blocks_match_real_output(folder: Path, without_xacro: None):
     check_page(TutorialPage((FOLDER / "README.md").read_text()), folder)
 
 
+@pytest.mark.long
 def test_the_terminals_of_driving_match_real_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name in ("tutorial", "drivers"):
         shutil.copytree(FOLDER.parent / name, tmp_path / name)

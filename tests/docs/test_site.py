@@ -12,6 +12,7 @@ from itertools import chain
 from pathlib import Path
 
 import click
+import pytest
 
 from zstate.cli.main import group
 
@@ -102,6 +103,7 @@ def pages_without_link(site: Path) -> list[str]:
     return [str(page) for page in pages if f'href="{page}"' not in contents and page.stem != "index"]
 
 
+@pytest.mark.long
 def test_site_is_complete_and_loads_nothing_from_other_hosts(tmp_path: Path) -> None:
     build(tmp_path)
     assert addresses_on_other_hosts(tmp_path) == []

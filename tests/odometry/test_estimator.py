@@ -86,6 +86,7 @@ def health_of(base: BaseEstimator, name: str) -> SourceHealth:
     return next(health for health in base.health() if health.name == name)
 
 
+@pytest.mark.long
 def test_errors_are_as_large_as_their_covariances_with_a_source_late_and_shuffled():
     """In 25 runs of 6 s in 3D, from rest, with a turned IMU; ``bench/micro/odometry.py`` has 100."""
     runs = 25
@@ -412,6 +413,7 @@ def drive_roughly(seed: int, *, compass: bool) -> tuple[float, list[float], floa
     return float(np.linalg.norm(error)), squares, reckoned
 
 
+@pytest.mark.long
 def test_a_rough_drive_is_inside_its_claim_with_a_bad_compass_and_better_than_dead_reckoning():
     runs = [drive_roughly(seed, compass=compass) for seed in range(2) for compass in (False, True)]
     errors, squares, reckoned = zip(*runs, strict=True)

@@ -394,6 +394,7 @@ def findings(fault: Fault, found: Run) -> list[str]:
     return wrong
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.soak if name in SIMILAR else ()) for name in FAULTS]
 )
@@ -402,9 +403,9 @@ def test_a_fault_leaves_the_estimate_inside_its_claim_or_is_named(name: str):
     assert findings(FAULTS[name], found) == []
 
 
-def test_a_base_without_faults_has_no_sentence():
-    for seed in range(3):
-        assert played(FAULTS["none"], seed).sentences == {}
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
+def test_a_base_without_faults_has_no_sentence(seed: int):
+    assert played(FAULTS["none"], seed).sentences == {}
 
 
 def test_stamps_that_go_back_begin_anew():

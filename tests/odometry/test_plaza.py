@@ -62,6 +62,7 @@ def mean_nees(points: Floats, covariances: Floats, data: plaza.Plaza) -> float:
     return float(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)[scored].mean())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["Plaza2", pytest.param("Plaza1", marks=pytest.mark.soak)])
 def test_a_real_mower_is_found_as_well_as_by_dead_reckoning(name: str):
     """Plaza1: 1.5 m after 1861 m. Plaza2 starts with a gyro bias, which standstill shows: 5.4 m, not 16.

@@ -33,13 +33,6 @@ def jackal() -> Recording:
     return recordings.load("jackal")
 
 
-@cache
-def track_of(*, as_joints: bool = False, has_compass: bool = False, start: float = 0.0) -> Track:
-    """A replay of the recording, once for all tests of it."""
-    calls = calls_of(husky(), as_joints=as_joints, has_compass=has_compass, start=start)
-    return played(husky(), calls, wheels=WHEELS if as_joints else None, reads_live=True)
-
-
 def dead_reckoning(start: float = 0.0) -> float:
     t, path = recordings.dead_reckoned(husky(), start=start)
     return recordings.error_of(husky(), t, path)
@@ -86,40 +79,30 @@ def test_wheels_and_gyro_alone_are_three_metres_off_after_359_metres():
     ("as_joints", "has_compass", "start"),
     [
         pytest.param(False, False, 0.0, id="velocity-no compass-in motion"),
-        pytest.param(True, True, 0.0, id="joints-bad compass-in motion"),
-        pytest.param(False, True, HUSKY_REST_S, id="velocity-bad compass-at rest"),
-        pytest.param(True, False, HUSKY_REST_S, id="joints-no compass-at rest"),
+        pytest.param(True, True, 0.0, id="joints-bad compass-in motion", marks=pytest.mark.long),
+        pytest.param(False, True, HUSKY_REST_S, id="velocity-bad compass-at rest", marks=pytest.mark.long),
+        pytest.param(True, False, HUSKY_REST_S, id="joints-no compass-at rest", marks=pytest.mark.long),
         pytest.param(False, True, 0.0, id="velocity-bad compass-in motion", marks=pytest.mark.soak),
         pytest.param(True, False, 0.0, id="joints-no compass-in motion", marks=pytest.mark.soak),
         pytest.param(False, False, HUSKY_REST_S, id="velocity-no compass-at rest", marks=pytest.mark.soak),
         pytest.param(True, True, HUSKY_REST_S, id="joints-bad compass-at rest", marks=pytest.mark.soak),
     ],
 )
-def test_a_husky_is_found_as_well_as_by_dead_reckoning_and_inside_its_claim(
+def test_a_husky_is_found_as_well_as_by_dead_reckoning_inside_its_claim_and_continuously(
     as_joints: bool, has_compass: bool, start: float
 ):
-    track = track_of(as_joints=as_joints, has_compass=has_compass, start=start)
+    """REP-105: no state is further from the last one than its velocity explains, at 10 Hz."""
+    calls = calls_of(husky(), as_joints=as_joints, has_compass=has_compass, start=start)
+    track = played(husky(), calls, wheels=WHEELS if as_joints else None, reads_live=True)
     found = score(husky(), track)
     assert found.error <= NO_WORSE * dead_reckoning(start)
     assert found.end_sigmas < THREE_SIGMA
     assert found.nees < 4.0  # 2 is expected, of errors that are one sample
     assert track.way == pytest.approx(359.0 if start == 0.0 else 130.0, rel=0.03)
+    assert track.longest_jump < 0.1
 
 
-@pytest.mark.parametrize(
-    ("as_joints", "has_compass"),
-    [
-        pytest.param(False, False, id="velocity-no compass"),
-        pytest.param(True, True, id="joints-bad compass"),
-        pytest.param(False, True, id="velocity-bad compass", marks=pytest.mark.soak),
-        pytest.param(True, False, id="joints-no compass", marks=pytest.mark.soak),
-    ],
-)
-def test_a_pose_in_odom_is_continuous(as_joints: bool, has_compass: bool):
-    """REP-105: no state is further from the last one than its velocity explains, at 10 Hz."""
-    assert track_of(as_joints=as_joints, has_compass=has_compass).longest_jump < 0.1
-
-
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("as_joints", "wheel_step"),
     [
@@ -138,6 +121,7 @@ def test_slow_sensors_cost_accuracy_and_no_more(as_joints: bool, wheel_step: int
     assert found.end_sigmas < THREE_SIGMA
 
 
+@pytest.mark.long
 def test_wheels_five_percent_too_fast_are_inside_the_claim():
     calls = [
         call._replace(values=(tuple(1.05 * part for part in call.values[0]),))
@@ -150,6 +134,7 @@ def test_wheels_five_percent_too_fast_are_inside_the_claim():
     assert found.end_sigmas < THREE_SIGMA
 
 
+@pytest.mark.long
 def test_a_gyro_whose_bias_is_far_off_is_inside_the_claim():
     """0.02 rad/s, two sigmas of a start in motion: a quarter of a turn in each 80 s."""
     found, _ = changed_score(imu_in_base(1.0, 0.02))
@@ -157,6 +142,7 @@ def test_a_gyro_whose_bias_is_far_off_is_inside_the_claim():
     assert found.end_sigmas < THREE_SIGMA
 
 
+@pytest.mark.long
 def test_a_mount_that_is_wrong_by_five_degrees_costs_little_and_is_named():
     """It tilts the base, so the height is many sigmas off: the sentence says so."""
     angle = math.radians(5.0)
@@ -170,6 +156,7 @@ def test_a_mount_that_is_wrong_by_five_degrees_costs_little_and_is_named():
     assert "the mount of the IMU is off" in track.sentences["imu"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["velocity", "imu"])
 def test_thirty_seconds_without_a_source_are_inside_the_claim(kind: str):
     found, track = changed_score(without(kind, 150.0, 180.0))
@@ -195,6 +182,7 @@ def test_a_gyro_that_contradicts_the_wheels_is_named_and_the_base_does_not_fly_o
     assert np.linalg.norm(track.live[:, 4:], axis=1).max() < 3.0  # it drives 1 m/s
 
 
+@pytest.mark.long
 def test_late_and_shuffled_data_of_a_recording_change_nothing():
     random = np.random.default_rng(0)
     calls = calls_of(husky())[:6000]

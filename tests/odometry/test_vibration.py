@@ -85,6 +85,7 @@ def check(ends: Sequence[Errors], bound: float, *, has_exact_noise: bool) -> Non
         assert 0.1 * freedom < mean < 1.2 * high, squares
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
@@ -99,6 +100,7 @@ def test_vibration_leaves_the_end_inside_its_claim(kind: str, name: str):
     check(ends, END_SIGMAS, has_exact_noise=False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_end_of_a_drive_is_inside_its_claim(kind: str):
     rest_s = 0.0 if kind == "velocity" else 3.0
