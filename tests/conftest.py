@@ -1,8 +1,8 @@
 """What runs, and what every test has: a rendezvous, free ports, sessions, processes that end with it.
 
-``pytest`` runs the tests that need pip's packages only, and little time. ``--system`` adds those that need more,
-each with the marker of its requirement (helpers/requirements.py); ``--long`` those that compute for seconds, as
-on a whole recording; ``--soak`` trials by the hundred.
+``pytest`` runs the tests that need pip's packages only, and little time. ``--system`` adds those that need
+more, each with the marker of its requirement (helpers/requirements.py); ``--long`` those that compute for
+seconds, as on a whole recording; ``--soak`` trials by the hundred.
 """
 
 from __future__ import annotations

@@ -78,6 +78,7 @@ def test_three_terminals_print_the_pose_of_the_hand(
 
 
 @pytest.mark.robots
+@pytest.mark.long
 def test_view_with_sliders_prints_its_address(start: Callable[[list[str]], subprocess.Popen[str]]) -> None:
     _, sliders, _ = commands(section(TEXT, "## See it"))
     view = start([*sliders, "--port", "0"])
@@ -86,6 +87,7 @@ def test_view_with_sliders_prints_its_address(start: Callable[[list[str]], subpr
 
 
 @pytest.mark.robots
+@pytest.mark.long
 def test_robots_of_the_picture_are_published_in_the_hall(
     start: Callable[[list[str]], subprocess.Popen[str]],
 ) -> None:

@@ -90,6 +90,7 @@ def test_report_lists_the_settings_of_every_subject(results: Results) -> None:
         assert f"- **{title}** ({name} 1.0): how {name} is set." in text
 
 
+@pytest.mark.long
 def test_plots_are_written_next_to_the_report_and_shown_in_it(results: Results) -> None:
     pytest.importorskip("matplotlib")
     plots = write_plots(results)

@@ -42,6 +42,7 @@ def test_floor_at_50_hz_loses_nothing_and_reports_its_costs() -> None:
 
 
 @pytest.mark.robots
+@pytest.mark.long
 def test_zstate_answers_correctly_and_a_late_joiner_gets_the_whole_tree() -> None:
     subject = subject_named("zstate_peer")
     facts = run_trial(subject, Scenario("rate", "panda", 50.0, seconds=1.0))

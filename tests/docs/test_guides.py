@@ -43,6 +43,7 @@ def test_every_file_of_a_guide_is_used_in_its_terminals(guide: str) -> None:
 
 
 @pytest.mark.parametrize("guide", GUIDES)
+@pytest.mark.long
 def test_terminals_print_what_the_guide_shows(
     guide: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

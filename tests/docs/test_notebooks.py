@@ -44,6 +44,7 @@ def texts(book: NotebookNode) -> list[list[str]]:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("name", ["live_lookups", pytest.param("training_set", marks=pytest.mark.robots)])
+@pytest.mark.long
 def test_a_notebook_runs_and_gives_the_outputs_that_it_has(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

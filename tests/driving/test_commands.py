@@ -115,6 +115,7 @@ def random_command(
 
 
 @pytest.mark.parametrize("modes", [MODES, MODES[:2], MODES[1:], MODES[1:2]], ids="-".join)
+@pytest.mark.long
 def test_no_sequence_of_modes_commands_silences_and_stops_exceeds_a_limit(modes: tuple[Mode, ...]):
     generator = np.random.default_rng(19)
     limits = random_limits(generator)

@@ -9,6 +9,7 @@ TICKS = 1000
 
 
 @pytest.mark.parametrize("seeds", [12, pytest.param(200, marks=pytest.mark.soak)])
+@pytest.mark.long
 def test_no_history_of_commands_stops_and_faults_has_a_setpoint_that_must_not_be(seeds: int):
     happened = run_all(range(seeds), TICKS)
     assert happened["tick"] >= seeds * TICKS

@@ -97,6 +97,7 @@ def in_every_order(steps: Sequence[Callable[[Drivers], None]]) -> Iterator[Drive
         yield drivers
 
 
+@pytest.mark.long
 def test_newer_of_two_live_drivers_of_a_joint_counts_in_every_order_of_arrival():
     steps: list[Callable[[Drivers], None]] = [
         lambda drivers: drivers.announce(1, since=100),

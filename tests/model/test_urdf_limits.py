@@ -74,6 +74,7 @@ def test_xml_nesting_and_size_have_limits():
     assert "more than 200000 elements" in errors(robot("<a/>" * 200_000))[0][1]
 
 
+@pytest.mark.long
 def test_many_faults_take_a_time_that_grows_with_their_number():
     def faulty(count: int) -> str:
         links = "".join(f'<link name="{"arm_segment" * 5}_{i}"/>' for i in range(count))

@@ -199,6 +199,7 @@ def test_a_closed_session_refuses_a_query():
         current_tokens(session, "zstate/*/@writer/*/*", 1.0)
 
 
+@pytest.mark.long
 def test_robots_of_a_large_fleet_are_discovered_within_the_default_timeout():
     with connect() as session, connect() as asker, many_tokens(session, 2000):
         until(lambda: len(discover(asker)) == 2000)

@@ -130,6 +130,7 @@ def test_edges_of_an_unannounced_writer_yield_to_those_of_an_announced_one(
     good.publish()
 
 
+@pytest.mark.long
 def test_ten_thousand_sessions_take_little_memory_and_disturb_no_writer(sessions, listener, good: GoodWriter):
     good.publish()
     before = resource_counts()

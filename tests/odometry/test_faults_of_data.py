@@ -307,6 +307,7 @@ def test_sources_are_bounded():
     assert len(base.health()) == 64
 
 
+@pytest.mark.long
 def test_memory_is_bounded_when_the_imu_never_comes_or_comes_once():
     for samples in (0, 1):
         base = estimator(wheels=DiffDrive("left", "right", radius=0.1, track=0.4))

@@ -82,6 +82,7 @@ def measured_run(body: SimulatedBody, steps: int) -> FilterState:
     return state
 
 
+@pytest.mark.long
 def test_errors_of_100_runs_are_as_large_as_the_covariance_states():
     bodies = [SimulatedBody(seed, dt_s=0.02) for seed in range(100)]
     nees = np.array([body.nees(measured_run(body, 180)) for body in bodies])

@@ -220,6 +220,7 @@ class Walk:
         return state
 
 
+@pytest.mark.long
 def test_errors_of_walks_are_as_large_as_the_covariance_states():
     nees = []
     for seed in range(20):

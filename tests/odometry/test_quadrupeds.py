@@ -94,6 +94,7 @@ def motion_of_a_trot() -> Motion:
     return motion
 
 
+@pytest.mark.long
 def test_feet_and_imu_give_the_path_of_a_trot():
     """Truth from the motion alone: Newton's iteration finds the joints, nothing of the estimator is used."""
     motion, random = motion_of_a_trot(), np.random.default_rng(1)

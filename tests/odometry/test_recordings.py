@@ -201,6 +201,7 @@ def test_late_and_shuffled_data_of_a_recording_change_nothing():
         pytest.param(False, False, id="velocity-no compass", marks=pytest.mark.soak),
     ],
 )
+@pytest.mark.long
 def test_a_jackal_that_turns_before_it_drives_keeps_its_yaw(as_joints: bool, has_compass: bool):
     """The raw gyro drifts 1.5 degrees in this minute."""
     calls = calls_of(jackal(), as_joints=as_joints, has_compass=has_compass)

@@ -196,6 +196,7 @@ MEMORY = """
 
 
 @pytest.mark.processes
+@pytest.mark.long
 def test_lookup_many_memory_does_not_grow_with_the_recording(tmp_path: Path, spawn):
     # 40 edges of 64 bytes: 6,000 samples would fill a buffer with 15 MB.
     sizes = {"small": 1_000, "large": 6_000}

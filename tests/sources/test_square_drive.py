@@ -71,6 +71,7 @@ def test_the_pose_moves_as_the_twist_says():
         assert state.speed == pytest.approx(LAP / (PERIOD_NS * 1e-9))
 
 
+@pytest.mark.long
 def test_wheels_turn_as_far_as_the_ground_below_them_passes():
     """From the poses alone: each wheel's contact point, its way, and the rotation in that time."""
     step = PERIOD_NS // 1600

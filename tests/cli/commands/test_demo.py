@@ -151,6 +151,7 @@ def test_other_commands_follow_the_rover_at_the_printed_address(spawn: Spawn):
 
 
 @pytest.mark.processes
+@pytest.mark.long
 def test_rover_without_the_libraries_of_maps_has_no_room():
     with missing_library("PIL"):
         ended = run_cli("demo", "rover", "--seconds", "0.5")

@@ -22,6 +22,7 @@ SETTINGS = str(Path(__file__).parents[3] / "models" / "rover.toml")
 
 
 @pytest.mark.processes
+@pytest.mark.long
 def test_live_odometry_drives_the_rover_and_its_recording_gives_a_report_and_a_plot(
     spawn: Spawn, tmp_path: Path
 ):

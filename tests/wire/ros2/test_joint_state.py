@@ -170,6 +170,7 @@ def test_payloads_of_equal_length_with_other_name_lengths_differ():
             assert decoder.decode(payload) == (5, "", names, to_block([1, 2, 3, 4]), None, None)
 
 
+@pytest.mark.long
 def test_changing_names_do_not_fill_the_memory():
     decoder = JointStateDecoder()
     tracemalloc.start()

@@ -128,6 +128,7 @@ def test_payloads_of_equal_length_with_other_frame_lengths_differ():
             assert decoder.decode(payload) == (5, (5,), edges, to_block(POSE))
 
 
+@pytest.mark.long
 def test_changing_frames_do_not_fill_the_memory():
     decoder = TfMessageDecoder()
     tracemalloc.start()
