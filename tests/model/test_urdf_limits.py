@@ -4,6 +4,7 @@ import gc
 import time
 from collections.abc import Callable
 
+import pytest
 from helpers.urdf_text import ARM, errors, joint, robot
 
 from zstate.model.urdf import parse_urdf

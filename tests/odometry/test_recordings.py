@@ -166,6 +166,7 @@ def test_thirty_seconds_without_a_source_are_inside_the_claim(kind: str):
         assert "silent" in track.sentences["imu"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seconds", [60.0, pytest.param(math.inf, marks=pytest.mark.soak, id="to the end")])
 @pytest.mark.parametrize(
     ("calls", "begin", "sentence"),
