@@ -31,10 +31,10 @@ from zstate import StatePublisher, Transform, TransformListener, connect, load_m
 from zstate.cli.main import _end, run
 from zstate.cli.output import logs
 from zstate.clock import Clock
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 
 RRBOT = str(Path(__file__).parents[2] / "models" / "rrbot.urdf")
-ALL_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
+ALL_STREAMS: tuple[StreamName, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 SHOULDER, ELBOW = 0.5, -0.2
 
 ROVER = """
@@ -220,7 +220,7 @@ def published_robot(
     robot: str = "rrbot",
     positions: Sequence[float] = (SHOULDER, ELBOW),
     *,
-    streams: Sequence[Stream] = ALL_STREAMS,
+    streams: Sequence[StreamName] = ALL_STREAMS,
     velocities: Sequence[float] | None = None,
     model: str = RRBOT,
     wire: str = "native",

@@ -14,17 +14,17 @@ from zstate.ingest.deadline import FLOOR_S
 from zstate.ingest.events import EventLog, StaticEdgeOwners, WriterEvent
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 
-SUBSCRIBED: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "transforms")
-ROS_SHARED: tuple[Stream, ...] = ("tf", "tf_static")
+SUBSCRIBED: tuple[StreamName, ...] = ("robot_description", "tf_static", "joint_states", "transforms")
+ROS_SHARED: tuple[StreamName, ...] = ("tf", "tf_static")
 DRIVER = WriterId("driver", "jetson", 412, 5, 7)
 RESTARTED = WriterId("driver", "jetson", 413, 6, 8)
 REFUSAL = InsertRefused("refused", reason="second writer", edge=("r1/tool", "r1/camera"))
 OTHER = WriterId("simulator", "laptop", 9, 6, 9)
 
 
-def announced(writer: WriterId = DRIVER, stream: Stream = "joint_states", name: str = "") -> Announcement:
+def announced(writer: WriterId = DRIVER, stream: StreamName = "joint_states", name: str = "") -> Announcement:
     return Announcement("r1", stream, writer, name)
 
 

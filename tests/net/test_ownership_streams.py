@@ -22,7 +22,7 @@ from zstate.net.session import Session, connect
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream, writer_key
+from zstate.wire.keys import StreamName, writer_key
 
 FIRST = WriterId("driver", "jetson", 412, 1_000_000_000, 7)
 SECOND = WriterId("simulator", "laptop", 9, 2_000_000_000, 8)
@@ -30,7 +30,7 @@ THIRD = WriterId("twin", "laptop", 10, 3_000_000_000, 9)
 
 
 def announcement(
-    writer: WriterId, stream: Stream = "joint_states", name: str = "", robot: str = "r1"
+    writer: WriterId, stream: StreamName = "joint_states", name: str = "", robot: str = "r1"
 ) -> Announcement:
     return Announcement(robot, stream, writer, name)
 

@@ -20,7 +20,7 @@ from zstate.net.presence import (
 )
 from zstate.net.session import Session, connect
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream, check_writer, writer_key
+from zstate.wire.keys import StreamName, check_writer, writer_key
 from zstate.wire.registry import get_wire
 
 DRIVER = WriterId("arm driver", "jetson", 412, 5, 7)
@@ -38,7 +38,7 @@ WRITER = """
 """
 
 
-def announced(session: Session, robot: str, stream: Stream, writer: WriterId) -> LivelinessToken:
+def announced(session: Session, robot: str, stream: StreamName, writer: WriterId) -> LivelinessToken:
     return announce(session, writer_key(robot, stream, writer.identity))
 
 

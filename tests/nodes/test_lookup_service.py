@@ -16,7 +16,7 @@ from zstate.net.session import Session, connect
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher import StatePublisher
 from zstate.transform import Transform
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 
 PERIOD = 10_000_000
 KEY = "zstate/r1/lookup"
@@ -144,7 +144,7 @@ def test_publisher_without_a_cache_answers_from_its_newest_sample(sessions: tupl
 
 def test_driver_and_state_publisher_of_one_robot_answer_the_same(sessions: tuple[Session, Session]):
     driver, other = sessions
-    derived: tuple[Stream, ...] = ("robot_description", "tf_static", "tf")
+    derived: tuple[StreamName, ...] = ("robot_description", "tf_static", "tf")
     with (
         StatePublisher(driver, RRBOT, "r1", streams=("joint_states",)) as joints,
         StatePublisher(other, RRBOT, "r1", streams=derived) as state,

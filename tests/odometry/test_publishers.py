@@ -21,7 +21,7 @@ from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
 from zstate.transform import Transform
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     Imu,
     Message,
@@ -43,7 +43,7 @@ TWIST_COVARIANCE = np.diag([6.0, 5.0, 4.0, 3.0, 2.0, 1.0]) * 1e-3
 class Messages(list[Any]):
     """The messages of r1 on one stream, as they arrive."""
 
-    def __init__(self, session: Session, stream: Stream, wire: str = "native") -> None:
+    def __init__(self, session: Session, stream: StreamName, wire: str = "native") -> None:
         self.refused: list[str] = []
         self._subscriber = subscribe(
             session,

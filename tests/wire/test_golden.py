@@ -21,7 +21,7 @@ from zstate.model.urdf import parse_urdf
 from zstate.net.sample_history import MAX_PAGE_BYTES
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import LATCHED_STREAMS, NAMED_STREAMS, STOP_STREAMS, Stream
+from zstate.wire.keys import LATCHED_STREAMS, NAMED_STREAMS, STOP_STREAMS, StreamName
 from zstate.wire.messages import MAX_BYTES, HistoryPage, Message, MotionOutcome, order_digest
 from zstate.wire.native import ENCODINGS, MAX_MESSAGE_BYTES, STREAM_TYPES, NativeWire, decode, encode
 from zstate.wire.protocol import SerializedSample
@@ -176,7 +176,7 @@ def shown_fields(message: Message) -> Json:
     return {name: shown(kinds[name][0], getattr(message, name)) for name in message.__struct_fields__}
 
 
-def stream_of(key: str) -> Stream:
+def stream_of(key: str) -> StreamName:
     """The stream of a key. Raises InvalidInput for other keys."""
     return "clock" if key == keys.CLOCK_KEY else keys.stream_from_key(key)
 
@@ -302,7 +302,7 @@ def test_the_page_lists_every_stream_with_its_key_its_message_and_how_it_is_deli
         assert row[1].partition(" ")[0] == kind.__name__
         assert row[0].endswith(">`") is (stream in NAMED_STREAMS)
         assert (row[2] == "latched") is (stream in {*LATCHED_STREAMS, "driver", *STOP_STREAMS})
-    assert f"\n{','.join(get_args(Stream))}\n" in section("Liveliness tokens")
+    assert f"\n{','.join(get_args(StreamName))}\n" in section("Liveliness tokens")
 
 
 def test_the_digest_in_the_page_is_that_of_its_names():
@@ -330,7 +330,7 @@ def test_the_size_limits_of_the_page_are_those_of_the_code():
 def parsed_key(key: str) -> Json | None:
     """The parts of a key as in the vectors; None if it is none of zstate."""
 
-    def writer(robot: str, streams: tuple[Stream, ...], identity: str) -> Json:
+    def writer(robot: str, streams: tuple[StreamName, ...], identity: str) -> Json:
         announced = Announcement.parse_all(robot, streams, identity)
         names = [one.name for one in announced if one.name]
         return {"robot": robot, "streams": list(streams), "id": parts(announced[0].writer, *names[:1])}
@@ -371,7 +371,7 @@ def parsed_key(key: str) -> Json | None:
     def owned(robot: str, identity: str) -> Json:
         return {"robot": robot, "id": parts(WriterId.parse(identity))}
 
-    def stream(name: Stream) -> Json:
+    def stream(name: StreamName) -> Json:
         found: Json = {"stream": name}
         if name != "clock":
             found["robot"] = keys.robot_from_key(key)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from zstate.errors import MessageError
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     LATCHED_BYTES,
     ClockMessage,
@@ -472,7 +472,7 @@ def test_one_changed_byte_raises_only_message_error(message: Message, at: int, v
         assert error.reason in {"truncated", "malformed"}
 
 
-def encoder_of(stream: Stream, name: str = "") -> StreamEncoder:
+def encoder_of(stream: StreamName, name: str = "") -> StreamEncoder:
     return NativeWire().stream_encoder(WriterNode("r1", WRITER, "z1", 0), stream, number=0, name=name)
 
 
@@ -496,7 +496,7 @@ def test_native_token_announces_writer_and_stream():
 
 
 def test_one_token_announces_all_streams_of_a_writer_and_the_name_of_its_static_edges():
-    streams: tuple[Stream, ...] = ("robot_description", "tf_static", "tf", "joint_states")
+    streams: tuple[StreamName, ...] = ("robot_description", "tf_static", "tf", "joint_states")
     tokens = [token for stream in streams if (token := encoder_of(stream, "mount").token)]
     (joined,) = NativeWire().joined_tokens(tokens)
     assert joined == f"zstate/r1/@writer/joint_states,tf,tf_static,robot_description/{WRITER.identity},mount"

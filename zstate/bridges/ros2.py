@@ -35,7 +35,7 @@ from zstate.odometry import OdometryPublisher
 from zstate.sources.joint_state_listener import DescriptionSubscriber, JointStateListener
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot
+from zstate.wire.keys import ANY, MODEL_WRITER, StreamName, check_robot
 from zstate.wire.messages import (
     Edges,
     Odometry,
@@ -156,7 +156,7 @@ class TransformBridge(Closeable):
         self._source = source
         self._wire = get_wire(source.wire)
         self._counters = counters
-        self._streams: tuple[Stream, ...] = tuple(dict.fromkeys((*self._wire.edges, "odometry")))
+        self._streams: tuple[StreamName, ...] = tuple(dict.fromkeys((*self._wire.edges, "odometry")))
         self._writers: dict[int, str] = {}
         self._placed: defaultdict[str, set[Edges]] = defaultdict(set)
         """Single edges on /tf, by writer: those that its odometry may have."""
@@ -347,7 +347,7 @@ class RobotBridge(Closeable):
 _LOG = logging.getLogger("zstate")
 
 # Streams that identify the publisher of a robot; one /tf may contain all robots.
-_ROBOT_STREAMS: tuple[Stream, ...] = ("joint_states", "robot_description")
+_ROBOT_STREAMS: tuple[StreamName, ...] = ("joint_states", "robot_description")
 
 _ADVICE = (
     "name one, as `zstate bridge panda` does, or give each its own namespace with the wire 'ros2:namespace=*'"

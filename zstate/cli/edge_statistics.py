@@ -14,7 +14,7 @@ from zstate.cli.output.console import count_text, rate_text
 from zstate.cli.output.text_layout import Table
 from zstate.errors import InvalidInput, format_duration
 from zstate.net.topic_statistics import TopicStatistics
-from zstate.wire.keys import Stream, full_name
+from zstate.wire.keys import StreamName, full_name
 from zstate.wire.messages import JointState, StampedMessage, TransformSample
 from zstate.wire.registry import get_wire
 
@@ -59,8 +59,8 @@ class EdgeStatistics(Closeable):
     ``clock`` is the one of the stamps.
     """
 
-    def __init__(self, session: Session, robot: str, wire: str, stream: Stream, clock: Clock) -> None:
-        def sources(robot: str, published: Stream, sample: StampedMessage) -> Iterator[str]:
+    def __init__(self, session: Session, robot: str, wire: str, stream: StreamName, clock: Clock) -> None:
+        def sources(robot: str, published: StreamName, sample: StampedMessage) -> Iterator[str]:
             if isinstance(sample, JointState) and published == "partial_joint_states":
                 yield from [f"{robot}//{joint}" for joint in sample.names or ()]
             elif isinstance(sample, JointState):

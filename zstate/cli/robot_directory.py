@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
     from zstate.wire.identity import Announcement
-    from zstate.wire.keys import Stream
+    from zstate.wire.keys import StreamName
 
 
 def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
@@ -80,10 +80,10 @@ class RobotDirectory(Closeable):
 
         return by_robot(self._announced.copy())
 
-    def streams(self, robot: str) -> frozenset[Stream]:
+    def streams(self, robot: str) -> frozenset[StreamName]:
         """The streams of ``robot`` that have a writer."""
         return frozenset(one.stream for one in self._announced.copy() if one.robot == robot)
 
-    def no_sample_text(self, robot: str, stream: Stream, *, ended: bool = False) -> str:
+    def no_sample_text(self, robot: str, stream: StreamName, *, ended: bool = False) -> str:
         """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
         return self.messages.no_sample_text(robot, stream, self.robots(), ended=ended)

@@ -30,7 +30,7 @@ from zstate.net.presence import RobotInfo, announce_reader, discover
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.sources.joint_state_listener import MAX_AGE_S, DescriptionSubscriber, JointStateReader
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream
+from zstate.wire.keys import ANY, MODEL_WRITER, StreamName
 from zstate.wire.messages import StaticTransforms, poses_from_block
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
@@ -84,7 +84,9 @@ class _CaptureSubscriptions(Closeable):
         self._captures = {one.info.name: one for one in captures}
         self._waiter = waiter
         self._wire = get_wire(wire)
-        streams: tuple[Stream, ...] = tuple(dict.fromkeys(("joint_states", self._wire.partial_joint_states)))
+        streams: tuple[StreamName, ...] = tuple(
+            dict.fromkeys(("joint_states", self._wire.partial_joint_states))
+        )
         with ExitStack() as opening:
             opening.enter_context(DescriptionSubscriber(session, robots, self._on_model, wire))
             names = (robots,) if isinstance(robots, str) else robots

@@ -14,7 +14,7 @@ from zstate.clock import LONGEST_WAIT_S
 from zstate.net.presence import announce_reader
 from zstate.net.streams import CAPACITY
 from zstate.net.subscription import Received, subscribe
-from zstate.wire.keys import Stream, check_robot
+from zstate.wire.keys import StreamName, check_robot
 from zstate.wire.messages import OccupancyGrid, StampedMessage
 from zstate.wire.registry import get_wire
 
@@ -35,9 +35,9 @@ class StreamReader(Closeable):
     Messages that cannot be decoded are skipped; the first of each kind is reported.
     """
 
-    def __init__(self, session: Session, robot: str, stream: Stream, wire: str = "native") -> None:
+    def __init__(self, session: Session, robot: str, stream: StreamName, wire: str = "native") -> None:
         self.robot = check_robot(robot)
-        self._stream: Stream = stream
+        self._stream: StreamName = stream
         self._refused: set[str] = set()
         self._samples: queue.SimpleQueue[TimedSample] = queue.SimpleQueue()
         self._waiter = ConditionWaiter()

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from zstate.net.subscription import Received
     from zstate.nodes.listener import Follow, TransformListener
     from zstate.transform import Transform
-    from zstate.wire.keys import Stream
+    from zstate.wire.keys import StreamName
 
 # A burst of notifications costs one check: conditions on a large fleet take milliseconds.
 _CHECK_INTERVAL_S = 0.02
@@ -166,7 +166,7 @@ class RobotReadiness(Closeable):
         from zstate.nodes.listener import TransformListener
         from zstate.wire.keys import JOINT_STREAMS
 
-        stream: Stream = "joint_states" if "robot_description" in streams else "robot_description"
+        stream: StreamName = "joint_states" if "robot_description" in streams else "robot_description"
         # Without a writer of joint states, transforms may be published instead.
         follows: list[Follow] = (
             ["joint_states", "tf"] if JOINT_STREAMS.isdisjoint(streams) else ["joint_states"]

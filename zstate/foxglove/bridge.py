@@ -21,14 +21,14 @@ from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.recorder import MessageQueue, SampleWriter, recorded_streams
 from zstate.recording.storage import ROBOT
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, LATCHED_STREAMS, STOP_STREAMS, Stream, check_robot
+from zstate.wire.keys import ANY, LATCHED_STREAMS, STOP_STREAMS, StreamName, check_robot
 from zstate.wire.messages import ClockMessage, Message, RobotDescription
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.topics import SHARED
 from zstate.wire.ros2.types import RosType
 
-_UNANNOUNCED: frozenset[Stream] = frozenset({*LATCHED_STREAMS, "clock"})
+_UNANNOUNCED: frozenset[StreamName] = frozenset({*LATCHED_STREAMS, "clock"})
 """Streams whose messages may arrive before their robot is announced."""
 
 _PERIOD_S = 0.01
@@ -38,10 +38,10 @@ _DISCOVERY_NS = 300_000_000
 _POLL_S = 0.05
 _JOIN_WITHIN_S = 0.9
 
-Feed = tuple[str, Stream]
+Feed = tuple[str, StreamName]
 """A stream of a robot."""
 
-_OF_DRIVERS: tuple[Stream, ...] = ("driver", *STOP_STREAMS)
+_OF_DRIVERS: tuple[StreamName, ...] = ("driver", *STOP_STREAMS)
 """Drivers and stops have no tokens: their topics come with the joint states."""
 
 
@@ -87,7 +87,7 @@ class ServedTopics:
         for number in self._of_robot.pop(robot, set()):
             self.close(ChannelId(number), robot)
 
-    def unlatch_all(self, stream: Stream) -> None:
+    def unlatch_all(self, stream: StreamName) -> None:
         """Forget the latched messages of ``stream``; the next subscription to it receives them again."""
         for number, key in list(self._latched):
             if key.split("/")[1] == stream:
@@ -180,8 +180,8 @@ class FoxgloveBridge(Closeable):
         self._feeds_of: dict[Announcement, list[tuple[ChannelId, Feed]]] = {}
         self._streams_of: dict[str, set[Announcement]] = {}
         self._descriptions: dict[str, str] = {}
-        self._subscribed: dict[Stream, tuple[str, ...]] = {}
-        self._announced: dict[str, tuple[tuple[Stream, ...], list[LivelinessToken]]] = {}
+        self._subscribed: dict[StreamName, tuple[str, ...]] = {}
+        self._announced: dict[str, tuple[tuple[StreamName, ...], list[LivelinessToken]]] = {}
         self._simulated_time: int | None = None
         self._wakeup = fork_safe(threading.Event())
         self._stop = fork_safe(threading.Event())
@@ -290,7 +290,7 @@ class FoxgloveBridge(Closeable):
         if stream not in self._streams:
             return ()
         # As streams of the topics and of their messages.
-        carried: list[tuple[Stream, Stream]] = [(stream, stream)]
+        carried: list[tuple[StreamName, StreamName]] = [(stream, stream)]
         if stream == "odometry" and stream in self._wire.edges:
             carried.append(("tf", "odometry"))
         if stream == "joint_states" and "driver" in self._streams:
@@ -321,7 +321,7 @@ class FoxgloveBridge(Closeable):
         for robot, writers in self._streams_of.items():
             if self._topics.has_readers(robot):  # covariances of moving edges
                 feeds |= {(robot, one.stream) for one in writers if one.stream in self._wire.edges}
-        robots_of: defaultdict[Stream, set[str]] = defaultdict(set)
+        robots_of: defaultdict[StreamName, set[str]] = defaultdict(set)
         for robot, stream in feeds:
             robots_of[stream].add(robot)
         for stream in self._streams:
@@ -334,7 +334,7 @@ class FoxgloveBridge(Closeable):
         announced = {feed for feed in feeds if feed[1] not in _OF_DRIVERS}
         self._announce({robot: {one for its, one in announced if its == robot} for robot, _ in announced})
 
-    def _subscribe(self, stream: Stream, robots: tuple[str, ...]) -> None:
+    def _subscribe(self, stream: StreamName, robots: tuple[str, ...]) -> None:
         if stream in LATCHED_STREAMS:
             self._topics.unlatch_all(stream)
         self._queue.unsubscribe(stream)
@@ -345,7 +345,7 @@ class FoxgloveBridge(Closeable):
                 stream, expressions, self._selected[0] if len(self._selected) == 1 else None
             )
 
-    def _announce(self, streams_of: Mapping[str, set[Stream]]) -> None:
+    def _announce(self, streams_of: Mapping[str, set[StreamName]]) -> None:
         """Announce this process as the reader of these streams of each robot."""
         for robot in self._announced.keys() | streams_of.keys():
             streams = tuple(sorted(streams_of.get(robot, ())))

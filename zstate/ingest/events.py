@@ -17,7 +17,7 @@ from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import EDGE_STREAMS, Stream
+from zstate.wire.keys import EDGE_STREAMS, StreamName
 
 Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]
 
@@ -50,7 +50,7 @@ class WriterEvent:
 
     kind: Kind
     robot: str
-    stream: Stream
+    stream: StreamName
     writer: WriterId | None
     at: int
     text: str
@@ -140,8 +140,8 @@ class CallbackThread(Closeable, Generic[T]):
                         threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
 
-_NAMED_SAMPLES: frozenset[Stream] = frozenset({*EDGE_STREAMS, "partial_joint_states"})
-_Place = tuple[str, Stream, str]
+_NAMED_SAMPLES: frozenset[StreamName] = frozenset({*EDGE_STREAMS, "partial_joint_states"})
+_Place = tuple[str, StreamName, str]
 
 
 class EventLog(Closeable):
@@ -153,13 +153,13 @@ class EventLog(Closeable):
 
     def __init__(
         self,
-        streams: Collection[Stream],
-        followed: Stream,
-        shared: Collection[Stream],
+        streams: Collection[StreamName],
+        followed: StreamName,
+        shared: Collection[StreamName],
         on_event: Callable[[WriterEvent], None] | None = None,
     ) -> None:
         self._streams = frozenset(streams)
-        self._followed: Stream = followed
+        self._followed: StreamName = followed
         # In ROS many programs publish parts of tf, and several may publish a robot's joints.
         self._exclusive = self._streams - {"joint_states", *shared} if shared else self._streams
         self._events: deque[WriterEvent] = deque(maxlen=KEPT)
@@ -218,7 +218,7 @@ class EventLog(Closeable):
             stream = self._followed if announced is None else announced.stream
             self._add("set back", robot, stream, writer, text)
 
-    def add_second_edge(self, stream: Stream, source: EdgeSource, refusal: InsertRefused) -> None:
+    def add_second_edge(self, stream: StreamName, source: EdgeSource, refusal: InsertRefused) -> None:
         """Add the conflict of a refused edge of ``source`` on ``stream``: its child has another owner."""
         child, text = refusal.edge[1], str(refusal)
         with self._lock:
@@ -247,7 +247,7 @@ class EventLog(Closeable):
         self._add_conflict(key, "tf_static", writer, text)
 
     def _add_conflict(
-        self, key: tuple[str, str, int, str], stream: Stream, writer: WriterId | None, text: str
+        self, key: tuple[str, str, int, str], stream: StreamName, writer: WriterId | None, text: str
     ) -> None:
         """Add a conflict, once for each robot, writer name, session and child in ``key``."""
         if key not in self._conflicts:
@@ -327,7 +327,7 @@ class EventLog(Closeable):
                     return writers[session]
         return announced
 
-    def _add(self, kind: Kind, robot: str, stream: Stream, writer: WriterId | None, text: str) -> None:
+    def _add(self, kind: Kind, robot: str, stream: StreamName, writer: WriterId | None, text: str) -> None:
         event = WriterEvent(kind, robot, stream, writer, time.time_ns(), text)
         self._events.append(event)
         if self._thread is not None:

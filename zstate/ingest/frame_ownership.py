@@ -38,7 +38,7 @@ from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
-from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, Stream, foreign_edge_problem, frame_owner
+from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, StreamName, foreign_edge_problem, frame_owner
 
 CONTESTED = ("second parent", "second writer", "loop")
 """The refusal reasons of edges that exclude each other."""
@@ -130,7 +130,7 @@ class FrameOwnership:
         *,
         is_shared: bool = False,
         placers: Collection[str] | None = None,
-        on_conflict: Callable[[Stream, EdgeSource, InsertRefused], None] | None = None,
+        on_conflict: Callable[[StreamName, EdgeSource, InsertRefused], None] | None = None,
         clock: Clock | None = None,
     ) -> None:
         self.buffer = buffer
@@ -732,7 +732,7 @@ class FrameOwnership:
         self.counters.for_robot(source.robot).count_refusal(error.reason, text)
         self.report_conflict("tf_static", source, error)
 
-    def report_conflict(self, stream: Stream, source: EdgeSource, error: InsertRefused) -> None:
+    def report_conflict(self, stream: StreamName, source: EdgeSource, error: InsertRefused) -> None:
         """Call ``on_conflict`` if ``error`` refuses an edge of ``source`` because of another writer."""
         if error.reason in (*CONTESTED, FOREIGN_FRAME) and self._on_conflict is not None:
             self._on_conflict(stream, source, error)

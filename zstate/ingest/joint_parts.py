@@ -31,7 +31,7 @@ from zstate.ingest.base import ClockSetBack, StreamIngest
 from zstate.ingest.frame_ownership import EdgeSource, FrameOwnership
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.wire.joint_order import JointOrder
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import JointState, RobotDescription, Sample
 
 _ANNOUNCED, _LEFT_OR_UNANNOUNCED, _NO_WRITER = range(3)
@@ -259,7 +259,7 @@ class RobotParts:
         if part.refusal is None:
             if part is self._whole:  # the samples of others are counted one by one
                 self._counters.count_refusal(error.reason, f"{self._robot!r}: {text}")
-            stream: Stream = "joint_states" if part is self._whole else "partial_joint_states"
+            stream: StreamName = "joint_states" if part is self._whole else "partial_joint_states"
             source = EdgeSource(self._robot, self._writer(part), part.session or 0)
             self._ownership.report_conflict(stream, source, error)
         part.refusal = error

@@ -14,7 +14,7 @@ from typing import TypeAlias
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.ingest.base import StreamIngest
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 
 MAX_STRANGERS = 256
 """Writers of one robot that were never announced. Of more, the oldest is dropped with its edges."""
@@ -65,8 +65,8 @@ class StreamIngests:
     call it.
     """
 
-    def __init__(self, stream: Stream, *, is_shared: bool, has_parts: bool = False) -> None:
-        self.stream: Stream = stream
+    def __init__(self, stream: StreamName, *, is_shared: bool, has_parts: bool = False) -> None:
+        self.stream: StreamName = stream
         self.is_shared = is_shared
         self.has_parts = has_parts
         self.capacity = 0

@@ -18,7 +18,7 @@ from zstate.net.presence import RobotInfo, discover, discover_readers, discover_
 from zstate.net.session import Session
 from zstate.net.status import StatusSubscriber
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, EDGE_STREAMS, MODEL_WRITER, Stream
+from zstate.wire.keys import ANY, EDGE_STREAMS, MODEL_WRITER, StreamName
 from zstate.wire.messages import Status
 
 if TYPE_CHECKING:
@@ -85,10 +85,10 @@ class Graph:
         return [StreamGroup(*ends, tuple(streams)) for ends, streams in groups.items()]
 
 
-_OPTIONAL: frozenset[Stream] = frozenset({*EDGE_STREAMS, "partial_joint_states", "joint_commands"})
+_OPTIONAL: frozenset[StreamName] = frozenset({*EDGE_STREAMS, "partial_joint_states", "joint_commands"})
 """Streams that a robot with other ones does not lack."""
 
-RateLookup = Callable[[str, Stream, WriterId], float | None]
+RateLookup = Callable[[str, StreamName, WriterId], float | None]
 """The measured rate [Hz] of a robot's stream, as one writer publishes it; None if it is unknown."""
 
 
@@ -104,7 +104,7 @@ def build_graph(
     def programs(writers: Iterable[WriterId]) -> tuple[str, ...]:
         return tuple(sorted({str(writer) for writer in writers}))
 
-    written: dict[tuple[str, Stream], dict[str, list[WriterId]]] = {}
+    written: dict[tuple[str, StreamName], dict[str, list[WriterId]]] = {}
     """The writers of each stream, by the name under which they write; else ""."""
     for robot in robots:
         for stream, writer in robot.writers:
@@ -113,7 +113,7 @@ def build_graph(
             for name in names or ("",):
                 by_name.setdefault(name, []).append(writer)
     # A reader of all robots does not miss a stream that one of them lacks, and no reader misses a named one.
-    used: set[tuple[str, Stream]] = {
+    used: set[tuple[str, StreamName]] = {
         *written,
         *(
             (one.robot, one.stream)
@@ -209,7 +209,7 @@ class Topic:
     """A topic, with its leading slash, that carries ``stream``."""
 
     name: str
-    stream: Stream
+    stream: StreamName
     publishers: tuple[RosEndpoint, ...]
     subscribers: tuple[RosEndpoint, ...]
 
@@ -248,7 +248,7 @@ def discover_ros_graph(session: Session, wire: Ros2Wire) -> RosGraph:
 
     parse = parse_dds_token if wire.name == "ros2dds" else parse_token
     nodes: list[NodeToken] = []
-    ends: dict[tuple[str, Stream], list[RosEndpoint]] = {}
+    ends: dict[tuple[str, StreamName], list[RosEndpoint]] = {}
     for token in map(parse, discover_tokens(session, wire.writers_expression("*"))):
         if isinstance(token, NodeToken):
             nodes.append(token)

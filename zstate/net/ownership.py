@@ -37,7 +37,7 @@ from zstate.wire.keys import (
     MODEL_WRITER,
     NAMED_STREAMS,
     SENSOR_STREAMS,
-    Stream,
+    StreamName,
     edge_expression,
     edge_key,
     foreign_edge_problem,
@@ -68,7 +68,7 @@ CHECK_PERIOD_S = 0.05
 _STARTUP_S = 1.0
 """Each sample checks for this long: by then the tokens of writers that opened at the same time are here."""
 
-_MOVING: tuple[Stream, ...] = (*EDGE_STREAMS, "partial_joint_states")
+_MOVING: tuple[StreamName, ...] = (*EDGE_STREAMS, "partial_joint_states")
 
 _ALL_HISTORIES_OF_EDGES = tuple(f"{stream_expression(ANY, stream)}?session=0" for stream in _MOVING)
 """Queries that each writer of moving edges or of some joints receives, and to which none has samples."""
@@ -100,7 +100,7 @@ class WriterClaim(Closeable):
         """Tokens that came and went since the last ``check``."""
         self.on_change: Callable[[], None] | None = None
         """Called in a thread of Zenoh when a token has ended ``is_settled``."""
-        self._received: dict[tuple[Stream, str], zenoh.ext.AdvancedSubscriber[_Handler]] = {}
+        self._received: dict[tuple[StreamName, str], zenoh.ext.AdvancedSubscriber[_Handler]] = {}
         self._publishing: set[int] = set()
         self._first: Announcement | None = None
         self._next_check_s = 0.0

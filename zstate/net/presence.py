@@ -27,7 +27,7 @@ from zstate.net.queryable import MAX_REPLIES, Tokens, check_timeout, query_token
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READERS, Stream, parse_reader_key, shortened
+from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READERS, StreamName, parse_reader_key, shortened
 from zstate.wire.protocol import Wire, WriterTokens
 from zstate.wire.registry import get_wire
 
@@ -67,7 +67,7 @@ class RobotInfo:
     """
 
     name: str
-    writers: tuple[tuple[Stream, WriterId], ...]
+    writers: tuple[tuple[StreamName, WriterId], ...]
     static_names: tuple[tuple[str, WriterId], ...] = ()
     transform_names: tuple[tuple[str, WriterId], ...] = ()
     part_names: tuple[tuple[str, WriterId], ...] = ()
@@ -85,7 +85,7 @@ class RobotInfo:
         written = "; ".join(f"{writer} writes {', '.join(names)}" for writer, names in streams.items())
         return f"<robot {self.name!r}: {written or 'no writer'}>"
 
-    def names_of(self, writer: WriterId, stream: Stream) -> tuple[str, ...]:
+    def names_of(self, writer: WriterId, stream: StreamName) -> tuple[str, ...]:
         """The names under which ``writer`` writes on ``stream``, sorted; empty for streams without names."""
         names = {
             "tf_static": self.static_names,
@@ -118,7 +118,7 @@ def announce(session: Session, token: str) -> LivelinessToken:
 
 
 def announce_reader(
-    session: Session, wire: Wire, robot: str, streams: Sequence[Stream], program: str = ""
+    session: Session, wire: Wire, robot: str, streams: Sequence[StreamName], program: str = ""
 ) -> list[LivelinessToken]:
     """Announce this program as a reader of ``streams`` of ``robot``, if ``wire`` announces readers.
 
@@ -202,14 +202,14 @@ def _confirmed(session: Session, expression: str, timeout_s: float) -> Tokens:
 
 def by_robot(found: Iterable[Announcement]) -> tuple[RobotInfo, ...]:
     """The announced writers, grouped by robot, sorted."""
-    writers: dict[str, set[tuple[Stream, WriterId]]] = {}
-    names: dict[tuple[str, Stream], set[tuple[str, WriterId]]] = {}
+    writers: dict[str, set[tuple[StreamName, WriterId]]] = {}
+    names: dict[tuple[str, StreamName], set[tuple[str, WriterId]]] = {}
     for one in found:
         writers.setdefault(one.robot, set()).add((one.stream, one.writer))
         if one.name:
             names.setdefault((one.robot, one.stream), set()).add((one.name, one.writer))
 
-    def sorted_names(robot: str, stream: Stream) -> tuple[tuple[str, WriterId], ...]:
+    def sorted_names(robot: str, stream: StreamName) -> tuple[tuple[str, WriterId], ...]:
         return tuple(sorted(names.get((robot, stream), ())))
 
     return tuple(
@@ -372,7 +372,7 @@ class OtherTfSubscription(Closeable):
     def on_writer(self, announced: Announcement, *, alive: bool) -> None:
         """Subscribe or unsubscribe, if this writer makes a difference."""
         (self._writers.add if alive else self._writers.discard)(announced)
-        streams: dict[str, set[Stream]] = {}
+        streams: dict[str, set[StreamName]] = {}
         for one in self._writers:
             streams.setdefault(one.node, set()).add(one.stream)
         if not any(one.stream == "tf" and not _is_state_publisher(one, streams) for one in self._writers):
@@ -387,7 +387,7 @@ class OtherTfSubscription(Closeable):
             subscription.close()
 
 
-def _is_state_publisher(announced: Announcement, streams: Mapping[str, Collection[Stream]]) -> bool:
+def _is_state_publisher(announced: Announcement, streams: Mapping[str, Collection[StreamName]]) -> bool:
     """Whether it is of a node with the model that writes joint states, or is named robot_state_publisher.
 
     ``streams`` are those of each node; the nodes behind a zenoh-plugin-ros2dds bridge are not known.

@@ -38,7 +38,7 @@ from zstate.extension import kernel
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
 from zstate.net.streams import JOIN_WITHIN_S, to_serialized
-from zstate.wire.keys import Stream, stream_key
+from zstate.wire.keys import StreamName, stream_key
 from zstate.wire.messages import HistoryPage
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, decode, encode
 from zstate.wire.protocol import SerializedSample
@@ -194,7 +194,7 @@ class SampleCache:
 def serve_history(
     session: Session,
     robot: str,
-    stream: Stream,
+    stream: StreamName,
     cache: SampleCache,
     convert: Callable[[bytes], bytes] | None = None,
     *,

@@ -9,7 +9,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.wire.keys import ANY, LATCHED_STREAMS, Stream, shortened
+from zstate.wire.keys import ANY, LATCHED_STREAMS, StreamName, shortened
 from zstate.wire.messages import Message
 from zstate.wire.protocol import SerializedSample, Wire
 
@@ -25,7 +25,7 @@ class Received(NamedTuple):
 def decode_samples(
     wire: Wire,
     robot: str,
-    stream: Stream,
+    stream: StreamName,
     samples: Iterable[SerializedSample],
     on_error: Callable[[str, str], object] | None = None,
 ) -> Iterator[Received]:
@@ -48,7 +48,7 @@ def subscribe(
     session: Session,
     wire: Wire,
     robots: str | Sequence[str],
-    stream: Stream,
+    stream: StreamName,
     on_messages: Callable[[list[Received]], object],
     *,
     on_error: Callable[[str, str], object] | None = None,

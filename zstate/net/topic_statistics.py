@@ -23,7 +23,7 @@ from zstate.clock import Clock, SystemClock
 from zstate.ingest.deadline import Deadline
 from zstate.net.streams import StreamSubscriber
 from zstate.net.subscription import decode_samples
-from zstate.wire.keys import ANY, Stream
+from zstate.wire.keys import ANY, StreamName
 from zstate.wire.messages import StampedMessage
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ class WriterKey(NamedTuple):
     """One writer of one stream."""
 
     robot: str
-    stream: Stream
+    stream: StreamName
     session: int
 
 
@@ -191,10 +191,10 @@ class TopicStatistics(Closeable):
         session: Session,
         wire: Wire,
         *,
-        sources: Callable[[str, Stream, StampedMessage], Iterable[Hashable]] | None = None,
+        sources: Callable[[str, StreamName, StampedMessage], Iterable[Hashable]] | None = None,
         clock: Clock | None = None,
         window: int = WINDOW,
-        on_sample: Callable[[str, Stream, StampedMessage], None] | None = None,
+        on_sample: Callable[[str, StreamName, StampedMessage], None] | None = None,
     ) -> None:
         self.gaps = SequenceGaps()
         self._session, self._wire = session, wire
@@ -206,7 +206,7 @@ class TopicStatistics(Closeable):
         self._subscriptions = ExitStack()
         self._subscribers: list[StreamSubscriber] = []
 
-    def subscribe(self, stream: Stream, robot: str = ANY) -> None:
+    def subscribe(self, stream: StreamName, robot: str = ANY) -> None:
         """Count ``stream`` of ``robot``, or of all robots, from now on."""
 
         def on_samples(samples: list[SerializedSample]) -> None:
@@ -226,7 +226,7 @@ class TopicStatistics(Closeable):
         """Whether more samples have arrived than were taken in here: then rates are too low."""
         return any(subscriber.full_batches for subscriber in self._subscribers)
 
-    def add(self, robot: str, stream: Stream, sample: StampedMessage, at: int, now: int) -> None:
+    def add(self, robot: str, stream: StreamName, sample: StampedMessage, at: int, now: int) -> None:
         """Count a sample that arrived ``at``, when it was ``now`` by the clock of the stamps."""
         self.gaps.add(sample.session, sample.seq)
         received = Received(at, sample.stamp, sample.seq, now - sample.stamp)

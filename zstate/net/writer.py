@@ -21,7 +21,7 @@ from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.wire.identity import WriterId
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import Message
 from zstate.wire.protocol import StreamEncoder, Wire, WriterNode
 
@@ -117,16 +117,16 @@ class WireWriter(Closeable):
         if token is not None:
             self._opened.enter_context(announce(session, token))
 
-    def open_stream(self, stream: Stream, name: str = "") -> SampleWriter:
+    def open_stream(self, stream: StreamName, name: str = "") -> SampleWriter:
         """Open and announce ``stream``; edges under ``name``."""
         return self._announced(SampleWriter(self._session, self._encoder(stream, name)))
 
-    def open_latched(self, stream: Stream, name: str = "") -> LatchedWriter:
+    def open_latched(self, stream: StreamName, name: str = "") -> LatchedWriter:
         """Open and announce ``stream`` for a latched value; static edges under ``name``."""
         encoder = self._encoder(stream, name)
         return self._announced(LatchedWriter(self._session, encoder, is_large=stream == "map"))
 
-    def _encoder(self, stream: Stream, name: str = "") -> StreamEncoder:
+    def _encoder(self, stream: StreamName, name: str = "") -> StreamEncoder:
         return self._wire.stream_encoder(self._node, stream, self._session.next_number(), name)
 
     def _announced(self, writer: W) -> W:

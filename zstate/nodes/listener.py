@@ -37,7 +37,7 @@ from zstate.wire.keys import (
     EDGE_STREAMS,
     MODEL_WRITER,
     NAMED_STREAMS,
-    Stream,
+    StreamName,
     check_robot,
     shortened,
     stream_from_key,
@@ -121,7 +121,7 @@ class TransformListener(Closeable):
         self._samples = StreamIngests(follow, is_shared=follow in self._wire.shared)
         self._parts = StreamIngests(self._wire.partial_joint_states, is_shared=True, has_parts=True)
         self._sample_streams = self._received_streams()
-        streams: tuple[Stream, ...] = ("robot_description", "tf_static", *self._sample_streams)
+        streams: tuple[StreamName, ...] = ("robot_description", "tf_static", *self._sample_streams)
         self._events = EventLog(streams, follow, self._wire.shared, on_event)
         self._ownership = FrameOwnership(
             self.buffer,
@@ -138,7 +138,7 @@ class TransformListener(Closeable):
         self._observers: tuple[Callable[[], object], ...] = ()
         with ExitStack() as opening:
             opening.enter_context(self._events)
-            latched: dict[Stream, Callable[[SerializedSample], None]] = {
+            latched: dict[StreamName, Callable[[SerializedSample], None]] = {
                 "robot_description": self._on_description,
                 "tf_static": self._on_statics,
             }
@@ -170,8 +170,8 @@ class TransformListener(Closeable):
         self.buffer.explain_emptiness(self._explain_emptiness)
         _LISTENERS.add(self)
 
-    def _received_streams(self) -> dict[Stream, StreamIngests]:
-        received: dict[Stream, StreamIngests] = {self._follow: self._samples}
+    def _received_streams(self) -> dict[StreamName, StreamIngests]:
+        received: dict[StreamName, StreamIngests] = {self._follow: self._samples}
         if self._follow == "joint_states":
             received[self._parts.stream] = self._parts  # in ROS any joint state may be a part
         for stream in self._wire.edges:
@@ -179,7 +179,7 @@ class TransformListener(Closeable):
                 received[stream] = StreamIngests(stream, is_shared=True)
         return received
 
-    def _subscribe(self, session: Session, streams: Sequence[Stream]) -> ExitStack:
+    def _subscribe(self, session: Session, streams: Sequence[StreamName]) -> ExitStack:
         """Receive the samples of ``streams`` until the stack is closed."""
         with ExitStack() as opening:
             for stream in streams:
@@ -188,7 +188,7 @@ class TransformListener(Closeable):
                 opening.enter_context(self._subscriber(session, keys, samples))
             return opening.pop_all()
 
-    def _keys(self, stream: Stream) -> list[str]:
+    def _keys(self, stream: StreamName) -> list[str]:
         """The key expressions of ``stream`` of the robots."""
         return [self._wire.expression(robot, stream) for robot in self._robots]
 
@@ -404,7 +404,7 @@ class TransformListener(Closeable):
         # In ROS nothing can be withdrawn: an empty payload there is a broken message.
         return not arrival.payload and not self._wire.shared
 
-    def _decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
+    def _decode(self, stream: StreamName, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         try:
             return self._wire.decode(stream, arrival, robot)
         except MessageError as error:

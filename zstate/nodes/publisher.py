@@ -33,7 +33,7 @@ from zstate.rate import RateReport
 from zstate.sources.joint_source import JointReading, JointSource
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import MODEL_WRITER, Stream, wire_name
+from zstate.wire.keys import MODEL_WRITER, StreamName, wire_name
 from zstate.wire.messages import (
     JointState,
     RobotDescription,
@@ -53,10 +53,10 @@ _LOG = logging.getLogger("zstate")
 
 Positions: TypeAlias = ArrayLike | Mapping[str, float | Sequence[float]]
 
-STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
+STREAMS: tuple[StreamName, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 """The streams of a robot's state."""
 
-_SAMPLED: tuple[Stream, ...] = ("joint_states", "tf")
+_SAMPLED: tuple[StreamName, ...] = ("joint_states", "tf")
 
 
 def positions_block(model: RobotModel, positions: Positions) -> bytes:
@@ -146,7 +146,7 @@ class StatePublisher(SamplePublisher):
         robot: str | None = None,
         wires: str | Sequence[str] = ("native",),
         *,
-        streams: Sequence[Stream] = STREAMS,
+        streams: Sequence[StreamName] = STREAMS,
         clock: Clock | None = None,
         program: str = "",
         takeover: bool = False,

@@ -16,7 +16,7 @@ from zstate.errors import format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.rate import RateReport
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import Level, Status, from_block
 from zstate.wire.native import joint_positions
 
@@ -55,7 +55,7 @@ class PublisherStats:
     sent: int
     refused: int
     last_refusal: str
-    streams: Mapping[tuple[str, Stream], StreamStats]
+    streams: Mapping[tuple[str, StreamName], StreamStats]
     rate: RateReport | None
     outside_limits: int = 0
     last_excess: str = ""

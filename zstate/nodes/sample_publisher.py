@@ -22,7 +22,7 @@ from zstate.net.writer import SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
 from zstate.rate import Rate, RateReport
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream, check_robot, check_writer
+from zstate.wire.keys import StreamName, check_robot, check_writer
 from zstate.wire.messages import StampedMessage, renumbered
 from zstate.wire.registry import as_wire_names, get_wire
 
@@ -42,7 +42,7 @@ class SamplePublisher(Closeable):
         self._wires = as_wire_names(wires)
         self._clock: Clock = clock or SystemClock()
         self._session_id = session_id
-        self._writers: dict[tuple[str, Stream], SampleWriter] = {}
+        self._writers: dict[tuple[str, StreamName], SampleWriter] = {}
         self._limits: LimitWatch | None = None
         self._seq: int = 0
         self._refused = 0
@@ -158,7 +158,7 @@ class SensorPublisher(SamplePublisher):
         self,
         session: Session,
         robot: str,
-        stream: Stream,
+        stream: StreamName,
         sensor: str,
         *,
         wires: str | Sequence[str],
@@ -168,7 +168,7 @@ class SensorPublisher(SamplePublisher):
         identity = local_writer(secrets.randbits(32), program)
         super().__init__(robot, wires, clock, identity.session)
         self.sensor = check_writer(sensor)
-        self._stream: Stream = stream
+        self._stream: StreamName = stream
         with ExitStack() as opening:
             if "native" in self._wires:
                 announced = Announcement(self.robot, stream, identity, self.sensor)

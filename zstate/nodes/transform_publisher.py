@@ -29,7 +29,7 @@ from zstate.nodes.static_publisher import edge_writer_name
 from zstate.rate import RateReport
 from zstate.transform import UPPER_TRIANGLE, Transform
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import Stream, full_name
+from zstate.wire.keys import StreamName, full_name
 from zstate.wire.messages import Edges, Odometry, WriterTransforms, edge_of, order_digest, to_block
 from zstate.wire.protocol import carrier
 from zstate.wire.registry import get_wire
@@ -53,7 +53,7 @@ class EdgePublisher(SamplePublisher):
         self,
         session: Session,
         robot: str,
-        stream: Stream,
+        stream: StreamName,
         *,
         writer: str | None,
         wires: str | Sequence[str],
@@ -153,7 +153,7 @@ class EdgePublisher(SamplePublisher):
         return order_digest(names)
 
 
-def _carried(sample: WriterTransforms, stream: Stream) -> WriterTransforms:
+def _carried(sample: WriterTransforms, stream: StreamName) -> WriterTransforms:
     """``sample`` on ``stream``: without the velocity where that has transforms alone."""
     return edge_of(sample) if isinstance(sample, Odometry) and stream != "odometry" else sample
 

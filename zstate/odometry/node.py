@@ -35,7 +35,7 @@ from zstate.odometry.requests import apply_request
 from zstate.odometry.source_noise import PoseNoise, VelocityNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.transform import Transform
-from zstate.wire.keys import Stream, check_robot, odometry_request_key, shortened
+from zstate.wire.keys import StreamName, check_robot, odometry_request_key, shortened
 from zstate.wire.messages import Imu, Pose, Velocity, covariance_matrix, from_block, with_full_names
 from zstate.wire.registry import get_wire
 
@@ -165,7 +165,7 @@ class SensorListener(Closeable):
         self._wire = get_wire(wire)
         self._refusals = Refusals("measurement")
         self.refused: dict[str, int] = self._refusals.counts
-        callbacks: dict[Stream, Callable[..., object]] = {}
+        callbacks: dict[StreamName, Callable[..., object]] = {}
         if on_imu is not None:
             callbacks["imu"] = on_imu
         if on_velocity is not None:

@@ -19,7 +19,7 @@ from zstate.recording.driver_messages import DRIVER_TYPES, decode_command, decod
 from zstate.recording.encode import POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     JointState,
     Message,
@@ -34,19 +34,19 @@ from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import NAMED_TOPICS, SHARED, FrameNames, robot_from_topic, ros_type
 
-_TOPICS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
-STREAMS: tuple[Stream, ...] = (*_TOPICS, *TOPICS)
+_TOPICS: tuple[StreamName, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
+STREAMS: tuple[StreamName, ...] = (*_TOPICS, *TOPICS)
 """The streams of a robot's state, which are decoded by default. ``transforms`` are channels of the topic tf
 with the name of a writer, and those of their covariances; ``partial_joint_states`` channels of the topic
 joint_states with such a name."""
 
-SCAN_STREAMS: tuple[Stream, ...] = ("scan", "map")
+SCAN_STREAMS: tuple[StreamName, ...] = ("scan", "map")
 """Further streams that can be decoded: the channels of these types, whatever their topic is."""
 
-ODOMETRY_STREAMS: tuple[Stream, ...] = ("imu", "velocity", "pose", "odometry")
+ODOMETRY_STREAMS: tuple[StreamName, ...] = ("imu", "velocity", "pose", "odometry")
 """Likewise. The edges of odometry are recorded on tf as well, and read from there."""
 
-_NAMED: dict[Stream, Stream] = {topic: named for named, topic in TOPICS.items()}
+_NAMED: dict[StreamName, StreamName] = {topic: named for named, topic in TOPICS.items()}
 
 _SESSION, _PREFIX = "zstate.session", "zstate.frame_prefix"
 
@@ -67,7 +67,7 @@ class RecordedWriter:
     """
 
     robot: str
-    stream: Stream
+    stream: StreamName
     session: int
     edge_writer: str | None
     program: str | None
@@ -80,7 +80,7 @@ class RecordedWriter:
         Topics of IMUs, velocities, poses and odometry in a bag are those of one of ``robots``, or of "ros":
         their namespace may be that of a sensor.
         """
-        stream: Stream = "transforms"
+        stream: StreamName = "transforms"
         name, facts = channel.topic.rpartition("/")[2], channel.metadata
         foreign = _SESSION not in facts
         if child_frame(channel) is None:
@@ -206,7 +206,7 @@ class DecodedRecording:
     def messages(
         self,
         robots: Collection[str] | None = None,
-        streams: Collection[Stream] = STREAMS,
+        streams: Collection[StreamName] = STREAMS,
         begin: int | None = None,
         end: int | None = None,
     ) -> Iterator[DecodedMessage]:
@@ -257,7 +257,7 @@ class DecodedRecording:
     def records(
         self,
         robots: Collection[str] | None = None,
-        streams: Collection[Stream] = STREAMS,
+        streams: Collection[StreamName] = STREAMS,
         begin: int | None = None,
         end: int | None = None,
     ) -> Iterator[UndecodedRecord]:
@@ -306,7 +306,7 @@ class ChannelDecoder(NamedTuple):
     """
 
     writer: RecordedWriter
-    topic: Stream
+    topic: StreamName
     names: FrameNames
     ros: RosDecoder
     covariances_of: str
@@ -379,7 +379,7 @@ def check_has_robot(recording: DecodedRecording, robot: str) -> str:
 
 
 def robot_with_joint_states(
-    recording: DecodedRecording, robot: str | None, streams: Collection[Stream] = ("joint_states",)
+    recording: DecodedRecording, robot: str | None, streams: Collection[StreamName] = ("joint_states",)
 ) -> str:
     """``robot``, or the only one with joint states on ``streams``.
 

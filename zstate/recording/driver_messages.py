@@ -21,7 +21,7 @@ from typing import Any
 
 from zstate.errors import InvalidInput
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     DriverState,
     JointCommand,
@@ -34,7 +34,7 @@ from zstate.wire.messages import (
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.types import DIAGNOSTIC_ARRAY, JOINT_STATE, RosType
 
-DRIVER_TYPES: dict[Stream, RosType] = {
+DRIVER_TYPES: dict[StreamName, RosType] = {
     "joint_commands": JOINT_STATE,
     "driver": DIAGNOSTIC_ARRAY,
     "stop": DIAGNOSTIC_ARRAY,
@@ -43,7 +43,7 @@ DRIVER_TYPES: dict[Stream, RosType] = {
 """The streams of drivers and their types, in recordings by zstate. They are never published again, since a
 replay must not move hardware."""
 
-_LAST_NAMES: dict[Stream, str] = {
+_LAST_NAMES: dict[StreamName, str] = {
     "joint_commands": "joint_commands",
     "driver": "diagnostics",
     "stop": "stops",
@@ -51,7 +51,7 @@ _LAST_NAMES: dict[Stream, str] = {
 }
 """The last names of their topics."""
 
-_KINDS: dict[Stream, type[DriverState] | type[Stop]] = {"driver": DriverState, "stop": Stop}
+_KINDS: dict[StreamName, type[DriverState] | type[Stop]] = {"driver": DriverState, "stop": Stop}
 _TEXTS = frozenset({"program", "state", "reason", "commander", "last_refusal", "how"})
 """The fields that are texts."""
 
@@ -61,13 +61,13 @@ _LEVELS = {"stopped": _WARN, "fault": _ERROR}
 """Those of the states of a driver that are not OK."""
 
 
-def driver_topic(namespace: str, stream: Stream) -> str:
+def driver_topic(namespace: str, stream: StreamName) -> str:
     """The topic of a stream of drivers, for a robot in ``namespace`` ("" is the root)."""
     topic = f"/{_LAST_NAMES[stream]}"
     return f"/{namespace}{topic}" if namespace and stream != "driver" else topic
 
 
-def driver_stream(topic: str, type_name: str) -> Stream | None:
+def driver_stream(topic: str, type_name: str) -> StreamName | None:
     """The stream of drivers that has this topic; None if it is another topic."""
     last_name = topic.rpartition("/")[2]
     for stream, kind in DRIVER_TYPES.items():
@@ -141,7 +141,7 @@ def encode_status(message: DriverState | Stop, robot: str, program: str) -> byte
     return writer.payload()
 
 
-def decode_status(stream: Stream, payload: bytes) -> DriverState | Stop:
+def decode_status(stream: StreamName, payload: bytes) -> DriverState | Stop:
     """The message of ``stream`` in ``payload``. Raises MessageError."""
     reader = CdrReader(payload, DIAGNOSTIC_ARRAY.name)
     fields: dict[str, Any] = {"stamp": reader.stamp()}

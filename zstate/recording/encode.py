@@ -30,7 +30,7 @@ from zstate.recording.driver_messages import (
 from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.storage import EDGE_WRITER, ROBOT
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     POSE_BYTES,
     ClockMessage,
@@ -78,7 +78,7 @@ CHANNEL_BURST = 1000
 CHANNELS_PER_S = 10.0
 """Rate at which a robot opens channels, per second of log time, after the first ``CHANNEL_BURST``."""
 
-_STREAMS: dict[type[Message], Stream] = {
+_STREAMS: dict[type[Message], StreamName] = {
     JointState: "joint_states",
     TransformSample: "tf",
     StaticTransforms: "tf_static",
@@ -94,7 +94,7 @@ _STREAMS: dict[type[Message], Stream] = {
     OccupancyGrid: "map",
     ClockMessage: "clock",
 }
-_NAMED_STREAMS: dict[type[Message], Stream] = {
+_NAMED_STREAMS: dict[type[Message], StreamName] = {
     **_STREAMS,
     JointState: "partial_joint_states",
     TransformSample: "transforms",
@@ -102,7 +102,7 @@ _NAMED_STREAMS: dict[type[Message], Stream] = {
 }
 """The streams of messages that have the name of a writer."""
 
-TOPICS: dict[Stream, Stream] = {"transforms": "tf", "partial_joint_states": "joint_states"}
+TOPICS: dict[StreamName, StreamName] = {"transforms": "tf", "partial_joint_states": "joint_states"}
 """The streams after which the topics of others are named: ROS has no topics of single writers."""
 
 POSED_FRAME = "zstate.posed_frame"
@@ -192,10 +192,10 @@ class RecordingEncoder:
         self._statics: dict[tuple[str, int], StaticAccumulator] = {}
         self._orders: dict[str, OrderRegistry] = {}
         self._pending = PendingSamples()
-        self._counts: Counter[tuple[str, Stream]] = Counter()
+        self._counts: Counter[tuple[str, StreamName]] = Counter()
 
     @property
-    def messages(self) -> dict[tuple[str, Stream], int]:
+    def messages(self) -> dict[tuple[str, StreamName], int]:
         """Messages written, by robot and stream; repetitions of latched ones are not counted."""
         return dict(self._counts)
 
@@ -247,7 +247,7 @@ class RecordingEncoder:
             self._refuse(reason if stamp else "no stamp", f"{robot!r}: {error}")
         return True
 
-    def withdraw(self, robot: str, stream: Stream, name: str, log_time: int) -> None:
+    def withdraw(self, robot: str, stream: StreamName, name: str, log_time: int) -> None:
         """Write that the writer ``name`` has withdrawn its static edges (``tf_static``), or its ``map``.
 
         ROS cannot express this: the messages are a TFMessage without transforms, and a grid without cells.
@@ -381,7 +381,7 @@ class RecordingEncoder:
     def _channel(
         self,
         robot: str,
-        stream: Stream,
+        stream: StreamName,
         session: int,
         log_time: int,
         edge_writer: str = "",
@@ -419,7 +419,7 @@ class RecordingEncoder:
             self._writer.release(unused.number)
         return channel
 
-    def topic(self, robot: str, stream: Stream, writer_name: str = "") -> tuple[str, RosType, Qos]:
+    def topic(self, robot: str, stream: StreamName, writer_name: str = "") -> tuple[str, RosType, Qos]:
         """The topic that carries a stream of ``robot``, its type and its QoS.
 
         ``writer_name`` is the name of a sensor, of odometry or of a map. Covariances, and measured poses of
@@ -444,7 +444,7 @@ class RecordingEncoder:
         return Ros2Options(namespace=self._namespaces[robot], frame_prefix=f"{robot}/")
 
 
-def _latched_key(robot: str, stream: Stream, name: str) -> str:
+def _latched_key(robot: str, stream: StreamName, name: str) -> str:
     """The key of a latched message, in the file and in its robot."""
     return f"{robot}/{stream}/{name}"
 
@@ -452,9 +452,9 @@ def _latched_key(robot: str, stream: Stream, name: str) -> str:
 class ChannelEncoder:
     """Encodes the messages of one writer on ``stream``, for the channel ``number`` of the file."""
 
-    def __init__(self, number: ChannelId, stream: Stream, names: FrameNames) -> None:
+    def __init__(self, number: ChannelId, stream: StreamName, names: FrameNames) -> None:
         self.number = number
-        self._stream: Stream = stream
+        self._stream: StreamName = stream
         self._names = names
         self._sample_names = _NAMED
         self._encoder = RosStreamEncoder(names, _NAMED)

@@ -15,7 +15,7 @@ from zstate.model.urdf import parse_urdf
 from zstate.recording.decode import RecordedWriter, recorded_writers
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import ROBOT, Channel
-from zstate.wire.keys import LATCHED_STREAMS, Stream
+from zstate.wire.keys import LATCHED_STREAMS, StreamName
 from zstate.wire.messages import LaserScan, from_float32_block
 from zstate.wire.ros2.cdr import decode_string
 from zstate.wire.ros2.decoder import RosDecoder
@@ -97,7 +97,7 @@ class RecordedStream:
     the topic; None for other streams.
     """
 
-    stream: Stream
+    stream: StreamName
     topic: str
     type: str
     count: int

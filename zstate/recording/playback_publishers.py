@@ -27,7 +27,7 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder
-from zstate.wire.keys import EDGE_STREAMS, MODEL_WRITER, NAMED_STREAMS, SENSOR_STREAMS, Stream, full_name
+from zstate.wire.keys import EDGE_STREAMS, MODEL_WRITER, NAMED_STREAMS, SENSOR_STREAMS, StreamName, full_name
 from zstate.wire.messages import (
     Edges,
     JointState,
@@ -49,10 +49,10 @@ EdgeWriter: TypeAlias = tuple[str, str]
 LatchedMessage: TypeAlias = RobotDescription | StaticTransforms | OccupancyGrid
 """Messages in effect until the next of their writer."""
 
-_Named: TypeAlias = tuple[str, Stream, str]
+_Named: TypeAlias = tuple[str, StreamName, str]
 """The robot, the stream and the name of a writer."""
 
-_SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
+_SAMPLES: tuple[StreamName, ...] = ("joint_states", "tf")
 
 
 class PlaybackPublishers(Closeable):
@@ -112,10 +112,10 @@ class PlaybackPublishers(Closeable):
                 )
             )
             for robot in {robot for robot, _ in recorded if robot}:
-                own = set(self._robots[robot].streams) if robot in self._robots else set[Stream]()
+                own = set(self._robots[robot].streams) if robot in self._robots else set[StreamName]()
                 if robot in in_parts:
                     own.add("joint_states")
-                streams: list[Stream] = [
+                streams: list[StreamName] = [
                     one for one in _SAMPLES if (robot, one) in recorded and one not in own
                 ]
                 self._others[robot] = self._open_passthrough(robot, streams)
@@ -145,8 +145,8 @@ class PlaybackPublishers(Closeable):
 
     def _open(self, robot: str, model: RobotModel, is_computed: bool) -> None:
         """Open the publisher of a robot with a known model."""
-        joints: tuple[Stream, ...] = () if robot in self._in_parts else ("joint_states",)
-        streams: tuple[Stream, ...] = (*joints, "tf_static", "robot_description")
+        joints: tuple[StreamName, ...] = () if robot in self._in_parts else ("joint_states",)
+        streams: tuple[StreamName, ...] = (*joints, "tf_static", "robot_description")
         self._modelled.set_model(robot, model)
         if is_computed:
             self._computed.set_model(robot, model)
@@ -253,7 +253,7 @@ class _RobotPublisher(NamedTuple):
 
     publisher: StatePublisher
     order: JointOrder
-    streams: tuple[Stream, ...]
+    streams: tuple[StreamName, ...]
 
 
 class TransformPlayback(Closeable):
@@ -406,7 +406,7 @@ class PassthroughPublisher(Closeable):
         self,
         session: Session,
         robot: str,
-        streams: Sequence[Stream],
+        streams: Sequence[StreamName],
         edge_writer: str = "",
         *,
         wires: Sequence[str],
@@ -417,11 +417,11 @@ class PassthroughPublisher(Closeable):
         self._session_id = secrets.randbits(32)
         self._robot = robot
         self.edge_writer = edge_writer
-        self._moving: Stream = "odometry" if "odometry" in streams else "transforms"
+        self._moving: StreamName = "odometry" if "odometry" in streams else "transforms"
         self._sessions = sessions
         self._is_alone = "native" in wires and not takeover
-        self._seqs: Counter[Stream] = Counter()
-        self._latched: dict[tuple[Stream, str], list[LatchedWriter]] = {}
+        self._seqs: Counter[StreamName] = Counter()
+        self._latched: dict[tuple[StreamName, str], list[LatchedWriter]] = {}
         self._placed: dict[str, set[Edge]] = {}
         self._maps: set[str] = set()
         self._writer = writer = local_writer(self._session_id)
@@ -434,7 +434,7 @@ class PassthroughPublisher(Closeable):
             self._wire_writers = [
                 opening.enter_context(WireWriter(session, get_wire(wire), robot, writer)) for wire in wires
             ]
-            self._streams: dict[Stream, list[SampleWriter]] = {
+            self._streams: dict[StreamName, list[SampleWriter]] = {
                 stream: [
                     one.open_stream(carrier(get_wire(wire), stream), edge_writer)
                     for wire, one in zip(wires, self._wire_writers, strict=True)
@@ -449,7 +449,7 @@ class PassthroughPublisher(Closeable):
         if self._claim is not None:
             self._claim.check()
             self._edge_monitor.check()
-        stream: Stream = next(one for one in _carrying(message) if one in self._streams)
+        stream: StreamName = next(one for one in _carrying(message) if one in self._streams)
         if isinstance(message, TransformSample) and stream in EDGE_STREAMS:
             self._own(message.edges or ())
         write_all(self._streams[stream], renumbered(message, self._seqs[stream], self._session_id))
@@ -512,7 +512,7 @@ class PassthroughPublisher(Closeable):
             for latched in self._latched["map", writer]:
                 latched.withdraw()
 
-    def _latch(self, stream: Stream, writer: str) -> list[LatchedWriter]:
+    def _latch(self, stream: StreamName, writer: str) -> list[LatchedWriter]:
         if (stream, writer) not in self._latched:
             announced = self._announced(stream, writer)
             with ExitStack() as opening:
@@ -524,7 +524,7 @@ class PassthroughPublisher(Closeable):
             self._latched[stream, writer] = opened
         return self._latched[stream, writer]
 
-    def _announced(self, stream: Stream, writer: str) -> Announcement:
+    def _announced(self, stream: StreamName, writer: str) -> Announcement:
         return Announcement(self._robot, stream, self._writer, writer if stream in NAMED_STREAMS else "")
 
     def _claimed(self, opening: ExitStack, streams: Sequence[Announcement]) -> WriterClaim | None:
@@ -539,7 +539,7 @@ class PassthroughPublisher(Closeable):
         self._opened.close()
 
 
-def _carrying(message: Message) -> tuple[Stream, ...]:
+def _carrying(message: Message) -> tuple[StreamName, ...]:
     """The streams that may carry ``message``."""
     if isinstance(message, JointState):
         return ("partial_joint_states", "joint_states")
@@ -552,7 +552,7 @@ def _is_computed(robot: str, writers: Collection[RecordedWriter]) -> bool:
     That is the case without recorded transforms, or if the writer of the joint states wrote them too.
     """
 
-    def sessions(stream: Stream) -> set[int]:
+    def sessions(stream: StreamName) -> set[int]:
         return {writer.session for writer in writers if (writer.robot, writer.stream) == (robot, stream)}
 
     return sessions("tf") <= sessions("joint_states")

@@ -31,7 +31,7 @@ from zstate.recording.driver_messages import DRIVER_TYPES
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, LATCHED_STREAMS, NAMED_STREAMS, SENSOR_STREAMS, Stream, check_robot
+from zstate.wire.keys import ANY, LATCHED_STREAMS, NAMED_STREAMS, SENSOR_STREAMS, StreamName, check_robot
 from zstate.wire.messages import Message, Odometry, StampedMessage, Stop, edge_of
 from zstate.wire.protocol import SerializedSample, Wire
 from zstate.wire.registry import get_wire
@@ -63,7 +63,7 @@ class Batch(NamedTuple):
     process dropped samples before or among them.
     """
 
-    stream: Stream
+    stream: StreamName
     robot: str | None
     arrivals: list[SerializedSample]
     stamp: int
@@ -83,9 +83,9 @@ class MessageQueue(Closeable):
         self._waiting = self._bytes = 0
         self._has_room = fork_safe(threading.Condition())
         self._is_open = True
-        self._subscribers: dict[Stream, Closeable] = {}
+        self._subscribers: dict[StreamName, Closeable] = {}
 
-    def subscribe(self, stream: Stream, expressions: Sequence[str], robot: str | None) -> None:
+    def subscribe(self, stream: StreamName, expressions: Sequence[str], robot: str | None) -> None:
         """Subscribe to a stream, in place of the last subscription to it.
 
         An empty payload of a latched stream is a withdrawn value.
@@ -112,7 +112,7 @@ class MessageQueue(Closeable):
             subscriber = StreamSubscriber(self._session, expressions, put)
         self._subscribers[stream] = subscriber
 
-    def unsubscribe(self, stream: Stream) -> None:
+    def unsubscribe(self, stream: StreamName) -> None:
         """End the subscription to a stream; what is in the queue can still be read."""
         subscriber = self._subscribers.pop(stream, None)
         if subscriber is not None:
@@ -183,13 +183,13 @@ class SampleWriter:
         return messages
 
 
-def recorded_streams(wire: Wire) -> tuple[Stream, ...]:
+def recorded_streams(wire: Wire) -> tuple[StreamName, ...]:
     """The streams of robots that a recording of ``wire`` holds; the clock belongs to no robot."""
     # On a ROS wire all moving edges are on tf, and all joints on joint_states.
     named = wire.partial_joint_states, wire.transforms
-    latched: tuple[Stream, ...] = ("robot_description", "tf_static", "map")
+    latched: tuple[StreamName, ...] = ("robot_description", "tf_static", "map")
     driving = tuple(DRIVER_TYPES) if wire.name == "native" else ()
-    samples: tuple[Stream, ...] = ("joint_states", "tf", *named, *SENSOR_STREAMS, "odometry", *driving)
+    samples: tuple[StreamName, ...] = ("joint_states", "tf", *named, *SENSOR_STREAMS, "odometry", *driving)
     return tuple(dict.fromkeys((*latched, *samples)))
 
 
@@ -204,7 +204,7 @@ class RecorderStats:
     ``lost`` that many of the ``messages``.
     """
 
-    messages: Mapping[tuple[str, Stream], int]
+    messages: Mapping[tuple[str, StreamName], int]
     bytes: int
     files: tuple[Path, ...]
     dropped: int

@@ -56,7 +56,7 @@ from zstate.recording.joint_states import DELAYED_NS, JointStateReader
 from zstate.recording.reader import RecordingReader
 from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.scan import Scan, scan_from_message
-from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, full_name
+from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, StreamName, full_name
 from zstate.wire.messages import (
     DriverState,
     Edges,
@@ -169,7 +169,7 @@ class Recording(Closeable):
         return buffer
 
     def fill(
-        self, buffer: TransformBuffer, streams: Collection[Stream] = STREAMS
+        self, buffer: TransformBuffer, streams: Collection[StreamName] = STREAMS
     ) -> Iterator[DecodedMessage]:
         """Insert all of the recording into an empty ``buffer``; each message is returned when it is in.
 
@@ -182,7 +182,7 @@ class Recording(Closeable):
         buffer: TransformBuffer,
         counters: Counters,
         robots: Collection[str] | None,
-        streams: Collection[Stream],
+        streams: Collection[StreamName],
     ) -> Iterator[DecodedMessage]:
         buffer.is_recording = True
         recording = DecodedRecording(self._reader, counters.count_refusal)
@@ -262,7 +262,7 @@ class Recording(Closeable):
                 yield message
 
     def _measurements(
-        self, kind: type[_Measurement], robot: str | None, stream: Stream, sensor: str | None
+        self, kind: type[_Measurement], robot: str | None, stream: StreamName, sensor: str | None
     ) -> Iterator[_Measurement]:
         refusals = Refusals(f"recorded {stream}")
         for writer, message, _ in self._messages(robot, stream, refusals):
@@ -323,7 +323,9 @@ class Recording(Closeable):
             assert isinstance(message, Stop)
             yield writer.program or "", message
 
-    def _messages(self, robot: str | None, stream: Stream, refusals: Refusals) -> Iterator[DecodedMessage]:
+    def _messages(
+        self, robot: str | None, stream: StreamName, refusals: Refusals
+    ) -> Iterator[DecodedMessage]:
         recording = DecodedRecording(self._reader, refusals.count)
         robot = robot or self.robot
         robots = None if robot is None else (check_has_robot(recording, robot),)

@@ -22,7 +22,7 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.sources.joint_state_merger import JointStateMerger
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import JointState, RobotDescription, message_size
 from zstate.wire.protocol import Wire
 from zstate.wire.registry import get_wire
@@ -51,7 +51,7 @@ class JointStateReader:
         max_age_s: float,
         on_error: Callable[[str, object], object],
         *,
-        stream: Stream = "joint_states",
+        stream: StreamName = "joint_states",
     ) -> None:
         self.model = model
         self.newest: JointReading | None = None
@@ -147,8 +147,8 @@ class JointStateListener(Closeable):
         self._unread: Inbox[JointReading] = Inbox(_CAPACITY, session.check)
         self._lock = fork_safe_lock()
         self._on_reading = on_reading
-        self._stream: Stream = stream
-        streams: tuple[Stream, ...] = (stream,)
+        self._stream: StreamName = stream
+        streams: tuple[StreamName, ...] = (stream,)
         if stream == "joint_states":
             streams = tuple(dict.fromkeys((stream, self._wire.partial_joint_states)))
         with ExitStack() as opening:

@@ -25,7 +25,7 @@ from zstate.recording.reader import RecordingReader
 from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.view.world_source import TIME_JUMP_NS, WriterName
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import LaserScan, Message, OccupancyGrid
 
 _READ_AHEAD = 30
@@ -245,7 +245,9 @@ class RecordedWorld(Closeable):
             self._refusals.count("malformed map", f"{name}: {error}")
             return None
 
-    def _messages(self, name: WriterName, stream: Stream, begin: int, end: int) -> Sequence[DecodedMessage]:
+    def _messages(
+        self, name: WriterName, stream: StreamName, begin: int, end: int
+    ) -> Sequence[DecodedMessage]:
         with self._lock:
             if not self._is_open:
                 return ()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput, printable
-from zstate.wire.keys import MAX_NAME_LENGTH, NAMED_STREAMS, Stream, check_writer, shortened
+from zstate.wire.keys import MAX_NAME_LENGTH, NAMED_STREAMS, StreamName, check_writer, shortened
 
 _ALL_AND_SOME_JOINTS = {"joint_states", "partial_joint_states"}
 
@@ -69,7 +69,7 @@ class Announcement:
     """
 
     robot: str
-    stream: Stream
+    stream: StreamName
     writer: WriterId
     name: str = ""
     node: str = ""
@@ -80,7 +80,7 @@ class Announcement:
         return self.writer.identity + (f",{_quoted(self.name)}" if self.name else "")
 
     @classmethod
-    def parse(cls, robot: str, stream: Stream, identity: str) -> Announcement:
+    def parse(cls, robot: str, stream: StreamName, identity: str) -> Announcement:
         """The content of a token with this ``identity``. Raises InvalidInput if it is not one."""
         fields = identity.split(",", 6)
         is_named = len(fields) == 6 and stream in NAMED_STREAMS
@@ -91,7 +91,7 @@ class Announcement:
         return found
 
     @classmethod
-    def parse_all(cls, robot: str, streams: Sequence[Stream], identity: str) -> tuple[Announcement, ...]:
+    def parse_all(cls, robot: str, streams: Sequence[StreamName], identity: str) -> tuple[Announcement, ...]:
         """The contents of one token for several ``streams``, of which the named ones have one name.
 
         Raises InvalidInput as ``parse`` does.

@@ -45,7 +45,7 @@ from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput
 
-Stream = Literal[
+StreamName = Literal[
     "joint_states",
     "partial_joint_states",
     "tf",
@@ -69,24 +69,24 @@ Stream = Literal[
 CLOCK_KEY = "zstate/clock"
 ANY = "*"
 
-EDGE_STREAMS: tuple[Stream, ...] = ("transforms", "odometry")
+EDGE_STREAMS: tuple[StreamName, ...] = ("transforms", "odometry")
 """The streams of moving edges under the names of their writers."""
 
-SENSOR_STREAMS: tuple[Stream, ...] = ("scan", "imu", "velocity", "pose")
+SENSOR_STREAMS: tuple[StreamName, ...] = ("scan", "imu", "velocity", "pose")
 """The streams of sensors under their names."""
 
-STOP_STREAMS: tuple[Stream, ...] = ("stop", "relax")
+STOP_STREAMS: tuple[StreamName, ...] = ("stop", "relax")
 """The streams of stops. Access control lets every identity write the first, which never drops a load."""
 
-NAMED_STREAMS: frozenset[Stream] = frozenset(
+NAMED_STREAMS: frozenset[StreamName] = frozenset(
     {*EDGE_STREAMS, *SENSOR_STREAMS, *STOP_STREAMS, "tf_static", "partial_joint_states", "map"}
 )
 """The streams with one key for each of the writer names of a robot."""
 
-LATCHED_STREAMS: frozenset[Stream] = frozenset({"robot_description", "tf_static", "map"})
+LATCHED_STREAMS: frozenset[StreamName] = frozenset({"robot_description", "tf_static", "map"})
 """The streams of one current value, which late joiners receive as well."""
 
-JOINT_STREAMS: frozenset[Stream] = frozenset({"joint_states", "partial_joint_states"})
+JOINT_STREAMS: frozenset[StreamName] = frozenset({"joint_states", "partial_joint_states"})
 """The streams of joint positions."""
 
 READERS = "zstate/@reader/*/*/*"
@@ -111,7 +111,7 @@ MAX_FRAME_NAME_LENGTH = 1024
 _MAX_KEY_LENGTH = 16_384
 """A name of ``MAX_NAME_LENGTH`` is up to 12 times as long when it is quoted."""
 
-_STREAMS: dict[str, Stream] = {stream: stream for stream in get_args(Stream)}
+_STREAMS: dict[str, StreamName] = {stream: stream for stream in get_args(StreamName)}
 _RESERVED = frozenset("/*$?#")
 _CLOCK_CHUNK = CLOCK_KEY.rpartition("/")[2]
 
@@ -159,7 +159,7 @@ def shortened(text: str) -> str:
     return text if len(text) <= MAX_NAME_LENGTH else f"{text[:MAX_NAME_LENGTH]}..."
 
 
-def stream_key(robot: str, stream: Stream, writer: str = "") -> str:
+def stream_key(robot: str, stream: StreamName, writer: str = "") -> str:
     """The key of ``stream``: of the ``NAMED_STREAMS`` one for each ``writer``; ``clock`` has only one."""
     if stream == "clock":
         return CLOCK_KEY
@@ -167,7 +167,7 @@ def stream_key(robot: str, stream: Stream, writer: str = "") -> str:
     return f"{key}/{check_writer(writer)}" if stream in NAMED_STREAMS else key
 
 
-def stream_from_key(key: str) -> Stream:
+def stream_from_key(key: str) -> StreamName:
     """The stream of a ``stream_key``. Raises InvalidInput for any other key."""
     chunks = _chunks(key)
     if len(chunks) > 2 and chunks[0] == "zstate" and chunks[2] in _STREAMS:
@@ -177,7 +177,7 @@ def stream_from_key(key: str) -> Stream:
     raise _form_error(key, "zstate/<robot>/<stream>")
 
 
-def stream_expression(robot: str, stream: Stream) -> str:
+def stream_expression(robot: str, stream: StreamName) -> str:
     """The key expression of every writer of ``stream``."""
     if stream == "clock":
         return CLOCK_KEY
@@ -268,12 +268,12 @@ def odometry_request_key(robot: str, writer: str) -> str:
     return f"zstate/{check_robot(robot)}/{ODOMETRY_CHUNK}/{check_writer(writer)}"
 
 
-def writer_key(robot: str, streams: Stream | Collection[Stream], identity: str) -> str:
+def writer_key(robot: str, streams: StreamName | Collection[StreamName], identity: str) -> str:
     """The liveliness token of one writer of ``streams``."""
     return f"zstate/{check_robot(robot)}/@writer/{_joined(streams)}/{identity}"
 
 
-def writer_expression(robot: str, stream: Stream | None = None) -> str:
+def writer_expression(robot: str, stream: StreamName | None = None) -> str:
     """The key expression of all writer tokens of ``robot``, or of those with ``stream`` in their streams.
 
     The tokens of streams whose names contain that of ``stream`` match, too.
@@ -282,13 +282,13 @@ def writer_expression(robot: str, stream: Stream | None = None) -> str:
     return f"zstate/{_check_robot_or_any(robot)}/@writer/{streams}/*"
 
 
-def parse_writer_key(key: str) -> tuple[str, tuple[Stream, ...], str]:
+def parse_writer_key(key: str) -> tuple[str, tuple[StreamName, ...], str]:
     """Robot, streams and identity in a ``writer_key``."""
     robot, streams, identity = _parse(key, "zstate/<robot>/@writer/<streams>/<identity>")
     return check_robot(robot), _split(streams), identity
 
 
-def reader_key(robot: str, streams: Stream | Collection[Stream], identity: str) -> str:
+def reader_key(robot: str, streams: StreamName | Collection[StreamName], identity: str) -> str:
     """The liveliness token of one reader of ``streams``; robot ``"*"`` means all.
 
     Readers write below no robot's prefix.
@@ -296,22 +296,22 @@ def reader_key(robot: str, streams: Stream | Collection[Stream], identity: str) 
     return f"zstate/@reader/{quote(robot, safe='')}/{_joined(streams)}/{identity}"
 
 
-def parse_reader_key(key: str) -> tuple[str, tuple[Stream, ...], str]:
+def parse_reader_key(key: str) -> tuple[str, tuple[StreamName, ...], str]:
     """Robot, streams and identity in a ``reader_key``."""
     robot, streams, identity = _parse(key, "zstate/@reader/<robot>/<streams>/<identity>")
     return _check_robot_or_any(unquote(robot)), _split(streams), identity
 
 
-def _joined(streams: Stream | Collection[Stream]) -> str:
+def _joined(streams: StreamName | Collection[StreamName]) -> str:
     """``streams`` in one chunk, each once, in one canonical order."""
     names = (streams,) if isinstance(streams, str) else streams
     return ",".join(name for name in _STREAMS if name in names)
 
 
-def _split(chunk: str) -> tuple[Stream, ...]:
+def _split(chunk: str) -> tuple[StreamName, ...]:
     """The streams in a chunk. Raises InvalidInput unless they are in canonical form."""
     names = chunk.split(",")
-    streams: tuple[Stream, ...] = tuple(_STREAMS[name] for name in _STREAMS if name in names)
+    streams: tuple[StreamName, ...] = tuple(_STREAMS[name] for name in _STREAMS if name in names)
     # One canonical form: two tokens of one writer would count as two writers.
     if not streams or ",".join(streams) != chunk:
         order = ", ".join(_STREAMS)

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput, MessageError, printable
 from zstate.transform import COVARIANCE_NUMBERS
-from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, Stream, full_name
+from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, StreamName, full_name
 
 Edges = tuple[tuple[str, str], ...]
 Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -825,7 +825,7 @@ LATCHED_BYTES = GRID_CELLS + 8 * 2**10
 ATTACHMENT_BYTES = 1_024
 STATIC_EDGES = 10_000
 
-MAX_BYTES: Mapping[Stream, int] = {
+MAX_BYTES: Mapping[StreamName, int] = {
     "joint_states": SAMPLE_BYTES,
     "partial_joint_states": SAMPLE_BYTES,
     "tf": SAMPLE_BYTES,
@@ -850,7 +850,7 @@ _OVERHEAD = 200
 """The least size of a decoded message without its numbers and names [bytes]."""
 
 
-def check_size(stream: Stream, size: int, factor: int = 1) -> None:
+def check_size(stream: StreamName, size: int, factor: int = 1) -> None:
     """Raise MessageError for a payload of ``size`` bytes that is too large for ``stream``."""
     limit = MAX_BYTES[stream] * factor
     if size > limit:

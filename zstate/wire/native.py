@@ -19,7 +19,7 @@ import msgspec
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     LATCHED_BYTES,
     SAMPLE_BYTES,
@@ -82,7 +82,7 @@ ENCODINGS: dict[type[Message], str] = {
     Status: "zstate/Status;v=1",
     HistoryPage: "zstate/Past;v=1",
 }
-STREAM_TYPES: dict[Stream, type[Message]] = {
+STREAM_TYPES: dict[StreamName, type[Message]] = {
     "joint_states": JointState,
     "partial_joint_states": JointState,
     "tf": TransformSample,
@@ -128,7 +128,7 @@ _DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in ENCODINGS}
 _ENCODING = re.compile(r"zstate/(\w+);v=([1-9]\d{0,8})")
 
 
-def stream_encoding(stream: Stream) -> str:
+def stream_encoding(stream: StreamName) -> str:
     """The Zenoh encoding of the messages of a stream."""
     return ENCODINGS[STREAM_TYPES[stream]]
 
@@ -252,7 +252,7 @@ class NativeStreamEncoder:
     can_withdraw = True
     attachment = None
 
-    def __init__(self, robot: str, writer: WriterId, stream: Stream, name: str) -> None:
+    def __init__(self, robot: str, writer: WriterId, stream: StreamName, name: str) -> None:
         self.key = keys.stream_key(robot, stream, name)
         self.encoding = stream_encoding(stream)
         identity = Announcement(robot, stream, writer, name if stream in keys.NAMED_STREAMS else "").identity
@@ -269,31 +269,31 @@ class NativeWire:
     """The native wire format (``zstate.wire.protocol.Wire``)."""
 
     name = "native"
-    shared: frozenset[Stream] = frozenset()
-    transforms: Stream = "transforms"
+    shared: frozenset[StreamName] = frozenset()
+    transforms: StreamName = "transforms"
     edges = keys.EDGE_STREAMS
-    partial_joint_states: Stream = "partial_joint_states"
+    partial_joint_states: StreamName = "partial_joint_states"
 
     def node_token(self, node: WriterNode) -> None:
         return None
 
     def stream_encoder(
-        self, node: WriterNode, stream: Stream, number: int, name: str = ""
+        self, node: WriterNode, stream: StreamName, number: int, name: str = ""
     ) -> NativeStreamEncoder:
         return NativeStreamEncoder(node.robot, node.writer, stream, name)
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[Stream], reader: WriterId, zid: str, number: Callable[[], int]
+        self, robot: str, streams: Sequence[StreamName], reader: WriterId, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         identity = replace(reader, session=number()).identity
         return (keys.reader_key(robot, streams, identity),)
 
-    def expression(self, robot: str, stream: Stream) -> str:
+    def expression(self, robot: str, stream: StreamName) -> str:
         return keys.stream_expression(robot, stream)
 
     robot_from_key = staticmethod(keys.robot_from_key)
 
-    def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
+    def decode(self, stream: StreamName, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         if arrival.size or len(arrival.payload) > _MIN_LIMIT_BYTES:
             check_size(stream, arrival.size or len(arrival.payload))
         message = decode(arrival.payload, arrival.encoding, STREAM_TYPES[stream])
@@ -301,7 +301,7 @@ class NativeWire:
             check_edges(message)
         return (message,)
 
-    def usual_envelope(self, stream: Stream) -> Envelope:
+    def usual_envelope(self, stream: StreamName) -> Envelope:
         return Envelope(stream_encoding(stream))
 
     def edge_writer_name(self, key: str) -> str:

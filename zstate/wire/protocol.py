@@ -11,7 +11,7 @@ from msgspec import Struct
 from zstate.errors import InvalidInput
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import ANY, Stream, check_robot
+from zstate.wire.keys import ANY, StreamName, check_robot
 from zstate.wire.messages import Message
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class StreamEncoder(Protocol):
         ...
 
 
-def carrier(wire: Wire, stream: Stream) -> Stream:
+def carrier(wire: Wire, stream: StreamName) -> StreamName:
     """The stream that carries ``stream`` on ``wire``: in ROS transforms are on /tf."""
     if stream == "transforms":
         return wire.transforms
@@ -119,23 +119,25 @@ class Wire(WriterTokens, Protocol):
     name: str
     """Its name for users: "native", ..."""
 
-    shared: frozenset[Stream]
+    shared: frozenset[StreamName]
     """The streams of a robot that several writers publish, each a part."""
 
-    transforms: Stream
+    transforms: StreamName
     """The stream that carries the edges of a ``TransformPublisher``."""
 
-    edges: tuple[Stream, ...]
+    edges: tuple[StreamName, ...]
     """The streams of all moving edges that are not a model's."""
 
-    partial_joint_states: Stream
+    partial_joint_states: StreamName
     """The stream that carries the joints of a ``PartialStatePublisher``."""
 
     def node_token(self, node: WriterNode) -> str | None:
         """The liveliness token of a writer as a node of the ROS graph; None if there is no such graph."""
         ...
 
-    def stream_encoder(self, node: WriterNode, stream: Stream, number: int, name: str = "") -> StreamEncoder:
+    def stream_encoder(
+        self, node: WriterNode, stream: StreamName, number: int, name: str = ""
+    ) -> StreamEncoder:
         """The encoder of ``stream`` for the writer ``node``.
 
         ``number`` identifies the stream within the session; ``name`` is the one under which the writer
@@ -144,7 +146,7 @@ class Wire(WriterTokens, Protocol):
         ...
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[Stream], reader: WriterId, zid: str, number: Callable[[], int]
+        self, robot: str, streams: Sequence[StreamName], reader: WriterId, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         """The liveliness tokens of ``reader`` for ``streams`` of ``robot``, or of all robots for ``"*"``.
 
@@ -152,7 +154,7 @@ class Wire(WriterTokens, Protocol):
         """
         ...
 
-    def expression(self, robot: str, stream: Stream) -> str:
+    def expression(self, robot: str, stream: StreamName) -> str:
         """The key expression of ``stream`` from all writers of ``robot``, or of all robots for ``"*"``."""
         ...
 
@@ -160,11 +162,11 @@ class Wire(WriterTokens, Protocol):
         """The robot that a key belongs to. Raises InvalidInput if it belongs to none."""
         ...
 
-    def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
+    def decode(self, stream: StreamName, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         """The messages of a sample received on ``stream`` of ``robot``. Raises MessageError."""
         ...
 
-    def usual_envelope(self, stream: Stream) -> Envelope | None:
+    def usual_envelope(self, stream: StreamName) -> Envelope | None:
         """The envelope of samples whose payloads a ``FastPath`` can compare; None if it knows no format."""
         ...
 

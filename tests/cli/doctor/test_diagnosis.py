@@ -29,7 +29,7 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import ImuPublisher, OdometryPublisher, SensorListener
 from zstate.sources import JointStateListener
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import Stream, reader_key, writer_key
+from zstate.wire.keys import StreamName, reader_key, writer_key
 from zstate.wire.messages import JointState, order_digest
 from zstate.wire.native import ENCODINGS, encode
 
@@ -60,7 +60,7 @@ def warnings(*arguments: str) -> dict[str, str]:
 
 @contextmanager
 def published_with_stamps(
-    stamp: Callable[[], int], streams: tuple[Stream, ...] = ALL_STREAMS
+    stamp: Callable[[], int], streams: tuple[StreamName, ...] = ALL_STREAMS
 ) -> Iterator[None]:
     """Publishes rrbot a hundred times a second, with the stamps that ``stamp`` returns."""
     with (

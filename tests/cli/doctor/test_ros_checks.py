@@ -18,9 +18,9 @@ from zstate.cli.doctor.diagnosis import with_same_options
 from zstate.cli.session import SessionOptions
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.scans import Grid, MapPublisher, ScanPublisher
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 
-WITHOUT_JOINTS: tuple[Stream, ...] = ("tf", "tf_static", "robot_description")
+WITHOUT_JOINTS: tuple[StreamName, ...] = ("tf", "tf_static", "robot_description")
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_nodes_of_one_robot_are_sound_under_any_name(ros_router: str):
 def test_joints_of_other_models_on_the_topic_are_ok(ros_router: str, gripper: str):
     with ExitStack() as nodes:
         nodes.enter_context(published_robot(wire="ros2", router=ros_router))
-        only: tuple[Stream, ...] = ("joint_states",)
+        only: tuple[StreamName, ...] = ("joint_states",)
         nodes.enter_context(
             published_robot("grip", wire="ros2", router=ros_router, model=gripper, streams=only)
         )
@@ -97,7 +97,7 @@ def test_two_robots_in_one_namespace_are_a_warning(ros_router: str, gripper: str
 
 def test_driver_of_other_joints_is_distinguished_from_a_missing_one(ros_router: str, gripper: str):
     with ExitStack() as nodes:
-        only: tuple[Stream, ...] = ("joint_states",)
+        only: tuple[StreamName, ...] = ("joint_states",)
         nodes.enter_context(published_robot(wire="ros2", router=ros_router, streams=WITHOUT_JOINTS))
         nodes.enter_context(
             published_robot("grip", wire="ros2", router=ros_router, model=gripper, streams=only)

@@ -18,7 +18,7 @@ from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.nodes.publisher import StatePublisher
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.native import ENCODINGS
 from zstate.wire.registry import get_wire
 
@@ -57,7 +57,7 @@ def native_keys(follow: Follow) -> tuple[str, ...]:
 
 
 def ros_keys(follow: Follow) -> tuple[str, ...]:
-    streams: tuple[Stream, ...] = (follow, "robot_description", "tf_static")
+    streams: tuple[StreamName, ...] = (follow, "robot_description", "tf_static")
     return tuple(get_wire("ros2").expression("r1", stream).replace("*", TYPE_HASH) for stream in streams)
 
 

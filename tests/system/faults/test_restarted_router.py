@@ -17,7 +17,7 @@ from zstate.net.presence import LivelinessToken, announce
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream, stream_key, writer_key
+from zstate.wire.keys import StreamName, stream_key, writer_key
 from zstate.wire.messages import Odometry, WriterTransforms, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
@@ -35,7 +35,7 @@ STILL = to_block([0.0] * 6)
 class Fleet:
     """Writers of ``odom -> base``, one for each robot; all share a session, so that they cost no threads."""
 
-    def __init__(self, session: Session, stream: Stream) -> None:
+    def __init__(self, session: Session, stream: StreamName) -> None:
         self._message = {"transforms": WriterTransforms, "odometry": Odometry}[stream]
         self._seq = 0
         self._tokens: list[LivelinessToken] = []
@@ -66,7 +66,7 @@ def frozen(listener: TransformListener, since: int) -> list[str]:
 
 
 @contextmanager
-def moving_fleet(endpoint: str, stream: Stream) -> Iterator[TransformListener]:
+def moving_fleet(endpoint: str, stream: StreamName) -> Iterator[TransformListener]:
     """A listener of a fleet that publishes twice a second."""
     with (
         connect(mode="client", endpoints=endpoint) as robots,
@@ -79,7 +79,7 @@ def moving_fleet(endpoint: str, stream: Stream) -> Iterator[TransformListener]:
 
 @pytest.mark.parametrize("stream", ["transforms", "odometry"])
 def test_no_robot_of_a_fleet_is_frozen_after_a_restart_of_the_router(
-    start: Start, endpoint: str, stream: Stream
+    start: Start, endpoint: str, stream: StreamName
 ):
     router = start("router", listen=endpoint)
     with moving_fleet(endpoint, stream) as listener:

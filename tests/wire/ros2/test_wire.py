@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.protocol import SerializedSample, StreamEncoder, WriterNode
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
@@ -58,7 +58,7 @@ def arrival(
     return SerializedSample(key or key_of(JOINT_STATES), payload, "zenoh/bytes", attached)
 
 
-def encoder_of(wire: Ros2Wire, stream: Stream, number: int) -> StreamEncoder:
+def encoder_of(wire: Ros2Wire, stream: StreamName, number: int) -> StreamEncoder:
     return wire.stream_encoder(NODE, stream, number)
 
 

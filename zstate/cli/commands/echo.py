@@ -17,7 +17,7 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from zstate.wire.keys import Stream
+    from zstate.wire.keys import StreamName
 
 
 def _check_amount(amount: float) -> float:
@@ -61,7 +61,7 @@ def echo_command(
     *,
     network: SessionOptions,
     robot: str | None,
-    stream: Stream,
+    stream: StreamName,
     once: bool,
     timeout: float,
     field: str | None,
@@ -134,7 +134,7 @@ def echo_command(
     ):
         selected = named_robot(session, robot, wire)
         document: Callable[[Any], Any]
-        named: dict[Stream, Callable[..., Any]] = {
+        named: dict[StreamName, Callable[..., Any]] = {
             "map": map_document,
             "imu": imu_document,
             "velocity": velocity_document,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from zstate.net.graph import Graph
     from zstate.net.session import Session
     from zstate.wire.identity import WriterId
-    from zstate.wire.keys import Stream
+    from zstate.wire.keys import StreamName
 
 _MEASURED_WITHIN_S = 0.4
 _READERS_WITHIN_S = 0.15
@@ -84,7 +84,7 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.wire.registry import get_wire
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
-        always: tuple[Stream, ...] = (
+        always: tuple[StreamName, ...] = (
             "joint_states",
             "partial_joint_states",
             *EDGE_STREAMS,
@@ -98,7 +98,7 @@ def _discover_measured_graph(session: Session) -> Graph:
         readers = discover_readers(session, _READERS_WITHIN_S)
         # tf is published only while it is read: measuring must not make a publisher start.
         read = {one.robot for one in readers if one.stream == "tf"}
-        moving: set[tuple[str, Stream]] = {(robot.name, stream) for robot in robots for stream in always}
+        moving: set[tuple[str, StreamName]] = {(robot.name, stream) for robot in robots for stream in always}
         for robot in robots:
             if read & {robot.name, ANY}:
                 statistics.subscribe("tf", robot.name)
@@ -111,7 +111,7 @@ def _discover_measured_graph(session: Session) -> Graph:
         ]
         statistics.wait(expected, _MEASURED_WITHIN_S)
 
-        def rate_hz(robot: str, stream: Stream, writer: WriterId) -> float | None:
+        def rate_hz(robot: str, stream: StreamName, writer: WriterId) -> float | None:
             source = statistics.get(WriterKey(robot, stream, writer.session))
             return None if source is None else source.published_hz()
 

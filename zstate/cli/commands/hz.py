@@ -16,7 +16,7 @@ from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.stream_reader import StreamReader, TimedSample
-    from zstate.wire.keys import Stream
+    from zstate.wire.keys import StreamName
 
 _SETTLING_S = 0.1
 
@@ -52,7 +52,7 @@ def hz_command(
     *,
     network: SessionOptions,
     robot: str | None,
-    stream: Stream,
+    stream: StreamName,
     window: int,
     once: bool,
     seconds: float | None,

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from zstate.net.session import Session
     from zstate.net.topic_statistics import TopicStatistics
     from zstate.wire.identity import WriterId
-    from zstate.wire.keys import Stream
+    from zstate.wire.keys import StreamName
     from zstate.wire.ros2.wire import Ros2Wire
 
 T = TypeVar("T")
@@ -45,7 +45,7 @@ _REFRESH_S, _JSON_PERIOD_S = 0.5, 1.0
 _DISCOVERY_S = 0.5
 _HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
 _OPTIONAL = ("since", "age")
-_MEASURED: tuple[Stream, ...] = (
+_MEASURED: tuple[StreamName, ...] = (
     *("joint_states", "partial_joint_states", "transforms", "odometry"),
     *("scan", "imu", "velocity", "pose"),
 )
@@ -200,7 +200,7 @@ def _lasting_text(nanoseconds: int) -> str:
 def _robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> list[dict[str, Any]]:
     from zstate.net.topic_statistics import WriterKey
 
-    def writer_facts(robot: RobotInfo, stream: Stream, writer: WriterId) -> dict[str, Any]:
+    def writer_facts(robot: RobotInfo, stream: StreamName, writer: WriterId) -> dict[str, Any]:
         source = statistics.get(WriterKey(robot.name, stream, writer.session))
         return {
             "stream": stream,

@@ -31,7 +31,7 @@ from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import printable
-from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, Stream, check_robot
+from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, StreamName, check_robot
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -52,7 +52,7 @@ _FIRST_AFTER_S = 1.0
 # Discovery takes less.
 _DISCOVERY_S = 0.3
 _WITHIN_NS = 2_000_000_000
-_OWN_RATES: dict[Stream, str] = {"transforms": "transforms", "odometry": "odometry", "scan": "scans"}
+_OWN_RATES: dict[StreamName, str] = {"transforms": "transforms", "odometry": "odometry", "scan": "scans"}
 """The streams that have a rate apart from that of the joint states, and its column."""
 
 
@@ -352,7 +352,7 @@ class RobotMonitor(Closeable):
         self._reported = reason
         return reason
 
-    def _follow(self, robot: str, streams: frozenset[Stream]) -> None:
+    def _follow(self, robot: str, streams: frozenset[StreamName]) -> None:
         """Follow a robot that has appeared, or whose joint states have."""
         from zstate.metrics.buffer import MeteredBuffer
         from zstate.nodes.listener import TransformListener
@@ -366,8 +366,8 @@ class RobotMonitor(Closeable):
         if known is not None and follow in (known.follow, "tf"):
             return
         # A native listener also receives moving edges, and partial joint states as joint states.
-        others: tuple[Stream, ...] = () if is_ros(self._wire) else ("partial_joint_states", *EDGE_STREAMS)
-        shown: list[Stream] = [stream for stream in (follow, *others) if stream in streams]
+        others: tuple[StreamName, ...] = () if is_ros(self._wire) else ("partial_joint_states", *EDGE_STREAMS)
+        shown: list[StreamName] = [stream for stream in (follow, *others) if stream in streams]
         if not shown:
             return
         if follow not in self._listeners:
@@ -411,9 +411,9 @@ class RobotMonitor(Closeable):
             for status in faulty:
                 print_wrapped(printable(f"{one.robot}  {status.level}  {_program(status)}: {status.text}"))
 
-    def _own_rates(self, robot: str, measure: RobotMeasure) -> dict[Stream, float]:
+    def _own_rates(self, robot: str, measure: RobotMeasure) -> dict[StreamName, float]:
         """The rates of streams other than the joint states, 0 for those that are silent."""
-        rates: dict[Stream, float] = {}
+        rates: dict[StreamName, float] = {}
         for stream in _OWN_RATES:
             counted = self._counted.get((robot, stream))
             if counted is not None:
@@ -426,7 +426,7 @@ class RobotMonitor(Closeable):
         return rates
 
 
-def _rate_facts(rates: Mapping[Stream, float]) -> dict[str, float | None]:
+def _rate_facts(rates: Mapping[StreamName, float]) -> dict[str, float | None]:
     return {f"{column}_hz": rates.get(stream) for stream, column in _OWN_RATES.items()}
 
 

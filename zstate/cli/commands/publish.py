@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from zstate.rate import RateReport
     from zstate.sources import JointReading, JointStateListener
     from zstate.sources.joint_source import JointSource
-    from zstate.wire.keys import Stream
+    from zstate.wire.keys import StreamName
 
 _RATE_HZ = 100.0
-_DERIVED: tuple[Stream, ...] = ("robot_description", "tf_static", "tf")
-_EVERYTHING: tuple[Stream, ...] = ("joint_states", *_DERIVED)
+_DERIVED: tuple[StreamName, ...] = ("robot_description", "tf_static", "tf")
+_EVERYTHING: tuple[StreamName, ...] = ("joint_states", *_DERIVED)
 
 
 def _check_source(source: str) -> str:

@@ -19,7 +19,7 @@ from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, Stream, foreign_edge_problem, full_name
+from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, StreamName, foreign_edge_problem, full_name
 from zstate.wire.messages import DriverState, Status
 
 _MIN_RECEIVED = 0.8
@@ -125,7 +125,7 @@ def _waits_checks(probe: RobotProbe) -> Iterator[Check]:
 
     The check of joint_states names those that wait for joints alone, and has better advice.
     """
-    streams: dict[str, list[Stream]] = {}
+    streams: dict[str, list[StreamName]] = {}
     for stream, reader in sorted(probe.waits.items()):
         streams.setdefault(str(reader), []).append(stream)
     for program, waited in streams.items():
@@ -300,7 +300,7 @@ def _parts_checks(probe: RobotProbe, model: RobotModel | None) -> Iterator[Check
 
 def named_writers_checks(
     probe: RobotProbe,
-    stream: Stream,
+    stream: StreamName,
     stream_samples: StreamSamples,
     names: Sequence[tuple[str, WriterId]],
     hz: str | None = None,

@@ -29,7 +29,7 @@ from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, Wri
 from zstate.nodes.clock import SimulatedClock
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, SENSOR_STREAMS, Stream
+from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, SENSOR_STREAMS, StreamName
 from zstate.wire.messages import (
     Imu,
     JointState,
@@ -48,9 +48,9 @@ from zstate.wire.registry import get_wire
 _MIN_WINDOW_S = 1.2  # writers publish their status once a second
 _READERS_WITHIN_S = 0.3
 _REPLY_WITHIN_S = 0.4
-_MEASURED: tuple[Stream, ...] = (*SENSOR_STREAMS, "odometry")
-_NATIVE_STREAMS: tuple[Stream, ...] = (*sorted(JOINT_STREAMS), "transforms", *_MEASURED)
-_ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", *_MEASURED)
+_MEASURED: tuple[StreamName, ...] = (*SENSOR_STREAMS, "odometry")
+_NATIVE_STREAMS: tuple[StreamName, ...] = (*sorted(JOINT_STREAMS), "transforms", *_MEASURED)
+_ROS_STREAMS: tuple[StreamName, ...] = ("joint_states", "tf", *_MEASURED)
 
 
 class WriterSamples:
@@ -123,12 +123,12 @@ class StreamCollector(Closeable):
         self.drivers: DriverStateListener | None = None
         self._session, self._on_change = session, on_change
         self._wire = get_wire(wire)
-        self._samples: dict[tuple[str, Stream], dict[int, WriterSamples]] = {}
+        self._samples: dict[tuple[str, StreamName], dict[int, WriterSamples]] = {}
         self._listeners: dict[Follow, TransformListener] = {}
         followed: dict[Follow, list[str]] = {}
         for info in robots:
             followed.setdefault(followed_stream(info, wire), []).append(info.name)
-        latched: list[Stream] = ["robot_description"]
+        latched: list[StreamName] = ["robot_description"]
         if any(info.map_names for info in robots):
             latched.append("map")
         with ExitStack() as opening:
@@ -157,7 +157,7 @@ class StreamCollector(Closeable):
         """The listener of all robots that move by the stream ``follow``."""
         return self._listeners[follow]
 
-    def samples(self, robot: str, stream: Stream) -> StreamSamples:
+    def samples(self, robot: str, stream: StreamName) -> StreamSamples:
         """What has arrived of ``stream`` of ``robot``."""
         statistics = self.topic.get((robot, stream)) or IntervalStatistics()
         return StreamSamples(statistics, self._samples.get((robot, stream), {}).copy())
@@ -181,7 +181,7 @@ class StreamCollector(Closeable):
             except NoClock as error:
                 return error
 
-    def _on_sample(self, robot: str, stream: Stream, sample: StampedMessage) -> None:
+    def _on_sample(self, robot: str, stream: StreamName, sample: StampedMessage) -> None:
         if robot not in self.statuses:
             return  # of a robot that joined later
         writers = self._samples.setdefault((robot, stream), {})
@@ -210,7 +210,7 @@ class StreamCollector(Closeable):
             self.events[event.robot].append(event)
 
 
-def _sources(robot: str, stream: Stream, sample: StampedMessage) -> Iterator[Hashable]:
+def _sources(robot: str, stream: StreamName, sample: StampedMessage) -> Iterator[Hashable]:
     if stream in ("joint_states", "tf"):
         yield robot, stream
     yield WriterKey(robot, stream, sample.session)
@@ -296,17 +296,17 @@ class RobotProbe:
         return self._of("scan")
 
     @property
-    def measured(self) -> dict[Stream, StreamSamples]:
+    def measured(self) -> dict[StreamName, StreamSamples]:
         """Those of other sensors than laser scanners, and of odometry."""
         return {stream: self._of(stream) for stream in _MEASURED if stream != "scan"}
 
     @property
-    def nodes(self) -> dict[Stream, StreamSamples]:
+    def nodes(self) -> dict[StreamName, StreamSamples]:
         """Those of each ROS node; empty on the native wire."""
-        streams: tuple[Stream, ...] = () if self.collector.is_native else ("joint_states", "tf")
+        streams: tuple[StreamName, ...] = () if self.collector.is_native else ("joint_states", "tf")
         return {stream: self._of(stream) for stream in streams}
 
-    def _of(self, stream: Stream) -> StreamSamples:
+    def _of(self, stream: StreamName) -> StreamSamples:
         return self.collector.samples(self.info.name, stream)
 
     @property
@@ -340,7 +340,7 @@ class RobotProbe:
         """The text of the first refusal of each reason."""
         return self._listener.refusals if self.is_alone else self._listener.refusals_of(self.info.name)
 
-    def writers(self, stream: Stream) -> list[WriterId]:
+    def writers(self, stream: StreamName) -> list[WriterId]:
         """The announced writers of ``stream``, the newest last."""
         found = [writer for written, writer in self.info.writers if written == stream]
         return sorted(found, key=lambda writer: writer.since)
@@ -417,13 +417,13 @@ class RobotProbe:
 
     def silent_writers(self) -> set[WriterId]:
         """The announced writers of which nothing has arrived, not even a reply with their clock."""
-        streams: tuple[Stream, ...] = ("tf", *_NATIVE_STREAMS)
+        streams: tuple[StreamName, ...] = ("tf", *_NATIVE_STREAMS)
         known = {session for stream in streams for session in self._of(stream).writers}
         known.update(self.statuses, (offset.writer.session for offset in self.offsets))
         return {writer for _, writer in self.info.writers if writer.session not in known}
 
 
-def unwritten_streams(info: RobotInfo, readers: Sequence[Announcement]) -> dict[Stream, WriterId]:
+def unwritten_streams(info: RobotInfo, readers: Sequence[Announcement]) -> dict[StreamName, WriterId]:
     """The streams that programs of the robot ``info`` wait for, with such a program: none writes them.
 
     A program of the robot is one that also writes a stream of it. One that reads edges or latched streams,
@@ -431,11 +431,11 @@ def unwritten_streams(info: RobotInfo, readers: Sequence[Announcement]) -> dict[
     """
     written = {stream for stream, _ in info.writers}
     programs = {(writer.host, writer.pid) for _, writer in info.writers}
-    streams: dict[WriterId, set[Stream]] = {}
+    streams: dict[WriterId, set[StreamName]] = {}
     for one in readers:
         if one.robot == info.name and (one.writer.host, one.writer.pid) in programs:
             streams.setdefault(one.writer, set()).add(one.stream)
-    waits: dict[Stream, WriterId] = {}
+    waits: dict[StreamName, WriterId] = {}
     for reader, read in streams.items():
         if read <= {*JOINT_STREAMS, *SENSOR_STREAMS}:
             missing = read - written

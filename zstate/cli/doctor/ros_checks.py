@@ -24,7 +24,7 @@ from zstate.cli.output.console import count_text, rate_text
 from zstate.cli.output.wire_text import RosMessages
 from zstate.errors import format_duration
 from zstate.model.robot import RobotModel
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 
 _MAX_NAMES = 6
 
@@ -150,10 +150,10 @@ class _RosChecks:
         text = f"{nodes} announced on {topic}, but no message arrives"
         return broken("tf", text, f"zstate hz{self._robot} --stream tf")
 
-    def _topic(self, stream: Stream) -> str:
+    def _topic(self, stream: StreamName) -> str:
         return self._messages.topic(self._probe.info.name, stream)
 
-    def _names(self, stream: Stream) -> dict[str, list[str]]:
+    def _names(self, stream: StreamName) -> dict[str, list[str]]:
         """The joints or child frames on a topic, each with the nodes that publish it."""
         names: dict[str, list[str]] = {}
         for session, node in self._by_node[stream].items():
@@ -161,7 +161,7 @@ class _RosChecks:
                 names.setdefault(name, []).append(self._probe.writer_name(session))
         return names
 
-    def _rates(self, stream: Stream) -> tuple[str, str]:
+    def _rates(self, stream: StreamName) -> tuple[str, str]:
         """The rate of each node on a topic; and the first one that has stopped publishing, or ""."""
         texts, silent = list[str](), ""
         for session, node in self._by_node[stream].items():

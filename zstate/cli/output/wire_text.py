@@ -13,7 +13,7 @@ from zstate.cli.output.console import count_text
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
     from zstate.net.presence import RobotInfo
-    from zstate.wire.keys import Stream
+    from zstate.wire.keys import StreamName
 
 
 OTHER_HOSTS = "--mode lan, or --connect tcp/HOST:7447 to a router"
@@ -53,7 +53,7 @@ class NativeMessages:
     robot: str | None = None
     """The robot of a command that names none; None if it must name one."""
 
-    def place(self, robot: str, streams: Sequence[Stream]) -> str:
+    def place(self, robot: str, streams: Sequence[StreamName]) -> str:
         """The keys or topics of ``streams``."""
         names = streams[0] if len(streams) == 1 else f"{{{','.join(streams)}}}"
         return f"zstate/{robot}/{names}"
@@ -81,7 +81,9 @@ class NativeMessages:
         hint = did_you_mean(robot, [info.name for info in robots])
         return f"robot {robot!r} is not announced{hint} ({self.announced(robots)})"
 
-    def no_sample_text(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, ended: bool) -> str:
+    def no_sample_text(
+        self, robot: str, stream: StreamName, robots: Sequence[RobotInfo], *, ended: bool
+    ) -> str:
         """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
         streams = {written for info in robots if info.name == robot for written, _ in info.writers}
         if not streams:
@@ -118,7 +120,7 @@ class NativeMessages:
         return f"{stream} of {robot!r} has no writer{' any more' * ended}; {start}"
 
     def missing_text(
-        self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, has_frames: bool
+        self, robot: str, stream: StreamName, robots: Sequence[RobotInfo], *, has_frames: bool
     ) -> str:
         """Which robots lack ``stream`` so that a pose is unknown; ``has_frames`` if some frames are known."""
         selected = [info for info in robots if robot in ("*", info.name)]
@@ -165,11 +167,11 @@ class RosMessages:
         namespace = self._options.namespace
         return None if namespace == "*" else namespace.rpartition("/")[2] or SHARED
 
-    def topic(self, robot: str, stream: Stream) -> str:
+    def topic(self, robot: str, stream: StreamName) -> str:
         """The topic that carries ``stream`` of ``robot``; for "*" with NAMESPACE as the robot."""
         return self._topics.topic("NAMESPACE" if robot == "*" else robot, stream)
 
-    def place(self, robot: str, streams: Sequence[Stream]) -> str:
+    def place(self, robot: str, streams: Sequence[StreamName]) -> str:
         topics = ", ".join(self.topic(robot, stream) for stream in streams)
         return f"ROS 2 topic{'s' if len(streams) > 1 else ''} {topics} ({self._where.removeprefix('in ')})"
 
@@ -182,14 +184,16 @@ class RosMessages:
     def unknown(self, robot: str, robots: Sequence[RobotInfo]) -> str:
         return self.announced(robots)
 
-    def no_sample_text(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, ended: bool) -> str:
+    def no_sample_text(
+        self, robot: str, stream: StreamName, robots: Sequence[RobotInfo], *, ended: bool
+    ) -> str:
         topic, writers = self.topic(robot, stream), self._writers(robot, stream, robots)
         if writers:
             return f"{', '.join(writers)} publishes {topic}, but no {'new ' * ended}message arrives"
         return f"no node publishes {topic} {self._where}{' any more' * ended}; {self._advice}"
 
     def missing_text(
-        self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, has_frames: bool
+        self, robot: str, stream: StreamName, robots: Sequence[RobotInfo], *, has_frames: bool
     ) -> str:
         is_written = bool(self._writers(robot, "tf", robots))
         return "" if has_frames and is_written else self.no_sample_text(robot, "tf", robots, ended=False)
@@ -203,6 +207,6 @@ class RosMessages:
         without_owner = re.sub(rf"(?<![\w/]){SHARED}/", "", text)
         return re.sub(r"`zstate (ls|tree|static)\b", rf"`zstate \1 --wire {self._spec}", without_owner)
 
-    def _writers(self, robot: str, stream: Stream, robots: Sequence[RobotInfo]) -> list[str]:
+    def _writers(self, robot: str, stream: StreamName, robots: Sequence[RobotInfo]) -> list[str]:
         infos = [info for info in robots if robot in ("*", info.name)]
         return sorted({str(writer) for info in infos for one, writer in info.writers if one == stream})

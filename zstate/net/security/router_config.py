@@ -16,9 +16,9 @@ from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
 from zstate.net.security.acl import AclRoles, access_control, check_namespace
 from zstate.net.security.credentials import Credentials
-from zstate.wire.keys import EDGE_STREAMS, Stream, check_robot, stream_expression
+from zstate.wire.keys import EDGE_STREAMS, StreamName, check_robot, stream_expression
 
-DOWNSAMPLED: tuple[Stream, ...] = ("joint_states", "partial_joint_states", "tf", *EDGE_STREAMS)
+DOWNSAMPLED: tuple[StreamName, ...] = ("joint_states", "partial_joint_states", "tf", *EDGE_STREAMS)
 """Streams that may lose samples: each is replaced by a newer one."""
 
 _WIDTH = 100

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     ClockMessage,
     Edges,
@@ -59,7 +59,7 @@ FLOAT_BYTES = 4
 CELL_BYTES = 1
 """Of a cell of a grid."""
 
-_MEASUREMENTS: dict[Stream, Callable[[bytes, int, int, FrameNames], Imu | Velocity | Pose | Odometry]] = {
+_MEASUREMENTS: dict[StreamName, Callable[[bytes, int, int, FrameNames], Imu | Velocity | Pose | Odometry]] = {
     "imu": decode_imu,
     "velocity": decode_velocity,
     "pose": decode_pose,
@@ -78,7 +78,7 @@ class RosDecoder:
         self._edges = TfMessageDecoder()
 
     def messages(
-        self, stream: Stream, payload: bytes, session: int, seq: int, names: FrameNames
+        self, stream: StreamName, payload: bytes, session: int, seq: int, names: FrameNames
     ) -> Sequence[Message]:
         """The messages of ``payload`` on ``stream``. Raises MessageError.
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeVar
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.keys import Stream, shortened
+from zstate.wire.keys import StreamName, shortened
 
 Reliability = Literal["reliable", "best_effort"]
 Durability = Literal["volatile", "transient_local"]
@@ -117,7 +117,7 @@ class Qos:
         )
 
 
-STREAM_QOS: dict[Stream, Qos] = {
+STREAM_QOS: dict[StreamName, Qos] = {
     "joint_states": Qos(depth=10),
     "tf": Qos(depth=100),
     "tf_static": Qos(durability="transient_local", depth=1),

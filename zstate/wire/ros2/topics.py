@@ -26,7 +26,7 @@ from collections.abc import Callable
 from functools import cached_property, lru_cache, partial
 
 from zstate.errors import InvalidInput
-from zstate.wire.keys import ANY, Stream, wire_name
+from zstate.wire.keys import ANY, StreamName, wire_name
 from zstate.wire.messages import Edges
 from zstate.wire.ros2.options import Ros2Options, check_token
 from zstate.wire.ros2.types import (
@@ -49,7 +49,7 @@ SHARED = "ros"
 HUMBLE_HASH = "TypeHashNotSupported"
 """Type hash in the keys of ROS 2 Humble, whose types have none."""
 
-_TYPES: dict[Stream, RosType] = {
+_TYPES: dict[StreamName, RosType] = {
     "joint_states": JOINT_STATE,
     "robot_description": STRING,
     "tf": TF_MESSAGE,
@@ -63,14 +63,14 @@ _TYPES: dict[Stream, RosType] = {
     "clock": CLOCK,
 }
 
-NAMED_TOPICS: frozenset[Stream] = frozenset({"scan", "map", "imu", "velocity", "pose", "odometry"})
+NAMED_TOPICS: frozenset[StreamName] = frozenset({"scan", "map", "imu", "velocity", "pose", "odometry"})
 """The streams whose topics are named by their writers."""
 
 _CACHED_ORDERS = 64
 """Edge orders with cached names: each writer of a topic has its own, and few change theirs."""
 
 
-def ros_type(stream: Stream) -> RosType:
+def ros_type(stream: StreamName) -> RosType:
     """The ROS type that carries ``stream``. Raises InvalidInput for a stream without a ROS topic."""
     if stream not in _TYPES:
         raise InvalidInput(
@@ -79,7 +79,7 @@ def ros_type(stream: Stream) -> RosType:
     return _TYPES[stream]
 
 
-def topic_stream(topic: str, dds_type: str) -> Stream | None:
+def topic_stream(topic: str, dds_type: str) -> StreamName | None:
     """The stream that ``topic`` carries by its type and its last name; None if it is none."""
     last_name = topic.rpartition("/")[2]
     for stream, kind in _TYPES.items():
@@ -94,7 +94,7 @@ class RmwKeys:
     def __init__(self, options: Ros2Options) -> None:
         self._options = options
 
-    def topic(self, robot: str, stream: Stream, name: str = "") -> str:
+    def topic(self, robot: str, stream: StreamName, name: str = "") -> str:
         """The full ROS name of the topic, with its leading slash.
 
         ``name`` is that of a sensor or a map, by default "scan" and "map". Raises InvalidInput if it is no
@@ -106,13 +106,13 @@ class RmwKeys:
             last_name = name
         return self._topic(self._options.robot_namespace(robot), stream, last_name)
 
-    def key(self, robot: str, stream: Stream, name: str = "") -> str:
+    def key(self, robot: str, stream: StreamName, name: str = "") -> str:
         """The Zenoh key of ``stream``. Raises InvalidInput for a name that ROS does not allow."""
         kind = ros_type(stream)
         type_hash = kind.hash if self._options.hash == "iron" else HUMBLE_HASH
         return f"{self._options.domain}{self.topic(robot, stream, name)}/{kind.dds}/{type_hash}"
 
-    def expression(self, robot: str, stream: Stream) -> str:
+    def expression(self, robot: str, stream: StreamName) -> str:
         """The key expression of ``stream``; robot ``"*"`` means all robots in the namespace.
 
         With ``namespace=*`` these are all robots in a namespace of one token.
@@ -141,11 +141,11 @@ class RmwKeys:
             raise InvalidInput(f"the key {key!r} is not of the form '<domain>/<topic>/<type>/<hash>'")
         return path
 
-    def _topic_pattern(self, robot: str, stream: Stream, last_name: str) -> str:
+    def _topic_pattern(self, robot: str, stream: StreamName, last_name: str) -> str:
         namespace = self._options.namespace if robot == ANY else self._options.robot_namespace(robot)
         return self._topic(namespace, stream, last_name)
 
-    def _topic(self, namespace: str, stream: Stream, last_name: str) -> str:
+    def _topic(self, namespace: str, stream: StreamName, last_name: str) -> str:
         ros_type(stream)
         is_global = stream == "clock" or (stream.startswith("tf") and self._options.tf == "global")
         return f"/{namespace}/{last_name}" if namespace and not is_global else f"/{last_name}"
@@ -159,10 +159,10 @@ class DdsKeys(RmwKeys):
     streams can be read as such: ``scan``, ``imu``, ``map`` and so on.
     """
 
-    def key(self, robot: str, stream: Stream, name: str = "") -> str:
+    def key(self, robot: str, stream: StreamName, name: str = "") -> str:
         return self.topic(robot, stream, name)[1:]
 
-    def expression(self, robot: str, stream: Stream) -> str:
+    def expression(self, robot: str, stream: StreamName) -> str:
         return self._topic_pattern(robot, stream, stream)[1:]
 
     def robot_from_key(self, key: str) -> str:
@@ -172,7 +172,7 @@ class DdsKeys(RmwKeys):
         name = key.rpartition("/")[2]
         return name if name in NAMED_TOPICS else None
 
-    def _topic(self, namespace: str, stream: Stream, last_name: str) -> str:
+    def _topic(self, namespace: str, stream: StreamName, last_name: str) -> str:
         ros_type(stream)
         return f"/{namespace}/{last_name}" if namespace else f"/{last_name}"
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, Stream
+from zstate.wire.keys import ANY, StreamName
 from zstate.wire.messages import JointTrajectory, Message, check_edges, check_size
 from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
 from zstate.wire.ros2.decoder import RosDecoder, decode_numbers, decode_trajectory
@@ -56,10 +56,10 @@ class Ros2Wire:
     """
 
     name = "ros2"
-    shared: frozenset[Stream] = frozenset({"tf", "tf_static"})
-    transforms: Stream = "tf"
-    edges: tuple[Stream, ...] = ("tf",)
-    partial_joint_states: Stream = "joint_states"
+    shared: frozenset[StreamName] = frozenset({"tf", "tf_static"})
+    transforms: StreamName = "tf"
+    edges: tuple[StreamName, ...] = ("tf",)
+    partial_joint_states: StreamName = "joint_states"
     _topic_keys = RmwKeys
     _has_gids = True
 
@@ -74,7 +74,7 @@ class Ros2Wire:
         return self._node(node).key
 
     def stream_encoder(
-        self, node: WriterNode, stream: Stream, number: int, name: str = ""
+        self, node: WriterNode, stream: StreamName, number: int, name: str = ""
     ) -> RosStreamEncoder:
         token = self._endpoint_token(node, stream, "MP", number, name)
         names, key = self._frame_names(node.robot), self._keys.key(node.robot, stream, name)
@@ -86,7 +86,7 @@ class Ros2Wire:
         return NodeToken(self.options.domain, node.zid, node.number, "/", namespace, name)
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[Stream], reader: WriterId, zid: str, number: Callable[[], int]
+        self, robot: str, streams: Sequence[StreamName], reader: WriterId, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         if robot == ANY:
             if self.options.namespace == ANY:
@@ -97,7 +97,7 @@ class Ros2Wire:
         return tuple(token for token in (self.node_token(node), *endpoints) if token is not None)
 
     def _endpoint_token(
-        self, node: WriterNode, stream: Stream, kind: Literal["MP", "MS"], number: int, name: str = ""
+        self, node: WriterNode, stream: StreamName, kind: Literal["MP", "MS"], number: int, name: str = ""
     ) -> str:
         """The token of ``node`` as publisher ("MP") or subscriber ("MS") of ``stream``."""
         topic, dds_type = self._keys.topic(node.robot, stream, name), ros_type(stream).dds
@@ -105,13 +105,13 @@ class Ros2Wire:
         token = EndpointToken(self._node(node), number, kind, topic, dds_type, type_hash, STREAM_QOS[stream])
         return token.key
 
-    def expression(self, robot: str, stream: Stream) -> str:
+    def expression(self, robot: str, stream: StreamName) -> str:
         return self._keys.expression(robot, stream)
 
     def robot_from_key(self, key: str) -> str:
         return self._keys.robot_from_key(key)
 
-    def usual_envelope(self, stream: Stream) -> Envelope | None:
+    def usual_envelope(self, stream: StreamName) -> Envelope | None:
         is_known = self._has_gids and stream == "joint_states"
         return Envelope(RosStreamEncoder.encoding, ATTACHMENT_BYTES) if is_known else None
 
@@ -119,7 +119,7 @@ class Ros2Wire:
         """The name of a scan's sensor, or of a map; None for edges, whose writers share the topics."""
         return self._keys.writer_name(key)
 
-    def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
+    def decode(self, stream: StreamName, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         # CDR repeats all frame names in each sample.
         check_size(stream, arrival.size or len(arrival.payload), 4 if stream in ("tf", "joint_states") else 1)
         session, seq = self._origin(arrival)
@@ -186,7 +186,7 @@ class Ros2DdsWire(Ros2Wire):
         super().node_token(node)
 
     def _endpoint_token(
-        self, node: WriterNode, stream: Stream, kind: Literal["MP", "MS"], number: int, name: str = ""
+        self, node: WriterNode, stream: StreamName, kind: Literal["MP", "MS"], number: int, name: str = ""
     ) -> str:
         ros, topic = ros_type(stream), self._keys.key(node.robot, stream, name)
         return DdsToken(node.zid, kind, topic, ros.name, STREAM_QOS[stream], ros.hash).key

@@ -27,7 +27,7 @@ from ros_messages import (
 )
 
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import Stream
+from zstate.wire.keys import StreamName
 from zstate.wire.messages import LaserScan, Message, OccupancyGrid, to_block, to_float32_block
 from zstate.wire.ros2 import types
 from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string
@@ -151,7 +151,7 @@ def encoded(message: Message) -> bytes:
     return RosStreamEncoder(PLAIN, SampleLayout()).encode(message)
 
 
-def decoded(stream: Stream, payload: bytes) -> Message:
+def decoded(stream: StreamName, payload: bytes) -> Message:
     (message,) = RosDecoder().messages(stream, payload, 77, 5, PLAIN)
     return message
 
