@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from zstate.nodes.partial_publisher import PartialStatePublisher
     from zstate.nodes.publisher import StatePublisher
     from zstate.nodes.static_publisher import StaticPublisher
+    from zstate.nodes.stream_listener import StreamListener
+    from zstate.nodes.stream_publisher import StreamPublisher
     from zstate.nodes.transform_publisher import TransformPublisher
     from zstate.recording.recorder import Recorder
     from zstate.recording.recording import Recording
@@ -81,6 +83,8 @@ __all__ = [
     "Stale",
     "StatePublisher",
     "StaticPublisher",
+    "StreamListener",
+    "StreamPublisher",
     "Transform",
     "TransformBuffer",
     "TransformListener",
@@ -108,6 +112,8 @@ _HOMES = {
     "SineSource": "sources",
     "StatePublisher": "nodes.publisher",
     "StaticPublisher": "nodes.static_publisher",
+    "StreamListener": "nodes.stream_listener",
+    "StreamPublisher": "nodes.stream_publisher",
     "Transform": "transform",
     "TransformBuffer": "buffer.buffer",
     "TransformListener": "nodes.listener",

@@ -406,7 +406,7 @@ def test_edges_of_a_ros_node_have_its_name_in_zstate_until_it_leaves(world):
     ros, native = world.join("ros2"), world.join("native")
 
     def names() -> set[str]:
-        return {name for info in discover(native) for name, _ in info.transform_names}
+        return {name for info in discover(native) for name, _ in info.named("transforms")}
 
     with StatePublisher(ros, RRBOT, "r1", ("ros2",)), TransformListener(native, "r1") as listener:
         stamps = iter(range(STAMP, STAMP + 1_000_000))

@@ -37,7 +37,7 @@ def relay(sessions: tuple[Session, Session], refusals: Counter[str]) -> Iterator
 
 
 def names(session: Session) -> set[str]:
-    return {name for info in discover(session, 0.2) for name, _ in info.transform_names}
+    return {name for info in discover(session, 0.2) for name, _ in info.named("transforms")}
 
 
 def test_writers_are_named_after_their_nodes():

@@ -23,7 +23,7 @@ from zstate.net.presence import local_writer
 from zstate.net.queryable import query
 from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.net.writer import WireWriter
 from zstate.wire.messages import (
     JointCommand,
@@ -422,7 +422,7 @@ def test_a_repeated_request_is_the_same_motion_and_an_older_one_is_refused(sessi
     with (
         hosted(sessions[0], driver),
         announced(sessions[1]),
-        StreamPublisher(sessions[1], key, ENCODINGS[JointCommand]) as commands,
+        KeyPublisher(sessions[1], key, ENCODINGS[JointCommand]) as commands,
     ):
         wait_for_reader(sessions[1], key)
 

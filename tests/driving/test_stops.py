@@ -29,7 +29,7 @@ from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.presence import local_writer
 from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session, connect
-from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import (
     driver_key,
@@ -146,7 +146,7 @@ def test_a_late_release_of_a_hosts_first_stop_does_not_end_its_second(sessions):
     key = release_key("arm", commander.identity)
     with (
         StopLatch(sessions[0], "arm", HOST, Refusals()) as latch,
-        StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
+        KeyPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
     ):
         wait_for_reader(sessions[1], key)
         latch.latch("first")
@@ -346,9 +346,7 @@ def test_a_forged_stop_and_its_release_do_not_end_the_stop_of_the_program_that_i
         assert "hand inside" in state.reason
         assert "a test" in state.reason
         release = Release(0, 0, local_writer(8).session, ((session, seq + 1),))
-        releases = StreamPublisher(
-            sessions[1], release_key("arm", local_writer(8).identity), ENCODINGS[Release]
-        )
+        releases = KeyPublisher(sessions[1], release_key("arm", local_writer(8).identity), ENCODINGS[Release])
         with releases, repeated(lambda: releases.put(encode(release))):
             until(lambda: arm.wait_for_driver().stops == ((session, seq),))
         assert arm.wait_for_driver().state == "stopped"
@@ -686,7 +684,7 @@ def test_a_driver_without_torque_stays_so_until_that_stop_is_released(sessions):
         held = {(one["session"], one["seq"]) for one in stops_in_file() if one["how"] == "hold"}
         until(lambda: held <= set(arm.wait_for_driver().stops))
         key = release_key("arm", local_writer(8).identity)
-        with StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases:
+        with KeyPublisher(sessions[1], key, ENCODINGS[Release]) as releases:
             message = encode(Release(0, 0, local_writer(8).session, tuple(held)))
             with repeated(lambda: releases.put(message)):
                 until(lambda: not held & set(arm.wait_for_driver().stops))
@@ -741,7 +739,7 @@ def test_a_commander_that_was_stopped_may_move_again_by_a_release_after_that_of_
             state = stop(sessions[1], "arm")
             releaser = local_writer(8)
             key = release_key("arm", releaser.identity)
-            with StreamPublisher(sessions[1], key, ENCODINGS[Release]) as releases:
+            with KeyPublisher(sessions[1], key, ENCODINGS[Release]) as releases:
                 message = encode(Release(0, 0, releaser.session, state.stops))
                 with repeated(lambda: releases.put(message)):
                     until(lambda: host.report().refused.get("not released"))
@@ -753,7 +751,7 @@ def test_a_release_in_the_name_of_another_program_is_refused(sessions):
     with hosted(sessions[0]) as host, Commander(sessions[1], "arm"):
         stopped = stop(sessions[1], "arm")
         key = release_key("arm", local_writer(8).identity)
-        releases = StreamPublisher(sessions[1], key, ENCODINGS[Release])
+        releases = KeyPublisher(sessions[1], key, ENCODINGS[Release])
         with releases, repeated(lambda: releases.put(encode(Release(0, 0, 9, stopped.stops)))):
             until(lambda: host.report().refused.get("foreign"))
         assert host.state == "stopped"

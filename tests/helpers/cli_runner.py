@@ -31,7 +31,7 @@ from zstate import StatePublisher, Transform, TransformListener, connect, load_m
 from zstate.cli.main import _end, run
 from zstate.cli.output import logs
 from zstate.clock import Clock
-from zstate.wire.keys import StreamName
+from zstate.streams import StreamName
 
 RRBOT = str(Path(__file__).parents[2] / "models" / "rrbot.urdf")
 ALL_STREAMS: tuple[StreamName, ...] = ("joint_states", "tf", "tf_static", "robot_description")

@@ -25,7 +25,7 @@ from helpers.processes import until
 from xxhash import xxh3_128_intdigest
 
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 
 JOINT_STATES = (
     "joint_states",
@@ -109,7 +109,7 @@ class RosPublisher:
         return self
 
     def wait_for_reader(self) -> RosPublisher:
-        with StreamPublisher(self._session, self.key, "") as probe:
+        with KeyPublisher(self._session, self.key, "") as probe:
             until(lambda: probe.has_readers)
         return self
 

@@ -10,7 +10,7 @@ from zstate.model.kinematics import Kinematics
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.se3 import to_matrix
 from zstate.transform import Transform
 from zstate.wire.messages import JointState
@@ -27,7 +27,7 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 def wait_for_reader(session: Session, key: str) -> None:
     """Waits until ``session`` has discovered a subscriber of ``key``, which receives all later samples."""
-    with StreamPublisher(session, key, "") as probe:
+    with KeyPublisher(session, key, "") as probe:
         until(lambda: probe.has_readers)
 
 

@@ -10,7 +10,7 @@ from helpers.processes import until
 from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, wait_for_stream_readers
 
 from zstate.net.latched import LatchedPublisher
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.messages import (
@@ -58,7 +58,7 @@ def test_garbage_on_every_key_is_counted_by_reason_and_logged_once(sessions, cap
                     (b"\xc1" + random.bytes(40), ours),
                     (random.bytes(40), "zenoh/bytes"),
                 ):
-                    with StreamPublisher(writer, f"zstate/r1/{key}", encoding) as stream:
+                    with KeyPublisher(writer, f"zstate/r1/{key}", encoding) as stream:
                         stream.put(payload)
         times = 2 * len(keys)
         expected = {"truncated": times, "foreign": 3 * times, "newer version": times, "malformed": times}
@@ -77,7 +77,7 @@ def test_message_with_invalid_positions_is_counted_and_the_next_is_inserted(sess
     order = order_digest(RRBOT.joint_names)
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
-        StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as driver,
+        KeyPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as driver,
         TransformListener(reader, "r1") as listener,
     ):
         until(lambda: driver.has_readers)

@@ -13,8 +13,8 @@ from zstate.errors import InsertRefused
 from zstate.ingest.deadline import FLOOR_S
 from zstate.ingest.events import EventLog, StaticEdgeOwners, WriterEvent
 from zstate.ingest.frame_ownership import EdgeSource
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import StreamName
 
 SUBSCRIBED: tuple[StreamName, ...] = ("robot_description", "tf_static", "joint_states", "transforms")
 ROS_SHARED: tuple[StreamName, ...] = ("tf", "tf_static")

@@ -10,7 +10,7 @@ from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, w
 
 from zstate.errors import InFuture
 from zstate.model.load import load_model
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
@@ -89,7 +89,7 @@ def test_writer_without_a_model_is_mapped_by_its_joint_names(sessions):
     state = JointState(STAMP, 0, 9, order_digest(names), to_block([2.0, 7.0, 1.0]), None, None, names)
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
-        StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as driver,
+        KeyPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as driver,
         TransformListener(reader, "r1") as listener,
     ):
         until(lambda: driver.has_readers)
@@ -103,7 +103,7 @@ def test_lost_samples_count_as_missed(sessions):
     order = order_digest(RRBOT.joint_names)
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
-        StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as driver,
+        KeyPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as driver,
         TransformListener(reader, "r1") as listener,
     ):
         until(lambda: driver.has_readers)

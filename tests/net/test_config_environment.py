@@ -9,7 +9,7 @@ from helpers.processes import Child, until
 from zstate.errors import ConfigError, PortBusy, Unreachable
 from zstate.net.config import implied_mode
 from zstate.net.session import connect
-from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.net.streams import KeyPublisher, StreamSubscriber
 
 ROUTER = """
     import sys
@@ -32,7 +32,7 @@ def test_connect_without_arguments_reads_the_environment(spawn, router, monkeypa
     with (
         connect() as session,
         connect(mode="client", endpoints=router) as given,
-        StreamPublisher(given, "somewhere", "") as writer,
+        KeyPublisher(given, "somewhere", "") as writer,
         StreamSubscriber(session, "somewhere", lambda _: None),
     ):
         until(lambda: writer.has_readers)
@@ -51,7 +51,7 @@ def test_empty_variables_are_ignored(monkeypatch: pytest.MonkeyPatch):
     with (
         connect() as one,
         connect() as other,
-        StreamPublisher(one, "here", "") as writer,
+        KeyPublisher(one, "here", "") as writer,
         StreamSubscriber(other, "here", lambda _: None),
     ):
         until(lambda: writer.has_readers)

@@ -49,7 +49,7 @@ DRIVER, MOUNT, VIEWER = (
 
 
 def test_readers_of_all_robots_read_each_stream_and_static_edges_have_the_names_of_their_writers():
-    statics = (("left", MOUNT), ("right", MOUNT))
+    statics = (("tf_static", "left", MOUNT), ("tf_static", "right", MOUNT))
     arm = RobotInfo("arm", (("joint_states", DRIVER), ("tf_static", MOUNT)), statics)
     readers = [Announcement(ANY, "joint_states", VIEWER), Announcement("base", "tf", VIEWER)]
     graph = build_graph([arm], readers, lambda robot, stream, writer: 500.0 if writer == DRIVER else None)

@@ -11,7 +11,7 @@ from helpers.robots import wait_for_reader
 from zstate.errors import Closed, InvalidInput
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.session import connect
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.wire.protocol import SerializedSample
 
 ENCODING = "zstate/StaticTransforms;v=1"
@@ -282,7 +282,7 @@ def test_values_and_samples_are_sent_as_the_wire_specification_lists():
         opened.enter_context(
             reader.zenoh.declare_subscriber("k/*", lambda one: received.update({str(one.key_expr): one}))
         )
-        sample = opened.enter_context(StreamPublisher(writer, "k/stream", ENCODING))
+        sample = opened.enter_context(KeyPublisher(writer, "k/stream", ENCODING))
         values = [
             opened.enter_context(LatchedPublisher(writer, "k/value", ENCODING)),
             opened.enter_context(LatchedPublisher(writer, "k/large", ENCODING, is_large=True)),

@@ -20,9 +20,10 @@ from zstate.net.ownership import TOKEN_EXPIRY_S, WriterClaim, check_edges
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import StreamName, writer_key
+from zstate.wire.keys import writer_key
 
 FIRST = WriterId("driver", "jetson", 412, 1_000_000_000, 7)
 SECOND = WriterId("simulator", "laptop", 9, 2_000_000_000, 8)

@@ -19,8 +19,9 @@ from zstate.net.presence import (
     local_writer,
 )
 from zstate.net.session import Session, connect
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import StreamName, check_writer, writer_key
+from zstate.wire.keys import check_writer, writer_key
 from zstate.wire.registry import get_wire
 
 DRIVER = WriterId("arm driver", "jetson", 412, 5, 7)

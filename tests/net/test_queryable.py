@@ -16,7 +16,7 @@ from helpers.processes import DEADLINE_S, until
 from zstate.net import query_workers
 from zstate.net.queryable import Queryable, Reply, RequestQueryable, parse_parameters, query
 from zstate.net.session import Session, connect
-from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.net.streams import KeyPublisher, StreamSubscriber
 
 KEY = "zstate/r1/lookup"
 
@@ -130,7 +130,7 @@ def test_slow_answer_delays_no_subscription_and_overflows_are_counted(
 
     received: list[bytes] = []
     with (
-        StreamPublisher(reader, "zstate/r1/tf", "") as stream,
+        KeyPublisher(reader, "zstate/r1/tf", "") as stream,
         StreamSubscriber(
             writer, "zstate/r1/tf", lambda arrivals: received.extend(one.payload for one in arrivals)
         ),

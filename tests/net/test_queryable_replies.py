@@ -92,7 +92,7 @@ def test_one_session_has_more_static_writers_than_the_default_channel_holds():
         with pytest.raises(SecondWriter, match="camera299"):
             last.set(edge("camera0", "camera299"))
         (robot,) = discover(session)
-        assert len(robot.static_names) == MORE_THAN_THE_DEFAULT + 1
+        assert len(robot.named("tf_static")) == MORE_THAN_THE_DEFAULT + 1
 
 
 def test_a_query_that_a_queryable_never_finishes_ends_with_its_timeout(sessions: tuple[Session, Session]):

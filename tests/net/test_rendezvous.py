@@ -16,7 +16,7 @@ from zstate.net.session import Session, connect
 NODE = """
     import sys, threading
     from zstate.net.session import connect
-    from zstate.net.streams import StreamPublisher, StreamSubscriber
+    from zstate.net.streams import KeyPublisher, StreamSubscriber
     name = sys.argv[1]
     received = set()
 
@@ -28,7 +28,7 @@ NODE = """
     stop = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.readline(), stop.set()), daemon=True).start()
     with connect() as session, StreamSubscriber(session, "k/*", on_samples):
-        with StreamPublisher(session, "k/" + name, "text/plain") as out:
+        with KeyPublisher(session, "k/" + name, "text/plain") as out:
             while not stop.wait(0.01):
                 out.put(name.encode())
 """

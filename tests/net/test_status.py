@@ -16,7 +16,7 @@ from zstate.errors import Closed, InvalidInput
 from zstate.net.presence import discover
 from zstate.net.session import Session, connect
 from zstate.net.status import StatusPublisher, StatusSubscriber
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource
 from zstate.wire.identity import WriterId
@@ -191,7 +191,7 @@ def test_invalid_status_is_counted_and_ignored(sessions):
     key = status_key("r1", ME)
     with ExitStack() as opened:
         publishers = {
-            encoding: opened.enter_context(StreamPublisher(sessions[0], key, encoding))
+            encoding: opened.enter_context(KeyPublisher(sessions[0], key, encoding))
             for encoding in ("", ENCODINGS[Status])
         }
         wait_for_reader(sessions[0], key)

@@ -6,7 +6,7 @@ from helpers.processes import DEADLINE_S, until
 
 from zstate.errors import Closed
 from zstate.net.session import connect
-from zstate.net.streams import StreamInbox, StreamPublisher, StreamSubscriber, capacity_for
+from zstate.net.streams import KeyPublisher, StreamInbox, StreamSubscriber, capacity_for
 from zstate.wire.protocol import SerializedSample
 
 KEY = "zstate/r/joint_states"
@@ -16,7 +16,7 @@ ENCODING = "zstate/JointState;v=1"
 def test_samples_arrive_in_order_with_key_and_encoding(sessions):
     got: list[SerializedSample] = []
     with (
-        StreamPublisher(sessions[0], KEY, ENCODING) as publisher,
+        KeyPublisher(sessions[0], KEY, ENCODING) as publisher,
         StreamSubscriber(sessions[1], "zstate/*/joint_states", got.extend) as subscriber,
     ):
         until(lambda: publisher.has_readers)
@@ -34,8 +34,8 @@ def test_other_readers_and_writers_of_a_session_continue_when_one_reader_closes(
     received: dict[str, list[SerializedSample]] = {"here": [], "there": []}
     many = "zstate/*/joint_states"
     with (
-        StreamPublisher(here, ours, "") as mine,
-        StreamPublisher(there, theirs, "") as other,
+        KeyPublisher(here, ours, "") as mine,
+        KeyPublisher(there, theirs, "") as other,
         StreamSubscriber(here, many, received["here"].extend),
         StreamSubscriber(there, many, received["there"].extend),
     ):
@@ -58,7 +58,7 @@ def test_other_readers_and_writers_of_a_session_continue_when_one_reader_closes(
 def test_attachment_arrives_with_its_sample(sessions):
     got: list[SerializedSample] = []
     with (
-        StreamPublisher(sessions[0], KEY, "") as publisher,
+        KeyPublisher(sessions[0], KEY, "") as publisher,
         StreamSubscriber(sessions[1], KEY, got.extend),
     ):
         until(lambda: publisher.has_readers)
@@ -68,7 +68,7 @@ def test_attachment_arrives_with_its_sample(sessions):
 
 
 def test_has_readers_follows_the_subscribers(sessions):
-    with StreamPublisher(sessions[0], KEY, ENCODING) as publisher:
+    with KeyPublisher(sessions[0], KEY, ENCODING) as publisher:
         assert not publisher.has_readers
         with StreamSubscriber(sessions[1], KEY, lambda samples: None):
             until(lambda: publisher.has_readers)
@@ -92,7 +92,7 @@ def test_slow_reader_receives_the_newest_samples_and_full_batches_are_counted(se
         assert go_on.wait(10)
 
     with (
-        StreamPublisher(sessions[0], KEY, ENCODING) as publisher,
+        KeyPublisher(sessions[0], KEY, ENCODING) as publisher,
         StreamSubscriber(sessions[1], KEY, slow, capacity=8) as subscriber,
         StreamSubscriber(sessions[1], KEY, seen.extend),
     ):
@@ -120,7 +120,7 @@ def test_failing_callback_is_counted_reported_once_and_called_again(
         raise RuntimeError(str(samples[0].payload))
 
     with (
-        StreamPublisher(sessions[0], KEY, ENCODING) as publisher,
+        KeyPublisher(sessions[0], KEY, ENCODING) as publisher,
         StreamSubscriber(sessions[1], KEY, raises) as subscriber,
     ):
         until(lambda: publisher.has_readers)
@@ -139,7 +139,7 @@ def test_a_subscriber_may_be_closed_twice_and_from_its_own_thread(sessions):
         subscriber.close()
         closed.set()
 
-    with StreamPublisher(sessions[0], KEY, ENCODING) as publisher:
+    with KeyPublisher(sessions[0], KEY, ENCODING) as publisher:
         subscriber = StreamSubscriber(sessions[1], KEY, close_myself)
         until(lambda: publisher.has_readers)
         publisher.put(b"1")
@@ -157,7 +157,7 @@ def test_close_does_not_wait_for_a_reader_that_is_busy(sessions):
         busy.set()
         went_on.append(go_on.wait(DEADLINE_S))
 
-    with StreamPublisher(sessions[0], KEY, ENCODING) as publisher:
+    with KeyPublisher(sessions[0], KEY, ENCODING) as publisher:
         subscriber = StreamSubscriber(sessions[1], KEY, hold)
         until(lambda: publisher.has_readers)
         publisher.put(b"1")
@@ -177,12 +177,12 @@ def test_a_closed_session_ends_the_threads_of_its_subscribers():
 
 
 def test_put_after_close_raises_closed(sessions):
-    publisher = StreamPublisher(sessions[0], KEY, ENCODING)
+    publisher = KeyPublisher(sessions[0], KEY, ENCODING)
     publisher.close()
     publisher.close()
     with pytest.raises(Closed, match=KEY):
         publisher.put(b"")
-    other = StreamPublisher(sessions[0], KEY, ENCODING)
+    other = KeyPublisher(sessions[0], KEY, ENCODING)
     sessions[0].close()
     with pytest.raises(Closed, match="session is closed"):
         other.put(b"")
@@ -193,7 +193,7 @@ def test_an_inbox_keeps_the_newest_samples_with_their_arrivals_and_reports_each_
     lost: list[None] = []
     with (
         StreamInbox(sessions[0], "test/inbox", 3, lambda: lost.append(None)) as inbox,
-        StreamPublisher(sessions[1], "test/inbox", "text/plain") as publisher,
+        KeyPublisher(sessions[1], "test/inbox", "text/plain") as publisher,
     ):
         until(lambda: publisher.has_readers)
         assert inbox.drain() == []

@@ -8,7 +8,7 @@ import pytest
 import zenoh
 from helpers.processes import DEADLINE_S, until
 
-from zstate.net.streams import SharedRing, StreamPublisher, StreamSubscriber
+from zstate.net.streams import KeyPublisher, SharedRing, StreamSubscriber
 from zstate.wire.protocol import SerializedSample
 
 KEYS = ("zstate/r1/joint_states", "zstate/r2/joint_states")
@@ -48,9 +48,9 @@ def test_subscriber_to_two_keys_receives_both_in_order_and_no_third(sessions):
     got: list[SerializedSample] = []
     writer, reader = sessions
     with (
-        StreamPublisher(writer, KEYS[0], "") as first,
-        StreamPublisher(writer, KEYS[1], "") as second,
-        StreamPublisher(writer, "zstate/r3/joint_states", "") as third,
+        KeyPublisher(writer, KEYS[0], "") as first,
+        KeyPublisher(writer, KEYS[1], "") as second,
+        KeyPublisher(writer, "zstate/r3/joint_states", "") as third,
     ):
         with StreamSubscriber(reader, KEYS, got.extend) as subscriber:
             until(lambda: first.has_readers and second.has_readers)
@@ -77,7 +77,7 @@ def test_thread_of_a_subscriber_to_two_keys_ends_with_the_session(sessions):
 
 def test_failed_declaration_leaves_no_subscriber(sessions):
     writer, reader = sessions
-    with StreamPublisher(writer, KEYS[0], "") as publisher:
+    with KeyPublisher(writer, KEYS[0], "") as publisher:
         with StreamSubscriber(reader, KEYS[0], lambda samples: None):
             until(lambda: publisher.has_readers)
         with pytest.raises(zenoh.ZError):

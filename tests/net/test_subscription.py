@@ -6,7 +6,7 @@ import pytest
 from helpers.processes import until
 
 from zstate.net.latched import LatchedPublisher
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.net.subscription import Received, subscribe
 from zstate.wire.messages import JointState, StaticTransforms, order_digest, to_block
 from zstate.wire.native import ENCODINGS, NativeWire, encode
@@ -21,7 +21,7 @@ def test_messages_of_a_stream_arrive_with_their_robot_and_broken_ones_are_report
     errors: list[tuple[str, str]] = []
     key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
     with (
-        StreamPublisher(sessions[0], key, encoding) as publisher,
+        KeyPublisher(sessions[0], key, encoding) as publisher,
         subscribe(
             sessions[1],
             NativeWire(),
@@ -44,8 +44,8 @@ def test_a_key_without_a_robot_is_reported_as_foreign(sessions):
     errors: list[str] = []
     received: list[Received] = []
     with (
-        StreamPublisher(sessions[0], "zstate/@x/joint_states", "") as foreign,
-        StreamPublisher(sessions[0], "zstate/R 1/joint_states", ENCODINGS[JointState]) as publisher,
+        KeyPublisher(sessions[0], "zstate/@x/joint_states", "") as foreign,
+        KeyPublisher(sessions[0], "zstate/R 1/joint_states", ENCODINGS[JointState]) as publisher,
         subscribe(
             sessions[1],
             NativeWire(),

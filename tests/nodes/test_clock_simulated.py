@@ -15,7 +15,7 @@ from zstate._util.bounded import MAX_ENTRIES
 from zstate.clock import MONOTONIC, ManualClock
 from zstate.errors import Closed, NoClock
 from zstate.model.load import load_model
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.clock import ClockPublisher, SimulatedClock
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -221,7 +221,7 @@ def test_invalid_clock_message_is_counted_and_changes_nothing(sessions):
     writer, reader = sessions
     with (
         ClockPublisher(writer) as publisher,
-        StreamPublisher(writer, "zstate/clock", "text/plain") as stranger,
+        KeyPublisher(writer, "zstate/clock", "text/plain") as stranger,
         SimulatedClock(reader) as clock,
     ):
         wait_for_reader(writer, "zstate/clock")

@@ -20,10 +20,11 @@ from zstate.net.presence import announce
 from zstate.net.session import Session
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.streams import SAMPLE_BYTES
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import edge_key, writer_key
-from zstate.wire.messages import SAMPLE_BYTES, WriterTransforms, order_digest, to_block
+from zstate.wire.messages import WriterTransforms, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
 KEY = "zstate/r1/transforms/thief"

@@ -17,7 +17,7 @@ from zstate.errors import AmbiguousFrame, InvalidInput, UnknownFrame
 from zstate.model.load import load_model
 from zstate.net.clock_offset import measure_offsets
 from zstate.net.presence import announce, discover
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
@@ -244,7 +244,7 @@ def test_close_ends_reception_and_may_be_repeated(sessions):
         listener.buffer.wait("world", "tool", timeout_s=5.0)
         listener.close()
         listener.close()
-        with StreamPublisher(writer, "zstate/r1/joint_states", "") as probe:
+        with KeyPublisher(writer, "zstate/r1/joint_states", "") as probe:
             until(lambda: not probe.has_readers)
         assert listener.buffer.latest("world", "tool") == STAMP
 
@@ -411,7 +411,7 @@ def test_writer_whose_token_has_no_name_is_announced(sessions, monkeypatch: pyte
     with (
         announce(writer, f"zstate/r1/@writer/{stream}/p,h,1,1,5"),
         TransformListener(reader, "r1") as listener,
-        StreamPublisher(writer, f"zstate/r1/{stream}/any", encoding) as publisher,
+        KeyPublisher(writer, f"zstate/r1/{stream}/any", encoding) as publisher,
     ):
         until(named)
     assert raised == []

@@ -15,8 +15,8 @@ from zstate.errors import Disconnected, InFuture, InPast, NoData, UnknownFrame, 
 from zstate.net.session import Session, connect
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher import StatePublisher
+from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.keys import StreamName
 
 PERIOD = 10_000_000
 KEY = "zstate/r1/lookup"

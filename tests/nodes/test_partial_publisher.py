@@ -222,4 +222,4 @@ def test_drivers_are_announced_with_their_names(sessions):
     first, second = sessions
     with PartialStatePublisher(first, RRBOT, [ELBOW], "r1", writer="gripper"):
         (info,) = discover(second)
-        assert [name for name, _ in info.part_names] == ["gripper"]
+        assert [name for name, _ in info.named("partial_joint_states")] == ["gripper"]

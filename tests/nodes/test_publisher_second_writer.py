@@ -20,9 +20,10 @@ from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
+from zstate.streams import is_named
 from zstate.transform import Transform
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import NAMED_STREAMS, stream_key, writer_expression, writer_key
+from zstate.wire.keys import stream_key, writer_expression, writer_key
 from zstate.wire.messages import JointState, RobotDescription, order_digest
 from zstate.wire.native import ENCODINGS, encode
 
@@ -155,7 +156,7 @@ def test_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_pu
             state = JointState(1, 0, stranger.session, order_digest(RRBOT.joint_names), bytes(16))
             answer = description if stream == "robot_description" else state
             # The token has no name, so it leaves open on which key its holder publishes.
-            key = stream_key("r1", stream, "any" if stream in NAMED_STREAMS else "")
+            key = stream_key("r1", stream, "any" if is_named(stream) else "")
             with pytest.raises(SecondWriter) as raised:
                 until(lambda: put(theirs, key, answer) or publisher.publish([0.0, 0.0]))
     assert raised.value.first == stranger

@@ -17,7 +17,7 @@ from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
 from zstate.net.presence import announce, discover
 from zstate.net.session import connect
 from zstate.net.status import StatusSubscriber
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
@@ -205,7 +205,7 @@ def test_token_of_an_earlier_writer_ends_none_that_publishes_an_edge(sessions):
     stranger = Announcement("r1", "transforms", WriterId("stranger", "laptop", 9, 1, 99), "stranger")
     with (
         TransformPublisher(ours, "r1", "wheels") as wheels,
-        StreamPublisher(theirs, "zstate/r1/transforms/stranger", ENCODINGS[WriterTransforms]) as stream,
+        KeyPublisher(theirs, "zstate/r1/transforms/stranger", ENCODINGS[WriterTransforms]) as stream,
     ):
         wheels.publish([pose("odom", "base_link")])
         with announce(theirs, writer_key("r1", "transforms", stranger.identity)):
@@ -371,7 +371,7 @@ def test_samples_that_arrive_after_their_writer_left_join_its_history(sessions):
             session = odometry._session_id
         until(lambda: [event.kind for event in listener.events()] == ["joined", "left"])
         late = WriterTransforms(stamp + 2, 2, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
-        with StreamPublisher(writer, key, ENCODINGS[WriterTransforms]) as stream:
+        with KeyPublisher(writer, key, ENCODINGS[WriterTransforms]) as stream:
             wait_for_reader(writer, key)
             stream.put(encode(late))
             until(lambda: counts() == [3])

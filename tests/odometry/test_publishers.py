@@ -20,8 +20,8 @@ from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     Imu,
     Message,
@@ -150,7 +150,7 @@ def test_a_sensor_has_one_writer(sessions):
             ImuPublisher(second_session, "r1", "chest")
         with VelocityPublisher(second_session, "r1", "chest"):  # another stream
             (robot,) = discover(second_session)
-    assert [name for name, _ in (*robot.imu_names, *robot.velocity_names)] == ["chest", "chest"]
+    assert [name for name, _ in (*robot.named("imu"), *robot.named("velocity"))] == ["chest", "chest"]
 
 
 def test_odometry_is_a_moving_edge_with_its_covariance(sessions):
@@ -263,7 +263,7 @@ def test_events_and_robots_name_the_writer_of_odometry(sessions):
         (event,) = listener.events()
         (robot,) = discover(reader)
     assert (event.kind, event.stream) == ("joined", "odometry")
-    assert [name for name, _ in robot.odometry_names] == ["wheels"]
+    assert [name for name, _ in robot.named("odometry")] == ["wheels"]
 
 
 def x_of(listener: TransformListener) -> float | None:

@@ -28,7 +28,7 @@ from zstate.model.robot import RobotModel
 from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import announce, local_writer
 from zstate.net.session import Session, connect
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
@@ -302,7 +302,7 @@ def test_changed_and_withdrawn_static_edges_are_recorded(sessions, tmp_path: Pat
     assert recorded == [[("tool", "hook")], [("tool", "hook"), ("fleet/map", "camera")], []]
 
 
-def put_state(publisher: StreamPublisher, seq: int, stamp: int = STAMP) -> None:
+def put_state(publisher: KeyPublisher, seq: int, stamp: int = STAMP) -> None:
     names = ("a",)
     state = JointState(stamp, seq, 5, order_digest(names), to_block([0.5]), None, None, names)
     publisher.put(encode(state))
@@ -313,8 +313,8 @@ def test_missed_undecodable_and_unwritable_messages_are_counted(sessions, tmp_pa
     key = "zstate/r1/joint_states"
     with (
         Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder,
-        StreamPublisher(writer, key, ENCODINGS[JointState]) as ours,
-        StreamPublisher(writer, key, "text/plain") as foreign,
+        KeyPublisher(writer, key, ENCODINGS[JointState]) as ours,
+        KeyPublisher(writer, key, "text/plain") as foreign,
     ):
         until(lambda: ours.has_readers and foreign.has_readers)
         for seq in (7, 8, 12):
@@ -337,7 +337,7 @@ def test_simulated_time_is_recorded_with_the_robots(sessions, tmp_path: Path):
     writer, reader = sessions
     with (
         Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder,
-        StreamPublisher(writer, "zstate/clock", ENCODINGS[ClockMessage]) as clock,
+        KeyPublisher(writer, "zstate/clock", ENCODINGS[ClockMessage]) as clock,
     ):
         until(lambda: clock.has_readers)
         clock.put(encode(ClockMessage(3_000_000_007, 0, 9)))
@@ -449,7 +449,7 @@ def test_full_disk_ends_the_recording_with_a_reason_and_what_it_has_lost_is_coun
     assert child.line() == "ready"
     with (
         StatePublisher(writer, GRIPPER, "r1") as publisher,
-        StreamPublisher(writer, "zstate/r1/joint_states", "") as probe,
+        KeyPublisher(writer, "zstate/r1/joint_states", "") as probe,
     ):
         until(lambda: probe.has_readers)
         dice = np.random.default_rng(3)
@@ -479,7 +479,7 @@ def test_close_finishes_the_file_and_may_be_repeated(sessions, tmp_path: Path):
         recorder.close()
         recorder.close()
         assert recorder.wait(0.0)
-        with StreamPublisher(writer, "zstate/r1/joint_states", "") as probe:
+        with KeyPublisher(writer, "zstate/r1/joint_states", "") as probe:
             until(lambda: not probe.has_readers)
     assert recorder.failure is None
     with RecordingReader(tmp_path / "run.mcap") as recording:
@@ -490,7 +490,7 @@ def test_received_samples_are_written_even_if_the_recording_ends_at_once(session
     writer, reader = sessions
     with (
         Recorder(reader, tmp_path / "run.mcap") as recorder,
-        StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as publisher,
+        KeyPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as publisher,
     ):
         until(lambda: publisher.has_readers)
         with closing(SampleCollector(reader, "zstate/r1/joint_states")) as tap:
@@ -532,7 +532,7 @@ def test_invalid_recorder_arguments_are_refused_and_create_no_file(sessions, tmp
     with pytest.raises(RecordingError, match="exists"):
         Recorder(session, path)
     assert path.read_text() == "mine"
-    with StreamPublisher(session, "zstate/r1/joint_states", "") as probe:
+    with KeyPublisher(session, "zstate/r1/joint_states", "") as probe:
         until(lambda: not probe.has_readers)
     with Recorder(session, path, overwrite=True):
         pass
@@ -761,7 +761,7 @@ def test_commands_are_recorded_as_joint_states_and_not_replayed(sessions, tmp_pa
         StatePublisher(sessions[0], RRBOT, "arm") as publisher,
         Recorder(sessions[1], path, ["arm"]) as recorder,
         announce(sessions[0], writer_key("arm", "joint_commands", teleop.identity)),
-        StreamPublisher(sessions[0], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as commands,
+        KeyPublisher(sessions[0], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as commands,
     ):
         wait_for_stream_readers(sessions[0], "arm", "joint_states", "joint_commands")
         publisher.publish([0.0, 0.0])

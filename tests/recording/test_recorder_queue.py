@@ -7,7 +7,7 @@ from helpers.processes import until
 from helpers.robots import SampleCollector, wait_for_reader
 
 from zstate.net.latched import LatchedPublisher
-from zstate.net.streams import CAPACITY, StreamPublisher
+from zstate.net.streams import CAPACITY, KeyPublisher
 from zstate.recording.recorder import QUEUE_LENGTH, Batch, MessageQueue
 
 
@@ -20,7 +20,7 @@ def test_several_subscriptions_share_one_queue_with_reception_times(sessions):
     batches: list[Batch] = []
     with (
         MessageQueue(reader) as inbox,
-        StreamPublisher(writer, "a/samples", "") as samples,
+        KeyPublisher(writer, "a/samples", "") as samples,
         LatchedPublisher(writer, "a/value", "") as value,
     ):
         value.set(b"holds")
@@ -45,7 +45,7 @@ def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):
     sent = QUEUE_LENGTH + 3 * CAPACITY
     with (
         MessageQueue(reader) as inbox,
-        StreamPublisher(writer, "a/samples", "") as samples,
+        KeyPublisher(writer, "a/samples", "") as samples,
         closing(SampleCollector(reader, "a/samples")) as tap,
     ):
         inbox.subscribe("joint_states", ["a/samples"], "r1")
@@ -65,7 +65,7 @@ def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):
 def test_close_ends_without_a_reader_and_keeps_waiting_batches(sessions):
     writer, reader = sessions
     inbox = MessageQueue(reader)
-    with StreamPublisher(writer, "a/samples", "") as samples:
+    with KeyPublisher(writer, "a/samples", "") as samples:
         inbox.subscribe("joint_states", ["a/samples"], "r1")
         until(lambda: samples.has_readers)
         for number in range(QUEUE_LENGTH + 2 * CAPACITY):

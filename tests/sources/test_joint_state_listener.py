@@ -9,7 +9,7 @@ from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.model.load import load_model
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointStateListener
 from zstate.wire.messages import JointState, order_digest, to_block
@@ -25,7 +25,7 @@ FLOATING = load_model(
 
 def put(session: Session, payload: bytes, encoding: str = ENCODINGS[JointState]) -> None:
     wait_for_reader(session, KEY)
-    with StreamPublisher(session, KEY, encoding) as stream:
+    with KeyPublisher(session, KEY, encoding) as stream:
         stream.put(payload)
 
 
@@ -177,7 +177,7 @@ def test_the_newest_1024_readings_wait_for_their_reader(sessions):
     block, order = to_block([1.0, 2.0]), order_digest(RRBOT.joint_names)
     with JointStateListener(reader, "r1", RRBOT) as source:
         wait_for_reader(writer, KEY)
-        with StreamPublisher(writer, KEY, ENCODINGS[JointState]) as stream:
+        with KeyPublisher(writer, KEY, ENCODINGS[JointState]) as stream:
             for batch in range(11):  # each ends with a message whose refusal shows that it was received
                 for seq in range(100 * batch, 100 * batch + 100):
                     stream.put(encode(JointState(seq, seq, 1, order, block)))

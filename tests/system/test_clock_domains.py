@@ -19,7 +19,7 @@ from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.stamp_checks import StampCheck, likely_cause
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.clock import ClockPublisher, SimulatedClock
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -440,7 +440,7 @@ def test_stamps_of_transforms_are_checked_without_a_description(sessions):
     edges = (("base", "hand"),)
     pose = to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     with (
-        StreamPublisher(writer, "zstate/r1/tf", ENCODINGS[TransformSample]) as publisher,
+        KeyPublisher(writer, "zstate/r1/tf", ENCODINGS[TransformSample]) as publisher,
         TransformListener(reader, "r1", follow="tf") as listener,
     ):
         until(lambda: publisher.has_readers)

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,11 +19,12 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.urdf import parse_urdf
 from zstate.net.sample_history import MAX_PAGE_BYTES
+from zstate.streams import StreamName, all_streams, is_named, latched_streams
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import LATCHED_STREAMS, NAMED_STREAMS, STOP_STREAMS, StreamName
-from zstate.wire.messages import MAX_BYTES, HistoryPage, Message, MotionOutcome, order_digest
-from zstate.wire.native import ENCODINGS, MAX_MESSAGE_BYTES, STREAM_TYPES, NativeWire, decode, encode
+from zstate.wire.keys import STOP_STREAMS
+from zstate.wire.messages import HistoryPage, Message, MotionOutcome, order_digest
+from zstate.wire.native import ENCODINGS, MAX_MESSAGE_BYTES, NativeWire, decode, encode
 from zstate.wire.protocol import SerializedSample
 
 Json = dict[str, Any]
@@ -296,13 +297,13 @@ def test_integers_are_accepted_in_the_range_of_the_page_only(title: str, form: s
 
 def test_the_page_lists_every_stream_with_its_key_its_message_and_how_it_is_delivered():
     rows = {row[0].strip("`"): row for row in rows_of(section("Keys"))}
-    for stream, kind in STREAM_TYPES.items():
+    for stream, kind in ((row.name, row.type) for row in all_streams()):
         ends = [f"/{stream}", *(f"/{stream}/<{name}>" for name in ("writer", "sensor", "id"))]
         (row,) = (row for key, row in rows.items() if any(key.endswith(end) for end in ends))
         assert row[1].partition(" ")[0] == kind.__name__
-        assert row[0].endswith(">`") is (stream in NAMED_STREAMS)
-        assert (row[2] == "latched") is (stream in {*LATCHED_STREAMS, "driver", *STOP_STREAMS})
-    assert f"\n{','.join(get_args(StreamName))}\n" in section("Liveliness tokens")
+        assert row[0].endswith(">`") is (is_named(stream))
+        assert (row[2] == "latched") is (stream in {*latched_streams(), "driver", *STOP_STREAMS})
+    assert f"\n{','.join(row.name for row in all_streams())}\n" in section("Liveliness tokens")
 
 
 def test_the_digest_in_the_page_is_that_of_its_names():
@@ -321,10 +322,14 @@ def test_the_size_limits_of_the_page_are_those_of_the_code():
     for names, limit in rows_of(section("Size limits"))[2:]:
         limits |= {name.strip("`"): int(limit) for name in names.split(", ")}
     single = {kind.__name__: size for kind, size in MAX_MESSAGE_BYTES.items()}
-    for stream, kind in STREAM_TYPES.items():
+    for stream, kind in ((row.name, row.type) for row in all_streams()):
         assert single.pop(kind.__name__, limits[stream]) == limits[stream]
     assert single[HistoryPage.__name__] > MAX_PAGE_BYTES  # the page is checked before it is decoded
-    assert limits == {**MAX_BYTES, **single, HistoryPage.__name__: MAX_PAGE_BYTES}
+    assert limits == {
+        **{row.name: row.max_bytes for row in all_streams()},
+        **single,
+        HistoryPage.__name__: MAX_PAGE_BYTES,
+    }
 
 
 def parsed_key(key: str) -> Json | None:
@@ -375,7 +380,7 @@ def parsed_key(key: str) -> Json | None:
         found: Json = {"stream": name}
         if name != "clock":
             found["robot"] = keys.robot_from_key(key)
-        if name in NAMED_STREAMS and name not in STOP_STREAMS:
+        if is_named(name) and name not in STOP_STREAMS:
             found["name"] = NativeWire().edge_writer_name(key)
         return found
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from zstate.errors import InvalidInput, MessageError
+from zstate.streams import stream_named
 from zstate.wire.messages import (
-    MAX_BYTES,
     DriverState,
     Imu,
     JointState,
@@ -122,7 +122,7 @@ def test_a_block_of_ranges_is_little_endian_float32():
 def test_a_scan_has_at_most_100000_rays():
     ranges = bytes(4 * 100_000)
     largest = scan(ranges=ranges, intensities=ranges, frame="\U0001f916" * 1024)
-    assert len(encode(largest)) <= MAX_BYTES["scan"]
+    assert len(encode(largest)) <= stream_named("scan").max_bytes
     with pytest.raises(InvalidInput, match="100001 rays, where 100000 are allowed"):
         scan(ranges=bytes(4 * 100_000 + 4))
 
@@ -257,7 +257,7 @@ def test_messages_of_sensors_and_odometry_fit_the_limit_of_their_streams():
     frame, six = "\U0001f916" * 1024, bytes(21 * 8)
     edge = ((frame, frame),)
     largest = odometry(edges=edge, order=order_digest(edge), covariances=six, twist_covariance=six)
-    assert max(len(encode(one)) for one in (imu(frame=frame), largest)) <= MAX_BYTES["odometry"]
+    assert max(len(encode(one)) for one in (imu(frame=frame), largest)) <= stream_named("odometry").max_bytes
 
 
 def test_frames_of_a_measurement_get_their_full_names():

@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import MessageError
+from zstate.streams import LATCHED_BYTES, StreamName, all_streams
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
-    LATCHED_BYTES,
     ClockMessage,
     DriverState,
     HistoryPage,
@@ -42,7 +41,6 @@ from zstate.wire.messages import (
 )
 from zstate.wire.native import (
     ENCODINGS,
-    STREAM_TYPES,
     NativeWire,
     decode,
     decode_joint_state,
@@ -479,7 +477,7 @@ def encoder_of(stream: StreamName, name: str = "") -> StreamEncoder:
 def test_native_wire_implements_the_protocol_for_every_stream():
     wire: Wire = NativeWire()
     by_type = {type(message): message for message in MESSAGES}
-    for stream, kind in STREAM_TYPES.items():
+    for stream, kind in ((row.name, row.type) for row in all_streams()):
         message, encoder = by_type[kind], encoder_of(stream, "w")
         assert encoder.encoding == ENCODINGS[kind]
         assert encoder.key.startswith(wire.expression("r1", stream).rstrip("*"))

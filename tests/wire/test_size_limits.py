@@ -14,10 +14,11 @@ from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.net.latched import LatchedPublisher
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
-from zstate.wire.messages import MAX_BYTES, JointState, StaticTransforms, Status, order_digest
+from zstate.streams import stream_named
+from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
 from zstate.wire.native import ENCODINGS, NativeWire, decode, encode
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
@@ -33,7 +34,7 @@ def statics(count: int) -> StaticTransforms:
 @pytest.mark.parametrize("wire", ["native", "ros2"])
 @pytest.mark.parametrize("stream", ["joint_states", "tf", "tf_static", "robot_description"])
 def test_each_stream_has_a_largest_payload(wire, stream):
-    size = 4 * MAX_BYTES[stream] + 1
+    size = 4 * stream_named(stream).max_bytes + 1
     for arrival in (
         SerializedSample("key", bytes(size), "any"),
         SerializedSample("key", b"\0", "any", None, size),
@@ -71,7 +72,7 @@ def test_of_samples_that_wait_for_a_description_the_newest_1024_or_4_mib_are_kep
 def test_too_large_messages_are_counted_and_later_ones_are_inserted(sessions):
     writer, reader = sessions
     with (
-        StreamPublisher(writer, "zstate/r2/joint_states", ENCODINGS[JointState]) as stranger,
+        KeyPublisher(writer, "zstate/r2/joint_states", ENCODINGS[JointState]) as stranger,
         LatchedPublisher(writer, "zstate/r1/tf_static/mount", ENCODINGS[StaticTransforms]) as mount,
         TransformListener(reader) as listener,
         StatePublisher(writer, RRBOT, "r1") as publisher,

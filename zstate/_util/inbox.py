@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Generic, TypeVar
@@ -64,6 +66,18 @@ class Inbox(Generic[T]):
             newest = self._items[-1] if self._items else None
             self._items.clear()
         return newest
+
+    def take(self, timeout_s: float | None = None) -> T | None:
+        """The oldest item; None if none arrives within ``timeout_s``, or after the end."""
+        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            with self._changed:
+                self._check()
+                left_s = max(0.0, min(deadline - time.monotonic(), _LONGEST_WAIT_S))
+                if self._changed.wait_for(lambda: self._items or self._closed, left_s):
+                    return self._items.popleft() if self._items else None
+                if time.monotonic() >= deadline:
+                    return None
 
     def __iter__(self) -> Iterator[T]:
         while True:

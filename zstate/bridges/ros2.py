@@ -33,9 +33,10 @@ from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import OdometryPublisher
 from zstate.sources.joint_state_listener import DescriptionSubscriber, JointStateListener
+from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, MODEL_WRITER, StreamName, check_robot
+from zstate.wire.keys import ANY, MODEL_WRITER, check_robot
 from zstate.wire.messages import (
     Edges,
     Odometry,

@@ -14,7 +14,8 @@ from zstate.cli.output.console import count_text, rate_text
 from zstate.cli.output.text_layout import Table
 from zstate.errors import InvalidInput, format_duration
 from zstate.net.topic_statistics import TopicStatistics
-from zstate.wire.keys import StreamName, full_name
+from zstate.streams import StreamName
+from zstate.wire.keys import full_name
 from zstate.wire.messages import JointState, StampedMessage, TransformSample
 from zstate.wire.registry import get_wire
 

@@ -12,8 +12,8 @@ from zstate.cli.output.wire_text import NativeMessages, is_ros, messages_for
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
+    from zstate.streams import StreamName
     from zstate.wire.identity import Announcement
-    from zstate.wire.keys import StreamName
 
 
 def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:

@@ -30,7 +30,8 @@ from zstate.net.presence import RobotInfo, announce_reader, discover
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.sources.joint_state_listener import MAX_AGE_S, DescriptionSubscriber, JointStateReader
-from zstate.wire.keys import ANY, MODEL_WRITER, StreamName
+from zstate.streams import StreamName
+from zstate.wire.keys import ANY, MODEL_WRITER
 from zstate.wire.messages import StaticTransforms, poses_from_block
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
@@ -158,7 +159,7 @@ class _RobotCapture:
     def missing(self) -> list[str]:
         """What is announced and has not arrived."""
         streams = {stream for stream, _ in self.info.writers}
-        static_names = {name for name, _ in self.info.static_names} - {MODEL_WRITER}
+        static_names = {name for name, _ in self.info.named("tf_static")} - {MODEL_WRITER}
         joints = self._joints
         conditions = {
             "its model has not arrived": "robot_description" in streams and joints is None,

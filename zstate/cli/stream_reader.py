@@ -14,7 +14,8 @@ from zstate.clock import LONGEST_WAIT_S
 from zstate.net.presence import announce_reader
 from zstate.net.streams import CAPACITY
 from zstate.net.subscription import Received, subscribe
-from zstate.wire.keys import StreamName, check_robot
+from zstate.streams import StreamName
+from zstate.wire.keys import check_robot
 from zstate.wire.messages import OccupancyGrid, StampedMessage
 from zstate.wire.registry import get_wire
 

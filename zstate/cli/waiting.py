@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from zstate.net.session import Session
     from zstate.net.subscription import Received
     from zstate.nodes.listener import Follow, TransformListener
+    from zstate.streams import StreamName
     from zstate.transform import Transform
-    from zstate.wire.keys import StreamName
 
 # A burst of notifications costs one check: conditions on a large fleet take milliseconds.
 _CHECK_INTERVAL_S = 0.02
@@ -164,7 +164,7 @@ class RobotReadiness(Closeable):
         if not streams:
             return directory.messages.unknown(robot, directory.robots())
         from zstate.nodes.listener import TransformListener
-        from zstate.wire.keys import JOINT_STREAMS
+        from zstate.streams import JOINT_STREAMS
 
         stream: StreamName = "joint_states" if "robot_description" in streams else "robot_description"
         # Without a writer of joint states, transforms may be published instead.

@@ -1,14 +1,19 @@
 """Commands to the program that owns a robot's hardware, within limits. Not a safety-rated channel."""
 
-from zstate.driving.commander import Commander
-from zstate.driving.driver import Calibration, Driver, Setpoint
-from zstate.driving.driver_state import DriverReport
-from zstate.driving.host import DriverHost
-from zstate.driving.limits import Limits
-from zstate.driving.motion import Motion, Outcome
-from zstate.driving.setpoint_limiter import SetpointLimiter
-from zstate.driving.simulated_driver import SimulatedDriver
-from zstate.driving.stops import stop
+from typing import TYPE_CHECKING
+
+from zstate._util.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from zstate.driving.commander import Commander
+    from zstate.driving.driver import Calibration, Driver, Setpoint
+    from zstate.driving.driver_state import DriverReport
+    from zstate.driving.host import DriverHost
+    from zstate.driving.limits import Limits
+    from zstate.driving.motion import Motion, Outcome
+    from zstate.driving.setpoint_limiter import SetpointLimiter
+    from zstate.driving.simulated_driver import SimulatedDriver
+    from zstate.driving.stops import stop
 
 __all__ = [
     "Calibration",
@@ -24,3 +29,24 @@ __all__ = [
     "SimulatedDriver",
     "stop",
 ]
+
+_HOMES = {
+    "Calibration": "driver",
+    "Commander": "commander",
+    "Driver": "driver",
+    "DriverHost": "host",
+    "DriverReport": "driver_state",
+    "Limits": "limits",
+    "Motion": "motion",
+    "Outcome": "motion",
+    "Setpoint": "driver",
+    "SetpointLimiter": "setpoint_limiter",
+    "SimulatedDriver": "simulated_driver",
+    "stop": "stops",
+}
+
+__getattr__ = lazy_names(__name__, _HOMES)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -35,7 +35,7 @@ from zstate.net.ownership import WriterClaim
 from zstate.net.presence import local_writer
 from zstate.net.queryable import check_timeout, query
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.net.writer import WireWriter
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import check_robot, driver_key, motion_key, release_key
@@ -128,7 +128,7 @@ class Commander(Closeable):
             self._writer = writer.open_stream("joint_commands")
             self._claim.confirm()
             key = release_key(self.robot, identity.identity)
-            self._releases = opening.enter_context(StreamPublisher(session, key, ENCODINGS[Release]))
+            self._releases = opening.enter_context(KeyPublisher(session, key, ENCODINGS[Release]))
             opening.enter_context(LatchedSubscriber(session, driver_key(self.robot), self._on_state))
             self._opened = opening.pop_all()
 

@@ -20,16 +20,14 @@ from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.recorder import MessageQueue, SampleWriter, recorded_streams
 from zstate.recording.storage import ROBOT
+from zstate.streams import StreamName, is_latched
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, LATCHED_STREAMS, STOP_STREAMS, StreamName, check_robot
+from zstate.wire.keys import ANY, STOP_STREAMS, check_robot
 from zstate.wire.messages import ClockMessage, Message, RobotDescription
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.topics import SHARED
 from zstate.wire.ros2.types import RosType
-
-_UNANNOUNCED: frozenset[StreamName] = frozenset({*LATCHED_STREAMS, "clock"})
-"""Streams whose messages may arrive before their robot is announced."""
 
 _PERIOD_S = 0.01
 """Samples are forwarded at most so often, together."""
@@ -335,7 +333,7 @@ class FoxgloveBridge(Closeable):
         self._announce({robot: {one for its, one in announced if its == robot} for robot, _ in announced})
 
     def _subscribe(self, stream: StreamName, robots: tuple[str, ...]) -> None:
-        if stream in LATCHED_STREAMS:
+        if is_latched(stream):
             self._topics.unlatch_all(stream)
         self._queue.unsubscribe(stream)
         self._subscribed[stream] = robots
@@ -367,7 +365,8 @@ class FoxgloveBridge(Closeable):
             for arrival in batch.arrivals:
                 robot = self._samples.robot_of(batch, arrival)
                 # A sample that was queued when its robot left would open a channel again.
-                is_late = batch.stream not in _UNANNOUNCED and robot not in self._streams_of
+                may_be_early = is_latched(batch.stream) or batch.stream == "clock"
+                is_late = not may_be_early and robot not in self._streams_of
                 if robot is None or is_late:
                     continue
                 for message in self._samples.write(encoder, robot, batch._replace(stamp=stamp), arrival):

@@ -16,8 +16,8 @@ from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
 from zstate.ingest.frame_ownership import EdgeSource
+from zstate.streams import StreamName, edge_streams
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import EDGE_STREAMS, StreamName
 
 Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]
 
@@ -140,7 +140,6 @@ class CallbackThread(Closeable, Generic[T]):
                         threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
 
-_NAMED_SAMPLES: frozenset[StreamName] = frozenset({*EDGE_STREAMS, "partial_joint_states"})
 _Place = tuple[str, StreamName, str]
 
 
@@ -323,7 +322,8 @@ class EventLog(Closeable):
         announced = self._alive.get((robot, self._followed, ""), {}).get(session)
         if announced is None:
             for (owner, stream, _), writers in self._alive.items():
-                if owner == robot and stream in _NAMED_SAMPLES and session in writers:
+                has_samples = stream in (*edge_streams(), "partial_joint_states")
+                if owner == robot and has_samples and session in writers:
                     return writers[session]
         return announced
 

@@ -37,8 +37,9 @@ from zstate.clock import Clock, MonotonicClock
 from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
 from zstate.model.robot import RobotModel
+from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, StreamName, foreign_edge_problem, frame_owner
+from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, foreign_edge_problem, frame_owner
 
 CONTESTED = ("second parent", "second writer", "loop")
 """The refusal reasons of edges that exclude each other."""

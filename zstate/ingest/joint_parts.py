@@ -30,8 +30,8 @@ from zstate.errors import InsertRefused, MessageError
 from zstate.ingest.base import ClockSetBack, StreamIngest
 from zstate.ingest.frame_ownership import EdgeSource, FrameOwnership
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.streams import StreamName
 from zstate.wire.joint_order import JointOrder
-from zstate.wire.keys import StreamName
 from zstate.wire.messages import JointState, RobotDescription, Sample
 
 _ANNOUNCED, _LEFT_OR_UNANNOUNCED, _NO_WRITER = range(3)

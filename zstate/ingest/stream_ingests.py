@@ -14,7 +14,7 @@ from typing import TypeAlias
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.ingest.base import StreamIngest
-from zstate.wire.keys import StreamName
+from zstate.streams import StreamName
 
 MAX_STRANGERS = 256
 """Writers of one robot that were never announced. Of more, the oldest is dropped with its edges."""

@@ -19,9 +19,10 @@ from zstate.errors import MessageError
 from zstate.net.ownership import CHECK_PERIOD_S, Edge, frame_conflict, named_edges, seniority
 from zstate.net.session import Session
 from zstate.net.streams import CAPACITY, Ring, to_serialized
+from zstate.streams import SAMPLE_BYTES, edge_streams
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import EDGE_STREAMS, stream_key, writer_expression
-from zstate.wire.messages import SAMPLE_BYTES, TransformSample
+from zstate.wire.keys import stream_key, writer_expression
+from zstate.wire.messages import TransformSample
 from zstate.wire.native import NativeWire
 
 _WATCHED_S = 10.0
@@ -87,7 +88,7 @@ class EdgeMonitor(Closeable):
 
     def _on_token(self, token: zenoh.Sample, now: float) -> None:
         for rival in _WIRE.parse_token(str(token.key_expr), self._writer.robot):
-            if rival.stream not in EDGE_STREAMS:
+            if rival.stream not in edge_streams():
                 continue
             is_older = seniority(rival) < seniority(self._writer) and bool(rival.name)
             if token.kind == zenoh.SampleKind.DELETE:

@@ -17,8 +17,9 @@ from zstate.errors import NetworkError, Unreachable
 from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
 from zstate.net.status import StatusSubscriber
+from zstate.streams import StreamName, edge_streams
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, EDGE_STREAMS, MODEL_WRITER, StreamName
+from zstate.wire.keys import ANY, MODEL_WRITER
 from zstate.wire.messages import Status
 
 if TYPE_CHECKING:
@@ -85,11 +86,13 @@ class Graph:
         return [StreamGroup(*ends, tuple(streams)) for ends, streams in groups.items()]
 
 
-_OPTIONAL: frozenset[StreamName] = frozenset({*EDGE_STREAMS, "partial_joint_states", "joint_commands"})
-"""Streams that a robot with other ones does not lack."""
-
 RateLookup = Callable[[str, StreamName, WriterId], float | None]
 """The measured rate [Hz] of a robot's stream, as one writer publishes it; None if it is unknown."""
+
+
+def _is_optional(stream: StreamName) -> bool:
+    """Whether a robot with other streams does not lack this one."""
+    return stream in (*edge_streams(), "partial_joint_states", "joint_commands")
 
 
 def build_graph(
@@ -118,7 +121,7 @@ def build_graph(
         *(
             (one.robot, one.stream)
             for one in readers
-            if one.stream not in _OPTIONAL and (one.robot != ANY or not written)
+            if not _is_optional(one.stream) and (one.robot != ANY or not written)
         ),
     }
     unwritten: dict[str, list[WriterId]] = {"": []}

@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
+from functools import cache
 from itertools import islice
 from typing import NamedTuple, TypeAlias
 
@@ -29,15 +30,12 @@ from zstate.net.presence import ANSWER_WITHIN_S, announce, confirmed_tokens
 from zstate.net.queryable import query
 from zstate.net.session import Session
 from zstate.net.streams import Ring, to_serialized
+from zstate.streams import StreamName, edge_streams, is_measured, is_named
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import (
     ANY,
-    EDGE_STREAMS,
     FOREIGN_FRAME,
     MODEL_WRITER,
-    NAMED_STREAMS,
-    SENSOR_STREAMS,
-    StreamName,
     edge_expression,
     edge_key,
     foreign_edge_problem,
@@ -68,10 +66,16 @@ CHECK_PERIOD_S = 0.05
 _STARTUP_S = 1.0
 """Each sample checks for this long: by then the tokens of writers that opened at the same time are here."""
 
-_MOVING: tuple[StreamName, ...] = (*EDGE_STREAMS, "partial_joint_states")
 
-_ALL_HISTORIES_OF_EDGES = tuple(f"{stream_expression(ANY, stream)}?session=0" for stream in _MOVING)
-"""Queries that each writer of moving edges or of some joints receives, and to which none has samples."""
+def _moving_streams() -> tuple[StreamName, ...]:
+    return (*edge_streams(), "partial_joint_states")
+
+
+@cache
+def _all_histories_of_edges() -> tuple[str, ...]:
+    """Queries that each writer of moving edges or of some joints receives, and to which none has samples."""
+    return tuple(f"{stream_expression(ANY, stream)}?session=0" for stream in _moving_streams())
+
 
 _Handler: TypeAlias = "zenoh.handlers.Handler[zenoh.Sample]"
 
@@ -217,12 +221,10 @@ class WriterClaim(Closeable):
         stream = (rival.stream, rival.name)
         if stream not in self._received:
             ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
-            is_named = bool(rival.name) or rival.stream not in NAMED_STREAMS
+            has_key = bool(rival.name) or not is_named(rival.stream)
             self._received[stream] = zenoh.ext.declare_advanced_subscriber(
                 self._session.zenoh,
-                stream_key(rival.robot, *stream)
-                if is_named
-                else stream_expression(rival.robot, rival.stream),
+                stream_key(rival.robot, *stream) if has_key else stream_expression(rival.robot, rival.stream),
                 ring,
                 history=zenoh.ext.HistoryConfig(max_samples=1),
             )
@@ -258,13 +260,13 @@ class WriterClaim(Closeable):
 
     def _second_writer(self, first: Announcement) -> SecondWriter:
         what = f"{first.stream} of {first.robot!r}"
-        if first.stream in NAMED_STREAMS:
+        if is_named(first.stream):
             kind = "static edges" if first.stream == "tf_static" else first.stream.replace("_", " ")
             what = f"{kind} of {first.robot!r} under the name {first.name!r}"
         claimed = {claimed.stream for claimed in self._claimed}
         if "partial_joint_states" in {first.stream, *claimed} and first.stream not in claimed:
             advice = "stop it first, for it and this writer would publish the same joints"
-        elif first.stream in (*_MOVING, *SENSOR_STREAMS):
+        elif first.stream in _moving_streams() or is_measured(first.stream):
             advice = "stop it first, or give this writer another name"
         elif first.stream == "joint_commands":
             advice = "a robot has one commander at a time: close the first"
@@ -318,7 +320,7 @@ def claim_edges(
         # check received tokens: a peer that has replied has received ours, and we have received its tokens.
         if not session.zenoh.info.routers_zid():
             check_edges(session, writer, edges, allowed)
-            for histories in _ALL_HISTORIES_OF_EDGES:
+            for histories in _all_histories_of_edges():
                 for _ in query(session.zenoh, histories, ANSWER_WITHIN_S):
                     pass
         for edge in edges:
@@ -501,7 +503,7 @@ def frame_conflict(first: Announcement, edge: Edge, verb: str) -> SecondWriter:
     """The error of a writer whose edge excludes ``edge`` of the writer ``first``."""
     parent, child = edge
     advice = "stop or withdraw that first, or use takeover=True (--takeover)"
-    if first.stream in _MOVING:
+    if first.stream in _moving_streams():
         verb, advice = "places", "stop that first"
     text = (
         f"{writer_text(first.writer)} {verb} {child!r} on {parent!r} already, as {first.name!r} of "

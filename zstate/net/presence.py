@@ -26,8 +26,9 @@ from zstate.errors import InvalidInput, Unreachable, ZStateError
 from zstate.net.queryable import MAX_REPLIES, Tokens, check_timeout, query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READERS, StreamName, parse_reader_key, shortened
+from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READERS, parse_reader_key, shortened
 from zstate.wire.protocol import Wire, WriterTokens
 from zstate.wire.registry import get_wire
 
@@ -60,23 +61,13 @@ def local_writer(session: int, program: str = "") -> WriterId:
 class RobotInfo:
     """A robot with its writers as (stream, writer), sorted.
 
-    ``static_names`` are (name, writer) for the names under which static edges are written, and
-    ``transform_names`` and ``part_names`` the same for moving edges, and for drivers of some of its joints;
-    ``scan_names`` are its laser scanners, ``imu_names``, ``velocity_names`` and ``pose_names`` other
-    sensors, ``map_names`` its maps, and ``odometry_names`` its writers of odometry.
+    ``names`` are (stream, name, writer), sorted, of the streams whose writers have names: sensors, maps,
+    drivers of some joints, writers of edges.
     """
 
     name: str
     writers: tuple[tuple[StreamName, WriterId], ...]
-    static_names: tuple[tuple[str, WriterId], ...] = ()
-    transform_names: tuple[tuple[str, WriterId], ...] = ()
-    part_names: tuple[tuple[str, WriterId], ...] = ()
-    scan_names: tuple[tuple[str, WriterId], ...] = ()
-    map_names: tuple[tuple[str, WriterId], ...] = ()
-    imu_names: tuple[tuple[str, WriterId], ...] = ()
-    velocity_names: tuple[tuple[str, WriterId], ...] = ()
-    pose_names: tuple[tuple[str, WriterId], ...] = ()
-    odometry_names: tuple[tuple[str, WriterId], ...] = ()
+    names: tuple[tuple[StreamName, str, WriterId], ...] = ()
 
     def __repr__(self) -> str:
         streams: dict[str, list[str]] = {}
@@ -87,18 +78,11 @@ class RobotInfo:
 
     def names_of(self, writer: WriterId, stream: StreamName) -> tuple[str, ...]:
         """The names under which ``writer`` writes on ``stream``, sorted; empty for streams without names."""
-        names = {
-            "tf_static": self.static_names,
-            "transforms": self.transform_names,
-            "partial_joint_states": self.part_names,
-            "scan": self.scan_names,
-            "map": self.map_names,
-            "imu": self.imu_names,
-            "velocity": self.velocity_names,
-            "pose": self.pose_names,
-            "odometry": self.odometry_names,
-        }.get(stream, ())
-        return tuple(name for name, owner in names if owner == writer)
+        return tuple(name for name, owner in self.named(stream) if owner == writer)
+
+    def named(self, stream: StreamName) -> tuple[tuple[str, WriterId], ...]:
+        """The names of the writers of ``stream``, sorted: (name, writer)."""
+        return tuple((name, writer) for one, name, writer in self.names if one == stream)
 
 
 class LivelinessToken(Closeable):
@@ -203,29 +187,13 @@ def _confirmed(session: Session, expression: str, timeout_s: float) -> Tokens:
 def by_robot(found: Iterable[Announcement]) -> tuple[RobotInfo, ...]:
     """The announced writers, grouped by robot, sorted."""
     writers: dict[str, set[tuple[StreamName, WriterId]]] = {}
-    names: dict[tuple[str, StreamName], set[tuple[str, WriterId]]] = {}
+    names: dict[str, set[tuple[StreamName, str, WriterId]]] = {}
     for one in found:
         writers.setdefault(one.robot, set()).add((one.stream, one.writer))
         if one.name:
-            names.setdefault((one.robot, one.stream), set()).add((one.name, one.writer))
-
-    def sorted_names(robot: str, stream: StreamName) -> tuple[tuple[str, WriterId], ...]:
-        return tuple(sorted(names.get((robot, stream), ())))
-
+            names.setdefault(one.robot, set()).add((one.stream, one.name, one.writer))
     return tuple(
-        RobotInfo(
-            robot,
-            tuple(sorted(writers[robot])),
-            sorted_names(robot, "tf_static"),
-            sorted_names(robot, "transforms"),
-            sorted_names(robot, "partial_joint_states"),
-            sorted_names(robot, "scan"),
-            sorted_names(robot, "map"),
-            sorted_names(robot, "imu"),
-            sorted_names(robot, "velocity"),
-            sorted_names(robot, "pose"),
-            sorted_names(robot, "odometry"),
-        )
+        RobotInfo(robot, tuple(sorted(writers[robot])), tuple(sorted(names.get(robot, ()))))
         for robot in sorted(writers)
     )
 

@@ -38,9 +38,10 @@ from zstate.extension import kernel
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
 from zstate.net.streams import JOIN_WITHIN_S, to_serialized
-from zstate.wire.keys import StreamName, stream_key
+from zstate.streams import StreamName
+from zstate.wire.keys import stream_key
 from zstate.wire.messages import HistoryPage
-from zstate.wire.native import ENCODINGS, STREAM_TYPES, decode, encode
+from zstate.wire.native import ENCODINGS, decode, encode, stream_encoding
 from zstate.wire.protocol import SerializedSample
 
 T = TypeVar("T")
@@ -205,7 +206,7 @@ def serve_history(
     ``convert`` makes a payload of the stream of a cached one, if they differ. ``writer`` is the name in the
     key of a named stream.
     """
-    encoding = ENCODINGS[STREAM_TYPES[stream]]
+    encoding = stream_encoding(stream)
 
     def answer(parameters: Mapping[str, str]) -> Reply | None:
         if parameters.get("session", str(cache.writer)) != str(cache.writer):

@@ -20,7 +20,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher, StreamSubscriber, call_for_each
+from zstate.net.streams import KeyPublisher, StreamSubscriber, call_for_each
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import parse_status_key, status_expression, status_key
 from zstate.wire.messages import Status
@@ -45,7 +45,7 @@ class StatusPublisher(Closeable):
     def __init__(self, session: Session, robot: str, identity: str, status: Callable[[], Status]) -> None:
         self._session = session
         self._status = status
-        self._publisher = StreamPublisher(session, status_key(robot, identity), ENCODINGS[Status])
+        self._publisher = KeyPublisher(session, status_key(robot, identity), ENCODINGS[Status])
         with _LOCK:
             self._timer = _TIMERS.setdefault(session, _StatusTimer())
         self._timer.add(self)

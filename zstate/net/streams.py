@@ -22,7 +22,8 @@ from zstate._util.closeable import Closeable
 from zstate.errors import Closed
 from zstate.net.at_exit import join_at_exit
 from zstate.net.session import Session, Undeclarable
-from zstate.wire.messages import ATTACHMENT_BYTES, LATCHED_BYTES, SAMPLE_BYTES
+from zstate.streams import LATCHED_BYTES, SAMPLE_BYTES
+from zstate.wire.messages import ATTACHMENT_BYTES
 from zstate.wire.protocol import NO_ENVELOPE, Envelope, SerializedSample
 
 CAPACITY = 1024
@@ -237,7 +238,7 @@ def to_serialized(sample: zenoh.Sample, key: str = "", max_bytes: int = LATCHED_
     return SerializedSample(key, payload.to_bytes(), encoding, attached)
 
 
-class StreamPublisher(Closeable):
+class KeyPublisher(Closeable):
     """Publisher of samples on one key. Under congestion samples are dropped; the writer is never delayed."""
 
     def __init__(self, session: Session, key: str, encoding: str) -> None:

@@ -9,7 +9,8 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.wire.keys import ANY, LATCHED_STREAMS, StreamName, shortened
+from zstate.streams import StreamName, is_latched
+from zstate.wire.keys import ANY, shortened
 from zstate.wire.messages import Message
 from zstate.wire.protocol import SerializedSample, Wire
 
@@ -75,6 +76,6 @@ def subscribe(
             on_withdrawn(sample.key)
 
     keys = [wire.expression(name, stream) for name in names]
-    if stream in LATCHED_STREAMS:
+    if is_latched(stream):
         return LatchedSubscriber(session, keys, on_value)
     return StreamSubscriber(session, keys, on_samples)

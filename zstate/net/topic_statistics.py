@@ -23,7 +23,8 @@ from zstate.clock import Clock, SystemClock
 from zstate.ingest.deadline import Deadline
 from zstate.net.streams import StreamSubscriber
 from zstate.net.subscription import decode_samples
-from zstate.wire.keys import ANY, StreamName
+from zstate.streams import StreamName
+from zstate.wire.keys import ANY
 from zstate.wire.messages import StampedMessage
 
 if TYPE_CHECKING:

@@ -18,10 +18,10 @@ from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import announce
 from zstate.net.queryable import query_tokens
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
+from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import StreamName
 from zstate.wire.messages import Message
 from zstate.wire.protocol import StreamEncoder, Wire, WriterNode
 
@@ -34,7 +34,7 @@ _PERMISSION_ROUND_S = 0.02
 W = TypeVar("W", "SampleWriter", "LatchedWriter")
 
 
-class SampleWriter(StreamPublisher):
+class SampleWriter(KeyPublisher):
     """Publishes the samples of one stream of one writer.
 
     Encoding and sending are two calls, so that a message which one of several wires cannot represent is

@@ -31,18 +31,9 @@ from zstate.net.presence import OtherTfSubscription, WriterWatch, announce_reade
 from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
+from zstate.streams import StreamName, edge_streams, is_named
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import (
-    ANY,
-    EDGE_STREAMS,
-    MODEL_WRITER,
-    NAMED_STREAMS,
-    StreamName,
-    check_robot,
-    shortened,
-    stream_from_key,
-    stream_key,
-)
+from zstate.wire.keys import ANY, MODEL_WRITER, check_robot, shortened, stream_from_key, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
 from zstate.wire.protocol import SerializedSample, Wire, selected_robots
 from zstate.wire.registry import get_wire
@@ -444,7 +435,7 @@ class TransformListener(Closeable):
 
     def _set_followed_writer(self, samples: StreamIngests, announced: Announcement, *, alive: bool) -> None:
         robot, session = announced.robot, announced.writer.session
-        if samples.stream in EDGE_STREAMS or (samples.stream == "tf" and not self._wire.shared):
+        if samples.stream in edge_streams() or (samples.stream == "tf" and not self._wire.shared):
             (self._ownership.add_writer if alive else self._ownership.remove_writer)(robot, session)
         elif self._follow == "joint_states":
             parts = self._joint_parts(robot)
@@ -457,7 +448,7 @@ class TransformListener(Closeable):
         elif self._clock_offsets is not None:
             self._clock_offsets.unwatch(announced.writer)
         # A token without a name leaves open on which key of a named stream its writer publishes.
-        has_key = bool(announced.name) or samples.stream not in NAMED_STREAMS
+        has_key = bool(announced.name) or not is_named(samples.stream)
         if alive and self._history is not None and has_key:
             self._history.request(stream_key(robot, samples.stream, announced.name), session)
         if not alive:

@@ -31,9 +31,10 @@ from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusRepo
 from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.rate import RateReport
 from zstate.sources.joint_source import JointReading, JointSource
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import MODEL_WRITER, StreamName, wire_name
+from zstate.wire.keys import MODEL_WRITER, wire_name
 from zstate.wire.messages import (
     JointState,
     RobotDescription,

@@ -15,8 +15,8 @@ from zstate._util.format import html_of_fields
 from zstate.errors import format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.rate import RateReport
+from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import StreamName
 from zstate.wire.messages import Level, Status, from_block
 from zstate.wire.native import joint_positions
 

@@ -21,8 +21,9 @@ from zstate.net.status import StatusPublisher
 from zstate.net.writer import SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
 from zstate.rate import Rate, RateReport
+from zstate.streams import StreamName, is_named
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import StreamName, check_robot, check_writer
+from zstate.wire.keys import check_robot, check_writer
 from zstate.wire.messages import StampedMessage, renumbered
 from zstate.wire.registry import as_wire_names, get_wire
 
@@ -147,8 +148,10 @@ class SamplePublisher(Closeable):
             self._opened.close()
 
 
-class SensorPublisher(SamplePublisher):
+class MeasurementPublisher(SamplePublisher):
     """Base of the publishers of one ``sensor`` on ``stream``, which is the writer's name there.
+
+    On a stream without names ``sensor`` is empty.
 
     Under congestion messages are dropped, and joining listeners receive none from the past. On the native
     wire each sensor has one writer.
@@ -167,7 +170,9 @@ class SensorPublisher(SamplePublisher):
     ) -> None:
         identity = local_writer(secrets.randbits(32), program)
         super().__init__(robot, wires, clock, identity.session)
-        self.sensor = check_writer(sensor)
+        if not is_named(stream) and sensor:
+            raise InvalidInput(f"the writers of {stream} have no names; got {sensor!r}")
+        self.sensor = check_writer(sensor) if is_named(stream) else ""
         self._stream: StreamName = stream
         with ExitStack() as opening:
             if "native" in self._wires:

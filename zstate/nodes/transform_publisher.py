@@ -27,9 +27,10 @@ from zstate.nodes.publisher_status import StatusReporter
 from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.nodes.static_publisher import edge_writer_name
 from zstate.rate import RateReport
+from zstate.streams import StreamName
 from zstate.transform import UPPER_TRIANGLE, Transform
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import StreamName, full_name
+from zstate.wire.keys import full_name
 from zstate.wire.messages import Edges, Odometry, WriterTransforms, edge_of, order_digest, to_block
 from zstate.wire.protocol import carrier
 from zstate.wire.registry import get_wire

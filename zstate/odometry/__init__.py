@@ -1,16 +1,21 @@
 """Odometry: where a robot's base is, from an IMU, wheels, legs and poses, with a covariance."""
 
-from zstate.odometry.estimator import BaseCovariance, BaseEstimator, BaseState, BaseTwist
-from zstate.odometry.health import SourceHealth
-from zstate.odometry.invariant_filter import ImuNoise
-from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
-from zstate.odometry.map_correction import MapCorrection
-from zstate.odometry.node import OdometryNode, SensorListener
-from zstate.odometry.publishers import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
-from zstate.odometry.requests import request_odometry
-from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
-from zstate.odometry.source_noise import PoseNoise, VelocityNoise
-from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
+from typing import TYPE_CHECKING
+
+from zstate._util.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from zstate.odometry.estimator import BaseCovariance, BaseEstimator, BaseState, BaseTwist
+    from zstate.odometry.health import SourceHealth
+    from zstate.odometry.invariant_filter import ImuNoise
+    from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
+    from zstate.odometry.map_correction import MapCorrection
+    from zstate.odometry.node import OdometryNode, SensorListener
+    from zstate.odometry.publishers import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+    from zstate.odometry.requests import request_odometry
+    from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
+    from zstate.odometry.source_noise import PoseNoise, VelocityNoise
+    from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
 __all__ = [
     "Ackermann",
@@ -42,3 +47,40 @@ __all__ = [
     "Wheels",
     "request_odometry",
 ]
+
+_HOMES = {
+    "Ackermann": "wheels",
+    "BaseCovariance": "estimator",
+    "BaseEstimator": "estimator",
+    "BaseState": "estimator",
+    "BaseTwist": "estimator",
+    "DiffDrive": "wheels",
+    "ForceThresholds": "legs",
+    "ImuNoise": "invariant_filter",
+    "ImuPublisher": "publishers",
+    "LegNoise": "legs",
+    "Legs": "legs",
+    "MapCorrection": "map_correction",
+    "Mecanum": "wheels",
+    "OdometryNode": "node",
+    "OdometryPublisher": "publishers",
+    "PoseNoise": "source_noise",
+    "PosePublisher": "publishers",
+    "SensorListener": "node",
+    "SimulatedRover": "simulated_rover",
+    "SimulatedWheels": "simulated_rover",
+    "SourceHealth": "health",
+    "SpeedThresholds": "legs",
+    "VelocityNoise": "source_noise",
+    "VelocityPublisher": "publishers",
+    "WheelNoise": "wheels",
+    "WheelVelocity": "wheels",
+    "Wheels": "wheels",
+    "request_odometry": "requests",
+}
+
+__getattr__ = lazy_names(__name__, _HOMES)
+
+
+def __dir__() -> list[str]:
+    return __all__

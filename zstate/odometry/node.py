@@ -34,8 +34,9 @@ from zstate.odometry.publishers import OdometryPublisher
 from zstate.odometry.requests import apply_request
 from zstate.odometry.source_noise import PoseNoise, VelocityNoise
 from zstate.sources import JointReading, JointStateListener
+from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.keys import StreamName, check_robot, odometry_request_key, shortened
+from zstate.wire.keys import check_robot, odometry_request_key, shortened
 from zstate.wire.messages import Imu, Pose, Velocity, covariance_matrix, from_block, with_full_names
 from zstate.wire.registry import get_wire
 

@@ -10,14 +10,14 @@ from zstate.checks import real_numbers
 from zstate.clock import Clock, check_stamp
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
-from zstate.nodes.sample_publisher import SensorPublisher
+from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
 from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
 from zstate.wire.keys import full_name
 from zstate.wire.messages import Imu, Odometry, Pose, Velocity, to_block
 
 
-class ImuPublisher(SensorPublisher):
+class ImuPublisher(MeasurementPublisher):
     """Publishes the readings of one inertial measurement unit of a robot.
 
     ``sensor`` is its name, in ROS its topic. Its axes are those of ``frame``, by default a frame of the
@@ -76,7 +76,7 @@ class ImuPublisher(SensorPublisher):
             self._publish_message(message)
 
 
-class VelocityPublisher(SensorPublisher):
+class VelocityPublisher(MeasurementPublisher):
     """Publishes the velocities that one sensor of a robot measures: optical flow, a Doppler log, a leg.
 
     A velocity is that of ``frame`` relative to the world, in its own axes. Sensors, frames, writers and
@@ -120,7 +120,7 @@ class VelocityPublisher(SensorPublisher):
             self._publish_message(Velocity(stamp, 0, 0, self.frame, vector, turn, triangle))
 
 
-class PosePublisher(SensorPublisher):
+class PosePublisher(MeasurementPublisher):
     """Publishes the poses that one sensor of a robot measures: motion capture, a marker, a scan matcher.
 
     They are measurements, no edges: no lookup uses them. In ROS the message names the parent alone, and

@@ -19,7 +19,7 @@ from zstate.recording.driver_messages import DRIVER_TYPES, decode_command, decod
 from zstate.recording.encode import POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
-from zstate.wire.keys import StreamName
+from zstate.streams import StreamName
 from zstate.wire.messages import (
     JointState,
     Message,

@@ -20,8 +20,8 @@ import json
 from typing import Any
 
 from zstate.errors import InvalidInput
+from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     DriverState,
     JointCommand,

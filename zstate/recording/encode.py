@@ -29,8 +29,8 @@ from zstate.recording.driver_messages import (
 )
 from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.storage import EDGE_WRITER, ROBOT
+from zstate.streams import StreamName
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import StreamName
 from zstate.wire.messages import (
     POSE_BYTES,
     ClockMessage,

@@ -15,7 +15,7 @@ from zstate.model.urdf import parse_urdf
 from zstate.recording.decode import RecordedWriter, recorded_writers
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import ROBOT, Channel
-from zstate.wire.keys import LATCHED_STREAMS, StreamName
+from zstate.streams import StreamName, is_latched
 from zstate.wire.messages import LaserScan, from_float32_block
 from zstate.wire.ros2.cdr import decode_string
 from zstate.wire.ros2.decoder import RosDecoder
@@ -142,7 +142,7 @@ def recorded_robots(info: RecordingInfo) -> list[RecordedRobot]:
                     fault = str(error)
             streams: list[RecordedStream] = []
             for writer, channel in written:
-                rate = None if writer.stream in LATCHED_STREAMS else mean_rate(channel, info.duration_s)
+                rate = None if is_latched(writer.stream) else mean_rate(channel, info.duration_s)
                 names = ", ".join(filter(None, (writer.edge_writer, writer.program)))
                 facts = (channel.topic, channel.type_name, channel.count, rate, names)
                 rays = _ray_count(reader, channel.topic) if writer.stream == "scan" else None

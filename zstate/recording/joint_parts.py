@@ -26,7 +26,7 @@ from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import DecodedRecording, RecordedWriter
 from zstate.recording.joint_states import DELAYED_NS, JointStatePart
-from zstate.wire.keys import JOINT_STREAMS
+from zstate.streams import JOINT_STREAMS
 from zstate.wire.messages import JointState, RobotDescription, Sample
 
 _MAX_SETS = 64

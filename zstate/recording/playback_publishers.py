@@ -25,9 +25,10 @@ from zstate.net.session import Session
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
+from zstate.streams import StreamName, edge_streams, is_measured, is_named, measured_streams
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder
-from zstate.wire.keys import EDGE_STREAMS, MODEL_WRITER, NAMED_STREAMS, SENSOR_STREAMS, StreamName, full_name
+from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import (
     Edges,
     JointState,
@@ -137,7 +138,7 @@ class PlaybackPublishers(Closeable):
         ros = [wire for wire in self._wires if get_wire(wire).shared]
         found: dict[_Named, Sequence[str]] = {}
         for writer in writers:
-            if writer.stream in SENSOR_STREAMS or _edge_of_odometry(writer) in self._copied:
+            if is_measured(writer.stream) or _edge_of_odometry(writer) in self._copied:
                 found[_named(writer)] = self._wires
             elif ros and (writer.stream == "odometry" or writer in self._copied):
                 found.setdefault(_named(writer), ros)
@@ -212,7 +213,7 @@ class PlaybackPublishers(Closeable):
         elif isinstance(message, JointState) and robot is not None:
             positions, velocities, efforts = robot.order.read(message)
             robot.publisher.publish(positions, velocities, efforts, message.stamp)
-        elif writer.stream in (*SENSOR_STREAMS, "odometry") or writer in self._copied:
+        elif writer.stream in (*measured_streams(), "odometry") or writer in self._copied:
             publisher = self._named.get(_named(writer))
             if publisher is None:
                 return False
@@ -450,7 +451,7 @@ class PassthroughPublisher(Closeable):
             self._claim.check()
             self._edge_monitor.check()
         stream: StreamName = next(one for one in _carrying(message) if one in self._streams)
-        if isinstance(message, TransformSample) and stream in EDGE_STREAMS:
+        if isinstance(message, TransformSample) and stream in edge_streams():
             self._own(message.edges or ())
         write_all(self._streams[stream], renumbered(message, self._seqs[stream], self._session_id))
         self._seqs[stream] += 1
@@ -525,7 +526,7 @@ class PassthroughPublisher(Closeable):
         return self._latched[stream, writer]
 
     def _announced(self, stream: StreamName, writer: str) -> Announcement:
-        return Announcement(self._robot, stream, self._writer, writer if stream in NAMED_STREAMS else "")
+        return Announcement(self._robot, stream, self._writer, writer if is_named(stream) else "")
 
     def _claimed(self, opening: ExitStack, streams: Sequence[Announcement]) -> WriterClaim | None:
         if not self._is_alone or not streams:
@@ -543,7 +544,7 @@ def _carrying(message: Message) -> tuple[StreamName, ...]:
     """The streams that may carry ``message``."""
     if isinstance(message, JointState):
         return ("partial_joint_states", "joint_states")
-    return (*EDGE_STREAMS, "tf") if isinstance(message, TransformSample) else SENSOR_STREAMS
+    return (*edge_streams(), "tf") if isinstance(message, TransformSample) else measured_streams()
 
 
 def _is_computed(robot: str, writers: Collection[RecordedWriter]) -> bool:

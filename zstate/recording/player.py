@@ -36,8 +36,8 @@ from zstate.recording.playback_publishers import PlaybackPublishers
 from zstate.recording.player_clock import Lateness, PlayerClock
 from zstate.recording.reader import RecordingReader
 from zstate.sources.joint_source import JointReading, JointStateValidator
+from zstate.streams import latched_streams
 from zstate.wire.joint_order import JointNumbers
-from zstate.wire.keys import LATCHED_STREAMS
 from zstate.wire.messages import ClockMessage, JointState, StampedMessage
 from zstate.wire.registry import as_wire_names
 
@@ -120,7 +120,7 @@ class Player(Closeable):
             selected = tuple(check_has_robot(self._recording, robot) for robot in robots)
             self.robots = selected or self._recording.names
             streams = {writer.stream for writer in self._recording.writers_of(self.robots)}
-            self.has_samples = not streams <= {*LATCHED_STREAMS, *DRIVER_TYPES, "clock"}
+            self.has_samples = not streams <= {*latched_streams(), *DRIVER_TYPES, "clock"}
             self._begin, self._end = self._bounds(path, start_s, duration_s)
             self._models: dict[str, RobotModel] = {}
             self._in_parts: set[str] = set()
@@ -229,7 +229,7 @@ class Player(Closeable):
         self._position = begin
         writers = self._recording.writers_of(self.robots)
         latched = LatchedState()
-        for decoded in self._recording.messages(self.robots, LATCHED_STREAMS, end=begin):
+        for decoded in self._recording.messages(self.robots, latched_streams(), end=begin):
             latched.update(decoded)
         with (
             PlaybackPublishers(

@@ -30,8 +30,9 @@ from zstate.rate import Rate
 from zstate.recording.driver_messages import DRIVER_TYPES
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
+from zstate.streams import StreamName, is_latched, is_named, latched_streams, measured_streams
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, LATCHED_STREAMS, NAMED_STREAMS, SENSOR_STREAMS, StreamName, check_robot
+from zstate.wire.keys import ANY, check_robot
 from zstate.wire.messages import Message, Odometry, StampedMessage, Stop, edge_of
 from zstate.wire.protocol import SerializedSample, Wire
 from zstate.wire.registry import get_wire
@@ -106,7 +107,7 @@ class MessageQueue(Closeable):
                     self._bytes += sum(len(arrival.payload) for arrival in arrivals)
             self._on_batch()
 
-        if stream in LATCHED_STREAMS:
+        if is_latched(stream):
             subscriber = LatchedSubscriber(self._session, expressions, lambda arrival: put([arrival]))
         else:
             subscriber = StreamSubscriber(self._session, expressions, put)
@@ -150,7 +151,7 @@ class SampleWriter:
     def robot_of(self, batch: Batch, arrival: SerializedSample) -> str | None:
         """The robot of a sample; None, and counted, if its key has no valid names."""
         try:
-            if batch.stream in NAMED_STREAMS:
+            if is_named(batch.stream):
                 self._wire.edge_writer_name(arrival.key)  # raises for a key without one
             return self._wire.robot_from_key(arrival.key) if batch.robot is None else batch.robot
         except InvalidInput as error:
@@ -162,8 +163,8 @@ class SampleWriter:
     ) -> Sequence[Message]:
         """Write the messages of a sample of ``batch``, and return them."""
         stream, stamp = batch.stream, batch.stamp
-        edge_writer = self._wire.edge_writer_name(arrival.key) if stream in NAMED_STREAMS else None
-        if not arrival.payload and stream in LATCHED_STREAMS:
+        edge_writer = self._wire.edge_writer_name(arrival.key) if is_named(stream) else None
+        if not arrival.payload and is_latched(stream):
             if edge_writer is not None:
                 encoder.withdraw(robot, stream, edge_writer, stamp)
             return ()
@@ -187,10 +188,17 @@ def recorded_streams(wire: Wire) -> tuple[StreamName, ...]:
     """The streams of robots that a recording of ``wire`` holds; the clock belongs to no robot."""
     # On a ROS wire all moving edges are on tf, and all joints on joint_states.
     named = wire.partial_joint_states, wire.transforms
-    latched: tuple[StreamName, ...] = ("robot_description", "tf_static", "map")
+    latched = latched_streams()
     driving = tuple(DRIVER_TYPES) if wire.name == "native" else ()
-    samples: tuple[StreamName, ...] = ("joint_states", "tf", *named, *SENSOR_STREAMS, "odometry", *driving)
-    return tuple(dict.fromkeys((*latched, *samples)))
+    samples: tuple[StreamName, ...] = (
+        "joint_states",
+        "tf",
+        *named,
+        *measured_streams(),
+        "odometry",
+        *driving,
+    )
+    return tuple(dict.fromkeys(stream for stream in (*latched, *samples) if wire.carries(stream)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,7 +378,7 @@ class Recorder(Closeable):
                     self._counters.count("dropped")
                 elif (robot := self._samples.robot_of(batch, arrival)) is None:
                     pass  # counted
-                elif batch.stream in LATCHED_STREAMS and self._large.accepts(robot, len(arrival.payload)):
+                elif is_latched(batch.stream) and self._large.accepts(robot, len(arrival.payload)):
                     self._large.put(robot, batch, arrival)
                 else:
                     self._write_arrival(robot, batch, arrival)

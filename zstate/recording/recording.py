@@ -56,7 +56,8 @@ from zstate.recording.joint_states import DELAYED_NS, JointStateReader
 from zstate.recording.reader import RecordingReader
 from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.scan import Scan, scan_from_message
-from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, StreamName, full_name
+from zstate.streams import JOINT_STREAMS, StreamName
+from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import (
     DriverState,
     Edges,

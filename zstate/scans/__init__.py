@@ -1,10 +1,15 @@
 """Laser scans and occupancy grids."""
 
-from zstate.scans.grid import Grid, load_map
-from zstate.scans.listener import PlacedScan, ScanListener
-from zstate.scans.publishers import MapPublisher, RangeSource, ScanPublisher
-from zstate.scans.scan import Scan
-from zstate.scans.simulated_laser import SimulatedLaser, dummy_scan
+from typing import TYPE_CHECKING
+
+from zstate._util.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from zstate.scans.grid import Grid, load_map
+    from zstate.scans.listener import PlacedScan, ScanListener
+    from zstate.scans.publishers import MapPublisher, RangeSource, ScanPublisher
+    from zstate.scans.scan import Scan
+    from zstate.scans.simulated_laser import SimulatedLaser, dummy_scan
 
 __all__ = [
     "Grid",
@@ -18,3 +23,22 @@ __all__ = [
     "dummy_scan",
     "load_map",
 ]
+
+_HOMES = {
+    "Grid": "grid",
+    "MapPublisher": "publishers",
+    "PlacedScan": "listener",
+    "RangeSource": "publishers",
+    "Scan": "scan",
+    "ScanListener": "listener",
+    "ScanPublisher": "publishers",
+    "SimulatedLaser": "simulated_laser",
+    "dummy_scan": "simulated_laser",
+    "load_map": "grid",
+}
+
+__getattr__ = lazy_names(__name__, _HOMES)
+
+
+def __dir__() -> list[str]:
+    return __all__

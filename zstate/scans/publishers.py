@@ -13,7 +13,7 @@ from zstate.clock import Clock, check_stamp
 from zstate.errors import InvalidInput
 from zstate.net.presence import local_writer
 from zstate.net.session import Session
-from zstate.nodes.sample_publisher import SensorPublisher
+from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.static_publisher import ValuePublisher
 from zstate.rate import RateReport
 from zstate.scans.grid import Grid, grid_to_message
@@ -34,7 +34,7 @@ class RangeSource(Protocol):
         ...
 
 
-class ScanPublisher(SensorPublisher):
+class ScanPublisher(MeasurementPublisher):
     """Publishes the scans of one laser scanner of a robot, whose geometry is given once.
 
     ``sensor`` is the scanner's name, in ROS its topic. Its frame is ``frame``, by default a frame of the

@@ -22,7 +22,7 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.sources.joint_state_merger import JointStateMerger
-from zstate.wire.keys import StreamName
+from zstate.streams import StreamName
 from zstate.wire.messages import JointState, RobotDescription, message_size
 from zstate.wire.protocol import Wire
 from zstate.wire.registry import get_wire

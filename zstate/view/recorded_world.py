@@ -24,8 +24,8 @@ from zstate.recording.decode import DecodedMessage, DecodedRecording, LatchedSta
 from zstate.recording.reader import RecordingReader
 from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.scan import Scan, scan_from_message
+from zstate.streams import StreamName
 from zstate.view.world_source import TIME_JUMP_NS, WriterName
-from zstate.wire.keys import StreamName
 from zstate.wire.messages import LaserScan, Message, OccupancyGrid
 
 _READ_AHEAD = 30

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput, printable
-from zstate.wire.keys import MAX_NAME_LENGTH, NAMED_STREAMS, StreamName, check_writer, shortened
-
-_ALL_AND_SOME_JOINTS = {"joint_states", "partial_joint_states"}
+from zstate.streams import JOINT_STREAMS, StreamName, is_named
+from zstate.wire.keys import MAX_NAME_LENGTH, check_writer, shortened
 
 _MAX_DIGITS = 20
 _MAX_IDENTITY_LENGTH = 4 * 12 * MAX_NAME_LENGTH
@@ -63,7 +62,7 @@ class WriterId:
 class Announcement:
     """The content of a liveliness token: ``writer`` writes ``stream`` of ``robot``.
 
-    ``name`` is the name under which it writes, on the ``NAMED_STREAMS``; empty for other streams, and on
+    ``name`` is the name under which it writes, on a named stream; empty for others, and on
     wires without such names. ``node`` is the same for all streams of one ROS node, whose name other nodes may
     have, too; empty where nodes are not announced.
     """
@@ -83,8 +82,8 @@ class Announcement:
     def parse(cls, robot: str, stream: StreamName, identity: str) -> Announcement:
         """The content of a token with this ``identity``. Raises InvalidInput if it is not one."""
         fields = identity.split(",", 6)
-        is_named = len(fields) == 6 and stream in NAMED_STREAMS
-        name = check_writer(unquote(fields.pop())) if is_named else ""
+        has_name = len(fields) == 6 and is_named(stream)
+        name = check_writer(unquote(fields.pop())) if has_name else ""
         found = cls(robot, stream, WriterId.parse(",".join(fields)), name)
         if found.identity != identity:
             raise InvalidInput(f"{shortened(identity)!r} is not the identity of a writer and a name")
@@ -96,10 +95,9 @@ class Announcement:
 
         Raises InvalidInput as ``parse`` does.
         """
-        first = cls.parse(robot, max(streams, key=lambda stream: stream in NAMED_STREAMS), identity)
+        first = cls.parse(robot, max(streams, key=is_named), identity)
         return tuple(
-            cls(robot, stream, first.writer, first.name if stream in NAMED_STREAMS else "")
-            for stream in streams
+            cls(robot, stream, first.writer, first.name if is_named(stream) else "") for stream in streams
         )
 
     def conflicts_with(self, other: Announcement) -> bool:
@@ -108,10 +106,10 @@ class Announcement:
         Writers of a named stream conflict if their names are equal; without a name they never do. A writer of
         all joints conflicts with each writer of some of them.
         """
-        if self.robot == other.robot and {self.stream, other.stream} == _ALL_AND_SOME_JOINTS:
+        if self.robot == other.robot and {self.stream, other.stream} == JOINT_STREAMS:
             return self.writer.session != other.writer.session
         same = (self.robot, self.stream, self.name) == (other.robot, other.stream, other.name)
-        is_exclusive = self.stream not in NAMED_STREAMS or bool(self.name)
+        is_exclusive = not is_named(self.stream) or bool(self.name)
         return same and is_exclusive and self.writer.session != other.writer.session
 
 

@@ -40,54 +40,16 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from functools import lru_cache
-from typing import Literal, get_args
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput
-
-StreamName = Literal[
-    "joint_states",
-    "partial_joint_states",
-    "tf",
-    "transforms",
-    "tf_static",
-    "robot_description",
-    "joint_commands",
-    "joint_setpoints",
-    "driver",
-    "stop",
-    "relax",
-    "scan",
-    "map",
-    "imu",
-    "velocity",
-    "pose",
-    "odometry",
-    "clock",
-]
+from zstate.streams import StreamName, all_streams, find_stream, in_canonical_order, is_named
 
 CLOCK_KEY = "zstate/clock"
 ANY = "*"
 
-EDGE_STREAMS: tuple[StreamName, ...] = ("transforms", "odometry")
-"""The streams of moving edges under the names of their writers."""
-
-SENSOR_STREAMS: tuple[StreamName, ...] = ("scan", "imu", "velocity", "pose")
-"""The streams of sensors under their names."""
-
 STOP_STREAMS: tuple[StreamName, ...] = ("stop", "relax")
 """The streams of stops. Access control lets every identity write the first, which never drops a load."""
-
-NAMED_STREAMS: frozenset[StreamName] = frozenset(
-    {*EDGE_STREAMS, *SENSOR_STREAMS, *STOP_STREAMS, "tf_static", "partial_joint_states", "map"}
-)
-"""The streams with one key for each of the writer names of a robot."""
-
-LATCHED_STREAMS: frozenset[StreamName] = frozenset({"robot_description", "tf_static", "map"})
-"""The streams of one current value, which late joiners receive as well."""
-
-JOINT_STREAMS: frozenset[StreamName] = frozenset({"joint_states", "partial_joint_states"})
-"""The streams of joint positions."""
 
 READERS = "zstate/@reader/*/*/*"
 """The key expression of the tokens of all readers."""
@@ -111,7 +73,6 @@ MAX_FRAME_NAME_LENGTH = 1024
 _MAX_KEY_LENGTH = 16_384
 """A name of ``MAX_NAME_LENGTH`` is up to 12 times as long when it is quoted."""
 
-_STREAMS: dict[str, StreamName] = {stream: stream for stream in get_args(StreamName)}
 _RESERVED = frozenset("/*$?#")
 _CLOCK_CHUNK = CLOCK_KEY.rpartition("/")[2]
 
@@ -160,20 +121,19 @@ def shortened(text: str) -> str:
 
 
 def stream_key(robot: str, stream: StreamName, writer: str = "") -> str:
-    """The key of ``stream``: of the ``NAMED_STREAMS`` one for each ``writer``; ``clock`` has only one."""
+    """The key of ``stream``: of the named ones one for each ``writer``; ``clock`` has only one."""
     if stream == "clock":
         return CLOCK_KEY
     key = f"zstate/{check_robot(robot)}/{stream}"
-    return f"{key}/{check_writer(writer)}" if stream in NAMED_STREAMS else key
+    return f"{key}/{check_writer(writer)}" if is_named(stream) else key
 
 
 def stream_from_key(key: str) -> StreamName:
     """The stream of a ``stream_key``. Raises InvalidInput for any other key."""
     chunks = _chunks(key)
-    if len(chunks) > 2 and chunks[0] == "zstate" and chunks[2] in _STREAMS:
-        stream = _STREAMS[chunks[2]]
-        if len(chunks) == (4 if stream in NAMED_STREAMS else 3):
-            return stream
+    if len(chunks) > 2 and chunks[0] == "zstate" and (stream := find_stream(chunks[2])) is not None:
+        if len(chunks) == (4 if stream.named else 3):
+            return stream.name
     raise _form_error(key, "zstate/<robot>/<stream>")
 
 
@@ -182,7 +142,7 @@ def stream_expression(robot: str, stream: StreamName) -> str:
     if stream == "clock":
         return CLOCK_KEY
     key = f"zstate/{_check_robot_or_any(robot)}/{stream}"
-    return f"{key}/*" if stream in NAMED_STREAMS else key
+    return f"{key}/*" if is_named(stream) else key
 
 
 def lookup_key(robot: str) -> str:
@@ -304,17 +264,15 @@ def parse_reader_key(key: str) -> tuple[str, tuple[StreamName, ...], str]:
 
 def _joined(streams: StreamName | Collection[StreamName]) -> str:
     """``streams`` in one chunk, each once, in one canonical order."""
-    names = (streams,) if isinstance(streams, str) else streams
-    return ",".join(name for name in _STREAMS if name in names)
+    return ",".join(in_canonical_order((streams,) if isinstance(streams, str) else streams))
 
 
 def _split(chunk: str) -> tuple[StreamName, ...]:
     """The streams in a chunk. Raises InvalidInput unless they are in canonical form."""
-    names = chunk.split(",")
-    streams: tuple[StreamName, ...] = tuple(_STREAMS[name] for name in _STREAMS if name in names)
+    streams = in_canonical_order(chunk.split(","))
     # One canonical form: two tokens of one writer would count as two writers.
     if not streams or ",".join(streams) != chunk:
-        order = ", ".join(_STREAMS)
+        order = ", ".join(row.name for row in all_streams())
         raise InvalidInput(f"{shortened(chunk)!r} is not a list of streams, each once, in the order {order}")
     return streams
 

@@ -22,8 +22,9 @@ from msgspec import Meta, Struct
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput, MessageError, printable
+from zstate.streams import GRID_CELLS, StreamName, stream_named
 from zstate.transform import COVARIANCE_NUMBERS
-from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, StreamName, full_name
+from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, full_name
 
 Edges = tuple[tuple[str, str], ...]
 Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -650,7 +651,6 @@ def covariance_matrix(triangle: bytes) -> NDArray[np.float64]:
     return matrix
 
 
-GRID_CELLS = 4096 * 4096
 """The most cells of an occupancy grid."""
 
 
@@ -808,43 +808,8 @@ def _check_order(order: bytes, items: Sequence[str] | Sequence[tuple[str, str]])
         raise InvalidInput(f"the digest {order.hex()} is not that of the order sent with it")
 
 
-SAMPLE_BYTES = 256_000
-"""The transforms of 2000 links, names included, take less; in CDR they take up to four times as many."""
-
-SCAN_BYTES = 810_000
-"""A scan of ``SCAN_RAYS`` with intensities takes less on each wire."""
-
-SENSOR_BYTES = 10_000
-"""Odometry with the longest names of its frames takes less on each wire."""
-
-STOP_BYTES = 256_000
-"""Writers send far less; more than that is no text."""
-
-LATCHED_BYTES = GRID_CELLS + 8 * 2**10
-"""A grid of ``GRID_CELLS`` takes less on each wire."""
 ATTACHMENT_BYTES = 1_024
 STATIC_EDGES = 10_000
-
-MAX_BYTES: Mapping[StreamName, int] = {
-    "joint_states": SAMPLE_BYTES,
-    "partial_joint_states": SAMPLE_BYTES,
-    "tf": SAMPLE_BYTES,
-    "transforms": SAMPLE_BYTES,
-    "joint_commands": SAMPLE_BYTES,
-    "joint_setpoints": SAMPLE_BYTES,
-    "driver": SAMPLE_BYTES,
-    "stop": STOP_BYTES,
-    "relax": STOP_BYTES,
-    "scan": SCAN_BYTES,
-    "imu": SENSOR_BYTES,
-    "velocity": SENSOR_BYTES,
-    "pose": SENSOR_BYTES,
-    "odometry": SENSOR_BYTES,
-    "tf_static": 1_000_000,
-    "robot_description": LATCHED_BYTES,
-    "map": LATCHED_BYTES,
-    "clock": 1_000,
-}
 
 _OVERHEAD = 200
 """The least size of a decoded message without its numbers and names [bytes]."""
@@ -852,7 +817,7 @@ _OVERHEAD = 200
 
 def check_size(stream: StreamName, size: int, factor: int = 1) -> None:
     """Raise MessageError for a payload of ``size`` bytes that is too large for ``stream``."""
-    limit = MAX_BYTES[stream] * factor
+    limit = stream_named(stream).max_bytes * factor
     if size > limit:
         raise MessageError(f"{size} bytes on {stream}, where {limit} are allowed", reason="too large")
 

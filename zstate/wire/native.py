@@ -10,20 +10,26 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal, TypeVar
+from functools import lru_cache
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire import keys
-from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import StreamName
-from zstate.wire.messages import (
+from zstate.streams import (
     LATCHED_BYTES,
     SAMPLE_BYTES,
-    STOP_BYTES,
+    Stream,
+    StreamName,
+    edge_streams,
+    is_named,
+    stream_named,
+)
+from zstate.wire import keys
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.messages import (
     ClockMessage,
     Count,
     DriverState,
@@ -43,6 +49,7 @@ from zstate.wire.messages import (
     RobotDescription,
     SessionId,
     Stamp,
+    StampedMessage,
     StaticTransforms,
     Status,
     Stop,
@@ -82,27 +89,6 @@ ENCODINGS: dict[type[Message], str] = {
     Status: "zstate/Status;v=1",
     HistoryPage: "zstate/Past;v=1",
 }
-STREAM_TYPES: dict[StreamName, type[Message]] = {
-    "joint_states": JointState,
-    "partial_joint_states": JointState,
-    "tf": TransformSample,
-    "transforms": WriterTransforms,
-    "tf_static": StaticTransforms,
-    "robot_description": RobotDescription,
-    "joint_commands": JointCommand,
-    "joint_setpoints": JointState,
-    "driver": DriverState,
-    "stop": Stop,
-    "relax": Stop,
-    "scan": LaserScan,
-    "map": OccupancyGrid,
-    "imu": Imu,
-    "velocity": Velocity,
-    "pose": Pose,
-    "odometry": Odometry,
-    "clock": ClockMessage,
-}
-
 # The smallest limit: most payloads pass with one comparison.
 _MIN_LIMIT_BYTES = 1_000
 
@@ -110,7 +96,7 @@ MAX_MESSAGE_BYTES: dict[type[Message], int] = {
     ClockMessage: 1_000,
     Status: 64_000,
     DriverState: 256_000,
-    Stop: STOP_BYTES,
+    Stop: SAMPLE_BYTES,
     Release: 64_000,
     JointTrajectory: 4_000_000,
     MotionCancel: 1_000,
@@ -124,13 +110,32 @@ _DEFLATED = b"\x78"
 _FASTEST = 1
 
 _ENCODER = msgspec.msgpack.Encoder()
-_DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in ENCODINGS}
+
+
+class _Decoders(dict[type[Message], msgspec.msgpack.Decoder[Message]]):
+    """A decoder of each type, made at its first use."""
+
+    def __missing__(self, kind: type[Message]) -> msgspec.msgpack.Decoder[Message]:
+        self[kind] = decoder = msgspec.msgpack.Decoder(kind)
+        return decoder
+
+
+_DECODERS = _Decoders()
 _ENCODING = re.compile(r"zstate/(\w+);v=([1-9]\d{0,8})")
 
 
 def stream_encoding(stream: StreamName) -> str:
-    """The Zenoh encoding of the messages of a stream."""
-    return ENCODINGS[STREAM_TYPES[stream]]
+    """The Zenoh encoding of the messages of a stream. Raises InvalidInput for an unknown one."""
+    return encoding_of(stream_named(stream).type)
+
+
+@lru_cache(256)
+def encoding_of(kind: type[Message]) -> str:
+    """The Zenoh encoding of the messages of type ``kind``, which may be that of another package's stream."""
+    if kind in ENCODINGS:
+        return ENCODINGS[kind]
+    version = next((row.version for row in all_streams() if row.type is kind), VERSION)
+    return f"zstate/{kind.__name__};v={version}"
 
 
 def encode(message: Message) -> bytes:
@@ -139,6 +144,21 @@ def encode(message: Message) -> bytes:
     if isinstance(message, OccupancyGrid) and len(payload) > _DEFLATED_BYTES:
         return zlib.compress(payload, _FASTEST)
     return payload
+
+
+def new_message(row: Stream, stamp: int, fields: Mapping[str, Any]) -> StampedMessage:
+    """The message of ``row`` with ``fields``, not numbered yet.
+
+    Raises InvalidInput for fields that it does not have, that are missing, or of other types.
+    """
+    kind = row.type
+    assert issubclass(kind, StampedMessage)  # of measurements
+    try:
+        # Types are checked as a reader does it: a constructor checks none.
+        return msgspec.msgpack.decode(_ENCODER.encode(kind(stamp, 0, 0, **fields)), type=kind)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        own = ", ".join(kind.__struct_fields__[len(StampedMessage.__struct_fields__) :])
+        raise InvalidInput(f"no message of {row.name}, whose fields are {own}: {error}") from None
 
 
 def with_encodable_fields(state: DriverState) -> DriverState:
@@ -159,7 +179,7 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     Raises MessageError with the reason "foreign" (another type, or not a zstate message), "newer version",
     "too large", "truncated" or "malformed". The buffer checks whether the numbers are finite.
     """
-    if encoding != ENCODINGS[kind]:
+    if encoding != encoding_of(kind):
         raise _foreign_error(encoding, kind)
     if len(payload) > _MIN_LIMIT_BYTES and len(payload) > MAX_MESSAGE_BYTES.get(kind, LATCHED_BYTES):
         raise MessageError(f"a {_type_name(kind)} of {len(payload)} bytes", reason="too large")
@@ -255,7 +275,7 @@ class NativeStreamEncoder:
     def __init__(self, robot: str, writer: WriterId, stream: StreamName, name: str) -> None:
         self.key = keys.stream_key(robot, stream, name)
         self.encoding = stream_encoding(stream)
-        identity = Announcement(robot, stream, writer, name if stream in keys.NAMED_STREAMS else "").identity
+        identity = Announcement(robot, stream, writer, name if is_named(stream) else "").identity
         self.token = None if stream == "clock" else keys.writer_key(robot, stream, identity)
 
     def encode(self, message: Message) -> bytes:
@@ -271,8 +291,14 @@ class NativeWire:
     name = "native"
     shared: frozenset[StreamName] = frozenset()
     transforms: StreamName = "transforms"
-    edges = keys.EDGE_STREAMS
     partial_joint_states: StreamName = "partial_joint_states"
+
+    @property
+    def edges(self) -> tuple[StreamName, ...]:
+        return edge_streams()
+
+    def carries(self, stream: StreamName) -> bool:
+        return True
 
     def node_token(self, node: WriterNode) -> None:
         return None
@@ -296,7 +322,7 @@ class NativeWire:
     def decode(self, stream: StreamName, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         if arrival.size or len(arrival.payload) > _MIN_LIMIT_BYTES:
             check_size(stream, arrival.size or len(arrival.payload))
-        message = decode(arrival.payload, arrival.encoding, STREAM_TYPES[stream])
+        message = decode(arrival.payload, arrival.encoding, stream_named(stream).type)
         if stream == "tf_static":
             check_edges(message)
         return (message,)
@@ -328,18 +354,22 @@ class NativeWire:
 
 
 def _type_name(kind: type[Message]) -> str:
-    return ENCODINGS[kind].removeprefix("zstate/").partition(";")[0]
+    return encoding_of(kind).removeprefix("zstate/").partition(";")[0]
+
+
+def _version(kind: type[Message]) -> int:
+    return int(encoding_of(kind).rpartition("=")[2])
 
 
 def _foreign_error(encoding: str, kind: type[Message]) -> MessageError:
     match, name = _ENCODING.fullmatch(encoding), _type_name(kind)
-    if match and match[1] == name and int(match[2]) > VERSION:
+    if match and match[1] == name and int(match[2]) > _version(kind):
         return MessageError(
-            f"{name} of version {match[2]}, but this zstate reads version {VERSION}: `pip install -U zstate`",
+            f"{name} of version {match[2]}, but this zstate reads version {_version(kind)}: `pip install -U zstate`",
             reason="newer version",
         )
     return MessageError(
-        f"not a {name}: its encoding is {encoding!r}, ours is {ENCODINGS[kind]!r}; "
+        f"not a {name}: its encoding is {encoding!r}, ours is {encoding_of(kind)!r}; "
         "another program writes on this key",
         reason="foreign",
     )

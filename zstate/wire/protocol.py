@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from msgspec import Struct
 
 from zstate.errors import InvalidInput
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import ANY, StreamName, check_robot
+from zstate.wire.keys import ANY, check_robot
 from zstate.wire.messages import Message
 
 if TYPE_CHECKING:
@@ -125,11 +126,17 @@ class Wire(WriterTokens, Protocol):
     transforms: StreamName
     """The stream that carries the edges of a ``TransformPublisher``."""
 
-    edges: tuple[StreamName, ...]
-    """The streams of all moving edges that are not a model's."""
+    @property
+    def edges(self) -> tuple[StreamName, ...]:
+        """The streams of all moving edges that are not a model's."""
+        ...
 
     partial_joint_states: StreamName
     """The stream that carries the joints of a ``PartialStatePublisher``."""
+
+    def carries(self, stream: StreamName) -> bool:
+        """Whether the wire format has this stream."""
+        ...
 
     def node_token(self, node: WriterNode) -> str | None:
         """The liveliness token of a writer as a node of the ROS graph; None if there is no such graph."""

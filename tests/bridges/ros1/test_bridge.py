@@ -193,7 +193,7 @@ def test_other_moving_edges_are_carried_in_both_directions_and_not_back(
         # What the other node publishes has the stamp of one second.
         found = listener.buffer.lookup("odom", "world", S)
         assert_same_pose(found.pose7.tolist(), [3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], 0.0)
-        names = {name for info in discover(session) for name, _ in info.transform_names}
+        names = {name for info in discover(session) for name, _ in info.named("transforms")}
         writer, _ = listening.edges["odom", "world", S]
         assert names == {"slam", writer.strip("/").replace("/", ".")}
         writer, theirs = next(edge for key, edge in listening.edges.items() if key[:2] == ("map", "odom"))

@@ -28,7 +28,7 @@ def test_two_drivers_move_one_robot_and_publish_merges_them(spawn: Spawn):
         merged.buffer.wait("world", "tool", timeout_s=3 * SOON_S)
         until(lambda: own.buffer.can_lookup("world", "tool"))
         (info,) = discover(session)
-        assert len(info.part_names) == 2
+        assert len(info.named("partial_joint_states")) == 2
     assert "receiving zstate/rrbot/partial_joint_states: 2 positions" in publisher.stderr
     reason = failure("echo", "rrbot", "--once", "--timeout", "0.5")
     assert "`zstate echo rrbot --stream partial_joint_states`" in reason

@@ -11,7 +11,7 @@ from zstate import StatePublisher, StaticPublisher, Transform, connect, load_mod
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.edge_statistics import EdgeMeasure, EdgeRow, EdgeStatistics, overview_text, path_text
 from zstate.clock import ClockOffset, ManualClock
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
@@ -134,7 +134,7 @@ def test_missing_numbers_and_latency_are_measured():
         EdgeStatistics(reader, "r1", "native", "joint_states", CLOCK) as statistics,
     ):
         key, order = "zstate/r1/joint_states", order_digest(("swing",))
-        with StreamPublisher(writer, key, ENCODINGS[JointState]) as stream:
+        with KeyPublisher(writer, key, ENCODINGS[JointState]) as stream:
             until(lambda: stream.has_readers)
             for seq in (0, 1, 5):
                 stream.put(encode(JointState(CLOCK.now() - 10_000_000, seq, 7, order, to_block([0.5]))))

@@ -124,6 +124,6 @@ def test_maps_alone_are_published_until_the_command_is_interrupted(tmp_path: Pat
     with connect() as session:
         until(lambda: discover(session))
         (place,) = discover(session)
-    assert [name for name, _ in place.map_names] == ["floor"]
+    assert [name for name, _ in place.named("map")] == ["floor"]
     interrupted(child)
     assert child.line() == "replayed what is latched"

@@ -92,7 +92,7 @@ def test_loaded_robot_has_the_saved_poses(spawn: Spawn, tmp_path: Path, suffix: 
         again = listener.buffer.wait("world", "camera", timeout_s=10.0)
         assert again.pose7 == pytest.approx(there.pose7)
         (info,) = discover(session)
-        assert "calibration" in {name for name, _ in info.static_names}
+        assert "calibration" in {name for name, _ in info.named("tf_static")}
         count = listener.stats.received
         until(lambda: listener.stats.received > count)
     interrupted(child)

@@ -28,8 +28,9 @@ from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import ImuPublisher, OdometryPublisher, SensorListener
 from zstate.sources import JointStateListener
+from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import StreamName, reader_key, writer_key
+from zstate.wire.keys import reader_key, writer_key
 from zstate.wire.messages import JointState, order_digest
 from zstate.wire.native import ENCODINGS, encode
 

@@ -18,7 +18,7 @@ from zstate.cli.doctor.diagnosis import with_same_options
 from zstate.cli.session import SessionOptions
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.scans import Grid, MapPublisher, ScanPublisher
-from zstate.wire.keys import StreamName
+from zstate.streams import StreamName
 
 WITHOUT_JOINTS: tuple[StreamName, ...] = ("tf", "tf_static", "robot_description")
 

@@ -14,7 +14,7 @@ from zstate import StatePublisher, connect, load_model
 from zstate.cli.output.logs import without_controls
 from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import announce
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import reader_key, status_key, stream_key, writer_key
 from zstate.wire.messages import StaticTransforms, Status, to_block
@@ -47,7 +47,7 @@ def stranger() -> Iterator[None]:
         opened.enter_context(mount)
         for frame in ("gauge", f"cam{FAKE}"):
             mount.set(encode(StaticTransforms(77, (("tool", frame),), pose)))
-        status_publisher = StreamPublisher(session, status_key("rrbot", EVIL.identity), ENCODINGS[Status])
+        status_publisher = KeyPublisher(session, status_key("rrbot", EVIL.identity), ENCODINGS[Status])
         opened.enter_context(status_publisher)
         opened.enter_context(repeated(lambda: status_publisher.put(encode(status))))
         yield

@@ -19,7 +19,7 @@ from helpers.processes import DEADLINE_S, until
 from zstate import connect
 from zstate.cli.commands import joints
 from zstate.cli.output.logs import text_in
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.wire.messages import JointState
 from zstate.wire.native import ENCODINGS
 
@@ -85,7 +85,7 @@ def test_standard_output_of_a_service_is_json_too(spawn: Spawn, free_port: int):
 def test_library_warning_has_its_event_and_reason(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
     key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]
-    with published_robot(), connect() as session, StreamPublisher(session, key, encoding) as noise:
+    with published_robot(), connect() as session, KeyPublisher(session, key, encoding) as noise:
         command.line()
         until(lambda: noise.has_readers)
         noise.put(b"noise")

@@ -27,7 +27,7 @@ from zstate.net.presence import announce, discover_readers
 from zstate.net.security.acl import AclRoles, access_control
 from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS
 from zstate.nodes.transform_publisher import TransformPublisher
@@ -169,8 +169,8 @@ def test_robots_read_the_map_of_a_place_but_not_the_scans_of_another_robot(site:
         opened.enter_context(
             StreamSubscriber(robot, "zstate/*/scan/*", lambda batch: scans.extend(one.key for one in batch))
         )
-        foreign = opened.enter_context(StreamPublisher(place, keys_of["scan"], ENCODINGS[LaserScan]))
-        own = opened.enter_context(StreamPublisher(robot, keys_of["own"], ENCODINGS[LaserScan]))
+        foreign = opened.enter_context(KeyPublisher(place, keys_of["scan"], ENCODINGS[LaserScan]))
+        own = opened.enter_context(KeyPublisher(robot, keys_of["own"], ENCODINGS[LaserScan]))
 
         def publish() -> None:
             foreign.put(encode(front))
@@ -296,7 +296,7 @@ def test_robot_announced_as_another_takes_over_no_edges(site: Site):
     with (
         StatePublisher(robot, RRBOT, "r1") as publisher,
         TransformListener(site.join("desk"), "*", follow="tf") as listener,
-        StreamPublisher(thief, "zstate/r2/tf", ENCODINGS[TransformSample]) as stream,
+        KeyPublisher(thief, "zstate/r2/tf", ENCODINGS[TransformSample]) as stream,
     ):
         until(lambda: publish_and_check(publisher, listener))
         (info,) = discover(site.join("desk"))

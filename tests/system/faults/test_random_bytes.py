@@ -18,7 +18,7 @@ from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.nodes.publisher import StatePublisher
-from zstate.wire.keys import StreamName
+from zstate.streams import StreamName
 from zstate.wire.native import ENCODINGS
 from zstate.wire.registry import get_wire
 

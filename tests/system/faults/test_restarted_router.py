@@ -15,9 +15,10 @@ from helpers.processes import DEADLINE_S, repeated, until
 from zstate import TransformListener, connect
 from zstate.net.presence import LivelinessToken, announce
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher
+from zstate.net.streams import KeyPublisher
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import StreamName, stream_key, writer_key
+from zstate.wire.keys import stream_key, writer_key
 from zstate.wire.messages import Odometry, WriterTransforms, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
@@ -39,13 +40,13 @@ class Fleet:
         self._message = {"transforms": WriterTransforms, "odometry": Odometry}[stream]
         self._seq = 0
         self._tokens: list[LivelinessToken] = []
-        self._writers: list[tuple[int, StreamPublisher]] = []
+        self._writers: list[tuple[int, KeyPublisher]] = []
         for number in range(ROBOTS):
             robot, writer = f"r{number}", WriterId("robot", "host", 1 + number, 1, 1 + number)
             identity = Announcement(robot, stream, writer, NAME).identity
             self._tokens.append(announce(session, writer_key(robot, stream, identity)))
             key = stream_key(robot, stream, NAME)
-            publisher = StreamPublisher(session, key, ENCODINGS[self._message])
+            publisher = KeyPublisher(session, key, ENCODINGS[self._message])
             self._writers.append((writer.session, publisher))
 
     def publish(self) -> None:

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic
 
 from zstate.errors import InvalidInput, MessageError
+from zstate.streams import stream_named
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import (
-    MAX_BYTES,
     LaserScan,
     Message,
     OccupancyGrid,
@@ -135,7 +135,7 @@ def test_a_grid_has_the_bytes_of_rosbags(one: OccupancyGrid):
 
 
 def test_a_grid_of_4096_x_4096_cells_has_an_allowed_size():
-    assert len(encoded(grid(4096, 4096, frame="f" * 1024))) <= MAX_BYTES["map"]
+    assert len(encoded(grid(4096, 4096, frame="f" * 1024))) <= stream_named("map").max_bytes
 
 
 def test_mcap_ros2_support_decodes_scans_and_grids():

@@ -21,8 +21,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import StreamName
 from zstate.wire.protocol import SerializedSample, StreamEncoder, WriterNode
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID

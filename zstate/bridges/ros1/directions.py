@@ -36,9 +36,10 @@ from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.sources.joint_state_listener import MAX_AGE_S
 from zstate.sources.joint_state_merger import JointStateMerger
+from zstate.streams import JOINT_STREAMS, edge_streams
 from zstate.transform import Transform
 from zstate.wire.joint_order import Floats, JointNumbers
-from zstate.wire.keys import EDGE_STREAMS, JOINT_STREAMS, MODEL_WRITER
+from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
     Edges,
     JointState,
@@ -92,7 +93,7 @@ class NativeToRos1(Closeable):
         self._moving = node.publisher("/tf", node.ros.TFMessage)
         self._fixed = node.publisher("/tf_static", node.ros.TFMessage, latch=True)
         with ExitStack() as opening:
-            for stream in ("robot_description", "tf_static", *JOINT_STREAMS, *EDGE_STREAMS):
+            for stream in ("robot_description", "tf_static", *JOINT_STREAMS, *edge_streams()):
                 opening.enter_context(
                     subscribe(
                         session,

@@ -17,7 +17,7 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from zstate.wire.keys import StreamName
+    from zstate.streams import StreamName
 
 
 def _check_amount(amount: float) -> float:

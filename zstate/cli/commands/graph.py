@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from zstate.cli.output.drawing import Drawing
     from zstate.net.graph import Graph
     from zstate.net.session import Session
+    from zstate.streams import StreamName, edge_streams, measured_streams
     from zstate.wire.identity import WriterId
-    from zstate.wire.keys import StreamName
 
 _MEASURED_WITHIN_S = 0.4
 _READERS_WITHIN_S = 0.15
@@ -80,15 +80,15 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.net.graph import build_graph
     from zstate.net.presence import discover, discover_readers
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
-    from zstate.wire.keys import ANY, EDGE_STREAMS, SENSOR_STREAMS
+    from zstate.wire.keys import ANY
     from zstate.wire.registry import get_wire
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
         always: tuple[StreamName, ...] = (
             "joint_states",
             "partial_joint_states",
-            *EDGE_STREAMS,
-            *SENSOR_STREAMS,
+            *edge_streams(),
+            *measured_streams(),
             "joint_commands",
         )
         for stream in always:

@@ -16,7 +16,7 @@ from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.stream_reader import StreamReader, TimedSample
-    from zstate.wire.keys import StreamName
+    from zstate.streams import StreamName, is_named
 
 _SETTLING_S = 0.1
 
@@ -75,11 +75,10 @@ def hz_command(
     zstate hz --wire ros2 --stream tf --once           # /tf
     """
     from zstate.cli.stream_reader import StreamReader
-    from zstate.wire.keys import NAMED_STREAMS
     from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire
 
-    of_all = is_ros(wire) or stream in NAMED_STREAMS
+    of_all = is_ros(wire) or is_named(stream)
     stream = carrier(get_wire(wire), stream)
     refuse_topic(robot, wire)
     with (

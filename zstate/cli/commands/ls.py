@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
     from zstate.net.topic_statistics import TopicStatistics
+    from zstate.streams import StreamName
     from zstate.wire.identity import WriterId
-    from zstate.wire.keys import StreamName
     from zstate.wire.ros2.wire import Ros2Wire
 
 T = TypeVar("T")

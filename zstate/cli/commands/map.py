@@ -54,8 +54,8 @@ def map_command(
     from zstate.clock import wait_interruptible
     from zstate.errors import InvalidInput
     from zstate.scans import MapPublisher, load_map
+    from zstate.streams import GRID_CELLS
     from zstate.wire.keys import check_robot, check_writer
-    from zstate.wire.messages import GRID_CELLS
 
     place = check_robot(name or options.place_name(file), "place")
     check_writer(writer)

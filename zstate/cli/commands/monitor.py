@@ -31,7 +31,8 @@ from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import printable
-from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, StreamName, check_robot
+from zstate.streams import JOINT_STREAMS, StreamName, edge_streams
+from zstate.wire.keys import ANY, check_robot
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -366,7 +367,9 @@ class RobotMonitor(Closeable):
         if known is not None and follow in (known.follow, "tf"):
             return
         # A native listener also receives moving edges, and partial joint states as joint states.
-        others: tuple[StreamName, ...] = () if is_ros(self._wire) else ("partial_joint_states", *EDGE_STREAMS)
+        others: tuple[StreamName, ...] = (
+            () if is_ros(self._wire) else ("partial_joint_states", *edge_streams())
+        )
         shown: list[StreamName] = [stream for stream in (follow, *others) if stream in streams]
         if not shown:
             return

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from zstate.rate import RateReport
     from zstate.sources import JointReading, JointStateListener
     from zstate.sources.joint_source import JointSource
-    from zstate.wire.keys import StreamName
+    from zstate.streams import StreamName
 
 _RATE_HZ = 100.0
 _DERIVED: tuple[StreamName, ...] = ("robot_description", "tf_static", "tf")

@@ -141,7 +141,7 @@ def _show(player: Player, call: BackgroundCall[PlayerReport]) -> PlayerReport:
 def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequence[str]) -> list[str]:
     """Writers on the network of streams that a replay of ``robots`` would publish."""
     from zstate.net.presence import discover
-    from zstate.wire.keys import JOINT_STREAMS, SENSOR_STREAMS
+    from zstate.streams import JOINT_STREAMS, measured_streams
     from zstate.wire.registry import get_wire
 
     conflicts: list[str] = []
@@ -155,7 +155,7 @@ def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequenc
             "tf",
             "map",
             "odometry",
-            *SENSOR_STREAMS,
+            *measured_streams(),
         } - wire.shared
         for info in discover(session, wire=name):
             writers = {str(writer) for stream, writer in info.writers if stream in replayed}

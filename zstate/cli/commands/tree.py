@@ -108,7 +108,8 @@ def _collect_frames(
     from zstate.cli.robot_directory import announced_robots
     from zstate.cli.waiting import ConditionWaiter
     from zstate.net.presence import discover
-    from zstate.wire.keys import ANY, JOINT_STREAMS, MODEL_WRITER
+    from zstate.streams import JOINT_STREAMS
+    from zstate.wire.keys import ANY, MODEL_WRITER
 
     # Models and static edges arrive during discovery, which is mostly waiting.
     find = partial(discover, session) if robot == ANY else partial(announced_robots, session, robot)
@@ -122,7 +123,9 @@ def _collect_frames(
         if not robots:
             print_status(messages_for("native").announced(()))
             return ()
-        static_writers = [name for one in robots for name, _ in one.static_names if name != MODEL_WRITER]
+        static_writers = [
+            name for one in robots for name, _ in one.named("tf_static") if name != MODEL_WRITER
+        ]
 
         def has_models(stable: bool) -> bool:
             if not stable:

@@ -9,13 +9,12 @@ from typing import Any, Literal
 
 from zstate.cli.output.console import colored, count_text, output_width
 from zstate.errors import printable
-from zstate.wire.keys import EDGE_STREAMS, JOINT_STREAMS
+from zstate.streams import JOINT_STREAMS, edge_streams
 
 State = Literal["ok", "warning", "broken", "skipped"]
 
 _COLORS = {"ok": "green", "warning": "yellow", "broken": "red", "skipped": None}
 _STATE, _NAME, _MIN_TEXT = 7, 12, 20  # widths
-_MOVING = {*JOINT_STREAMS, *EDGE_STREAMS, "tf"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +76,7 @@ def robot_lines(robot: str, checks: Sequence[Check], *, in_full: bool) -> Iterat
         yield robot
         yield from map(check_text, shown)
     else:
-        moves = [check.text for check in checks if check.name in _MOVING]
+        moves = [check.text for check in checks if check.name in (*JOINT_STREAMS, *edge_streams(), "tf")]
         yield check_text(Check(robot, "ok", "; ".join(moves) or "sound"))
 
 

@@ -18,8 +18,9 @@ from zstate.model.robot import RobotModel, coordinate_names, representative_link
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
+from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import JOINT_STREAMS, MODEL_WRITER, StreamName, foreign_edge_problem, full_name
+from zstate.wire.keys import MODEL_WRITER, foreign_edge_problem, full_name
 from zstate.wire.messages import DriverState, Status
 
 _MIN_RECEIVED = 0.8
@@ -58,12 +59,12 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
     model, check = model_check(probe)
     yield check
     yield from driver_checks(probe)
-    if probe.info.part_names and "joint_states" not in probe.streams:
+    if probe.info.named("partial_joint_states") and "joint_states" not in probe.streams:
         yield from _parts_checks(probe, model)
     elif not probe.has_only_transforms:
         yield _samples_check(probe)
-    yield from named_writers_checks(probe, "transforms", probe.transforms, probe.info.transform_names)
-    yield from named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names)
+    yield from named_writers_checks(probe, "transforms", probe.transforms, probe.info.named("transforms"))
+    yield from named_writers_checks(probe, "scan", probe.scans, probe.info.named("scan"))
     yield from sensor_frames_checks(probe)
     yield from measured_checks(probe)
     yield clocks_check(probe)
@@ -285,7 +286,7 @@ def _parts_checks(probe: RobotProbe, model: RobotModel | None) -> Iterator[Check
     refused = refused_check(probe)
     if refused is not None:
         yield refused
-    yield from named_writers_checks(probe, stream, probe.parts, probe.info.part_names)
+    yield from named_writers_checks(probe, stream, probe.parts, probe.info.named("partial_joint_states"))
     written = {name for samples in probe.parts.writers.values() for name in samples.names}
     if model is not None and not written.issuperset(coordinate_names(model)):
         missing = [
@@ -332,10 +333,10 @@ def measured_checks(probe: RobotProbe, command: str = "") -> Iterator[Check]:
     """
     info = probe.info
     names = {
-        "odometry": info.odometry_names,
-        "imu": info.imu_names,
-        "velocity": info.velocity_names,
-        "pose": info.pose_names,
+        "odometry": info.named("odometry"),
+        "imu": info.named("imu"),
+        "velocity": info.named("velocity"),
+        "pose": info.named("pose"),
     }
     for stream, samples in probe.measured.items():
         hz = f"{command or f'zstate hz {info.name}'} --stream {stream}"
@@ -344,7 +345,7 @@ def measured_checks(probe: RobotProbe, command: str = "") -> Iterator[Check]:
 
 def maps_checks(probe: RobotProbe, patient: str) -> Iterator[Check]:
     """Whether each announced map has arrived; ``patient`` is the command that waits longer for them."""
-    for name, writer in probe.info.map_names:
+    for name, writer in probe.info.named("map"):
         grid = probe.maps.get(name)
         if grid is None:
             text = f"{writer} announces the map {name!r}, which has not arrived"
@@ -360,9 +361,9 @@ def sensor_frames_checks(probe: RobotProbe) -> Iterator[Check]:
     robot, info, measured = probe.info.name, probe.info, probe.measured
     frames = {frame.name for frame in probe.frames}
     for stream, what, samples, names in (
-        ("scan", "scans", probe.scans.writers, info.scan_names),
-        ("imu", "readings", measured["imu"].writers, info.imu_names),
-        ("velocity", "velocities", measured["velocity"].writers, info.velocity_names),
+        ("scan", "scans", probe.scans.writers, info.named("scan")),
+        ("imu", "readings", measured["imu"].writers, info.named("imu")),
+        ("velocity", "velocities", measured["velocity"].writers, info.named("velocity")),
     ):
         for sensor, writer in names:
             for frame in samples[writer.session].names if writer.session in samples else ():
@@ -440,7 +441,7 @@ def statics_check(probe: RobotProbe) -> Check:
         then = f"zstate tree {robot}  # the frames without that edge; stop its writer, or correct it"
         return warning("tf_static", without_program_advice(refused), then)
     writers = {frame.writer for frame in probe.all_frames if frame.kind == "static"}
-    for name, writer in dict(probe.info.static_names).items():
+    for name, writer in dict(probe.info.named("tf_static")).items():
         if name != MODEL_WRITER and name not in writers:
             text = f"{writer} announces static edges as {name!r}, but places no frame"
             return warning("tf_static", text, f"zstate tree {robot}")
@@ -451,7 +452,7 @@ def _refused_static(probe: RobotProbe) -> str | None:
     """Why a static edge is not used, with its writer."""
     texts = probe.refusals.values()
     refused = next((text for text in texts if text.startswith(_STATIC_PREFIX)), None)
-    for name, writer in probe.info.static_names:
+    for name, writer in probe.info.named("tf_static"):
         if refused is not None and refused.startswith(f"{_STATIC_PREFIX} {name!r}:"):
             return refused.replace(f"{name!r}:", f"{name!r} ({writer}):", 1)
     return refused
@@ -512,7 +513,7 @@ def shared_roots_checks(tops: Iterable[FrameInfo]) -> Iterator[Check]:
 
 def static_roots(probe: RobotProbe) -> Iterator[FrameInfo]:
     """One child of each root of the robot whose children are all placed by static writers, not by a model."""
-    writers = {name for name, _ in probe.info.static_names if name != MODEL_WRITER}
+    writers = {name for name, _ in probe.info.named("tf_static") if name != MODEL_WRITER}
     for root in probe.frames:
         if root.parent is None and root.name.startswith(f"{probe.info.name}/"):
             children = [frame for frame in probe.all_frames if frame.parent == root.name]

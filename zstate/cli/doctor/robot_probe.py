@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from functools import cached_property
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -28,8 +28,9 @@ from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, WriterKey
 from zstate.nodes.clock import SimulatedClock
 from zstate.nodes.listener import Follow, TransformListener
+from zstate.streams import JOINT_STREAMS, StreamName, edge_streams, measured_streams
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, EDGE_STREAMS, JOINT_STREAMS, SENSOR_STREAMS, StreamName
+from zstate.wire.keys import ANY
 from zstate.wire.messages import (
     Imu,
     JointState,
@@ -48,9 +49,20 @@ from zstate.wire.registry import get_wire
 _MIN_WINDOW_S = 1.2  # writers publish their status once a second
 _READERS_WITHIN_S = 0.3
 _REPLY_WITHIN_S = 0.4
-_MEASURED: tuple[StreamName, ...] = (*SENSOR_STREAMS, "odometry")
-_NATIVE_STREAMS: tuple[StreamName, ...] = (*sorted(JOINT_STREAMS), "transforms", *_MEASURED)
-_ROS_STREAMS: tuple[StreamName, ...] = ("joint_states", "tf", *_MEASURED)
+
+
+@cache
+def _measured() -> tuple[StreamName, ...]:
+    return (*measured_streams(), "odometry")
+
+
+def _native_streams() -> tuple[StreamName, ...]:
+    return (*sorted(JOINT_STREAMS), "transforms", *_measured())
+
+
+def _ros_streams() -> tuple[StreamName, ...]:
+    carries = get_wire("ros2").carries
+    return ("joint_states", "tf", *filter(carries, _measured()))
 
 
 class WriterSamples:
@@ -129,14 +141,14 @@ class StreamCollector(Closeable):
         for info in robots:
             followed.setdefault(followed_stream(info, wire), []).append(info.name)
         latched: list[StreamName] = ["robot_description"]
-        if any(info.map_names for info in robots):
+        if any(info.named("map") for info in robots):
             latched.append("map")
         with ExitStack() as opening:
             for stream in latched:
                 opening.enter_context(subscribe(session, self._wire, self.robot, stream, self._on_latched))
             topic = TopicStatistics(session, self._wire, sources=_sources, on_sample=self._on_sample)
             self.topic = opening.enter_context(topic)
-            for stream in _NATIVE_STREAMS if self.is_native else _ROS_STREAMS:
+            for stream in _native_streams() if self.is_native else _ros_streams():
                 topic.subscribe(stream, self.robot)
             # A subscription to tf makes publishers compute it: only of the robots that have nothing else.
             for name in followed.get("tf", ()) if self.is_native else ():
@@ -298,7 +310,7 @@ class RobotProbe:
     @property
     def measured(self) -> dict[StreamName, StreamSamples]:
         """Those of other sensors than laser scanners, and of odometry."""
-        return {stream: self._of(stream) for stream in _MEASURED if stream != "scan"}
+        return {stream: self._of(stream) for stream in _measured() if stream != "scan"}
 
     @property
     def nodes(self) -> dict[StreamName, StreamSamples]:
@@ -368,10 +380,13 @@ class RobotProbe:
         """Whether announced data has not arrived yet."""
         if "robot_description" in self.streams and self.description is None:
             return True
-        for samples, names in ((self.parts, self.info.part_names), (self.scans, self.info.scan_names)):
+        for samples, names in (
+            (self.parts, self.info.named("partial_joint_states")),
+            (self.scans, self.info.named("scan")),
+        ):
             if not {one.session for _, one in names} <= samples.writers.keys():
                 return True
-        if not {name for name, _ in self.info.map_names} <= self.maps.keys():
+        if not {name for name, _ in self.info.named("map")} <= self.maps.keys():
             return True
         if self.followed not in self.streams:
             return False
@@ -412,12 +427,12 @@ class RobotProbe:
     def has_only_transforms(self) -> bool:
         """Whether its writers publish moving edges, and no program publishes or reads joints or a model."""
         others = {*JOINT_STREAMS, "tf", "robot_description"}
-        has_edges = not self.streams.isdisjoint(EDGE_STREAMS)
+        has_edges = not self.streams.isdisjoint(edge_streams())
         return has_edges and others.isdisjoint({*self.streams, *self.waits})
 
     def silent_writers(self) -> set[WriterId]:
         """The announced writers of which nothing has arrived, not even a reply with their clock."""
-        streams: tuple[StreamName, ...] = ("tf", *_NATIVE_STREAMS)
+        streams: tuple[StreamName, ...] = ("tf", *_native_streams())
         known = {session for stream in streams for session in self._of(stream).writers}
         known.update(self.statuses, (offset.writer.session for offset in self.offsets))
         return {writer for _, writer in self.info.writers if writer.session not in known}
@@ -437,7 +452,7 @@ def unwritten_streams(info: RobotInfo, readers: Sequence[Announcement]) -> dict[
             streams.setdefault(one.writer, set()).add(one.stream)
     waits: dict[StreamName, WriterId] = {}
     for reader, read in streams.items():
-        if read <= {*JOINT_STREAMS, *SENSOR_STREAMS}:
+        if read <= {*JOINT_STREAMS, *measured_streams()}:
             missing = read - written
             if not JOINT_STREAMS.isdisjoint(read):  # either of the two may have all joints
                 missing -= {"partial_joint_states"} if written.isdisjoint(JOINT_STREAMS) else JOINT_STREAMS

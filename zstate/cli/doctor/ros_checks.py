@@ -24,7 +24,7 @@ from zstate.cli.output.console import count_text, rate_text
 from zstate.cli.output.wire_text import RosMessages
 from zstate.errors import format_duration
 from zstate.model.robot import RobotModel
-from zstate.wire.keys import StreamName
+from zstate.streams import StreamName
 
 _MAX_NAMES = 6
 
@@ -66,7 +66,7 @@ class _RosChecks:
         yield self._joints_check(model) if nodes else self._no_joints_check(model)
         yield self._transforms_check() if publishers else self._no_transforms_check()
         hz = f"zstate hz{self._robot} --stream scan"
-        yield from named_writers_checks(probe, "scan", probe.scans, probe.info.scan_names, hz)
+        yield from named_writers_checks(probe, "scan", probe.scans, probe.info.named("scan"), hz)
         yield from sensor_frames_checks(probe)
         yield from measured_checks(probe, f"zstate hz{self._robot}")
         yield stamps_check(probe)

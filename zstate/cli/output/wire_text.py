@@ -13,7 +13,7 @@ from zstate.cli.output.console import count_text
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
     from zstate.net.presence import RobotInfo
-    from zstate.wire.keys import StreamName
+    from zstate.streams import StreamName
 
 
 OTHER_HOSTS = "--mode lan, or --connect tcp/HOST:7447 to a router"

@@ -16,10 +16,14 @@ from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
 from zstate.net.security.acl import AclRoles, access_control, check_namespace
 from zstate.net.security.credentials import Credentials
-from zstate.wire.keys import EDGE_STREAMS, StreamName, check_robot, stream_expression
+from zstate.streams import StreamName, edge_streams
+from zstate.wire.keys import check_robot, stream_expression
 
-DOWNSAMPLED: tuple[StreamName, ...] = ("joint_states", "partial_joint_states", "tf", *EDGE_STREAMS)
-"""Streams that may lose samples: each is replaced by a newer one."""
+
+def downsampled_streams() -> tuple[StreamName, ...]:
+    """The streams that may lose samples: each is replaced by a newer one."""
+    return ("joint_states", "partial_joint_states", "tf", *edge_streams())
+
 
 _WIDTH = 100
 _INDENT = "  "
@@ -44,8 +48,10 @@ class Downsampling:
     def __post_init__(self) -> None:
         check_namespace(self.namespace)
         for stream, rate_hz in self.rates_hz.items():
-            if stream not in DOWNSAMPLED:
-                raise InvalidInput(f"{stream!r} cannot be downsampled; {', '.join(DOWNSAMPLED)} can")
+            if stream not in downsampled_streams():
+                raise InvalidInput(
+                    f"{stream!r} cannot be downsampled; {', '.join(downsampled_streams())} can"
+                )
             if not (math.isfinite(rate_hz) and rate_hz > 0.0):
                 raise InvalidInput(f"{stream!r} at {rate_hz} Hz; give a positive number of samples a second")
         if not self.rates_hz or not self.robots:
@@ -64,7 +70,7 @@ class Downsampling:
                 "freq": self.rates_hz[stream],
             }
             for robot in dict.fromkeys(self.robots)
-            for stream in DOWNSAMPLED
+            for stream in downsampled_streams()
             if stream in self.rates_hz
         ]
         return [{"id": "streams", **interfaces, "flows": ["egress"], "messages": ["put"], "rules": rules}]

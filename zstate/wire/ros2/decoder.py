@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.keys import StreamName
+from zstate.streams import StreamName
 from zstate.wire.messages import (
     ClockMessage,
     Edges,

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeVar
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.keys import StreamName, shortened
+from zstate.streams import StreamName
+from zstate.wire.keys import shortened
 
 Reliability = Literal["reliable", "best_effort"]
 Durability = Literal["volatile", "transient_local"]

@@ -26,7 +26,8 @@ from collections.abc import Callable
 from functools import cached_property, lru_cache, partial
 
 from zstate.errors import InvalidInput
-from zstate.wire.keys import ANY, StreamName, wire_name
+from zstate.streams import StreamName
+from zstate.wire.keys import ANY, wire_name
 from zstate.wire.messages import Edges
 from zstate.wire.ros2.options import Ros2Options, check_token
 from zstate.wire.ros2.types import (
@@ -49,7 +50,7 @@ SHARED = "ros"
 HUMBLE_HASH = "TypeHashNotSupported"
 """Type hash in the keys of ROS 2 Humble, whose types have none."""
 
-_TYPES: dict[StreamName, RosType] = {
+TYPES: dict[StreamName, RosType] = {
     "joint_states": JOINT_STATE,
     "robot_description": STRING,
     "tf": TF_MESSAGE,
@@ -72,17 +73,17 @@ _CACHED_ORDERS = 64
 
 def ros_type(stream: StreamName) -> RosType:
     """The ROS type that carries ``stream``. Raises InvalidInput for a stream without a ROS topic."""
-    if stream not in _TYPES:
+    if stream not in TYPES:
         raise InvalidInput(
-            f"the stream {stream!r} is not carried by ROS 2; carried are {', '.join(map(repr, _TYPES))}"
+            f"the stream {stream!r} is not carried by ROS 2; carried are {', '.join(map(repr, TYPES))}"
         )
-    return _TYPES[stream]
+    return TYPES[stream]
 
 
 def topic_stream(topic: str, dds_type: str) -> StreamName | None:
     """The stream that ``topic`` carries by its type and its last name; None if it is none."""
     last_name = topic.rpartition("/")[2]
-    for stream, kind in _TYPES.items():
+    for stream, kind in TYPES.items():
         if dds_type == kind.dds and (stream in NAMED_TOPICS or last_name == stream):
             return stream
     return None

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, StreamName
+from zstate.wire.keys import ANY
 from zstate.wire.messages import JointTrajectory, Message, check_edges, check_size
 from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
 from zstate.wire.ros2.decoder import RosDecoder, decode_numbers, decode_trajectory
@@ -38,6 +39,7 @@ from zstate.wire.ros2.topics import (
     HUMBLE_HASH,
     NAMED_TOPICS,
     SHARED,
+    TYPES,
     DdsKeys,
     FrameNames,
     RmwKeys,
@@ -68,6 +70,9 @@ class Ros2Wire:
         self._keys = self._topic_keys(self.options)
         self._decoder = RosDecoder()
         self._frame_names = lru_cache(64)(partial(FrameNames, self.options))
+
+    def carries(self, stream: StreamName) -> bool:
+        return stream in TYPES
 
     def node_token(self, node: WriterNode) -> str | None:
         self._frame_names(node.robot)  # raises InvalidInput before anything is declared

@@ -26,8 +26,8 @@ from ros_messages import (
     transform_stamped,
 )
 
+from zstate.streams import StreamName
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import StreamName
 from zstate.wire.messages import LaserScan, Message, OccupancyGrid, to_block, to_float32_block
 from zstate.wire.ros2 import types
 from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string

@@ -1,0 +1,68 @@
+"""Publisher of any stream of measurements, also of those that other packages bring."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from zstate.clock import Clock, check_stamp
+from zstate.errors import InvalidInput
+from zstate.net.session import Session
+from zstate.nodes.sample_publisher import MeasurementPublisher
+from zstate.streams import Stream, find_stream, stream_named
+from zstate.wire.native import new_message
+
+
+class StreamPublisher(MeasurementPublisher):
+    """Publishes the messages of one writer on ``stream``, a row or its name.
+
+    ``name`` is that of the sensor or program on a stream whose writers have names, and empty on others. On
+    the native wire one writer has it: SecondWriter, which names the first one, is raised if another writer
+    publishes, or by ``publish`` if both opened at once, which closes the later one. Under congestion
+    messages are dropped, and joining listeners receive none from the past. ``program`` is the script's name
+    by default.
+
+    Raises InvalidInput for a stream that no installed package brings, that is no measurement (joints, edges
+    and drivers have publishers of their own), or that one of ``wires`` does not carry. A context manager;
+    safe from any thread.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        stream: Stream | str,
+        name: str = "",
+        wires: str | Sequence[str] = ("native",),
+        *,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        self._row = checked_stream(stream)
+        if self._row.group != "measurement" or self._row.latched:
+            raise InvalidInput(
+                f"a StreamPublisher writes measurements; the stream {self._row.name!r} has its own publisher"
+            )
+        super().__init__(session, robot, self._row.name, name, wires=wires, clock=clock, program=program)
+
+    def publish(self, stamp: int | None = None, **fields: Any) -> None:
+        """Publish one message of ``fields`` at ``stamp`` [ns]; default: now. Its number is the next one.
+
+        Raises InvalidInput for fields that the message does not have, that are missing, or of other types;
+        SecondWriter; and Closed. If it raises, nothing was sent.
+        """
+        with self._refusals_counted():
+            stamp = self._clock.now() if stamp is None else check_stamp(stamp)
+            self._publish_message(new_message(self._row, stamp, fields))
+
+
+def checked_stream(stream: Stream | str) -> Stream:
+    """The row of ``stream``. Raises InvalidInput for one that is not known to all programs of this machine."""
+    if isinstance(stream, str):
+        return stream_named(stream)
+    if find_stream(stream.name) is not stream:
+        raise InvalidInput(
+            f"{stream!r} is not the one that programs find here: give its package an entry point in the group "
+            "'zstate.plugins' that leads to a zstate.plugins.Plugin with this row, and install it"
+        )
+    return stream

@@ -1,0 +1,38 @@
+"""What odometry brings: the streams of its sensors, and of its result."""
+
+from zstate.plugins import Plugin
+from zstate.streams import Stream
+
+_MESSAGES = "zstate.wire.messages"
+
+IMU = Stream(
+    "imu",
+    f"{_MESSAGES}:Imu",
+    summary="angular velocity and acceleration of a sensor",
+    named=True,
+    start="start the program of the sensor, with its zstate.odometry.ImuPublisher",
+)
+VELOCITY = Stream(
+    "velocity",
+    f"{_MESSAGES}:Velocity",
+    summary="measured velocity of a frame",
+    named=True,
+    start="start the program of the sensor, with its zstate.odometry.VelocityPublisher",
+)
+POSE = Stream(
+    "pose",
+    f"{_MESSAGES}:Pose",
+    summary="measured pose of a frame",
+    named=True,
+    start="start the program of the sensor, with its zstate.odometry.PosePublisher",
+)
+ODOMETRY = Stream(
+    "odometry",
+    f"{_MESSAGES}:Odometry",
+    summary="pose and velocity of a base, with covariances",
+    group="edges",
+    named=True,
+    start="start one: `zstate odometry {robot} --imu SENSOR`",
+)
+
+PLUGIN = Plugin("odometry", streams=(IMU, VELOCITY, POSE, ODOMETRY))

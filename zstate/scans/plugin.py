@@ -1,0 +1,28 @@
+"""What scans bring: the streams of laser scanners and of maps."""
+
+from zstate.plugins import Plugin
+from zstate.streams import LATCHED_BYTES, Stream
+
+_MESSAGES = "zstate.wire.messages"
+_SCAN_BYTES = 810_000
+"""A scan of the most rays, with intensities, takes less on each wire."""
+
+SCAN = Stream(
+    "scan",
+    f"{_MESSAGES}:LaserScan",
+    summary="ranges of a laser scanner",
+    named=True,
+    max_bytes=_SCAN_BYTES,
+    start="start one: `zstate scan {robot} --frame FRAME --dummy`",
+)
+MAP = Stream(
+    "map",
+    f"{_MESSAGES}:OccupancyGrid",
+    summary="an occupancy grid of a place",
+    named=True,
+    latched=True,
+    max_bytes=LATCHED_BYTES,
+    start="start one: `zstate map FILE.yaml --name {robot}`",
+)
+
+PLUGIN = Plugin("scans", streams=(SCAN, MAP))
