@@ -1,8 +1,8 @@
 """Streams: all that is true of one, once, in a row that every tool reads.
 
-The rows here are those of the core. Plugins have rows of their own: those of zstate in the ``plugin`` module
-of their folder, those of other packages where their entry point leads (see ``zstate.plugins``). These are read
-when a stream is met that zstate does not bring, once in a process, and by the tools that list all.
+The rows here are those of the core. Plugins have rows of their own: those of zstate in the ``plugin``
+module of their folder, those of other packages where their entry point leads (see ``zstate.plugins``). These
+are read when a stream is met that zstate does not bring, once in a process, and by the tools that list all.
 """
 
 from __future__ import annotations

@@ -57,12 +57,12 @@ class StreamPublisher(MeasurementPublisher):
 
 
 def checked_stream(stream: Stream | str) -> Stream:
-    """The row of ``stream``. Raises InvalidInput for one that is not known to all programs of this machine."""
+    """The row of ``stream``. Raises InvalidInput for one that other programs here do not know."""
     if isinstance(stream, str):
         return stream_named(stream)
     if find_stream(stream.name) is not stream:
         raise InvalidInput(
-            f"{stream!r} is not the one that programs find here: give its package an entry point in the group "
+            f"{stream!r} is not what other programs find: give its package an entry point in the group "
             "'zstate.plugins' that leads to a zstate.plugins.Plugin with this row, and install it"
         )
     return stream

@@ -23,6 +23,7 @@ from zstate.streams import (
     SAMPLE_BYTES,
     Stream,
     StreamName,
+    all_streams,
     edge_streams,
     is_named,
     stream_named,
