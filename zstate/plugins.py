@@ -49,6 +49,7 @@ class FoundPlugin(NamedTuple):
 
     entry: str
     distribution: str
+    version: str
     plugin: Plugin
     problem: str = ""
 
@@ -90,17 +91,11 @@ def other_plugins() -> tuple[Plugin, ...]:
     return tuple(one.plugin for one in found_plugins())
 
 
-def other_command(name: str) -> str | None:
-    """``"module:attribute"`` of the command ``name`` that another package brings; None if none does."""
-    return next(
-        (place for one in other_plugins() for own, place in one.commands.items() if own == name), None
-    )
-
-
 def _loaded(entry: EntryPoint) -> FoundPlugin:
     """The plugin of ``entry``; an empty one with its problem if it is none."""
     where = f"the plugin {entry.name!r} of {_distribution(entry)} ({entry.value})"
-    nothing = FoundPlugin(entry.name, _distribution(entry), Plugin(entry.name))
+    version = entry.dist.version if entry.dist is not None else ""
+    nothing = FoundPlugin(entry.name, _distribution(entry), version, Plugin(entry.name))
     try:
         plugin = entry.load()
     except (Exception, SystemExit) as error:  # whatever somebody else's module does when it is imported

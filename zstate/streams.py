@@ -41,8 +41,8 @@ class Stream:
     """One stream of robots, of which each tool knows all that it needs.
 
     - ``name``: lower-case letters, digits and underscores.
-    - ``message``: the class of its messages, a subclass of ``StampedMessage``, or ``"module:Class"``, which is
-      loaded when a message is encoded or decoded.
+    - ``message``: the class of its messages, a subclass of ``StampedMessage``, or ``"module:Class"``, which
+      is loaded when a message is encoded or decoded.
     - ``summary``: what it is, for lists.
     - ``group``: what tools treat alike; other packages have measurements.
     - ``named``: writers have names of their own, one key each: zstate/<robot>/<name>/<writer>. Otherwise one
@@ -52,6 +52,8 @@ class Stream:
       Without ``latched`` they are refused above 1 MB in any case.
     - ``version``: of its messages, in their Zenoh encoding. Fields may be appended within a version.
     - ``start``: how to start a writer, for the tools that miss one; ``{robot}`` in it is the robot's name.
+    - ``document``: ``"module:function"`` that makes a dict of a message and the name of its robot, as `zstate
+      echo` prints it; by default of all fields.
 
     Raises InvalidInput for a name that is none.
     """
@@ -66,12 +68,14 @@ class Stream:
     max_bytes: int = MEASUREMENT_BYTES
     version: int = 1
     start: str = ""
+    document: str = ""
 
     def __post_init__(self) -> None:
         text = self.name
         if not (text.isascii() and text.islower() and text.isidentifier()):
             raise InvalidInput(
-                f"the name of a stream is of lower-case letters, digits and underscores; got {printable(text)!r}"
+                "the name of a stream has lower-case letters, digits and underscores; got "
+                f"{printable(text)!r}"
             )
 
     def __repr__(self) -> str:
@@ -82,8 +86,35 @@ class Stream:
         """The class of its messages."""
         if not isinstance(self.message, str):
             return self.message
-        module, _, name = self.message.partition(":")
-        return getattr(import_module(module), name)
+        return _loaded(self.message)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether it has what sensors and programs measure, sample by sample."""
+        return self.group == "measurement" and not self.latched
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether its messages are samples, which come at a rate."""
+        return not self.latched and (self.group not in ("driver", "time") or self.name == "joint_setpoints")
+
+    @property
+    def is_echoed(self) -> bool:
+        """Whether its messages can be printed as documents."""
+        is_of_joints = self.group == "joints" or self.name == "joint_setpoints"
+        return is_of_joints or bool(self.document) or self.is_measured
+
+    def to_document(self, message: Message, robot: str) -> dict[str, Any]:
+        """What `zstate echo` prints of ``message``."""
+        if self.document:
+            return _loaded(self.document)(message, robot)
+        return {name: getattr(message, name) for name in message.__struct_fields__ if name != "session"}
+
+
+def _loaded(place: str) -> Any:
+    """What is at ``"module:name"``."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
 
 
 _MESSAGES = "zstate.wire.messages"
@@ -125,6 +156,7 @@ CORE = (
         "transforms",
         f"{_MESSAGES}:WriterTransforms",
         summary="moving edges, by the names of their writers",
+        document="zstate.cli.output.joint_state_text:transforms_document",
         named=True,
         group="edges",
         max_bytes=SAMPLE_BYTES,
@@ -199,8 +231,8 @@ def stream_named(name: StreamName) -> Stream:
     found = find_stream(name)
     if found is None:
         raise InvalidInput(
-            f"there is no stream {printable(name)!r}; known are {', '.join(_REGISTRY.rows)}. `zstate plugins` "
-            "lists the packages that bring others"
+            f"there is no stream {printable(name)!r}; known are {', '.join(_REGISTRY.rows)}. "
+            "`zstate plugins` lists the packages that bring others"
         )
     return found
 
@@ -230,7 +262,7 @@ def latched_streams() -> tuple[StreamName, ...]:
 @cache
 def measured_streams() -> tuple[StreamName, ...]:
     """The streams of what sensors and programs measure, sample by sample."""
-    return streams_where(lambda row: row.group == "measurement" and not row.latched)
+    return streams_where(lambda row: row.is_measured)
 
 
 def is_named(name: StreamName) -> bool:
@@ -248,7 +280,7 @@ def is_latched(name: StreamName) -> bool:
 def is_measured(name: StreamName) -> bool:
     """Whether the stream is one of ``measured_streams``, without a search for other packages' otherwise."""
     found = find_stream(name)
-    return found is not None and found.group == "measurement" and not found.latched
+    return found is not None and found.is_measured
 
 
 def in_canonical_order(names: Iterable[StreamName]) -> tuple[StreamName, ...]:

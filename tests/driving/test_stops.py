@@ -455,6 +455,15 @@ def kept_with(stops: Iterable[tuple[int, int]]) -> tuple[list[tuple[int, int]], 
     return others, len(kept) - len(others)
 
 
+def test_a_stop_is_confirmed_after_it_is_kept_for_the_next_host():
+    register = StopRegister(HOST)
+    register.add(ActiveStop(1, 5, "hold", "door open", "desk"))
+    assert [one.id for one in register.current.stops] == [(1, 5)]  # obeyed at once
+    assert register.current.ids == ()
+    register.save()
+    assert register.current.ids == ((1, 5),)
+
+
 def test_eight_stops_of_a_program_are_kept_and_one_of_the_host_stands_for_the_oldest_of_more():
     numbers = [(1, number) for number in range(9)]
     assert kept_with(numbers[:8]) == (numbers[:8], 0)

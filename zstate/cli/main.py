@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from zstate.cli.commands import load_command
+from zstate.cli.commands import load_command, load_other_command
 from zstate.cli.output import logs
 from zstate.cli.signals import SignalExit
 from zstate.errors import ZStateError
@@ -73,6 +73,7 @@ _COMMANDS = {
     "ros1": ("Run", "A bridge to ROS 1, in either direction."),
     "up": ("Run", "Start several processes from one file."),
     "init": ("Run", "Write a commented file for `zstate up`."),
+    "plugins": ("Run", "What other packages add: streams and commands."),
     "completion": ("Run", "Set up completion in a shell."),
 }
 
@@ -213,9 +214,9 @@ class Commands(click.Group):
         return list(_COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in _COMMANDS:
+        command = load_command(cmd_name) if cmd_name in _COMMANDS else load_other_command(cmd_name)
+        if command is None:
             return None
-        command = load_command(cmd_name)
         for one in (command, *(command.commands.values() if isinstance(command, click.Group) else ())):
             one.context_class = HelpContext
             for parameter in one.params if COMPLETION_VARIABLE in os.environ else ():
@@ -241,7 +242,8 @@ class Commands(click.Group):
             if len(args) == 1:
                 click.echo(ctx.get_help())
                 ctx.exit()
-        if args[0] not in _COMMANDS and not args[0].startswith("-"):
+        is_command = args[0] in _COMMANDS or args[0].startswith("-")
+        if not is_command and load_other_command(args[0]) is None:
             ctx.fail(
                 _ros_static_hint(args)
                 or f"there is no command {args[0]!r}; {command_hint(args[0], _COMMANDS)}"

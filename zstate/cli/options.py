@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
     from zstate.net.security.credentials import Credentials
     from zstate.net.session import Session
+    from zstate.streams import Stream
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -58,6 +59,24 @@ def _check_seconds(seconds: float) -> float:
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise InvalidInput(f"a duration is a positive number of seconds; got {seconds}")
     return seconds
+
+
+class StreamChoice(click.Choice[str]):
+    """The streams that meet ``condition``, of other packages as well: looked up when the choice is used."""
+
+    def __init__(self, condition: Callable[[Stream], bool]) -> None:
+        self._condition = condition
+        super().__init__(())
+
+    @property
+    def choices(self) -> Sequence[str]:
+        from zstate.streams import streams_where
+
+        return streams_where(self._condition)
+
+    @choices.setter
+    def choices(self, _: object) -> None:
+        """click sets those that it is created with."""
 
 
 RATE = number("HZ", _check_rate)

@@ -211,18 +211,23 @@ class LatchedStops(NamedTuple):
     """The ``stops`` that are not released, and how many have ``arrived`` until now, the ``newest`` last.
 
     A stop that is released before the next tick is known by these two. ``displaced`` are the last stops for
-    which the substitute stands.
+    which the substitute stands; those in ``unsaved`` are not kept for a restarted host yet.
     """
 
     stops: tuple[ActiveStop, ...] = ()
     arrived: int = 0
     newest: ActiveStop | None = None
     displaced: tuple[StopId, ...] = ()
+    unsaved: frozenset[StopId] = frozenset()
 
     @property
     def ids(self) -> tuple[StopId, ...]:
-        """What a driver reports as obeyed: also a displaced stop is confirmed to its program."""
-        return (*(one.id for one in self.stops), *self.displaced)
+        """What a driver reports as obeyed: a stop that is confirmed holds for the next host as well.
+
+        Also a displaced stop is confirmed to its program.
+        """
+        kept = (one.id for one in self.stops if one.id not in self.unsaved)
+        return (*kept, *self.displaced)
 
 
 class StopRegister:
@@ -268,6 +273,7 @@ class StopRegister:
         with self._lock:
             if self._is_unsaved:
                 self._save()
+                self.current = self.current._replace(unsaved=frozenset())
 
     def release(self, *releases: Release) -> None:
         """End the stops of ``releases``. One that names none counts once there is none."""
@@ -282,7 +288,9 @@ class StopRegister:
             if has_ended:
                 self._save()  # first: a release that is confirmed holds for the next host as well
                 stops = tuple(self._active.values())
-                self.current = self.current._replace(stops=stops, displaced=tuple(self._displaced_ids))
+                self.current = self.current._replace(
+                    stops=stops, displaced=tuple(self._displaced_ids), unsaved=frozenset()
+                )
 
     def _keep_released(self, ended: Sequence[ActiveStop], named: Sequence[StopId]) -> None:
         """Keep that ``ended`` are released. A cached stop whose release is forgotten stops once more.
@@ -319,7 +327,8 @@ class StopRegister:
         self._active[one.id] = one
         self._is_unsaved = True
         stops, displaced = tuple(self._active.values()), tuple(self._displaced_ids)
-        self.current = LatchedStops(stops, self.current.arrived + 1, one, displaced)
+        unsaved = self.current.unsaved | {one.id}
+        self.current = LatchedStops(stops, self.current.arrived + 1, one, displaced, unsaved)
 
     def _displace(self, stops: Iterable[ActiveStop]) -> None:
         """Let the substitute stand for the oldest of ``stops``. If it keeps the torque off, so does that."""

@@ -227,8 +227,9 @@ def test_leftover_children_and_programs_that_ignore_signals_are_killed(up):
 
 @pytest.mark.processes
 def test_a_line_without_an_end_is_cut(up):
-    code = "import sys; [sys.stdout.write('x' * 65536) for _ in range(100)]; print(); print('after')"
-    child = up(table("program", name="loud", run=["python3", "-c", code], restart="always"))
+    code = "import sys, time; [sys.stdout.write('x' * 65536) for _ in range(100)]; print()"
+    code += "; print('after', flush=True); time.sleep(60)"
+    child = up(table("program", name="loud", run=["python3", "-c", code]))
     line, after = child.line(), child.line()
     assert "x" * 65536 + " ... (cut at 65536 characters)" in line
     assert len(line) < 66_000

@@ -30,12 +30,7 @@ def _check_amount(amount: float) -> float:
 @click.argument("robot", required=False)
 @click.option(
     "--stream",
-    type=click.Choice(
-        [
-            *("joint_states", "partial_joint_states", "joint_setpoints", "transforms", "odometry"),
-            *("imu", "velocity", "pose", "scan", "map"),
-        ]
-    ),
+    type=options.StreamChoice(lambda row: row.is_echoed),
     default="joint_states",
     show_default=True,
 )
@@ -97,18 +92,14 @@ def echo_command(
         ChangeFilter,
         CsvFormatter,
         DescribedJointStates,
-        imu_document,
-        map_document,
-        odometry_document,
-        pose_document,
         scan_document,
         select_field,
-        transforms_document,
-        velocity_document,
         yaml_text,
     )
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
+    from zstate.streams import stream_named
+    from zstate.wire.messages import JointState, LaserScan
     from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire
 
@@ -134,21 +125,13 @@ def echo_command(
     ):
         selected = named_robot(session, robot, wire)
         document: Callable[[Any], Any]
-        named: dict[StreamName, Callable[..., Any]] = {
-            "map": map_document,
-            "imu": imu_document,
-            "velocity": velocity_document,
-            "pose": pose_document,
-            "odometry": odometry_document,
-        }
-        if stream == "scan":
-            document = partial(scan_document, robot=selected, has_ranges=(form or field) is not None)
-        elif stream in named:
-            document = partial(named[stream], robot=selected)
-        elif stream == "transforms":
-            document = transforms_document
-        else:
+        row = stream_named(stream)
+        if row.type is JointState:
             document = opened.enter_context(DescribedJointStates(session, selected, wire)).document
+        elif row.type is LaserScan and (form or field) is not None:
+            document = partial(scan_document, robot=selected, has_ranges=True)
+        else:
+            document = partial(row.to_document, robot=selected)
         carrying = carrier(get_wire(wire), stream)
         reader = opened.enter_context(StreamReader(session, selected, carrying, wire))
         received = reader.first(timeout if once else None)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from zstate.cli.output.drawing import Drawing
     from zstate.net.graph import Graph
     from zstate.net.session import Session
-    from zstate.streams import StreamName, edge_streams, measured_streams
+    from zstate.streams import StreamName
     from zstate.wire.identity import WriterId
 
 _MEASURED_WITHIN_S = 0.4
@@ -80,6 +80,7 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.net.graph import build_graph
     from zstate.net.presence import discover, discover_readers
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
+    from zstate.streams import edge_streams, measured_streams
     from zstate.wire.keys import ANY
     from zstate.wire.registry import get_wire
 

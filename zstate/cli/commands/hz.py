@@ -16,7 +16,7 @@ from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.stream_reader import StreamReader, TimedSample
-    from zstate.streams import StreamName, is_named
+    from zstate.streams import StreamName
 
 _SETTLING_S = 0.1
 
@@ -25,12 +25,7 @@ _SETTLING_S = 0.1
 @click.argument("robot", required=False)
 @click.option(
     "--stream",
-    type=click.Choice(
-        [
-            *("joint_states", "partial_joint_states", "joint_setpoints", "tf", "transforms", "odometry"),
-            *("imu", "velocity", "pose", "scan"),
-        ]
-    ),
+    type=options.StreamChoice(lambda row: row.is_sampled),
     default="joint_states",
     show_default=True,
 )
@@ -75,6 +70,7 @@ def hz_command(
     zstate hz --wire ros2 --stream tf --once           # /tf
     """
     from zstate.cli.stream_reader import StreamReader
+    from zstate.streams import is_named
     from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire
 

@@ -45,10 +45,6 @@ _REFRESH_S, _JSON_PERIOD_S = 0.5, 1.0
 _DISCOVERY_S = 0.5
 _HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
 _OPTIONAL = ("since", "age")
-_MEASURED: tuple[StreamName, ...] = (
-    *("joint_states", "partial_joint_states", "transforms", "odometry"),
-    *("scan", "imu", "velocity", "pose"),
-)
 
 
 @click.command("ls")
@@ -103,6 +99,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     from zstate.cli.robot_directory import RobotDirectory, check_found
     from zstate.net.presence import discover
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
+    from zstate.streams import streams_where
     from zstate.wire.registry import get_wire
 
     def text(robots: tuple[RobotInfo, ...]) -> str:
@@ -111,7 +108,8 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
         return robots_text(robots, statistics, width=output_width())
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
-        for measured_stream in _MEASURED:
+        measured_streams = streams_where(lambda row: row.is_measured or row.group in ("joints", "edges"))
+        for measured_stream in measured_streams:
             statistics.subscribe(measured_stream)
         facts = partial(_robots_facts, statistics=statistics)
         if watch:
@@ -125,7 +123,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
             WriterKey(robot.name, stream, writer.session)
             for robot in robots
             for stream, writer in robot.writers
-            if stream in _MEASURED
+            if stream in measured_streams
         ]
         statistics.wait(measured, _MEASURED_WITHIN_S)
         if as_json:

@@ -18,7 +18,7 @@ from zstate.model.robot import RobotModel, coordinate_names, representative_link
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
-from zstate.streams import JOINT_STREAMS, StreamName
+from zstate.streams import JOINT_STREAMS, StreamName, is_named
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import MODEL_WRITER, foreign_edge_problem, full_name
 from zstate.wire.messages import DriverState, Status
@@ -310,7 +310,7 @@ def named_writers_checks(
     samples = stream_samples.writers
     hz, what = hz or f"zstate hz {probe.info.name} --stream {stream}", stream.replace("_", " ")
     for name, writer in names:
-        received, known_as = samples.get(writer.session), f"{writer}, as {name!r}"
+        received, known_as = samples.get(writer.session), f"{writer}, as {name!r}" if name else str(writer)
         if received is None:
             stuck = ": it is stopped, or frozen" if writer in probe.unresponsive else ""
             text = f"{known_as}, is announced, but no sample arrives{stuck}"
@@ -327,20 +327,15 @@ def named_writers_checks(
 
 
 def measured_checks(probe: RobotProbe, command: str = "") -> Iterator[Check]:
-    """Whether each writer of odometry, each IMU and each sensor of velocities or poses publishes.
+    """Whether each writer of odometry and of measurements publishes, but for laser scanners.
 
     ``command`` shows rates, without its stream; default: that of the native wire.
     """
     info = probe.info
-    names = {
-        "odometry": info.named("odometry"),
-        "imu": info.named("imu"),
-        "velocity": info.named("velocity"),
-        "pose": info.named("pose"),
-    }
     for stream, samples in probe.measured.items():
         hz = f"{command or f'zstate hz {info.name}'} --stream {stream}"
-        yield from named_writers_checks(probe, stream, samples, names[stream], hz)
+        unnamed = [("", writer) for one, writer in info.writers if one == stream and not is_named(stream)]
+        yield from named_writers_checks(probe, stream, samples, info.named(stream) or unnamed, hz)
 
 
 def maps_checks(probe: RobotProbe, patient: str) -> Iterator[Check]:

@@ -152,7 +152,7 @@ class DescribedJointStates(JointStateFormatter, Closeable):
             self._described.set()
 
 
-def transforms_document(sample: TransformSample) -> Document:
+def transforms_document(sample: TransformSample, robot: str) -> Document:
     """``sample`` as a document: "stamp" [ns], "seq", and "transforms", poses by "parent -> child"."""
     poses = poses_from_block(sample.poses).tolist()
     edges = zip(sample.edges or (), poses, strict=False)
@@ -163,7 +163,7 @@ def transforms_document(sample: TransformSample) -> Document:
     return {"stamp": sample.stamp, "seq": sample.seq, "transforms": transforms}
 
 
-def scan_document(message: LaserScan, robot: str, *, has_ranges: bool) -> dict[str, Any]:
+def scan_document(message: LaserScan, robot: str, *, has_ranges: bool = False) -> dict[str, Any]:
     """A scan of ``robot`` as a document: stamp [ns], angles [rad], limits [m], and what it measured.
 
     ``has_ranges`` adds the range of each ray [m], NaN if it is no measurement.

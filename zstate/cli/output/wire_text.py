@@ -86,6 +86,8 @@ class NativeMessages:
     ) -> str:
         """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
         streams = {written for info in robots if info.name == robot for written, _ in info.writers}
+        from zstate.streams import find_stream
+
         if not streams:
             return self.unknown(robot, robots)
         if stream == "joint_setpoints":
@@ -104,19 +106,16 @@ class NativeMessages:
         command = f"zstate transform TARGET SOURCE --xyz X Y Z --robot {robot}"
         if stream == "partial_joint_states":
             command = f"{publish_command_for('joints', robot)} --only NAME"
-        elif stream == "odometry":
-            command = f"zstate odometry {robot} --imu SENSOR"
-        elif stream == "scan":
-            command = f"zstate scan {robot} --frame FRAME --dummy"
-        elif stream == "map":
-            command = f"zstate map FILE.yaml --name {robot}"
         elif stream != "transforms":
             command = publish_command_for("joints" if stream == "joint_states" else "publish", robot)
         start = f"start one: `{command}`"
-        if stream in ("imu", "velocity", "pose"):
+        row = find_stream(stream)
+        if row is not None and (row.start or row.is_measured):
             start = (
-                f"start the program of the sensor, with its zstate.odometry.{stream.capitalize()}Publisher"
+                row.start
+                or f"start the program that publishes it with a zstate.StreamPublisher of {stream!r}"
             )
+            start = start.replace("{robot}", robot)
         return f"{stream} of {robot!r} has no writer{' any more' * ended}; {start}"
 
     def missing_text(

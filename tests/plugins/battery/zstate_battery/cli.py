@@ -1,9 +1,9 @@
 """`zstate battery`: prints the charge of a battery once."""
 
 import click
-from zstate_battery import BATTERY
 
 import zstate
+from zstate_battery import BATTERY
 
 
 @click.command("battery")
