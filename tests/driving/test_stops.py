@@ -528,6 +528,7 @@ def test_a_stop_that_many_others_displace_is_reported_as_obeyed_until_its_releas
     register.add(ActiveStop(1, 5, "relax", "honest", "desk"))
     for session in range(1000, 1400):
         register.add(ActiveStop(session, 0, "hold", "", "flood"))
+    register.save()
     seen = register.current
     assert (1, 5) not in [one.id for one in seen.stops]
     assert (1, 5) in seen.ids

@@ -226,8 +226,8 @@ class LatchedStops(NamedTuple):
 
         Also a displaced stop is confirmed to its program.
         """
-        kept = (one.id for one in self.stops if one.id not in self.unsaved)
-        return (*kept, *self.displaced)
+        found = (*(one.id for one in self.stops), *self.displaced)
+        return tuple(one for one in found if one not in self.unsaved)
 
 
 class StopRegister:

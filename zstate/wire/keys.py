@@ -131,9 +131,9 @@ def stream_key(robot: str, stream: StreamName, writer: str = "") -> str:
 def stream_from_key(key: str) -> StreamName:
     """The stream of a ``stream_key``. Raises InvalidInput for any other key."""
     chunks = _chunks(key)
-    if len(chunks) > 2 and chunks[0] == "zstate" and (stream := find_stream(chunks[2])) is not None:
-        if len(chunks) == (4 if stream.named else 3):
-            return stream.name
+    stream = find_stream(chunks[2]) if len(chunks) > 2 and chunks[0] == "zstate" else None
+    if stream is not None and len(chunks) == (4 if stream.named else 3):
+        return stream.name
     raise _form_error(key, "zstate/<robot>/<stream>")
 
 

@@ -365,10 +365,9 @@ def _version(kind: type[Message]) -> int:
 def _foreign_error(encoding: str, kind: type[Message]) -> MessageError:
     match, name = _ENCODING.fullmatch(encoding), _type_name(kind)
     if match and match[1] == name and int(match[2]) > _version(kind):
-        return MessageError(
-            f"{name} of version {match[2]}, but this zstate reads version {_version(kind)}: `pip install -U zstate`",
-            reason="newer version",
-        )
+        update = "zstate" if kind in ENCODINGS else kind.__module__.partition(".")[0]
+        text = f"{name} of version {match[2]}, but this {update} reads version {_version(kind)}"
+        return MessageError(f"{text}: `pip install -U {update}`", reason="newer version")
     return MessageError(
         f"not a {name}: its encoding is {encoding!r}, ours is {encoding_of(kind)!r}; "
         "another program writes on this key",

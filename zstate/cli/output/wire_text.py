@@ -111,11 +111,8 @@ class NativeMessages:
         start = f"start one: `{command}`"
         row = find_stream(stream)
         if row is not None and (row.start or row.is_measured):
-            start = (
-                row.start
-                or f"start the program that publishes it with a zstate.StreamPublisher of {stream!r}"
-            )
-            start = start.replace("{robot}", robot)
+            program = f"start the program that publishes it, with a zstate.StreamPublisher of {stream!r}"
+            start = (row.start or program).replace("{robot}", robot)
         return f"{stream} of {robot!r} has no writer{' any more' * ended}; {start}"
 
     def missing_text(
