@@ -56,6 +56,12 @@ SIGNATURES = {
     "TransformPublisher.publish": "(transforms, stamp=None)",
     "TransformPublisher.run": "(source, rate_hz=50.0, *, seconds=None)",
     "TransformPublisher.close": "()",
+    "StreamPublisher": "(session, robot, stream, name='', wires=('native',), *, clock=None, program='')",
+    "StreamPublisher.publish": "(stamp=None, **fields)",
+    "StreamPublisher.close": "()",
+    "StreamListener": "(session, robot, stream, *, wire='native')",
+    "StreamListener.get": "(timeout_s=None)",
+    "StreamListener.close": "()",
     "JointStateListener": (
         "(session, robot, model=None, *, wire='native', stream='joint_states', on_reading=None, "
         "max_age_s=0.5)"

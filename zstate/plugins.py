@@ -1,6 +1,6 @@
-"""Plugins: what a folder, or a package of somebody else, adds to zstate, and how it is found.
+"""Plugins: what a folder, or a package of somebody else, adds to zstate; and all streams, by name.
 
-Those of zstate are a table of strings, imported on use. Other packages have an entry point::
+The plugins of zstate are a table of strings, imported on use. Other packages have an entry point::
 
     [project.entry-points."zstate.plugins"]
     battery = "zstate_battery:PLUGIN"
@@ -12,7 +12,8 @@ plugin that cannot be used is reported once, in the log, with its distribution; 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -20,13 +21,15 @@ from importlib.metadata import EntryPoint, entry_points
 from types import MappingProxyType
 from typing import NamedTuple
 
-from zstate.errors import printable
-from zstate.streams import CLOCK, CORE, Stream
+from zstate._util.fork_safe import fork_safe
+from zstate.errors import InvalidInput, printable
+from zstate.streams import CLOCK, CORE, StampedMessage, Stream, StreamName
 
 GROUP = "zstate.plugins"
 """The group of entry points."""
 
-_BUILT_IN = ("zstate.driving.plugin", "zstate.scans.plugin", "zstate.odometry.plugin")
+_BUILT_IN = ("driving", "scans", "odometry")
+"""The folders of zstate with a module ``plugin``."""
 
 _LOG = logging.getLogger("zstate")
 
@@ -57,7 +60,7 @@ class FoundPlugin(NamedTuple):
 @cache
 def built_in_plugins() -> tuple[Plugin, ...]:
     """The plugins of zstate itself that bring streams."""
-    return tuple(import_module(name).PLUGIN for name in _BUILT_IN)
+    return tuple(import_module(f"zstate.{folder}.plugin").PLUGIN for folder in _BUILT_IN)
 
 
 @cache
@@ -73,7 +76,11 @@ def found_plugins() -> tuple[FoundPlugin, ...]:
     for entry in sorted(entry_points(group=GROUP), key=lambda one: (_distribution(one), one.name)):
         one = _loaded(entry)
         problems = [one.problem] if one.problem else []
-        streams = [row for row in one.plugin.streams if _is_free(row.name, "stream", one, taken, problems)]
+        streams = [
+            row
+            for row in one.plugin.streams
+            if _is_usable(row, one, problems) and _is_free(row.name, "stream", one, taken, problems)
+        ]
         own = {
             name: place
             for name, place in one.plugin.commands.items()
@@ -107,6 +114,18 @@ def _loaded(entry: EntryPoint) -> FoundPlugin:
     return nothing._replace(plugin=plugin)
 
 
+def _is_usable(row: Stream, one: FoundPlugin, problems: list[str]) -> bool:
+    """Whether ``row`` is a stream that any package may bring; otherwise ``problems`` gets the reason."""
+    reason = ""
+    if row.group != "measurement" or row.latched:
+        reason = "the streams of other packages are measurements, and not latched"
+    elif isinstance(row.message, type) and not issubclass(row.message, StampedMessage):
+        reason = f"its messages are not StampedMessages, but of type {row.message.__name__}"
+    if reason:
+        problems.append(f"the stream {row.name!r} of {one.distribution} is not used: {reason}")
+    return not reason
+
+
 def _is_free(name: str, kind: str, one: FoundPlugin, taken: dict[str, str], problems: list[str]) -> bool:
     """Whether no other brings ``name``; from now on ``one`` does. Otherwise ``problems`` gets both."""
     owner = taken.setdefault(name, one.distribution)
@@ -119,3 +138,100 @@ def _is_free(name: str, kind: str, one: FoundPlugin, taken: dict[str, str], prob
 
 def _distribution(entry: EntryPoint) -> str:
     return entry.dist.name if entry.dist is not None else "an unknown distribution"
+
+
+class _Registry:
+    """The known rows by name, in the order of tokens: built-in ones, then those of other packages by name."""
+
+    def __init__(self) -> None:
+        self._lock = fork_safe(threading.RLock())
+        self._built_in: dict[StreamName, Stream] = {}
+        self._all: dict[StreamName, Stream] | None = None
+
+    def built_in(self) -> dict[StreamName, Stream]:
+        if not self._built_in:
+            rows = [*CORE, *(row for plugin in built_in_plugins() for row in plugin.streams), CLOCK]
+            self._built_in = {row.name: row for row in rows}
+        return self._built_in
+
+    def all(self) -> dict[StreamName, Stream]:
+        with self._lock:
+            if self._all is None:
+                self._all = self.built_in()  # a plugin may look for a stream while it is imported
+                others = [row for plugin in other_plugins() for row in plugin.streams]
+                self._all = self._all | {row.name: row for row in sorted(others, key=lambda row: row.name)}
+            return self._all
+
+
+_REGISTRY = _Registry()
+
+
+def find_stream(name: StreamName) -> Stream | None:
+    """The row of the stream ``name``; None if no plugin brings it."""
+    return _REGISTRY.built_in().get(name) or _REGISTRY.all().get(name)
+
+
+def stream_named(name: StreamName) -> Stream:
+    """The row of the stream ``name``. Raises InvalidInput with the known ones if no plugin brings it."""
+    found = find_stream(name)
+    if found is None:
+        raise InvalidInput(
+            f"there is no stream {printable(name)!r}; known are {', '.join(_REGISTRY.all())}. "
+            "`zstate plugins` lists the packages that bring others"
+        )
+    return found
+
+
+def all_streams() -> tuple[Stream, ...]:
+    """All rows, those of other packages as well, in the order of liveliness tokens."""
+    return tuple(_REGISTRY.all().values())
+
+
+def streams_where(condition: Callable[[Stream], bool]) -> tuple[StreamName, ...]:
+    """The names of the streams that meet ``condition``, those of other packages as well."""
+    return tuple(row.name for row in all_streams() if condition(row))
+
+
+@cache
+def edge_streams() -> tuple[StreamName, ...]:
+    """The streams of moving edges under the names of their writers."""
+    return tuple(row.name for row in _REGISTRY.built_in().values() if row.group == "edges")
+
+
+@cache
+def latched_streams() -> tuple[StreamName, ...]:
+    """The streams of one current value, which late joiners receive as well."""
+    return streams_where(lambda row: row.latched)
+
+
+@cache
+def measured_streams() -> tuple[StreamName, ...]:
+    """The streams of what sensors and programs measure, sample by sample."""
+    return streams_where(lambda row: row.is_measured)
+
+
+def is_named(name: StreamName) -> bool:
+    """Whether each writer of the stream has a key of its own."""
+    found = find_stream(name)
+    return found is not None and found.named
+
+
+def is_latched(name: StreamName) -> bool:
+    """Whether the stream has one current value, which late joiners receive as well."""
+    found = find_stream(name)
+    return found is not None and found.latched
+
+
+def is_measured(name: StreamName) -> bool:
+    """Whether the stream is one of ``measured_streams``, without a search for other packages' otherwise."""
+    found = find_stream(name)
+    return found is not None and found.is_measured
+
+
+def in_canonical_order(names: Iterable[StreamName]) -> tuple[StreamName, ...]:
+    """``names``, each once, in the order of tokens, without those that no plugin brings."""
+    given = set(names)
+    rows = _REGISTRY.built_in()
+    if not given <= rows.keys():
+        rows = _REGISTRY.all()
+    return tuple(name for name in rows if name in given)

@@ -1,22 +1,19 @@
 """Streams: all that is true of one, once, in a row that every tool reads.
 
 The rows here are those of the core. Plugins have rows of their own: those of zstate in the ``plugin``
-module of their folder, those of other packages where their entry point leads (see ``zstate.plugins``). These
-are read when a stream is met that zstate does not bring, once in a process, and by the tools that list all.
+module of their folder, those of other packages where their entry point leads. ``zstate.plugins`` finds them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import KW_ONLY, dataclass, field
-from functools import cache, cached_property
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
+
+from msgspec import Meta, Struct
 
 from zstate.errors import InvalidInput, printable
-
-if TYPE_CHECKING:
-    from zstate.wire.messages import Message, StampedMessage
 
 StreamName: TypeAlias = str
 """The name of a stream: one chunk of its keys, and the word of every tool for it."""
@@ -24,6 +21,28 @@ StreamName: TypeAlias = str
 Group: TypeAlias = Literal["model", "joints", "edges", "driver", "measurement", "time"]
 """What tools treat alike: what follows from a robot's model, joint positions, moving edges of writers, what
 goes to a driver and comes from it, what sensors and other programs measure, and the simulated time."""
+
+Stamp: TypeAlias = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+SessionId: TypeAlias = Annotated[int, Meta(ge=0)]
+"""Below 2^64, as MessagePack has no larger integers."""
+Count: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+"""One more than it can still be encoded: readers echo numbers, and count on from them."""
+
+
+class Message(Struct, frozen=True, array_like=True, gc=False):
+    """Base of the messages of the native wire format."""
+
+
+class StampedMessage(Message, frozen=True, array_like=True, gc=False):
+    """A message of a stream at the instant ``stamp`` [ns].
+
+    ``seq`` grows by one with each message of a ``session``, a random number drawn when a writer starts.
+    """
+
+    stamp: Stamp
+    seq: Count
+    session: SessionId
+
 
 KILOBYTE, MEGABYTE = 1_000, 1_000_000
 MEASUREMENT_BYTES = 10 * KILOBYTE
@@ -117,29 +136,17 @@ def _loaded(place: str) -> Any:
     return getattr(import_module(module), name)
 
 
-_MESSAGES = "zstate.wire.messages"
-
-__all__ = [
-    "Message",
-    "StampedMessage",
-    "Stream",
-    "StreamName",
-    "all_streams",
-    "find_stream",
-    "stream_named",
-]
-
 CORE = (
     Stream(
         "joint_states",
-        f"{_MESSAGES}:JointState",
+        "zstate.wire.messages:JointState",
         summary="positions, velocities and efforts of all joints",
         group="joints",
         max_bytes=SAMPLE_BYTES,
     ),
     Stream(
         "partial_joint_states",
-        f"{_MESSAGES}:JointState",
+        "zstate.wire.messages:JointState",
         summary="the same of some joints, by the names of their drivers",
         named=True,
         group="joints",
@@ -147,14 +154,14 @@ CORE = (
     ),
     Stream(
         "tf",
-        f"{_MESSAGES}:TransformSample",
+        "zstate.wire.messages:TransformSample",
         summary="poses of all joints of a model",
         group="model",
         max_bytes=SAMPLE_BYTES,
     ),
     Stream(
         "transforms",
-        f"{_MESSAGES}:WriterTransforms",
+        "zstate.wire.messages:WriterTransforms",
         summary="moving edges, by the names of their writers",
         document="zstate.cli.output.joint_state_text:transforms_document",
         named=True,
@@ -163,7 +170,7 @@ CORE = (
     ),
     Stream(
         "tf_static",
-        f"{_MESSAGES}:StaticTransforms",
+        "zstate.wire.messages:StaticTransforms",
         summary="fixed edges, by the names of their writers",
         named=True,
         group="model",
@@ -172,7 +179,7 @@ CORE = (
     ),
     Stream(
         "robot_description",
-        f"{_MESSAGES}:RobotDescription",
+        "zstate.wire.messages:RobotDescription",
         summary="the URDF, and the order of joints and edges",
         group="model",
         latched=True,
@@ -181,7 +188,7 @@ CORE = (
 )
 CLOCK = Stream(
     "clock",
-    f"{_MESSAGES}:ClockMessage",
+    "zstate.wire.messages:ClockMessage",
     summary="the simulated time",
     group="time",
     named=False,
@@ -190,110 +197,3 @@ CLOCK = Stream(
 
 JOINT_STREAMS = frozenset(row.name for row in CORE if row.group == "joints")
 """The streams of joint positions."""
-
-
-@dataclass
-class _Registry:
-    """The known rows by name, in the order of tokens: built-in ones, then those of other packages by name."""
-
-    rows: dict[StreamName, Stream] = field(default_factory=dict[StreamName, Stream])
-    has_others: bool = False
-
-    def built_in(self) -> dict[StreamName, Stream]:
-        if not self.rows:
-            from zstate.plugins import built_in_plugins  # noqa: PLC0415 - it imports rows of this class
-
-            rows = [*CORE, *(row for plugin in built_in_plugins() for row in plugin.streams), CLOCK]
-            self.rows = {row.name: row for row in rows}
-        return self.rows
-
-    def all(self) -> dict[StreamName, Stream]:
-        if not self.has_others:
-            from zstate.plugins import other_plugins  # noqa: PLC0415 - as above
-
-            self.built_in()
-            self.has_others = True  # before: a plugin may look for a stream while it is imported
-            others = [row for plugin in other_plugins() for row in plugin.streams]
-            self.rows |= {row.name: row for row in sorted(others, key=lambda row: row.name)}
-        return self.rows
-
-
-_REGISTRY = _Registry()
-
-
-def find_stream(name: StreamName) -> Stream | None:
-    """The row of the stream ``name``; None if no plugin brings it."""
-    return _REGISTRY.built_in().get(name) or _REGISTRY.all().get(name)
-
-
-def stream_named(name: StreamName) -> Stream:
-    """The row of the stream ``name``. Raises InvalidInput with the known ones if no plugin brings it."""
-    found = find_stream(name)
-    if found is None:
-        raise InvalidInput(
-            f"there is no stream {printable(name)!r}; known are {', '.join(_REGISTRY.rows)}. "
-            "`zstate plugins` lists the packages that bring others"
-        )
-    return found
-
-
-def all_streams() -> tuple[Stream, ...]:
-    """All rows, those of other packages as well, in the order of liveliness tokens."""
-    return tuple(_REGISTRY.all().values())
-
-
-def streams_where(condition: Callable[[Stream], bool]) -> tuple[StreamName, ...]:
-    """The names of the streams that meet ``condition``, those of other packages as well."""
-    return tuple(row.name for row in all_streams() if condition(row))
-
-
-@cache
-def edge_streams() -> tuple[StreamName, ...]:
-    """The streams of moving edges under the names of their writers."""
-    return tuple(row.name for row in _REGISTRY.built_in().values() if row.group == "edges")
-
-
-@cache
-def latched_streams() -> tuple[StreamName, ...]:
-    """The streams of one current value, which late joiners receive as well."""
-    return streams_where(lambda row: row.latched)
-
-
-@cache
-def measured_streams() -> tuple[StreamName, ...]:
-    """The streams of what sensors and programs measure, sample by sample."""
-    return streams_where(lambda row: row.is_measured)
-
-
-def is_named(name: StreamName) -> bool:
-    """Whether each writer of the stream has a key of its own."""
-    found = find_stream(name)
-    return found is not None and found.named
-
-
-def is_latched(name: StreamName) -> bool:
-    """Whether the stream has one current value, which late joiners receive as well."""
-    found = find_stream(name)
-    return found is not None and found.latched
-
-
-def is_measured(name: StreamName) -> bool:
-    """Whether the stream is one of ``measured_streams``, without a search for other packages' otherwise."""
-    found = find_stream(name)
-    return found is not None and found.is_measured
-
-
-def in_canonical_order(names: Iterable[StreamName]) -> tuple[StreamName, ...]:
-    """``names``, each once, in the order of tokens, without those that no plugin brings."""
-    given = set(names)
-    rows = _REGISTRY.built_in()
-    if not given <= rows.keys():
-        rows = _REGISTRY.all()
-    return tuple(name for name in rows if name in given)
-
-
-def __getattr__(name: str) -> Any:
-    # Base classes of messages, for those who add a stream: loaded then.
-    if name in {"Message", "StampedMessage"}:
-        return getattr(import_module(_MESSAGES), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

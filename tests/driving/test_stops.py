@@ -568,7 +568,9 @@ def test_a_stop_that_others_displace_within_one_tick_is_confirmed(sessions):
             put_stop(sessions[1], session, 0)
         until(lambda: host._stops.current.arrived == 401)
         may_read.set()
-        until(lambda: arm.wait_for_driver().state == "stopped" and arm.wait_for_driver().stops)
+        until(lambda: not host._stops.current.unsaved)
+        until(lambda: arm.wait_for_driver().stops == host._stops.current.ids)
+        assert arm.wait_for_driver().state == "stopped"
         assert (honest.session, 3) in arm.wait_for_driver().stops
         assert arm.release(DEADLINE_S).state == "ready"
 

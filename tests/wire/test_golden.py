@@ -19,7 +19,8 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.urdf import parse_urdf
 from zstate.net.sample_history import MAX_PAGE_BYTES
-from zstate.streams import StreamName, all_streams, is_named, latched_streams
+from zstate.plugins import all_streams, is_named, latched_streams
+from zstate.streams import StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import STOP_STREAMS

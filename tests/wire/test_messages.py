@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.streams import stream_named
+from zstate.plugins import stream_named
 from zstate.wire.messages import (
     DriverState,
     Imu,

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import MessageError
-from zstate.streams import LATCHED_BYTES, StreamName, all_streams
+from zstate.plugins import all_streams
+from zstate.streams import LATCHED_BYTES, StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.messages import (
     ClockMessage,

@@ -17,7 +17,7 @@ from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
-from zstate.streams import stream_named
+from zstate.plugins import stream_named
 from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
 from zstate.wire.native import ENCODINGS, NativeWire, decode, encode
 from zstate.wire.protocol import SerializedSample

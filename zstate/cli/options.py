@@ -70,7 +70,7 @@ class StreamChoice(click.Choice[str]):
 
     @property
     def choices(self) -> Sequence[str]:
-        from zstate.streams import streams_where
+        from zstate.plugins import streams_where
 
         return streams_where(self._condition)
 

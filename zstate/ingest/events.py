@@ -16,7 +16,8 @@ from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
 from zstate.ingest.frame_ownership import EdgeSource
-from zstate.streams import StreamName, edge_streams
+from zstate.plugins import edge_streams
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 
 Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]

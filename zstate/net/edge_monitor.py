@@ -19,7 +19,8 @@ from zstate.errors import MessageError
 from zstate.net.ownership import CHECK_PERIOD_S, Edge, frame_conflict, named_edges, seniority
 from zstate.net.session import Session
 from zstate.net.streams import CAPACITY, Ring, to_serialized
-from zstate.streams import SAMPLE_BYTES, edge_streams
+from zstate.plugins import edge_streams
+from zstate.streams import SAMPLE_BYTES
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import stream_key, writer_expression
 from zstate.wire.messages import TransformSample

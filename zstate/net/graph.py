@@ -17,7 +17,8 @@ from zstate.errors import NetworkError, Unreachable
 from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
 from zstate.net.status import StatusSubscriber
-from zstate.streams import StreamName, edge_streams
+from zstate.plugins import edge_streams
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MODEL_WRITER
 from zstate.wire.messages import Status

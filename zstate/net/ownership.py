@@ -30,7 +30,8 @@ from zstate.net.presence import ANSWER_WITHIN_S, announce, confirmed_tokens
 from zstate.net.queryable import query
 from zstate.net.session import Session
 from zstate.net.streams import Ring, to_serialized
-from zstate.streams import StreamName, edge_streams, is_measured, is_named
+from zstate.plugins import edge_streams, is_measured, is_named
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import (
     ANY,

@@ -9,7 +9,8 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.streams import StreamName, is_latched
+from zstate.plugins import is_latched
+from zstate.streams import StreamName
 from zstate.wire.keys import ANY, shortened
 from zstate.wire.messages import Message
 from zstate.wire.protocol import SerializedSample, Wire

@@ -31,7 +31,8 @@ from zstate.net.presence import OtherTfSubscription, WriterWatch, announce_reade
 from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.streams import StreamName, edge_streams, is_named
+from zstate.plugins import edge_streams, is_named
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, MODEL_WRITER, check_robot, shortened, stream_from_key, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms

@@ -20,8 +20,9 @@ from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
 from zstate.net.writer import SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
+from zstate.plugins import is_named
 from zstate.rate import Rate, RateReport
-from zstate.streams import StreamName, is_named
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import check_robot, check_writer
 from zstate.wire.messages import StampedMessage, renumbered

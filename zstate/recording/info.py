@@ -12,10 +12,11 @@ from typing import Any
 from zstate.errors import MessageError, ModelError
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
+from zstate.plugins import is_latched
 from zstate.recording.decode import RecordedWriter, recorded_writers
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import ROBOT, Channel
-from zstate.streams import StreamName, is_latched
+from zstate.streams import StreamName
 from zstate.wire.messages import LaserScan, from_float32_block
 from zstate.wire.ros2.cdr import decode_string
 from zstate.wire.ros2.decoder import RosDecoder

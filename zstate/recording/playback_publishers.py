@@ -24,8 +24,9 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
+from zstate.plugins import edge_streams, is_measured, is_named, measured_streams
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
-from zstate.streams import StreamName, edge_streams, is_measured, is_named, measured_streams
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.keys import MODEL_WRITER, full_name

@@ -18,6 +18,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
+from zstate.plugins import latched_streams
 from zstate.recording.decode import (
     ODOMETRY_STREAMS,
     SCAN_STREAMS,
@@ -36,7 +37,6 @@ from zstate.recording.playback_publishers import PlaybackPublishers
 from zstate.recording.player_clock import Lateness, PlayerClock
 from zstate.recording.reader import RecordingReader
 from zstate.sources.joint_source import JointReading, JointStateValidator
-from zstate.streams import latched_streams
 from zstate.wire.joint_order import JointNumbers
 from zstate.wire.messages import ClockMessage, JointState, StampedMessage
 from zstate.wire.registry import as_wire_names

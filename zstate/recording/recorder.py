@@ -26,11 +26,12 @@ from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
+from zstate.plugins import is_latched, is_named, latched_streams, measured_streams
 from zstate.rate import Rate
 from zstate.recording.driver_messages import DRIVER_TYPES
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
-from zstate.streams import StreamName, is_latched, is_named, latched_streams, measured_streams
+from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, check_robot
 from zstate.wire.messages import Message, Odometry, StampedMessage, Stop, edge_of

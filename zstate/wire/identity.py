@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput, printable
-from zstate.streams import JOINT_STREAMS, StreamName, is_named
+from zstate.plugins import is_named
+from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import MAX_NAME_LENGTH, check_writer, shortened
 
 _MAX_DIGITS = 20

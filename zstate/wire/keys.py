@@ -43,7 +43,8 @@ from functools import lru_cache
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput
-from zstate.streams import StreamName, all_streams, find_stream, in_canonical_order, is_named
+from zstate.plugins import all_streams, find_stream, in_canonical_order, is_named
+from zstate.streams import StreamName
 
 CLOCK_KEY = "zstate/clock"
 ANY = "*"

@@ -18,20 +18,24 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput, MessageError, printable
-from zstate.streams import GRID_CELLS, StreamName, stream_named
+from zstate.plugins import stream_named
+from zstate.streams import (
+    GRID_CELLS,
+    Count,
+    Message,
+    SessionId,
+    Stamp,
+    StampedMessage,
+    StreamName,
+)
 from zstate.transform import COVARIANCE_NUMBERS
 from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, full_name
 
 Edges = tuple[tuple[str, str], ...]
-Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-SessionId = Annotated[int, Meta(ge=0)]
-"""Below 2^64, as MessagePack has no larger integers."""
-Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-"""One more than it can still be encoded: readers echo numbers, and count on from them."""
 Interval = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
 Mode = Literal["position", "velocity", "effort"]
@@ -80,21 +84,6 @@ def order_digest(order: Sequence[str] | Sequence[tuple[str, str]]) -> bytes:
 @lru_cache(maxsize=256)  # a writer that sends names does so in each sample
 def _order_digest(order: tuple[object, ...]) -> bytes:
     return blake2b(msgspec.msgpack.encode(order), digest_size=8).digest()
-
-
-class Message(Struct, frozen=True, array_like=True, gc=False):
-    """Base of the messages of the native wire format."""
-
-
-class StampedMessage(Message, frozen=True, array_like=True, gc=False):
-    """A message of a stream at the instant ``stamp`` [ns].
-
-    ``seq`` grows by one with each message of a ``session``, a random number drawn when a writer starts.
-    """
-
-    stamp: Stamp
-    seq: Count
-    session: SessionId
 
 
 M = TypeVar("M", bound=Message)
@@ -417,7 +406,7 @@ class DriverState(Message, frozen=True, array_like=True, gc=False):
     ticks: Count = 0
     skipped: Count = 0
     faults: Count = 0
-    refused: dict[str, Count] = {}
+    refused: dict[str, Count] = {}  # noqa: RUF012 - msgspec copies it
     last_refusal: str = ""
     stops: StopIds = ()
     motion: Id | None = None
@@ -723,7 +712,7 @@ class Status(Message, frozen=True, array_like=True, gc=False):
     sent: Count
     late: Count
     text: str = ""
-    values: dict[str, str] = {}
+    values: dict[str, str] = {}  # noqa: RUF012 - likewise
 
 
 class HistoryPage(Message, frozen=True, array_like=True, gc=False):

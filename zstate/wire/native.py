@@ -18,16 +18,8 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.streams import (
-    LATCHED_BYTES,
-    SAMPLE_BYTES,
-    Stream,
-    StreamName,
-    all_streams,
-    edge_streams,
-    is_named,
-    stream_named,
-)
+from zstate.plugins import all_streams, edge_streams, is_named, stream_named
+from zstate.streams import LATCHED_BYTES, SAMPLE_BYTES, Stream, StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.messages import (

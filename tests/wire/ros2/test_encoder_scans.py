@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.streams import stream_named
+from zstate.plugins import stream_named
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import (
     LaserScan,

@@ -34,9 +34,10 @@ from zstate.net.subscription import Received, subscribe
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.plugins import edge_streams
 from zstate.sources.joint_state_listener import MAX_AGE_S
 from zstate.sources.joint_state_merger import JointStateMerger
-from zstate.streams import JOINT_STREAMS, edge_streams
+from zstate.streams import JOINT_STREAMS
 from zstate.transform import Transform
 from zstate.wire.joint_order import Floats, JointNumbers
 from zstate.wire.keys import MODEL_WRITER

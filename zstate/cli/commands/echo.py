@@ -98,7 +98,7 @@ def echo_command(
     )
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
-    from zstate.streams import stream_named
+    from zstate.plugins import stream_named
     from zstate.wire.messages import JointState, LaserScan
     from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire

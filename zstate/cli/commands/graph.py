@@ -80,7 +80,7 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.net.graph import build_graph
     from zstate.net.presence import discover, discover_readers
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
-    from zstate.streams import edge_streams, measured_streams
+    from zstate.plugins import edge_streams, measured_streams
     from zstate.wire.keys import ANY
     from zstate.wire.registry import get_wire
 

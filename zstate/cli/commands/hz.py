@@ -70,7 +70,7 @@ def hz_command(
     zstate hz --wire ros2 --stream tf --once           # /tf
     """
     from zstate.cli.stream_reader import StreamReader
-    from zstate.streams import is_named
+    from zstate.plugins import is_named
     from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire
 

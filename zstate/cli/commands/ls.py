@@ -99,7 +99,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     from zstate.cli.robot_directory import RobotDirectory, check_found
     from zstate.net.presence import discover
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
-    from zstate.streams import streams_where
+    from zstate.plugins import streams_where
     from zstate.wire.registry import get_wire
 
     def text(robots: tuple[RobotInfo, ...]) -> str:

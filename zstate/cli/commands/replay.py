@@ -141,7 +141,8 @@ def _show(player: Player, call: BackgroundCall[PlayerReport]) -> PlayerReport:
 def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequence[str]) -> list[str]:
     """Writers on the network of streams that a replay of ``robots`` would publish."""
     from zstate.net.presence import discover
-    from zstate.streams import JOINT_STREAMS, measured_streams
+    from zstate.plugins import measured_streams
+    from zstate.streams import JOINT_STREAMS
     from zstate.wire.registry import get_wire
 
     conflicts: list[str] = []

@@ -28,7 +28,8 @@ from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, WriterKey
 from zstate.nodes.clock import SimulatedClock
 from zstate.nodes.listener import Follow, TransformListener
-from zstate.streams import JOINT_STREAMS, StreamName, edge_streams, measured_streams
+from zstate.plugins import edge_streams, measured_streams
+from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY
 from zstate.wire.messages import (

@@ -16,7 +16,8 @@ from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
 from zstate.net.security.acl import AclRoles, access_control, check_namespace
 from zstate.net.security.credentials import Credentials
-from zstate.streams import StreamName, edge_streams
+from zstate.plugins import edge_streams
+from zstate.streams import StreamName
 from zstate.wire.keys import check_robot, stream_expression
 
 
