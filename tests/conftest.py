@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from helpers.plugins import battery_installed
 from helpers.processes import Child, find_free_port, until
 from helpers.requirements import REQUIREMENTS
 from helpers.tokens import have_met
@@ -29,6 +30,7 @@ from zstate.net.session import Session, connect
 
 if TYPE_CHECKING:
     from zstate.driving import DriverHost
+    from zstate.streams import Stream
 
 # bench/ is not in the package, so it is imported from the repository. The path is appended: the tests use an
 # installed zstate if there is one.
@@ -145,6 +147,13 @@ def sessions() -> Iterator[tuple[Session, Session]]:
     with connect() as writer, connect() as reader:
         until(lambda: have_met(writer, reader) and have_met(reader, writer))
         yield writer, reader
+
+
+@pytest.fixture
+def battery_plugin() -> Iterator[Stream]:
+    """The row of the stream ``battery`` of another package, installed during the test."""
+    with battery_installed() as row:
+        yield row
 
 
 @pytest.fixture

@@ -119,8 +119,14 @@ def _is_usable(row: Stream, one: FoundPlugin, problems: list[str]) -> bool:
     reason = ""
     if row.group != "measurement" or row.latched:
         reason = "the streams of other packages are measurements, and not latched"
-    elif isinstance(row.message, type) and not issubclass(row.message, StampedMessage):
-        reason = f"its messages are not StampedMessages, but of type {row.message.__name__}"
+    else:
+        try:
+            if not issubclass(row.type, StampedMessage):
+                reason = f"its messages are not StampedMessages, but of type {row.type.__name__}"
+        except Exception as error:  # whatever somebody else's module does when it is imported
+            reason = printable(
+                f"its message {row.message!r} cannot be loaded: {type(error).__name__}: {error}"
+            )
     if reason:
         problems.append(f"the stream {row.name!r} of {one.distribution} is not used: {reason}")
     return not reason
@@ -147,6 +153,10 @@ class _Registry:
         self._lock = fork_safe(threading.RLock())
         self._built_in: dict[StreamName, Stream] = {}
         self._all: dict[StreamName, Stream] | None = None
+
+    def forget(self) -> None:
+        """Look for all rows again, as in a new process."""
+        self._all = None
 
     def built_in(self) -> dict[StreamName, Stream]:
         if not self._built_in:

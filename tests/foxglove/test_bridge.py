@@ -16,7 +16,7 @@ import pytest
 from helpers.access_routers import join, router_with_users
 from helpers.foxglove_client import FoxgloveClient
 from helpers.processes import until
-from helpers.robots import RRBOT, STAMP, UPRIGHT, wait_for_stream_readers
+from helpers.robots import RRBOT, STAMP, UPRIGHT, wait_for_reader, wait_for_stream_readers
 from mcap.reader import make_reader
 
 from zstate.foxglove.bridge import FoxgloveBridge
@@ -28,6 +28,7 @@ from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.nodes.stream_publisher import StreamPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import OdometryPublisher
 from zstate.recording.recorder import Recorder
@@ -320,3 +321,24 @@ def test_simulated_time_is_broadcast_and_is_the_time_of_messages(sessions, serve
         client.until(lambda: client.frames.get("/joint_states"))
         assert client.frames["/joint_states"][0][0] == 5_000_000_000
         assert client.channels["/clock"]["schemaName"] == "rosgraph_msgs/msg/Clock"
+
+
+def test_stream_of_another_package_is_served_in_json(sessions, serve, battery_plugin):
+    writer, _ = sessions
+    with (
+        StreamPublisher(writer, "r1", battery_plugin, "main") as publisher,
+        FoxgloveClient(serve("r1").url) as client,
+    ):
+        client.subscribe("/battery/main")
+        wait_for_reader(writer, "zstate/r1/battery/main")
+        publisher.publish(STAMP, voltage=24.5, charge=0.75)
+        client.until(lambda: client.frames.get("/battery/main"))
+    channel = client.channels["/battery/main"]
+    assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
+    assert channel["schemaName"] == "zstate_battery.Battery"
+    described = json.loads(channel["schema"])
+    assert described["type"] == "object"
+    assert described["properties"]["charge"] == {"type": "number"}
+    ((_, payload),) = client.frames["/battery/main"]
+    fields = json.loads(payload)
+    assert (fields["stamp"], fields["voltage"], fields["charge"]) == (STAMP, 24.5, 0.75)

@@ -20,7 +20,7 @@ from zstate.plugins import is_latched
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.recorder import MessageQueue, SampleWriter, recorded_streams
-from zstate.recording.storage import ROBOT
+from zstate.recording.storage import ROBOT, ChannelType
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, STOP_STREAMS, check_robot
@@ -28,7 +28,6 @@ from zstate.wire.messages import ClockMessage, Message, RobotDescription
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.topics import SHARED
-from zstate.wire.ros2.types import RosType
 
 _PERIOD_S = 0.01
 """Samples are forwarded at most so often, together."""
@@ -58,7 +57,7 @@ class ServedTopics:
         self._latched: set[tuple[ChannelId, str]] = set()
         self._waiting: list[ServedMessage] = []
 
-    def open(self, topic: str, type: RosType, user: object) -> ChannelId:
+    def open(self, topic: str, type: ChannelType, user: object) -> ChannelId:
         """The channel of a topic, advertised until each ``user`` has closed it."""
         key = topic, type.name
         channel = self._channels.get(key)
@@ -98,7 +97,7 @@ class ServedTopics:
         self._server.send(messages)
 
     def channel(
-        self, topic: str, type: RosType, qos: Qos, metadata: Mapping[str, str] | None = None
+        self, topic: str, type: ChannelType, qos: Qos, metadata: Mapping[str, str] | None = None
     ) -> ChannelId:
         known = self._channels.get((topic, type.name))
         if known is not None and self._users[known.number]:
@@ -283,7 +282,7 @@ class FoxgloveBridge(Closeable):
 
     def _topics_of(
         self, encoder: RecordingEncoder, announced: Announcement
-    ) -> Sequence[tuple[str, RosType, Feed]]:
+    ) -> Sequence[tuple[str, ChannelType, Feed]]:
         """The topics that a writer's messages are on, with the stream that carries them."""
         robot, stream, name = announced.robot, announced.stream, announced.name
         if stream not in self._streams:
@@ -294,7 +293,7 @@ class FoxgloveBridge(Closeable):
             carried.append(("tf", "odometry"))
         if stream == "joint_states" and "driver" in self._streams:
             carried.extend(zip(_OF_DRIVERS, _OF_DRIVERS, strict=True))
-        topics: list[tuple[str, RosType, Feed]] = []
+        topics: list[tuple[str, ChannelType, Feed]] = []
         try:
             for of_topic, of_messages in carried:
                 topic, kind, _ = encoder.topic(robot, of_topic, name)

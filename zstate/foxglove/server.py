@@ -37,8 +37,8 @@ from websockets.typing import Subprotocol
 
 from zstate._util.closeable import Closeable
 from zstate.errors import printable
+from zstate.recording.storage import ChannelType
 from zstate.web_access import AccessCheck, is_websocket, listen
-from zstate.wire.ros2.types import RosType
 
 PORT = 8765
 SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
@@ -72,11 +72,11 @@ _SILENT.propagate = False
 
 
 class ServedChannel(NamedTuple):
-    """A topic of messages in CDR; its ``number`` is never used for another topic."""
+    """A topic of messages; its ``number`` is never used for another topic."""
 
     number: int
     topic: str
-    type: RosType
+    type: ChannelType
 
     @property
     def advertisement(self) -> dict[str, object]:
@@ -84,9 +84,9 @@ class ServedChannel(NamedTuple):
         return {
             "id": self.number,
             "topic": self.topic,
-            "encoding": "cdr",
+            "encoding": self.type.encoding,
             "schemaName": self.type.name,
-            "schemaEncoding": "ros2msg",
+            "schemaEncoding": self.type.schema_encoding,
             "schema": self.type.definition,
         }
 

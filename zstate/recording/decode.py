@@ -14,12 +14,14 @@ from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
+from zstate.plugins import stream_named
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance, is_covariance_topic
 from zstate.recording.driver_messages import DRIVER_TYPES, decode_command, decode_status, driver_stream
 from zstate.recording.encode import POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
-from zstate.recording.storage import EDGE_WRITER, ROBOT, Channel, Record
+from zstate.recording.storage import EDGE_WRITER, JSON, ROBOT, STREAM, VERSION, Channel, Record
 from zstate.streams import StreamName
+from zstate.wire.json_form import JsonDecoder, carried_as_json
 from zstate.wire.messages import (
     JointState,
     Message,
@@ -32,7 +34,7 @@ from zstate.wire.messages import (
 )
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.topics import NAMED_TOPICS, SHARED, FrameNames, robot_from_topic, ros_type
+from zstate.wire.ros2.topics import NAMED_TOPICS, SHARED, TYPES, FrameNames, robot_from_topic
 
 _TOPICS: tuple[StreamName, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
 STREAMS: tuple[StreamName, ...] = (*_TOPICS, *TOPICS)
@@ -57,6 +59,8 @@ _MAX_TRIED = 10_000
 @dataclass(frozen=True, slots=True)
 class RecordedWriter:
     """One writer of one stream, as one channel of a recording describes it.
+
+    ``stream`` may be one of another package, if that is installed here.
 
     ``robot`` is empty for the clock. ``edge_writer`` is the name under which edges were written: moving ones,
     or static ones, each time all of them; or the name of a driver of some joints, of a sensor, of odometry or
@@ -83,10 +87,14 @@ class RecordedWriter:
         stream: StreamName = "transforms"
         name, facts = channel.topic.rpartition("/")[2], channel.metadata
         foreign = _SESSION not in facts
-        if child_frame(channel) is None:
-            for stream in (*_TOPICS, *SCAN_STREAMS, *ODOMETRY_STREAMS):
+        if channel.encoding == JSON:
+            stream = facts[STREAM]
+            if foreign or not carried_as_json(stream):
+                return None
+        elif child_frame(channel) is None:
+            for stream, kind in TYPES.items():
                 is_named = name == stream or stream in NAMED_TOPICS
-                if is_named and channel.type_name == ros_type(stream).name:
+                if is_named and channel.type_name == kind.name:
                     break
             else:
                 of_driver = None if foreign else driver_stream(channel.topic, channel.type_name)
@@ -244,6 +252,8 @@ class DecodedRecording:
                 messages = (decode_command(record.payload, writer.session, seq),)
             elif writer.stream in DRIVER_TYPES:
                 messages = (decode_status(writer.stream, record.payload),)
+            elif channel.json is not None:
+                messages = (channel.json.decode(record.payload),)
             else:
                 topic = channel.topic
                 messages = channel.ros.messages(topic, record.payload, writer.session, seq, channel.names)
@@ -290,9 +300,13 @@ class DecodedRecording:
                 names = FrameNames(options, writer.robot or SHARED)
                 topic = TOPICS.get(writer.stream, writer.stream)
                 posed = channel.metadata.get(POSED_FRAME, "")
+                json = None
+                if channel.encoding == JSON:
+                    json = JsonDecoder(stream_named(writer.stream), channel.metadata.get(VERSION, "1"))
                 decoder = ChannelDecoder(
                     *(writer, topic, names, RosDecoder(), child_frame(channel) or ""),
                     posed and names.to_zstate(posed),
+                    json,
                 )
             self._known[channel] = decoder
         return self._known[channel]
@@ -302,7 +316,7 @@ class ChannelDecoder(NamedTuple):
     """The writer of a channel, the stream that its topic is named after, and the decoder of its messages.
 
     A channel of covariances has those of the child frame ``covariances_of``, by its name in ROS; one of
-    poses, those of the frame ``posed``, empty for the base of the robot.
+    poses, those of the frame ``posed``, empty for the base of the robot. ``json`` decodes a channel in JSON.
     """
 
     writer: RecordedWriter
@@ -311,6 +325,7 @@ class ChannelDecoder(NamedTuple):
     ros: RosDecoder
     covariances_of: str
     posed: str
+    json: JsonDecoder | None
 
 
 class LatchedState:

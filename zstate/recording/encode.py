@@ -1,4 +1,9 @@
-"""Encodes robot messages as ROS 2 messages, for a recording or for the clients of a server."""
+"""Encodes robot messages as ROS 2 messages, for a recording or for the clients of a server.
+
+Measurements that ROS has no type for, those of other packages, are in JSON, with a JSON schema, on the topics
+``/<namespace>/<stream>/<writer>``, or ``/<namespace>/<stream>`` of a stream whose writers have no names. The
+metadata of their channels name the stream and its version.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +17,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.robot import coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
+from zstate.plugins import stream_named
 from zstate.recording.covariances import (
     CHILD_FRAME,
     EdgeCovariance,
@@ -28,9 +34,10 @@ from zstate.recording.driver_messages import (
     program_of,
 )
 from zstate.recording.mcap.writer import ChannelId
-from zstate.recording.storage import EDGE_WRITER, ROBOT
+from zstate.recording.storage import EDGE_WRITER, ROBOT, STREAM, VERSION, ChannelType
 from zstate.streams import StreamName
 from zstate.wire.joint_order import SampleLayout
+from zstate.wire.json_form import carried_as_json, encode_json, json_type
 from zstate.wire.messages import (
     POSE_BYTES,
     ClockMessage,
@@ -59,7 +66,7 @@ from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS, Qos
 from zstate.wire.ros2.topics import SHARED, FrameNames, RmwKeys, ros_type
-from zstate.wire.ros2.types import POSE_WITH_COVARIANCE, RosType
+from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 
 MAX_LATCHED = 256
 """Latched messages of one robot: its description, the edges of each static writer, and its maps."""
@@ -118,7 +125,7 @@ class MessageOutput(Protocol):
     """Where encoded messages go: a recording (``RecordingWriter``), or the clients of a server."""
 
     def channel(
-        self, topic: str, type: RosType, qos: Qos, metadata: Mapping[str, str] | None = None
+        self, topic: str, type: ChannelType, qos: Qos, metadata: Mapping[str, str] | None = None
     ) -> ChannelId:
         """Declare a channel; an equal declaration returns the same id."""
         ...
@@ -205,9 +212,17 @@ class RecordingEncoder:
         return self._pending.dropped + self._pending.waiting
 
     def write_message(
-        self, robot: str, message: Message, log_time: int, edge_writer: str | None = None
+        self,
+        robot: str,
+        message: Message,
+        log_time: int,
+        edge_writer: str | None = None,
+        *,
+        stream: StreamName = "",
     ) -> bool:
         """Write ``message`` of ``robot``, received at ``log_time`` [ns]; the clock belongs to SHARED.
+
+        ``stream`` is the one that carried it: messages of other packages are of any type.
 
         ``edge_writer`` is the name under which edges are written: static ones, or moving ones of a
         TransformPublisher, which go to the topic tf; or under which a driver publishes some of the joints,
@@ -218,7 +233,10 @@ class RecordingEncoder:
         cannot grow.
         """
         try:
-            if isinstance(message, StaticTransforms):
+            if carried_as_json(stream):
+                with self._lock:
+                    self._write_json(robot, stream, message, log_time, edge_writer or "")
+            elif isinstance(message, StaticTransforms):
                 if edge_writer is None:
                     key = robot, message.session
                     edges = self._statics.setdefault(key, StaticAccumulator(message.session))
@@ -238,8 +256,9 @@ class RecordingEncoder:
             self._refuse("too many writers", f"{robot!r}: {error}")
             return False
         except InvalidInput as error:
-            is_stamped = isinstance(message, (StampedMessage, DriverState))
-            reason, stamp = "not sayable", message.stamp if is_stamped else 1
+            reason, stamp = "not sayable", 1
+            if isinstance(message, (StampedMessage, DriverState)) and not carried_as_json(stream):
+                stamp = message.stamp
             try:
                 to_time(stamp)
             except InvalidInput:
@@ -282,6 +301,17 @@ class RecordingEncoder:
         publish_time = max(message.stamp, 0)
         self._writer.write(channel.number, payload, log_time, publish_time, sequence=message.seq)
         self._counts[robot, stream] += 1
+
+    def _write_json(
+        self, robot: str, stream: StreamName, message: Message, log_time: int, edge_writer: str
+    ) -> None:
+        if not isinstance(message, StampedMessage):
+            raise InvalidInput(f"a message of {stream!r} without a stamp")
+        channel = self._channel(robot, stream, message.session, log_time, edge_writer)
+        if self._writer.is_read(channel.number):
+            payload, publish_time = encode_json(message), max(message.stamp, 0)
+            self._writer.write(channel.number, payload, log_time, publish_time, sequence=message.seq)
+            self._counts[robot, stream] += 1
 
     def _write_of_driver(
         self, robot: str, message: JointCommand | DriverState | Stop, log_time: int, edge_writer: str
@@ -408,6 +438,8 @@ class RecordingEncoder:
         if program:
             metadata["zstate.program"] = program
         topic, kind, qos = self.topic(robot, stream, edge_writer)
+        if carried_as_json(stream):
+            metadata |= {STREAM: stream, VERSION: str(stream_named(stream).version)}
         if child and stream == "pose":
             metadata[POSED_FRAME] = names.to_ros(child)
         elif child:
@@ -419,7 +451,7 @@ class RecordingEncoder:
             self._writer.release(unused.number)
         return channel
 
-    def topic(self, robot: str, stream: StreamName, writer_name: str = "") -> tuple[str, RosType, Qos]:
+    def topic(self, robot: str, stream: StreamName, writer_name: str = "") -> tuple[str, ChannelType, Qos]:
         """The topic that carries a stream of ``robot``, its type and its QoS.
 
         ``writer_name`` is the name of a sensor, of odometry or of a map. Covariances, and measured poses of
@@ -428,6 +460,9 @@ class RecordingEncoder:
         options = self._options(robot)
         if stream in DRIVER_TYPES:
             return driver_topic(options.namespace, stream), DRIVER_TYPES[stream], Qos()
+        if carried_as_json(stream):
+            tokens = filter(None, (options.namespace, stream, writer_name and ros_name(writer_name)))
+            return f"/{'/'.join(tokens)}", json_type(stream_named(stream)), Qos()
         carrier = TOPICS.get(stream, stream)
         topic = RmwKeys(options).topic(robot, carrier, ros_name(writer_name))
         return topic, ros_type(carrier), STREAM_QOS[carrier]

@@ -21,7 +21,8 @@ from __future__ import annotations
 import csv
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -135,23 +136,8 @@ class Exporter:
         Raises RecordingError if it exists (unless ``overwrite``) or cannot be written, InvalidInput without
         a sample, LibraryMissing for Parquet without pyarrow, and LookupFailed for frames without a path.
         """
-        if path.exists():
-            if any(path.samefile(file) for file in self._recording.info.files):
-                raise RecordingError(f"{str(path)!r} is the recording; choose another name", path=str(path))
-            if not overwrite:
-                text = f"{str(path)!r} exists; choose another name, or pass overwrite=True"
-                raise RecordingError(text, path=str(path))
-        incomplete = path.with_name(f"{path.name}.part")
-        try:
-            with (CsvTable if kind == "csv" else ParquetTable)(incomplete) as table:
-                report = self._write(table)
-            incomplete.replace(path)
-        except OSError as error:
-            text = f"{str(path)!r} cannot be written: {error.strerror or error}"
-            raise RecordingError(text, path=str(path)) from error
-        finally:
-            incomplete.unlink(missing_ok=True)
-        return report
+        with new_table(path, kind, self._recording, overwrite=overwrite) as table:
+            return self._write(table)
 
     def _write(self, table: Table) -> ExportReport:
         if self._is_as_recorded and not self._poses:
@@ -428,6 +414,33 @@ class Table(Closeable):
         """Remove all rows; the next ones may have other columns."""
 
 
+@contextmanager
+def new_table(
+    path: Path, kind: TableFormat, recording: Recording, *, overwrite: bool
+) -> Generator[Table, None, None]:
+    """A table of data of ``recording``, which is at ``path`` when the context ends without an exception.
+
+    Raises RecordingError if the file exists (unless ``overwrite``) or cannot be written, and LibraryMissing
+    for Parquet without pyarrow.
+    """
+    if path.exists():
+        if any(path.samefile(file) for file in recording.info.files):
+            raise RecordingError(f"{str(path)!r} is the recording; choose another name", path=str(path))
+        if not overwrite:
+            text = f"{str(path)!r} exists; choose another name, or pass overwrite=True"
+            raise RecordingError(text, path=str(path))
+    incomplete = path.with_name(f"{path.name}.part")
+    try:
+        with (CsvTable if kind == "csv" else ParquetTable)(incomplete) as table:
+            yield table
+        incomplete.replace(path)
+    except OSError as error:
+        text = f"{str(path)!r} cannot be written: {error.strerror or error}"
+        raise RecordingError(text, path=str(path)) from error
+    finally:
+        incomplete.unlink(missing_ok=True)
+
+
 class CsvTable(Table):
     """Comma-separated values, with a line of names first. Missing numbers are ``nan``."""
 
@@ -473,12 +486,16 @@ class ParquetTable(Table):
     def _write_row_group(self) -> None:
         table = self._arrow.concat_tables(self._pending)
         self._pending = []
+        types = self._arrow.types
+        numbers = [
+            one.name for one in table.schema if types.is_integer(one.type) or types.is_floating(one.type)
+        ]
         writer = self._writer or self._parquet.ParquetWriter(
             self._path,
             table.schema,
             compression="zstd",
             use_dictionary=False,  # numbers hardly repeat
-            use_byte_stream_split=True,
+            use_byte_stream_split=numbers,
         )
         self._writer = writer
         writer.write_table(table)

@@ -29,8 +29,7 @@ class RecordingInfo:
     """Summary of a recording. ``size`` is in bytes; ``first`` and ``last`` are log times [ns].
 
     ``profiles``, ``libraries`` and ``compressions`` of its files and the ``robots`` named by its channels are
-    without duplicates. ``skipped`` are channels that are not CDR; ``complete`` and ``losses`` are those of
-    RecordingReader.
+    without duplicates. ``skipped``, ``complete`` and ``losses`` are those of RecordingReader.
     """
 
     path: Path

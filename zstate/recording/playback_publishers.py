@@ -133,13 +133,19 @@ class PlaybackPublishers(Closeable):
     def _named_writers(self, writers: Collection[RecordedWriter]) -> dict[_Named, Sequence[str]]:
         """The wires on which each sensor, each writer of odometry, and its edge, is published.
 
+        ROS does not carry the streams of other packages.
+
         On the native wire odometry is its edge, which is recorded once more for ROS. The edge of a ROS node's
         odometry is that of another program on /tf, if it is one at all.
         """
         ros = [wire for wire in self._wires if get_wire(wire).shared]
         found: dict[_Named, Sequence[str]] = {}
         for writer in writers:
-            if is_measured(writer.stream) or _edge_of_odometry(writer) in self._copied:
+            if is_measured(writer.stream):
+                wires = [wire for wire in self._wires if get_wire(wire).carries(writer.stream)]
+                if wires:
+                    found[_named(writer)] = wires
+            elif _edge_of_odometry(writer) in self._copied:
                 found[_named(writer)] = self._wires
             elif ros and (writer.stream == "odometry" or writer in self._copied):
                 found.setdefault(_named(writer), ros)
@@ -207,18 +213,19 @@ class PlaybackPublishers(Closeable):
 
     def _publish_sample(self, writer: RecordedWriter, message: Message) -> bool:
         robot = self._robots.get(writer.robot)
-        if isinstance(message, JointState) and (
+        # By the stream first: messages of other packages are of any type.
+        if writer.stream in (*measured_streams(), "odometry") or writer in self._copied:
+            publisher = self._named.get(_named(writer))
+            if publisher is None:
+                return False
+            publisher.publish(message)
+        elif isinstance(message, JointState) and (
             writer.stream == "partial_joint_states" or writer.robot in self._in_parts
         ):
             self._parts_of(writer.robot).publish(writer, message)
         elif isinstance(message, JointState) and robot is not None:
             positions, velocities, efforts = robot.order.read(message)
             robot.publisher.publish(positions, velocities, efforts, message.stamp)
-        elif writer.stream in (*measured_streams(), "odometry") or writer in self._copied:
-            publisher = self._named.get(_named(writer))
-            if publisher is None:
-                return False
-            publisher.publish(message)
         elif isinstance(message, TransformSample) and writer.stream == "transforms":
             self._transforms.publish((writer.robot, writer.edge_writer or ""), message)
         elif isinstance(message, TransformSample):

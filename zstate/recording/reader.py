@@ -21,7 +21,6 @@ from zstate.errors import RecordingError
 from zstate.recording.mcap.file import McapFile, explain_unreadable, open_errors, split_files
 from zstate.recording.mcap.records import MAGIC
 from zstate.recording.storage import (
-    CDR,
     Channel,
     Format,
     ReadFilter,
@@ -57,7 +56,7 @@ class RecordingReader(Closeable):
 
     A truncated or damaged file is read as far as possible: ``complete`` is then False, and ``losses``
     describes what is missing. Damage that is found only during a read raises RecordingError there.
-    ``skipped`` are the channels whose encoding is not CDR; their records are left out.
+    ``skipped`` are the channels that are not readable (see ``Channel``); their records are left out.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -72,8 +71,8 @@ class RecordingReader(Closeable):
             self.close()
             raise
         channels = merge_channels(channel for storage in self.storages for channel in storage.channels)
-        self._channels = tuple(channel for channel in channels if channel.encoding == CDR)
-        self.skipped = tuple(channel for channel in channels if channel.encoding != CDR)
+        self._channels = tuple(channel for channel in channels if channel.is_readable)
+        self.skipped = tuple(channel for channel in channels if not channel.is_readable)
         self.losses = (
             *(f"{storage.path.name}: {loss}" for storage in self.storages for loss in storage.losses),
             *(f"{name} is missing" for name in missing),
@@ -81,7 +80,7 @@ class RecordingReader(Closeable):
         self.complete = not self.losses and all(storage.complete for storage in self.storages)
 
     def channels(self) -> tuple[Channel, ...]:
-        """The CDR channels of all files without duplicates, with their record counts."""
+        """The readable channels of all files without duplicates, with their record counts."""
         return self._channels
 
     @property

@@ -175,7 +175,7 @@ class SampleWriter:
         except MessageError as error:
             self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
         for message in messages:
-            is_known = encoder.write_message(robot, message, stamp, edge_writer)
+            is_known = encoder.write_message(robot, message, stamp, edge_writer, stream=stream)
             if isinstance(message, Odometry) and stream in self._wire.edges:
                 # On /tf, where ROS tools and readers of recordings find edges; ROS nodes publish it there.
                 encoder.write_message(robot, edge_of(message), stamp, edge_writer)

@@ -39,6 +39,7 @@ from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest, TransformIngest
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.robot import RobotModel
+from zstate.plugins import stream_named
 from zstate.recording.decode import (
     STREAMS,
     DecodedMessage,
@@ -57,6 +58,7 @@ from zstate.recording.reader import RecordingReader
 from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.streams import JOINT_STREAMS, StreamName
+from zstate.wire.json_form import carried_as_json, json_streams
 from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import (
     DriverState,
@@ -323,6 +325,23 @@ class Recording(Closeable):
         for writer, message, _ in self._messages(robot, "stop", Refusals("recorded stops")):
             assert isinstance(message, Stop)
             yield writer.program or "", message
+
+    def measurements(
+        self, stream: StreamName, robot: str | None = None, refusals: Refusals | None = None
+    ) -> Iterator[DecodedMessage]:
+        """The messages of ``stream``, one of another package, of ``robot``, by default of all robots.
+
+        Each has its writer and the time of its recording [ns]. They are in the order of recording and read
+        one after the other. Messages that cannot be decoded are left out, counted in ``refusals``; the first
+        of each reason is logged. Raises InvalidInput for a stream that no installed package brings, for one
+        that ROS carries, and for a robot that is not in the recording.
+        """
+        if not carried_as_json(stream_named(stream).name):
+            known = ", ".join(json_streams()) or "none is installed"
+            raise InvalidInput(
+                f"{stream!r} is no stream of measurements of another package; those are: {known}"
+            )
+        return self._messages(robot, stream, refusals or Refusals(f"recorded {stream}"))
 
     def _messages(
         self, robot: str | None, stream: StreamName, refusals: Refusals

@@ -13,17 +13,43 @@ EDGE_WRITER = "zstate.writer"
 ROBOT = "zstate.robot"
 """Channel metadata key under which a recorder writes the robot's name."""
 
+STREAM = "zstate.stream"
+"""Channel metadata key under which a recorder writes the stream of messages in JSON."""
+VERSION = "zstate.version"
+"""Channel metadata key of the version of that stream."""
+
 CDR = "cdr"
+JSON = "json"
 
 Format: TypeAlias = Literal["mcap", "sqlite3"]
 """rosbag2's storage identifiers."""
+
+
+class ChannelType(Protocol):
+    """The type of the messages of a channel: a RosType, or a JsonType.
+
+    ``encoding`` is that of the messages, and ``schema_encoding`` that of ``definition``, as MCAP names them;
+    ``hash`` is empty for a type that ROS does not have.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def definition(self) -> str: ...
+    @property
+    def encoding(self) -> str: ...
+    @property
+    def schema_encoding(self) -> str: ...
+    @property
+    def hash(self) -> str: ...
 
 
 @dataclass(frozen=True)
 class Channel:
     """One topic as one writer offered it.
 
-    ``type_name`` is the ROS type ("sensor_msgs/msg/JointState"), empty if the file does not state it.
+    ``type_name`` is the ROS type ("sensor_msgs/msg/JointState"), or the class of messages in JSON, empty if
+    the file does not state it.
     ``count`` is the number of records in the recording.
     """
 
@@ -32,6 +58,11 @@ class Channel:
     encoding: str
     metadata: Mapping[str, str] = field(hash=False)
     count: int
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether its records are read: CDR, and JSON of a recorder that names the stream."""
+        return self.encoding == CDR or (self.encoding == JSON and STREAM in self.metadata)
 
 
 class Record(NamedTuple):
@@ -68,8 +99,8 @@ class ReadFilter(NamedTuple):
     end: int
 
     def accepts(self, channel: Channel) -> bool:
-        """Whether records of ``channel`` are read at all: only CDR is."""
-        return channel.encoding == CDR and (self.topics is None or channel.topic in self.topics)
+        """Whether records of ``channel`` are read at all."""
+        return channel.is_readable and (self.topics is None or channel.topic in self.topics)
 
 
 class SortedPart(NamedTuple):
@@ -99,7 +130,7 @@ class Storage(Protocol):
     losses: tuple[str, ...]
 
     def parts(self, read_filter: ReadFilter) -> Sequence[SortedPart]:
-        """The selected records of CDR channels."""
+        """The selected records of readable channels."""
         ...
 
     def close(self) -> None:

@@ -61,9 +61,18 @@ def _read_stamps(file: str) -> NDArray[np.int64]:
     type=options.Checked("FILE", _read_stamps),
     help="A row for each stamp in FILE, integers of nanoseconds, interpolated.",
 )
+@click.option(
+    "--stream",
+    metavar="NAME",
+    help="Instead: the messages of a stream of measurements of another package, one row each.",
+)
 @click.option("--csv", "kind", flag_value="csv", help="Write comma-separated values.")
 @click.option("--parquet", "kind", flag_value="parquet", help="Write Parquet.")
-@click.option("--output", metavar="FILE", help="Default: RECORDING with the suffix of the format.")
+@click.option(
+    "--output",
+    metavar="FILE",
+    help="Default: RECORDING with the suffix of the format; with --stream .NAME before it.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 def export_command(
     *,
@@ -72,6 +81,7 @@ def export_command(
     poses: tuple[tuple[str, str], ...],
     rate: float | None,
     stamps: NDArray[np.int64] | None,
+    stream: str | None,
     kind: TableFormat | None,
     output: str | None,
     overwrite: bool,
@@ -86,11 +96,23 @@ def export_command(
     If drivers published some of the joints each, each of their samples is a row, with the positions of
     the other drivers interpolated, and without efforts. Parquet needs pyarrow: pip install 'zstate[export]'.
 
+    With --stream, columns are stamp [ns], robot, writer, and the fields of the messages, nested ones in
+    JSON; of ROBOT, by default of all robots. The package that brings the stream must be installed here.
+    The default format is then --csv.
+
     \b
     zstate export run.mcap --parquet                         # run.parquet
     zstate export run.mcap panda --csv --rate 50 --pose panda_link0 panda_hand
     zstate export run.mcap --parquet --stamps images.txt --output images.parquet
+    zstate export run.mcap --stream battery                  # run.battery.csv
     """
+    if stream is not None:
+        if poses or rate is not None or stamps is not None:
+            raise click.UsageError(
+                "--stream exports messages as recorded, without --pose, --rate and --stamps"
+            )
+        _export_stream(file, robot, stream, kind or "csv", output, overwrite=overwrite)
+        return
     if kind is None:
         raise click.UsageError("Missing option '--csv' or '--parquet'.")
     if rate is not None and stamps is not None:
@@ -110,6 +132,26 @@ def export_command(
         except RecordingError as error:
             fail(str(error).replace("overwrite=True", "--overwrite"))
     print_wrapped(summary(report, path, time.monotonic() - start))
+
+
+def _export_stream(
+    file: str, robot: str | None, stream: str, kind: TableFormat, output: str | None, *, overwrite: bool
+) -> None:
+    from zstate.errors import RecordingError
+    from zstate.recording.recording import Recording
+    from zstate.recording.stream_export import export_stream
+
+    path = Path(output) if output else Path(file).with_suffix(f".{stream}.{kind}")
+    with Recording(file, robot) as recording:
+        try:
+            rows, refused = export_stream(recording, stream, path, kind, overwrite=overwrite)
+        except RecordingError as error:
+            fail(str(error).replace("overwrite=True", "--overwrite"))
+    losses = ", ".join(f"{count_text(count, 'message')} left out ({why})" for why, count in refused.items())
+    where = f"{path} ({size_text(path.stat().st_size)})"
+    print_wrapped(
+        f"exported {count_text(rows, 'message')} of {stream} into {where}; {losses or 'nothing missing'}"
+    )
 
 
 class ExportProgress:

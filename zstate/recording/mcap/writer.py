@@ -20,9 +20,8 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, RecordingError
 from zstate.recording.mcap.file import IDENTITY, later_splits, split_path
-from zstate.recording.storage import CDR
+from zstate.recording.storage import ChannelType
 from zstate.wire.ros2.qos import Qos
-from zstate.wire.ros2.types import RosType
 
 LIBRARY = f"zstate {version('zstate')}"
 
@@ -41,20 +40,20 @@ _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 ChannelId = NewType("ChannelId", int)
 """A channel of a whole recording; its MCAP id may differ between files."""
-ChannelKey: TypeAlias = tuple[str, str, frozenset[tuple[str, str]]]
+ChannelKey: TypeAlias = tuple[str, str, str, frozenset[tuple[str, str]]]
 
 
 class ChannelDeclaration(NamedTuple):
     """A channel as every file of the recording declares it."""
 
     topic: str
-    type: RosType
+    type: ChannelType
     metadata: Mapping[str, str]
 
     @property
     def key(self) -> ChannelKey:
         """Hashable, and the same for equal channels."""
-        return self.topic, self.type.hash, frozenset(self.metadata.items())
+        return self.topic, self.type.name, self.type.definition, frozenset(self.metadata.items())
 
 
 class RecordedMessage(NamedTuple):
@@ -185,7 +184,7 @@ class SplitFile:
             if not overwrite:  # on a full disk, repeated starts must not leave many empty files
                 path.unlink()
             raise
-        self._schemas: dict[str, int] = {}
+        self._schemas: dict[tuple[str, str], int] = {}
         self._numbers: dict[ChannelKey, int] = {}
         self._number_of: dict[ChannelId, int] = {}
         # Bytes of the chunk in progress, without compression, and of all that precedes the first message.
@@ -211,10 +210,13 @@ class SplitFile:
         if key not in self._numbers:
             topic, kind, metadata = declaration
             writer = self.output.writer
-            if kind.name not in self._schemas:
+            schema = kind.name, kind.definition
+            if schema not in self._schemas:
                 text = kind.definition.encode()
-                self._schemas[kind.name] = writer.register_schema(kind.name, "ros2msg", text)
-            self._numbers[key] = writer.register_channel(topic, CDR, self._schemas[kind.name], dict(metadata))
+                self._schemas[schema] = writer.register_schema(kind.name, kind.schema_encoding, text)
+            self._numbers[key] = writer.register_channel(
+                topic, kind.encoding, self._schemas[schema], dict(metadata)
+            )
         self._number_of[channel] = self._numbers[key]
 
     def is_over(self, log_time: int, max_bytes: float, max_ns: float) -> bool:
@@ -259,7 +261,7 @@ class SplitFile:
 
 
 class RecordingWriter(Closeable):
-    """Writes CDR messages into ``path``, and into path_1, path_2 ... when it splits. Any thread may write.
+    """Writes messages into ``path``, and into path_1, path_2 ... when it splits. Any thread may write.
 
     A file ends once it has grown by ``max_bytes`` (the chunk in progress counted without compression, the
     index at its end not counted), its log times span ``max_seconds`` or it has 60,000 channels. The next file
@@ -319,10 +321,12 @@ class RecordingWriter(Closeable):
         return self._finished_bytes + self._split.output.size
 
     def channel(
-        self, topic: str, type: RosType, qos: Qos, metadata: Mapping[str, str] | None = None
+        self, topic: str, type: ChannelType, qos: Qos, metadata: Mapping[str, str] | None = None
     ) -> ChannelId:
-        """Declare a channel; an equal declaration returns the same id."""
-        facts = {"offered_qos_profiles": qos.to_rosbag_yaml(), "topic_type_hash": type.hash}
+        """Declare a channel; an equal declaration returns the same id. Only ROS has ``qos``."""
+        facts: dict[str, str] = {}
+        if type.hash:
+            facts = {"offered_qos_profiles": qos.to_rosbag_yaml(), "topic_type_hash": type.hash}
         declaration = ChannelDeclaration(topic, type, {**facts, **(metadata or {})})
         key = declaration.key
         with self._writing():

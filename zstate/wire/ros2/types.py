@@ -122,6 +122,9 @@ class RosType(NamedTuple):
     hash: str
     definition: str
 
+    encoding = "cdr"
+    schema_encoding = "ros2msg"
+
     @classmethod
     def from_fields(cls, short: str) -> RosType:
         """The type ``short`` (package/type), from its fields and those of the types within."""
