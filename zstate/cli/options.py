@@ -69,7 +69,7 @@ class StreamChoice(click.Choice[str]):
         super().__init__(())
 
     @property
-    def choices(self) -> Sequence[str]:
+    def choices(self) -> Sequence[str]:  # pyright: ignore  # click keeps them in a variable
         from zstate.plugins import streams_where
 
         return streams_where(self._condition)

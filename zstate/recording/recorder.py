@@ -1,4 +1,4 @@
-"""Records robot streams from the network into MCAP files that every ROS tool opens."""
+"""Records robot streams from the network into MCAP files, in the messages of ROS 2 where it has some."""
 
 from __future__ import annotations
 

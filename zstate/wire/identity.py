@@ -107,7 +107,7 @@ class Announcement:
         Writers of a named stream conflict if their names are equal; without a name they never do. A writer of
         all joints conflicts with each writer of some of them.
         """
-        if self.robot == other.robot and {self.stream, other.stream} == JOINT_STREAMS:
+        if self.robot == other.robot and frozenset((self.stream, other.stream)) == JOINT_STREAMS:
             return self.writer.session != other.writer.session
         same = (self.robot, self.stream, self.name) == (other.robot, other.stream, other.name)
         is_exclusive = not is_named(self.stream) or bool(self.name)
