@@ -982,8 +982,7 @@ def test_a_release_while_the_loop_is_off_lets_its_commander_move_the_robot(sessi
             assert host.report().refused.get("stopped")
         arm.release()
         with repeated(lambda: arm.send({"elbow": 0.1})):
-            host.run(seconds=0.3)
-        assert driver.written().size
+            until(lambda: (host.run(seconds=0.1), driver.written().size)[1])
 
 
 # Ends of the program

@@ -263,7 +263,7 @@ HOST = """
     from zstate import connect, load_model
     from zstate.driving import DriverHost, SimulatedDriver
     model = load_model("rrbot")
-    with connect() as session, DriverHost(session, SimulatedDriver(model), model, "arm", ttl_s=0.1) as host:
+    with connect() as session, DriverHost(session, SimulatedDriver(model), model, "arm", ttl_s=10.0) as host:
         print("open", flush=True)
         host.run()
 """

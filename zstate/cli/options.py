@@ -69,7 +69,9 @@ class StreamChoice(click.Choice[str]):
         super().__init__(())
 
     @property
-    def choices(self) -> Sequence[str]:  # pyright: ignore  # click keeps them in a variable
+    def choices(  # pyright: ignore[reportIncompatibleVariableOverride]  # a variable of click's
+        self,
+    ) -> Sequence[str]:
         from zstate.plugins import streams_where
 
         return streams_where(self._condition)

@@ -169,6 +169,8 @@ def test_invalid_numbers_are_wrong_usage(option: str, value: str):
 
 def test_a_bare_name_of_two_robots_lists_both():
     with published_robot("r1"), published_robot("r2"):
+        # With the first of them alone the name is clear.
+        until(lambda: run_cli("tf", "world", "tool", "--once").code)
         message = failure("tf", "world", "tool", "--once", "--timeout", "5")
         named = run_cli("tf", "r1/world", "r1/tool", "--once")
     assert "'r1/world'" in message
