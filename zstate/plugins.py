@@ -1,4 +1,4 @@
-"""Plugins: what a folder, or a package of somebody else, adds to zstate; and all streams, by name.
+"""Plugins: what a folder, or another package, adds to zstate; and all streams, by name.
 
 The plugins of zstate are a table of strings, imported on use. Other packages have an entry point::
 
@@ -105,7 +105,7 @@ def _loaded(entry: EntryPoint) -> FoundPlugin:
     nothing = FoundPlugin(entry.name, _distribution(entry), version, Plugin(entry.name))
     try:
         plugin = entry.load()
-    except (Exception, SystemExit) as error:  # whatever somebody else's module does when it is imported
+    except (Exception, SystemExit) as error:  # whatever another package's module does when it is imported
         text = printable(f"{type(error).__name__}: {error}")
         return nothing._replace(problem=f"{where} cannot be imported: {text}; all else works without it")
     if not isinstance(plugin, Plugin):
@@ -123,7 +123,7 @@ def _is_usable(row: Stream, one: FoundPlugin, problems: list[str]) -> bool:
         try:
             if not issubclass(row.type, StampedMessage):
                 reason = f"its messages are not StampedMessages, but of type {row.type.__name__}"
-        except Exception as error:  # whatever somebody else's module does when it is imported
+        except Exception as error:  # whatever another package's module does when it is imported
             reason = printable(
                 f"its message {row.message!r} cannot be loaded: {type(error).__name__}: {error}"
             )
@@ -134,12 +134,13 @@ def _is_usable(row: Stream, one: FoundPlugin, problems: list[str]) -> bool:
 
 def _is_free(name: str, kind: str, one: FoundPlugin, taken: dict[str, str], problems: list[str]) -> bool:
     """Whether no other brings ``name``; from now on ``one`` does. Otherwise ``problems`` gets both."""
-    owner = taken.setdefault(name, one.distribution)
-    if owner is not one.distribution:
-        problems.append(
-            f"the {kind} {name!r} of {one.distribution} is not used: {owner} brings one of that name"
-        )
-    return owner is one.distribution
+    owner = taken.get(name)
+    if owner is None:
+        taken[name] = one.distribution
+    else:
+        text = f"the {kind} {name!r} of {one.distribution} is not used: {owner} brings one of that name"
+        problems.append(text)
+    return owner is None
 
 
 def _distribution(entry: EntryPoint) -> str:

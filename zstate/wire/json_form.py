@@ -107,7 +107,7 @@ class JsonDecoder:
 def _class_of(row: Stream) -> type[StampedMessage]:
     try:
         kind = row.type
-    except Exception as error:  # whatever somebody else's module does when it is imported
+    except Exception as error:  # whatever another package's module does when it is imported
         raise _no_form(row, error) from None
     if not issubclass(kind, StampedMessage):
         raise _no_form(row, TypeError(f"{kind.__name__} is no StampedMessage"))

@@ -36,7 +36,7 @@ def load_other_command(name: str) -> click.Command | None:
             module, _, attribute = place.partition(":")
             try:
                 command = getattr(import_module(module), attribute)
-            except Exception as error:  # whatever somebody else's module does when it is imported
+            except Exception as error:  # whatever another package's module does when it is imported
                 problem = f"cannot be loaded: {type(error).__name__}: {error}"
                 fail(f"the command {name!r} of {one.distribution} ({place}) {problem}")
             if not isinstance(command, click.Command):

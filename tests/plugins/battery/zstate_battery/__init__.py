@@ -1,4 +1,4 @@
-"""A package of somebody else, which adds a stream and a command to zstate."""
+"""A package that adds a stream and a command to zstate."""
 
 from zstate.plugins import Plugin
 from zstate.streams import StampedMessage, Stream
