@@ -59,8 +59,15 @@ class FoundPlugin(NamedTuple):
 
 @cache
 def built_in_plugins() -> tuple[Plugin, ...]:
-    """The plugins of zstate itself that bring streams."""
-    return tuple(import_module(f"zstate.{folder}.plugin").PLUGIN for folder in _BUILT_IN)
+    """The plugins of zstate itself that bring streams, without those whose folder is removed."""
+    found: list[Plugin] = []
+    for folder in _BUILT_IN:
+        try:
+            found.append(import_module(f"zstate.{folder}.plugin").PLUGIN)
+        except ModuleNotFoundError as error:
+            if error.name not in (f"zstate.{folder}", f"zstate.{folder}.plugin"):
+                raise
+    return tuple(found)
 
 
 @cache

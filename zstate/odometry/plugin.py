@@ -4,7 +4,6 @@ from zstate.plugins import Plugin
 from zstate.streams import Stream
 
 _MESSAGES = "zstate.wire.messages"
-_DOCUMENTS = "zstate.cli.output.joint_state_text"
 
 IMU = Stream(
     "imu",
@@ -12,7 +11,7 @@ IMU = Stream(
     summary="angular velocity and acceleration of a sensor",
     named=True,
     start="start the program of the sensor, with its zstate.odometry.ImuPublisher",
-    document=f"{_DOCUMENTS}:imu_document",
+    document="zstate.odometry.documents:imu_document",
 )
 VELOCITY = Stream(
     "velocity",
@@ -20,7 +19,7 @@ VELOCITY = Stream(
     summary="measured velocity of a frame",
     named=True,
     start="start the program of the sensor, with its zstate.odometry.VelocityPublisher",
-    document=f"{_DOCUMENTS}:velocity_document",
+    document="zstate.odometry.documents:velocity_document",
 )
 POSE = Stream(
     "pose",
@@ -28,7 +27,7 @@ POSE = Stream(
     summary="measured pose of a frame",
     named=True,
     start="start the program of the sensor, with its zstate.odometry.PosePublisher",
-    document=f"{_DOCUMENTS}:pose_document",
+    document="zstate.odometry.documents:pose_document",
 )
 ODOMETRY = Stream(
     "odometry",
@@ -37,7 +36,7 @@ ODOMETRY = Stream(
     group="edges",
     named=True,
     start="start one: `zstate odometry {robot} --imu SENSOR`",
-    document=f"{_DOCUMENTS}:odometry_document",
+    document="zstate.odometry.documents:odometry_document",
 )
 
 PLUGIN = Plugin("odometry", streams=(IMU, VELOCITY, POSE, ODOMETRY))

@@ -22,7 +22,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,8 +55,6 @@ from zstate.recording.info import RecordingInfo, read_info
 from zstate.recording.joint_parts import MergedJointStateReader, RecordedJoints, has_parts
 from zstate.recording.joint_states import DELAYED_NS, JointStateReader
 from zstate.recording.reader import RecordingReader
-from zstate.scans.grid import Grid, grid_from_message
-from zstate.scans.scan import Scan, scan_from_message
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.json_form import carried_as_json, json_streams
 from zstate.wire.keys import MODEL_WRITER, full_name
@@ -80,6 +78,10 @@ from zstate.wire.messages import (
     poses_from_block,
     with_full_names,
 )
+
+if TYPE_CHECKING:
+    from zstate.scans.grid import Grid
+    from zstate.scans.scan import Scan
 
 # A buffer that keeps a whole recording: 28 years, on any clock.
 HISTORY_S = 9e8
@@ -229,6 +231,8 @@ class Recording(Closeable):
         ``buffer()``: ``Recording.place`` reads the file in each call. Messages that are no scan are left
         out; the first of each reason is logged. Raises InvalidInput for a robot that is not in the recording.
         """
+        from zstate.scans.scan import scan_from_message  # noqa: PLC0415 - scans are a plugin
+
         refusals = Refusals("recorded scans")
         for writer, message, _ in self._messages(robot, "scan", refusals):
             if isinstance(message, LaserScan) and sensor in (None, writer.edge_writer):
@@ -282,6 +286,8 @@ class Recording(Closeable):
         left out; the first of each reason is logged. Raises InvalidInput for a robot that is not in the
         recording.
         """
+        from zstate.scans.grid import grid_from_message  # noqa: PLC0415 - scans are a plugin
+
         refusals = Refusals("recorded maps")
         latched = LatchedState()
         for decoded in self._messages(robot, "map", refusals):

@@ -4,7 +4,6 @@ from zstate.plugins import Plugin
 from zstate.streams import LATCHED_BYTES, Stream
 
 _MESSAGES = "zstate.wire.messages"
-_DOCUMENTS = "zstate.cli.output.joint_state_text"
 _SCAN_BYTES = 810_000
 """A scan of the most rays, with intensities, takes less on each wire."""
 
@@ -15,7 +14,7 @@ SCAN = Stream(
     named=True,
     max_bytes=_SCAN_BYTES,
     start="start one: `zstate scan {robot} --frame FRAME --dummy`",
-    document=f"{_DOCUMENTS}:scan_document",
+    document="zstate.scans.documents:scan_document",
 )
 MAP = Stream(
     "map",
@@ -25,7 +24,7 @@ MAP = Stream(
     latched=True,
     max_bytes=LATCHED_BYTES,
     start="start one: `zstate map FILE.yaml --name {robot}`",
-    document=f"{_DOCUMENTS}:map_document",
+    document="zstate.scans.documents:map_document",
 )
 
 PLUGIN = Plugin("scans", streams=(SCAN, MAP))

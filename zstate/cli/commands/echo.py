@@ -92,7 +92,6 @@ def echo_command(
         ChangeFilter,
         CsvFormatter,
         DescribedJointStates,
-        scan_document,
         select_field,
         yaml_text,
     )
@@ -129,6 +128,8 @@ def echo_command(
         if row.type is JointState:
             document = opened.enter_context(DescribedJointStates(session, selected, wire)).document
         elif row.type is LaserScan and (form or field) is not None:
+            from zstate.scans.documents import scan_document
+
             document = partial(scan_document, robot=selected, has_ranges=True)
         else:
             document = partial(row.to_document, robot=selected)

@@ -1,4 +1,4 @@
-"""Joint states, transforms, scans and maps as documents, and documents as YAML, CSV or a single field."""
+"""Joint states and transforms as documents, and documents as YAML, CSV or a single field."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from math import isnan
 from threading import Event
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-import numpy as np
-
 from zstate._util.closeable import Closeable
 from zstate._util.format import did_you_mean
 from zstate.cli.output.console import print_status
@@ -20,21 +18,10 @@ from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.urdf import parse_urdf
 from zstate.net.subscription import Received, subscribe
-from zstate.scans.grid import grid_from_message
-from zstate.scans.map_files import SAVED_FREE, SAVED_OCCUPIED
-from zstate.scans.scan import scan_from_message
-from zstate.wire.keys import full_name
 from zstate.wire.messages import (
-    Imu,
     JointState,
-    LaserScan,
-    OccupancyGrid,
-    Odometry,
-    Pose,
     RobotDescription,
     TransformSample,
-    Velocity,
-    covariance_matrix,
     from_block,
     order_digest,
     poses_from_block,
@@ -161,123 +148,6 @@ def transforms_document(sample: TransformSample, robot: str) -> Document:
         for (parent, child), pose in edges
     }
     return {"stamp": sample.stamp, "seq": sample.seq, "transforms": transforms}
-
-
-def scan_document(message: LaserScan, robot: str, *, has_ranges: bool = False) -> dict[str, Any]:
-    """A scan of ``robot`` as a document: stamp [ns], angles [rad], limits [m], and what it measured.
-
-    ``has_ranges`` adds the range of each ray [m], NaN if it is no measurement.
-    """
-    scan = scan_from_message(message, robot)
-    ranges = np.where(scan.valid, scan.ranges.astype(float), np.nan)
-    measured = ranges[scan.valid]
-    document: dict[str, Any] = {
-        "stamp": scan.stamp,
-        "seq": message.seq,
-        "frame": scan.frame,
-        "angle_min": scan.angle_min,
-        "angle_increment": scan.angle_increment,
-        "ray_ns": scan.ray_ns,
-        "range_min": scan.range_min,
-        "range_max": scan.range_max,
-        "rays": len(ranges),
-        "valid": len(measured),
-        "nearest": measured.min().item() if measured.size else np.nan,
-        "farthest": measured.max().item() if measured.size else np.nan,
-    }
-    return {**document, "ranges": ranges.tolist()} if has_ranges else document
-
-
-def imu_document(message: Imu, robot: str) -> dict[str, Any]:
-    """A reading of an IMU of ``robot``: stamp [ns], gyro [rad/s], accel [m/s^2], and sigmas if known."""
-    document = _head(message, robot)
-    document |= {"gyro": _list(message.gyro), "accel": _list(message.accel)}
-    if message.orientation is not None:
-        document["orientation"] = _list(message.orientation)
-    triangles = message.gyro_covariance, message.accel_covariance, message.orientation_covariance
-    return document | _sigmas(zip(("gyro", "accel", "orientation"), triangles, strict=True))
-
-
-def velocity_document(message: Velocity, robot: str) -> dict[str, Any]:
-    """A velocity of a frame of ``robot``: stamp [ns], linear [m/s], angular [rad/s], and sigmas if known."""
-    document = {**_head(message, robot), "linear": _list(message.linear)}
-    if message.angular is not None:
-        document["angular"] = _list(message.angular)
-    return document | _sigmas([("velocity", message.covariance)])
-
-
-def pose_document(message: Pose, robot: str) -> dict[str, Any]:
-    """A measured pose of ``robot``: stamp [ns], frames, pose [m], and sigmas [m, rad] if known.
-
-    Without a child it is that of the robot's base.
-    """
-    pose = _list(message.pose)
-    document: dict[str, Any] = {"stamp": message.stamp, "seq": message.seq}
-    document["parent"] = full_name(robot, message.parent)
-    if message.child:
-        document["child"] = full_name(robot, message.child)
-    document |= {"translation": pose[:3], "rotation": pose[3:]}
-    return document | _sigmas([("pose", message.covariance)])
-
-
-def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
-    """Odometry of ``robot``: stamp [ns], frames, pose [m], velocities [m/s, rad/s], and sigmas if known."""
-    ((parent, child),) = message.edges or (("", ""),)
-    pose, twist = _list(message.poses), _list(message.twist)
-    document = {
-        "stamp": message.stamp,
-        "seq": message.seq,
-        "parent": full_name(robot, parent),
-        "child": full_name(robot, child),
-        "translation": pose[:3],
-        "rotation": pose[3:],
-        "linear": twist[:3],
-        "angular": twist[3:],
-    }
-    return document | _sigmas([("pose", message.covariances), ("twist", message.twist_covariance)])
-
-
-def _head(message: Imu | Velocity, robot: str) -> dict[str, Any]:
-    return {"stamp": message.stamp, "seq": message.seq, "frame": full_name(robot, message.frame)}
-
-
-def _list(block: bytes) -> list[float]:
-    return from_block(block).tolist()
-
-
-def _sigmas(covariances: Iterable[tuple[str, bytes | None]]) -> dict[str, list[float]]:
-    """The standard deviations of each known covariance, in the units of its numbers."""
-    return {
-        f"{name}_sigma": np.sqrt(np.diag(covariance_matrix(triangle))).tolist()
-        for name, triangle in covariances
-        if triangle is not None
-    }
-
-
-def map_document(message: OccupancyGrid, robot: str) -> dict[str, Any]:
-    """A map of ``robot`` as a document: stamp [ns], geometry [m] and counts of cells.
-
-    As in files of map_saver, cells from 65 are occupied, those from 0 to 25 free, all others unknown.
-    """
-    grid = grid_from_message(message, robot)
-    height, width = grid.cells.shape
-    occupied = int(np.count_nonzero(grid.cells >= SAVED_OCCUPIED))
-    free = int(np.count_nonzero((grid.cells >= 0) & (grid.cells <= SAVED_FREE)))
-    return {
-        "stamp": grid.stamp,
-        "frame": grid.frame,
-        "resolution": grid.resolution,
-        "width": width,
-        "height": height,
-        "size": list(grid.size),
-        "origin": {
-            "translation": grid.origin.translation.tolist(),
-            "rotation": grid.origin.rotation.tolist(),
-        },
-        "occupied": occupied,
-        "free": free,
-        "unknown": grid.cells.size - occupied - free,
-    }
 
 
 def yaml_text(value: Any, indent: str = "") -> str:
