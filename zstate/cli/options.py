@@ -69,15 +69,13 @@ class StreamChoice(click.Choice[str]):
         super().__init__(())
 
     @property
-    def choices(  # pyright: ignore[reportIncompatibleVariableOverride]  # a variable of click's
-        self,
-    ) -> Sequence[str]:
+    def choices(self) -> Sequence[str]:
         from zstate.plugins import streams_where
 
         return streams_where(self._condition)
 
     @choices.setter
-    def choices(self, _: object) -> None:
+    def choices(self, _: object) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """click sets those that it is created with."""
 
 
