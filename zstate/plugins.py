@@ -200,6 +200,11 @@ def stream_named(name: StreamName) -> Stream:
     return found
 
 
+def own_streams() -> tuple[Stream, ...]:
+    """The rows that zstate itself brings, in the order of liveliness tokens."""
+    return tuple(_REGISTRY.built_in().values())
+
+
 def all_streams() -> tuple[Stream, ...]:
     """All rows, those of other packages as well, in the order of liveliness tokens."""
     return tuple(_REGISTRY.all().values())
@@ -213,7 +218,7 @@ def streams_where(condition: Callable[[Stream], bool]) -> tuple[StreamName, ...]
 @cache
 def edge_streams() -> tuple[StreamName, ...]:
     """The streams of moving edges under the names of their writers."""
-    return tuple(row.name for row in _REGISTRY.built_in().values() if row.group == "edges")
+    return tuple(row.name for row in own_streams() if row.group == "edges")
 
 
 @cache

@@ -73,6 +73,8 @@ class Stream:
     - ``start``: how to start a writer, for the tools that miss one; ``{robot}`` in it is the robot's name.
     - ``document``: ``"module:function"`` that makes a dict of a message and the name of its robot, as `zstate
       echo` prints it; by default of all fields.
+    - ``ros``: ``"module:name"`` of how ROS 2 carries it (zstate.wire.ros2.streams.RosStream); empty if it
+      does not.
 
     Raises InvalidInput for a name that is none.
     """
@@ -88,6 +90,7 @@ class Stream:
     version: int = 1
     start: str = ""
     document: str = ""
+    ros: str = ""
 
     def __post_init__(self) -> None:
         text = self.name
@@ -106,6 +109,11 @@ class Stream:
         if not isinstance(self.message, str):
             return self.message
         return _loaded(self.message)
+
+    @cached_property
+    def ros_form(self) -> Any:
+        """How ROS 2 carries it."""
+        return _loaded(self.ros)
 
     @property
     def is_measured(self) -> bool:
@@ -142,6 +150,7 @@ CORE = (
         "zstate.wire.messages:JointState",
         summary="positions, velocities and efforts of all joints",
         group="joints",
+        ros="zstate.wire.ros2.streams:JOINT_STATES",
         max_bytes=SAMPLE_BYTES,
     ),
     Stream(
@@ -157,6 +166,7 @@ CORE = (
         "zstate.wire.messages:TransformSample",
         summary="poses of all joints of a model",
         group="model",
+        ros="zstate.wire.ros2.streams:TF",
         max_bytes=SAMPLE_BYTES,
     ),
     Stream(
@@ -175,6 +185,7 @@ CORE = (
         named=True,
         group="model",
         latched=True,
+        ros="zstate.wire.ros2.streams:TF_STATIC",
         max_bytes=MEGABYTE,
     ),
     Stream(
@@ -183,6 +194,7 @@ CORE = (
         summary="the URDF, and the order of joints and edges",
         group="model",
         latched=True,
+        ros="zstate.wire.ros2.streams:ROBOT_DESCRIPTION",
         max_bytes=LATCHED_BYTES,
     ),
 )
@@ -192,6 +204,7 @@ CLOCK = Stream(
     summary="the simulated time",
     group="time",
     named=False,
+    ros="zstate.wire.ros2.streams:SIMULATED_TIME",
     max_bytes=KILOBYTE,
 )
 

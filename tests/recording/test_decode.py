@@ -41,7 +41,7 @@ from zstate.wire.messages import (
 )
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.qos import STREAM_QOS
+from zstate.wire.ros2.streams import ros_stream
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import JOINT_STATE, LASER_SCAN, OCCUPANCY_GRID
 
@@ -158,7 +158,7 @@ def test_messages_that_are_no_scan_or_map_are_counted_and_the_others_read(tmp_pa
             ("/floor", grid(session=0), OCCUPANCY_GRID),
         ):
             payload = RosStreamEncoder(FrameNames(Ros2Options(), "ros"), SampleLayout()).encode(message)
-            channel = builder.writer.channel(topic, kind, STREAM_QOS["scan"])
+            channel = builder.writer.channel(topic, kind, ros_stream("scan").qos)
             # A grid ends with the number of its cells, 4 bytes, and its two cells.
             lies = payload[:-6] + (2**31).to_bytes(4, "little") + payload[-2:]
             for bad in (payload[: len(payload) // 2], payload[:-1], b"", lies, payload):
@@ -245,7 +245,7 @@ def test_undecodable_messages_are_reported_and_skipped(tmp_path: Path):
         builder.describe("arm")
         builder.joints("arm", START, swing_positions(0))
         facts = {"zstate.robot": "arm", "zstate.session": "1"}
-        joints = builder.writer.channel("/joint_states", JOINT_STATE, STREAM_QOS["joint_states"], facts)
+        joints = builder.writer.channel("/joint_states", JOINT_STATE, ros_stream("joint_states").qos, facts)
         builder.writer.write(joints, b"\0\1\0\0" + bytes(4), START + MS, START + MS)
         builder.joints("arm", START + 2 * MS, swing_positions(1))
     read = DecodedFile(tmp_path / "r.mcap")

@@ -34,7 +34,8 @@ from zstate.wire.messages import (
 )
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.topics import NAMED_TOPICS, SHARED, TYPES, FrameNames, robot_from_topic
+from zstate.wire.ros2.streams import has_named_topics, ros_streams
+from zstate.wire.ros2.topics import SHARED, FrameNames, robot_from_topic
 
 _TOPICS: tuple[StreamName, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
 STREAMS: tuple[StreamName, ...] = (*_TOPICS, *TOPICS)
@@ -92,9 +93,9 @@ class RecordedWriter:
             if foreign or not carried_as_json(stream):
                 return None
         elif child_frame(channel) is None:
-            for stream, kind in TYPES.items():
-                is_named = name == stream or stream in NAMED_TOPICS
-                if is_named and channel.type_name == kind.name:
+            for stream, carried in ros_streams().items():
+                is_named = name == stream or carried.is_named
+                if is_named and channel.type_name == carried.type.name:
                     break
             else:
                 of_driver = None if foreign else driver_stream(channel.topic, channel.type_name)
@@ -113,7 +114,7 @@ class RecordedWriter:
             robot="" if stream == "clock" else robot,
             stream=stream,
             session=int.from_bytes(digest, "little") if foreign else int(facts[_SESSION]),
-            edge_writer=facts.get(EDGE_WRITER, name if stream in NAMED_TOPICS else None),
+            edge_writer=facts.get(EDGE_WRITER, name if has_named_topics(stream) else None),
             program=facts.get("zstate.program"),
             foreign=foreign,
         )

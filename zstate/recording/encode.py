@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
+from functools import cache
 from types import MappingProxyType
 from typing import Protocol
 
@@ -17,7 +18,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.robot import coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import stream_named
+from zstate.plugins import own_streams, stream_named
 from zstate.recording.covariances import (
     CHILD_FRAME,
     EdgeCovariance,
@@ -40,15 +41,11 @@ from zstate.wire.joint_order import SampleLayout
 from zstate.wire.json_form import carried_as_json, encode_json, json_type
 from zstate.wire.messages import (
     POSE_BYTES,
-    ClockMessage,
     DriverState,
-    Imu,
     JointCommand,
     JointState,
-    LaserScan,
     Message,
     OccupancyGrid,
-    Odometry,
     Pose,
     RobotDescription,
     Sample,
@@ -56,16 +53,15 @@ from zstate.wire.messages import (
     StaticTransforms,
     Stop,
     TransformSample,
-    Velocity,
-    WriterTransforms,
     order_digest,
     to_block,
 )
 from zstate.wire.ros2.cdr import to_time
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.qos import STREAM_QOS, Qos
-from zstate.wire.ros2.topics import SHARED, FrameNames, RmwKeys, ros_type
+from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.streams import ros_stream
+from zstate.wire.ros2.topics import SHARED, FrameNames, RmwKeys
 from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 
 MAX_LATCHED = 256
@@ -85,30 +81,6 @@ CHANNEL_BURST = 1000
 CHANNELS_PER_S = 10.0
 """Rate at which a robot opens channels, per second of log time, after the first ``CHANNEL_BURST``."""
 
-_STREAMS: dict[type[Message], StreamName] = {
-    JointState: "joint_states",
-    TransformSample: "tf",
-    StaticTransforms: "tf_static",
-    RobotDescription: "robot_description",
-    JointCommand: "joint_commands",
-    DriverState: "driver",
-    Stop: "stop",
-    LaserScan: "scan",
-    Imu: "imu",
-    Velocity: "velocity",
-    Pose: "pose",
-    Odometry: "odometry",
-    OccupancyGrid: "map",
-    ClockMessage: "clock",
-}
-_NAMED_STREAMS: dict[type[Message], StreamName] = {
-    **_STREAMS,
-    JointState: "partial_joint_states",
-    TransformSample: "transforms",
-    WriterTransforms: "transforms",
-}
-"""The streams of messages that have the name of a writer."""
-
 TOPICS: dict[StreamName, StreamName] = {"transforms": "tf", "partial_joint_states": "joint_states"}
 """The streams after which the topics of others are named: ROS has no topics of single writers."""
 
@@ -119,6 +91,15 @@ NO_MAP = OccupancyGrid(0, 1, "map", 1.0, 0, 0, to_block([0.0, 0.0, 0.0, 0.0, 0.0
 """Recorded when a map is withdrawn."""
 
 _NAMED = SampleLayout()
+
+
+@cache
+def _stream_of(kind: type[Message], *, has_name: bool = False) -> StreamName:
+    """The stream of messages of type ``kind``; ``has_name`` if their writer has a name, as some on /tf."""
+    if has_name and kind is TransformSample:
+        return "transforms"
+    rows = [row for row in own_streams() if row.type is kind]
+    return next((row.name for row in rows if row.named and has_name), rows[0].name)
 
 
 class MessageOutput(Protocol):
@@ -286,7 +267,7 @@ class RecordingEncoder:
         if sample_names is None:
             self._pending.append(robot, message, log_time)
             return
-        stream = (_NAMED_STREAMS if edge_writer else _STREAMS)[type(message)]
+        stream = _stream_of(type(message), has_name=bool(edge_writer))
         if stream == "transforms":
             assert isinstance(message, TransformSample)
             edges = sample_names.moving_edges if message.edges is None else message.edges
@@ -324,7 +305,7 @@ class RecordingEncoder:
             program = program_of(message, edge_writer)
             payload = encode_status(message, robot, program)
             seq = message.seq if isinstance(message, Stop) else 0
-        stream = _STREAMS[type(message)]
+        stream = _stream_of(type(message))
         channel = self._channel(robot, stream, message.session, log_time, program=program)
         self._writer.write(channel.number, payload, log_time, max(message.stamp, 0), sequence=seq)
         self._counts[robot, stream] += 1
@@ -363,7 +344,7 @@ class RecordingEncoder:
         log_time: int,
         edge_writer: str = "",
     ) -> None:
-        stream = _STREAMS[type(message)]
+        stream = _stream_of(type(message))
         key = _latched_key(robot, stream, edge_writer)
         with self._lock:
             latched = self._latched.setdefault(robot, {})
@@ -465,7 +446,7 @@ class RecordingEncoder:
             return f"/{'/'.join(tokens)}", json_type(stream_named(stream)), Qos()
         carrier = TOPICS.get(stream, stream)
         topic = RmwKeys(options).topic(robot, carrier, ros_name(writer_name))
-        return topic, ros_type(carrier), STREAM_QOS[carrier]
+        return topic, *ros_stream(carrier)[:2]
 
     def _options(self, robot: str) -> Ros2Options:
         """The namespace and the frame prefix of a robot. Raises InvalidInput for an invalid name."""

@@ -26,7 +26,7 @@ from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.plugins import is_latched, is_named, latched_streams, measured_streams
+from zstate.plugins import edge_streams, is_latched, is_named, latched_streams, measured_streams
 from zstate.rate import Rate
 from zstate.recording.driver_messages import DRIVER_TYPES
 from zstate.recording.encode import RecordingEncoder
@@ -191,14 +191,7 @@ def recorded_streams(wire: Wire) -> tuple[StreamName, ...]:
     named = wire.partial_joint_states, wire.transforms
     latched = latched_streams()
     driving = tuple(DRIVER_TYPES) if wire.name == "native" else ()
-    samples: tuple[StreamName, ...] = (
-        "joint_states",
-        "tf",
-        *named,
-        *measured_streams(),
-        "odometry",
-        *driving,
-    )
+    samples = ("joint_states", "tf", *named, *measured_streams(), *edge_streams(), *driving)
     return tuple(dict.fromkeys(stream for stream in (*latched, *samples) if wire.carries(stream)))
 
 

@@ -19,7 +19,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.plugins import is_measured, measured_streams
 from zstate.streams import Stream, StreamName
 from zstate.wire.messages import Message, StampedMessage
-from zstate.wire.ros2.topics import TYPES
+from zstate.wire.ros2.streams import ros_streams
 
 _ENCODER = msgspec.json.Encoder()
 _NOT_FINITE = (b'"NaN"', b'Infinity"')
@@ -28,12 +28,12 @@ _SCALARS = ("boolean", "integer", "number", "string")
 
 def carried_as_json(stream: StreamName) -> bool:
     """Whether messages of ``stream`` are recorded and displayed in JSON: measurements without a ROS type."""
-    return stream not in TYPES and is_measured(stream)
+    return stream not in ros_streams() and is_measured(stream)
 
 
 def json_streams() -> tuple[StreamName, ...]:
     """The streams of ``carried_as_json``."""
-    return tuple(name for name in measured_streams() if name not in TYPES)
+    return tuple(name for name in measured_streams() if name not in ros_streams())
 
 
 class JsonType(NamedTuple):

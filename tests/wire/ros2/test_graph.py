@@ -13,7 +13,8 @@ from zstate.wire.ros2.graph import (
     parse_dds_token,
     parse_token,
 )
-from zstate.wire.ros2.qos import STREAM_QOS, Qos
+from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.streams import ros_stream, ros_streams
 
 ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
 JOINT_STATE_HASH = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
@@ -25,7 +26,7 @@ PUBLISHER = EndpointToken(
     topic="/fleet/r1/joint_states",
     dds_type="sensor_msgs::msg::dds_::JointState_",
     hash=JOINT_STATE_HASH,
-    qos=STREAM_QOS["joint_states"],
+    qos=ros_stream("joint_states").qos,
 )
 PUBLISHER_KEY = (
     f"@ros2_lv/5/{ZID}/0/10/MP/%/%fleet%r1/zstate/%fleet%r1%joint_states/"
@@ -35,7 +36,8 @@ PUBLISHER_KEY = (
 WORDS = st.text("abcXYZ_019", min_size=1, max_size=10)
 PATHS = st.lists(WORDS, max_size=3).map(lambda tokens: "/" + "/".join(tokens))
 NUMBERS = st.integers(0, 10**9)
-QOS = st.sampled_from([*STREAM_QOS.values(), Qos("best_effort", depth=5), Qos(history="keep_all", depth=0)])
+OFFERED = [one.qos for one in ros_streams().values()]
+QOS = st.sampled_from([*OFFERED, Qos("best_effort", depth=5), Qos(history="keep_all", depth=0)])
 NODES = st.builds(NodeToken, NUMBERS, WORDS, NUMBERS, PATHS, PATHS, WORDS)
 ENDPOINTS = st.builds(
     EndpointToken, NODES, NUMBERS, st.sampled_from(["MP", "MS", "SS", "SC"]), PATHS, WORDS, WORDS, QOS
@@ -104,13 +106,13 @@ def test_one_expression_matches_the_graph_of_a_domain():
 
 def test_bridge_token_has_topic_type_and_qos():
     token = DdsToken(
-        ZID, "MP", "r1/tf_static", "tf2_msgs/msg/TFMessage", STREAM_QOS["tf_static"], "RIHS01_e3"
+        ZID, "MP", "r1/tf_static", "tf2_msgs/msg/TFMessage", ros_stream("tf_static").qos, "RIHS01_e3"
     )
     start = f"@/{ZID}/@ros2_lv/MP/r1§tf_static/tf2_msgs§msg§TFMessage/:1:1:0,1"
     assert token.key == f"{start}:typehash=RIHS01_e3;"
     assert parse_dds_token(token.key) == token
     assert parse_dds_token(start) == DdsToken(
-        ZID, "MP", "r1/tf_static", "tf2_msgs/msg/TFMessage", STREAM_QOS["tf_static"]
+        ZID, "MP", "r1/tf_static", "tf2_msgs/msg/TFMessage", ros_stream("tf_static").qos
     )
 
 

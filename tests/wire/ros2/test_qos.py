@@ -10,7 +10,10 @@ from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReli
 from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.ros2.qos import STREAM_QOS, Qos
+from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.streams import ros_streams
+
+STREAM_QOS = {stream: one.qos for stream, one in ros_streams().items()}
 
 DEPTHS = st.integers(1, 2**31 - 1)
 KEPT = st.one_of(

@@ -2,7 +2,8 @@ import pytest
 
 from zstate.errors import InvalidInput
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, ros_type, topic_stream
+from zstate.wire.ros2.streams import ros_type, topic_stream
+from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys
 from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID, TF_MESSAGE
 
 STREAMS = ("joint_states", "robot_description", "tf", "tf_static", "clock")

@@ -216,7 +216,8 @@ def _robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> l
 
 def _ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
     """Nodes, then topics with their publishers and subscribers; a hint if there are none."""
-    from zstate.wire.ros2.topics import HUMBLE_HASH, ros_type
+    from zstate.wire.ros2.streams import ros_type
+    from zstate.wire.ros2.topics import HUMBLE_HASH
 
     if not graph.nodes and not graph.topics:
         if wire.name == "ros2dds":
@@ -257,7 +258,7 @@ def _namespaces_hint(graph: RosGraph, wire: Ros2Wire) -> str:
 
 
 def _ros_graph_facts(graph: RosGraph, wire: Ros2Wire) -> dict[str, Any]:
-    from zstate.wire.ros2.topics import ros_type
+    from zstate.wire.ros2.streams import ros_type
 
     def ends_facts(ends: Sequence[RosEndpoint]) -> list[dict[str, Any]]:
         return [

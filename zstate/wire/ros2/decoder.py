@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from hashlib import blake2b
 from math import isfinite
 from typing import NamedTuple
@@ -17,18 +17,15 @@ from zstate.streams import StreamName
 from zstate.wire.messages import (
     ClockMessage,
     Edges,
-    Imu,
     JointState,
     JointTrajectory,
     LaserScan,
     Message,
     OccupancyGrid,
-    Odometry,
-    Pose,
     RobotDescription,
+    StampedMessage,
     StaticTransforms,
     TransformSample,
-    Velocity,
     from_block,
     order_digest,
     poses_from_block,
@@ -43,7 +40,8 @@ from zstate.wire.ros2.cdr import (
     decode_string,
     unpack_stamps,
 )
-from zstate.wire.ros2.odometry import decode_imu, decode_odometry, decode_pose, decode_velocity
+from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.streams import RosStream, ros_stream
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
     FLOAT64_MULTI_ARRAY,
@@ -59,12 +57,6 @@ FLOAT_BYTES = 4
 CELL_BYTES = 1
 """Of a cell of a grid."""
 
-_MEASUREMENTS: dict[StreamName, Callable[[bytes, int, int, FrameNames], Imu | Velocity | Pose | Odometry]] = {
-    "imu": decode_imu,
-    "velocity": decode_velocity,
-    "pose": decode_pose,
-    "odometry": decode_odometry,
-}
 _SCAN_FLOATS = 7
 _POSE_NUMBERS = 7
 _STAMP_WORDS = STAMP_BYTES // 4
@@ -99,14 +91,10 @@ class RosDecoder:
             urdf = decode_string(payload)
             digest = blake2b(urdf.encode(), digest_size=8).hexdigest()
             message = RobotDescription(session, urdf, digest, joint_names=(), moving_edges=(), clock="")
-        elif stream == "scan":
-            message = decode_scan(payload, session, seq, names)
-            _checked_stamp(message.stamp)
-        elif stream == "map":
-            message = decode_grid(payload, session, names)
-        elif stream in _MEASUREMENTS:
-            message = _MEASUREMENTS[stream](payload, session, seq, names)
-            _checked_stamp(message.stamp)
+        elif (decode := ros_stream(stream).decode) is not None:
+            message = decode(payload, session, seq, names)
+            if isinstance(message, StampedMessage):
+                _checked_stamp(message.stamp)
         else:
             message = ClockMessage(decode_clock(payload), seq, session)
         return (message,)
@@ -332,8 +320,11 @@ def decode_scan(payload: bytes, session: int, seq: int, names: FrameNames) -> La
         raise reader.malformed(str(error)) from None
 
 
-def decode_grid(payload: bytes, session: int, names: FrameNames) -> OccupancyGrid:
-    """The grid in ``payload``; its ``map_load_time`` is ignored. Raises as ``decode_scan`` does."""
+def decode_grid(payload: bytes, session: int, seq: int, names: FrameNames) -> OccupancyGrid:
+    """The grid in ``payload``, which has no ``seq``; its ``map_load_time`` is ignored.
+
+    Raises as ``decode_scan`` does.
+    """
     reader = CdrReader(payload, OCCUPANCY_GRID.name)
     stamp, frame = reader.stamp(), names.to_zstate(reader.text())
     reader.stamp()
@@ -391,3 +382,9 @@ def decode_trajectory(payload: bytes, session: int, seq: int) -> JointTrajectory
         return JointTrajectory(stamp, seq, session, names, *numbers, start=stamp or None)
     except InvalidInput as error:
         raise reader.malformed(str(error)) from None
+
+
+SCAN_STREAM = RosStream(LASER_SCAN, Qos("best_effort", depth=5), is_named=True, decode=decode_scan)
+MAP_STREAM = RosStream(
+    OCCUPANCY_GRID, Qos(durability="transient_local", depth=1), is_named=True, decode=decode_grid
+)

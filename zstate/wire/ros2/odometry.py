@@ -21,6 +21,8 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
+from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.streams import RosStream
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import IMU, ODOMETRY, POSE_WITH_COVARIANCE, TWIST_WITH_COVARIANCE
 
@@ -176,3 +178,9 @@ def _triangle(block: bytes, size: int) -> bytes | None:
     if not is_finite or np.abs(matrix - matrix.T).max() > _SYMMETRY * np.abs(matrix).max():
         raise InvalidInput(f"a covariance is symmetric and finite; got {matrix.tolist()}")
     return to_block(matrix[np.triu_indices(size)])
+
+
+IMU_STREAM = RosStream(IMU, Qos(depth=10), is_named=True, decode=decode_imu)
+VELOCITY_STREAM = RosStream(TWIST_WITH_COVARIANCE, Qos(depth=10), is_named=True, decode=decode_velocity)
+POSE_STREAM = RosStream(POSE_WITH_COVARIANCE, Qos(depth=10), is_named=True, decode=decode_pose)
+ODOMETRY_STREAM = RosStream(ODOMETRY, Qos(depth=10), is_named=True, decode=decode_odometry)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeVar
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.streams import StreamName
 from zstate.wire.keys import shortened
 
 Reliability = Literal["reliable", "best_effort"]
@@ -116,25 +115,6 @@ class Qos:
             f"  liveliness_lease_duration:{_FOREVER}\n"
             "  avoid_ros_namespace_conventions: false"
         )
-
-
-STREAM_QOS: dict[StreamName, Qos] = {
-    "joint_states": Qos(depth=10),
-    "tf": Qos(depth=100),
-    "tf_static": Qos(durability="transient_local", depth=1),
-    "robot_description": Qos(durability="transient_local", depth=1),
-    "scan": Qos("best_effort", depth=5),
-    "map": Qos(durability="transient_local", depth=1),
-    # As the broadcasters of ros2_control: readers of sensor data request best effort, others reliable.
-    "imu": Qos(depth=10),
-    "velocity": Qos(depth=10),
-    "pose": Qos(depth=10),
-    "odometry": Qos(depth=10),
-    # Readers request best effort (rclcpp's ClockQoS) or reliable (a plain subscription). DDS matches a
-    # reliable writer with both, a best-effort writer with the former only. An old time is useless.
-    "clock": Qos(depth=1),
-}
-"""The QoS that the writer of each stream offers, as robot_state_publisher, tf2 and map_server do."""
 
 
 def _parse_policy(numbers: dict[Policy, int], text: str, default: Policy) -> Policy:

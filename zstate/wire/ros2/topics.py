@@ -30,19 +30,7 @@ from zstate.streams import StreamName
 from zstate.wire.keys import ANY, wire_name
 from zstate.wire.messages import Edges
 from zstate.wire.ros2.options import Ros2Options, check_token
-from zstate.wire.ros2.types import (
-    CLOCK,
-    IMU,
-    JOINT_STATE,
-    LASER_SCAN,
-    OCCUPANCY_GRID,
-    ODOMETRY,
-    POSE_WITH_COVARIANCE,
-    STRING,
-    TF_MESSAGE,
-    TWIST_WITH_COVARIANCE,
-    RosType,
-)
+from zstate.wire.ros2.streams import has_named_topics, ros_streams, ros_type
 
 SHARED = "ros"
 """The robot of topics in the root namespace, and of frames that belong to no robot."""
@@ -50,43 +38,8 @@ SHARED = "ros"
 HUMBLE_HASH = "TypeHashNotSupported"
 """Type hash in the keys of ROS 2 Humble, whose types have none."""
 
-TYPES: dict[StreamName, RosType] = {
-    "joint_states": JOINT_STATE,
-    "robot_description": STRING,
-    "tf": TF_MESSAGE,
-    "tf_static": TF_MESSAGE,
-    "scan": LASER_SCAN,
-    "map": OCCUPANCY_GRID,
-    "imu": IMU,
-    "velocity": TWIST_WITH_COVARIANCE,
-    "pose": POSE_WITH_COVARIANCE,
-    "odometry": ODOMETRY,
-    "clock": CLOCK,
-}
-
-NAMED_TOPICS: frozenset[StreamName] = frozenset({"scan", "map", "imu", "velocity", "pose", "odometry"})
-"""The streams whose topics are named by their writers."""
-
 _CACHED_ORDERS = 64
 """Edge orders with cached names: each writer of a topic has its own, and few change theirs."""
-
-
-def ros_type(stream: StreamName) -> RosType:
-    """The ROS type that carries ``stream``. Raises InvalidInput for a stream without a ROS topic."""
-    if stream not in TYPES:
-        raise InvalidInput(
-            f"the stream {stream!r} is not carried by ROS 2; carried are {', '.join(map(repr, TYPES))}"
-        )
-    return TYPES[stream]
-
-
-def topic_stream(topic: str, dds_type: str) -> StreamName | None:
-    """The stream that ``topic`` carries by its type and its last name; None if it is none."""
-    last_name = topic.rpartition("/")[2]
-    for stream, kind in TYPES.items():
-        if dds_type == kind.dds and (stream in NAMED_TOPICS or last_name == stream):
-            return stream
-    return None
 
 
 class RmwKeys:
@@ -102,7 +55,7 @@ class RmwKeys:
         ROS name.
         """
         last_name = stream
-        if stream in NAMED_TOPICS and name:
+        if has_named_topics(stream) and name:
             check_token(f"{stream} name", name, ", which becomes the name of a ROS topic")
             last_name = name
         return self._topic(self._options.robot_namespace(robot), stream, last_name)
@@ -118,7 +71,7 @@ class RmwKeys:
 
         With ``namespace=*`` these are all robots in a namespace of one token.
         """
-        last_name = ANY if stream in NAMED_TOPICS else stream
+        last_name = ANY if has_named_topics(stream) else stream
         return (
             f"{self._options.domain}{self._topic_pattern(robot, stream, last_name)}/{ros_type(stream).dds}/*"
         )
@@ -133,7 +86,8 @@ class RmwKeys:
     def writer_name(self, key: str) -> str | None:
         """The name of the sensor or map of ``key``; None for other topics. Raises InvalidInput as above."""
         *_, name, dds_type, _hash = self._path(key)
-        return name if any(dds_type == ros_type(stream).dds for stream in NAMED_TOPICS) else None
+        named = (one for one in ros_streams().values() if one.is_named)
+        return name if any(dds_type == one.type.dds for one in named) else None
 
     @staticmethod
     def _path(key: str) -> list[str]:
@@ -171,7 +125,7 @@ class DdsKeys(RmwKeys):
 
     def writer_name(self, key: str) -> str | None:
         name = key.rpartition("/")[2]
-        return name if name in NAMED_TOPICS else None
+        return name if has_named_topics(name) else None
 
     def _topic(self, namespace: str, stream: StreamName, last_name: str) -> str:
         ros_type(stream)

@@ -34,18 +34,15 @@ from zstate.wire.ros2.graph import (
     unpack_attachment,
 )
 from zstate.wire.ros2.options import Ros2Options, check_token
-from zstate.wire.ros2.qos import STREAM_QOS, Qos
+from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.streams import has_named_topics, ros_stream, ros_streams, ros_type, topic_stream
 from zstate.wire.ros2.topics import (
     HUMBLE_HASH,
-    NAMED_TOPICS,
     SHARED,
-    TYPES,
     DdsKeys,
     FrameNames,
     RmwKeys,
     robot_from_topic,
-    ros_type,
-    topic_stream,
 )
 from zstate.wire.ros2.types import FLOAT64_MULTI_ARRAY, JOINT_TRAJECTORY, RosType
 
@@ -72,7 +69,7 @@ class Ros2Wire:
         self._frame_names = lru_cache(64)(partial(FrameNames, self.options))
 
     def carries(self, stream: StreamName) -> bool:
-        return stream in TYPES
+        return stream in ros_streams()
 
     def node_token(self, node: WriterNode) -> str | None:
         self._frame_names(node.robot)  # raises InvalidInput before anything is declared
@@ -107,8 +104,8 @@ class Ros2Wire:
         """The token of ``node`` as publisher ("MP") or subscriber ("MS") of ``stream``."""
         topic, dds_type = self._keys.topic(node.robot, stream, name), ros_type(stream).dds
         type_hash = self._keys.key(node.robot, stream).rpartition("/")[2]
-        token = EndpointToken(self._node(node), number, kind, topic, dds_type, type_hash, STREAM_QOS[stream])
-        return token.key
+        qos = ros_stream(stream).qos
+        return EndpointToken(self._node(node), number, kind, topic, dds_type, type_hash, qos).key
 
     def expression(self, robot: str, stream: StreamName) -> str:
         return self._keys.expression(robot, stream)
@@ -164,7 +161,7 @@ class Ros2Wire:
         if stream is None or stream == "clock":
             return ()
         named = robot_from_topic(topic) if robot == ANY else robot
-        name = topic.rpartition("/")[2] if stream in NAMED_TOPICS else ""
+        name = topic.rpartition("/")[2] if has_named_topics(stream) else ""
         # a namespace or a name that ROS does not allow matches no topic
         with suppress(InvalidInput):
             if topic == self._keys.topic(named, stream, name):
@@ -194,7 +191,7 @@ class Ros2DdsWire(Ros2Wire):
         self, node: WriterNode, stream: StreamName, kind: Literal["MP", "MS"], number: int, name: str = ""
     ) -> str:
         ros, topic = ros_type(stream), self._keys.key(node.robot, stream, name)
-        return DdsToken(node.zid, kind, topic, ros.name, STREAM_QOS[stream], ros.hash).key
+        return DdsToken(node.zid, kind, topic, ros.name, ros_stream(stream).qos, ros.hash).key
 
     def _origin(self, arrival: SerializedSample) -> tuple[int, int]:
         self._received[arrival.key] += 1

@@ -1,0 +1,76 @@
+"""How ROS 2 carries the streams: the type and the QoS of their topics, as ``Stream.ros`` names them.
+
+Those of sensors and maps are beside the functions that encode and decode their messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+from zstate.errors import InvalidInput
+from zstate.plugins import own_streams
+from zstate.streams import Message, StreamName
+from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosType
+
+
+class RosStream(NamedTuple):
+    """The ``type`` of a stream's topics, and the ``qos`` that its writers offer.
+
+    Topics with ``is_named`` have the name of the sensor, or of the writer, and are found by their type. Their
+    messages are made by ``decode(payload, session, seq, names)``; those of others by ``RosDecoder``.
+    """
+
+    type: RosType
+    qos: Qos
+    is_named: bool = False
+    decode: Callable[..., Message] | None = None
+
+
+# The QoS of robot_state_publisher, tf2 and map_server, and of the broadcasters of ros2_control: readers of
+# sensor data request best effort, others reliable.
+JOINT_STATES = RosStream(JOINT_STATE, Qos(depth=10))
+TF = RosStream(TF_MESSAGE, Qos(depth=100))
+TF_STATIC = RosStream(TF_MESSAGE, Qos(durability="transient_local", depth=1))
+ROBOT_DESCRIPTION = RosStream(STRING, Qos(durability="transient_local", depth=1))
+# Readers request best effort (rclcpp's ClockQoS) or reliable (a plain subscription). DDS matches a reliable
+# writer with both, a best-effort writer with the former only. An old time is useless.
+SIMULATED_TIME = RosStream(CLOCK, Qos(depth=1))
+
+
+@cache
+def ros_streams() -> dict[StreamName, RosStream]:
+    """The streams that ROS 2 carries."""
+    return {row.name: row.ros_form for row in own_streams() if row.ros}
+
+
+def ros_stream(stream: StreamName) -> RosStream:
+    """How ROS 2 carries ``stream``. Raises InvalidInput for a stream without a ROS topic."""
+    carried = ros_streams()
+    if stream not in carried:
+        raise InvalidInput(
+            f"the stream {stream!r} is not carried by ROS 2; carried are {', '.join(map(repr, carried))}"
+        )
+    return carried[stream]
+
+
+def ros_type(stream: StreamName) -> RosType:
+    """The ROS type that carries ``stream``. Raises InvalidInput as ``ros_stream`` does."""
+    return ros_stream(stream).type
+
+
+def has_named_topics(stream: StreamName) -> bool:
+    """Whether the topics of the stream have the names of its writers."""
+    carried = ros_streams().get(stream)
+    return carried is not None and carried.is_named
+
+
+def topic_stream(topic: str, dds_type: str) -> StreamName | None:
+    """The stream that ``topic`` carries by its type and its last name; None if it is none."""
+    last_name = topic.rpartition("/")[2]
+    for stream, carried in ros_streams().items():
+        if dds_type == carried.type.dds and (carried.is_named or last_name == stream):
+            return stream
+    return None
