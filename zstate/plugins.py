@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 from zstate._util.fork_safe import fork_safe
 from zstate.errors import InvalidInput, printable
-from zstate.streams import CLOCK, CORE, StampedMessage, Stream, StreamName
+from zstate.streams import CLOCK, CORE, Stream, StreamName
 
 GROUP = "zstate.plugins"
 """The group of entry points."""
@@ -123,6 +123,8 @@ def _loaded(entry: EntryPoint) -> FoundPlugin:
 
 def _is_usable(row: Stream, one: FoundPlugin, problems: list[str]) -> bool:
     """Whether ``row`` is a stream that any package may bring; otherwise ``problems`` gets the reason."""
+    from zstate.message import StampedMessage  # noqa: PLC0415 - msgspec is loaded for other packages alone
+
     reason = ""
     if row.group != "measurement" or row.latched:
         reason = "the streams of other packages are measurements, and not latched"

@@ -9,11 +9,12 @@ from __future__ import annotations
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from importlib import import_module
-from typing import Annotated, Any, Literal, TypeAlias
-
-from msgspec import Meta, Struct
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from zstate.errors import InvalidInput, printable
+
+if TYPE_CHECKING:
+    from zstate.message import Message
 
 StreamName: TypeAlias = str
 """The name of a stream: one chunk of its keys, and the word of every tool for it."""
@@ -21,28 +22,6 @@ StreamName: TypeAlias = str
 Group: TypeAlias = Literal["model", "joints", "edges", "driver", "measurement", "time"]
 """What tools treat alike: what follows from a robot's model, joint positions, moving edges of writers, what
 goes to a driver and comes from it, what sensors and other programs measure, and the simulated time."""
-
-Stamp: TypeAlias = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-SessionId: TypeAlias = Annotated[int, Meta(ge=0)]
-"""Below 2^64, as MessagePack has no larger integers."""
-Count: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-"""One more than it can still be encoded: readers echo numbers, and count on from them."""
-
-
-class Message(Struct, frozen=True, array_like=True, gc=False):
-    """Base of the messages of the native wire format."""
-
-
-class StampedMessage(Message, frozen=True, array_like=True, gc=False):
-    """A message of a stream at the instant ``stamp`` [ns].
-
-    ``seq`` grows by one with each message of a ``session``, a random number drawn when a writer starts.
-    """
-
-    stamp: Stamp
-    seq: Count
-    session: SessionId
-
 
 KILOBYTE, MEGABYTE = 1_000, 1_000_000
 MEASUREMENT_BYTES = 10 * KILOBYTE
@@ -210,3 +189,10 @@ CLOCK = Stream(
 
 JOINT_STREAMS = frozenset(row.name for row in CORE if row.group == "joints")
 """The streams of joint positions."""
+
+
+def __getattr__(name: str) -> Any:
+    # The base class of messages, for those who add a stream; msgspec is loaded then.
+    if name == "StampedMessage":
+        return _loaded("zstate.message:StampedMessage")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -100,8 +100,10 @@ class EncoderCase:
 
 
 @pytest.fixture
-def case(tmp_path: Path) -> EncoderCase:
-    return EncoderCase(tmp_path / "run.mcap", alone="cart", programs={1: "driver@host pid 7"})
+def case(tmp_path: Path) -> Iterator[EncoderCase]:
+    made = EncoderCase(tmp_path / "run.mcap", alone="cart", programs={1: "driver@host pid 7"})
+    yield made
+    made.writer.close()
 
 
 def test_numbers_of_a_joint_state_have_the_names_of_their_coordinates(case: EncoderCase):

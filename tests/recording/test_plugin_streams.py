@@ -19,6 +19,7 @@ from mcap.writer import Writer
 
 from zstate import StatePublisher, StreamListener, StreamPublisher
 from zstate.errors import InvalidInput, MessageError
+from zstate.message import StampedMessage
 from zstate.net.session import Session
 from zstate.recording.decode import DecodedMessage, DecodedRecording
 from zstate.recording.info import read_info, recorded_robots
@@ -26,7 +27,7 @@ from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
 from zstate.recording.recording import Recording
-from zstate.streams import StampedMessage, Stream
+from zstate.streams import Stream
 from zstate.wire.json_form import JsonDecoder, encode_json, json_type
 
 COUNT = 20

@@ -275,6 +275,7 @@ def test_restarted_writer_has_its_own_channel_and_name(sessions, tmp_path: Path)
         for start in (1, 2):
             with StatePublisher(writer, RRBOT, "r1") as publisher:
                 wait_for_stream_readers(writer, "r1")
+                until(lambda wanted=start: len(recorder._programs) == wanted)
                 publisher.publish([0.0, float(start)], stamp=STAMP + start)
                 until(lambda wanted=start: count(recorder, "r1") == wanted)
     with RecordingReader(tmp_path / "run.mcap") as recording:
@@ -764,6 +765,7 @@ def test_commands_are_recorded_as_joint_states_and_not_replayed(sessions, tmp_pa
         KeyPublisher(sessions[0], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as commands,
     ):
         wait_for_stream_readers(sessions[0], "arm", "joint_states", "joint_commands")
+        until(lambda: teleop.session in recorder._programs)
         publisher.publish([0.0, 0.0])
         for command in (renewal, setpoint):
             commands.put(encode(command))

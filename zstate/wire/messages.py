@@ -22,16 +22,9 @@ from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput, MessageError, printable
+from zstate.message import Count, Message, SessionId, Stamp, StampedMessage
 from zstate.plugins import stream_named
-from zstate.streams import (
-    GRID_CELLS,
-    Count,
-    Message,
-    SessionId,
-    Stamp,
-    StampedMessage,
-    StreamName,
-)
+from zstate.streams import GRID_CELLS, StreamName
 from zstate.transform import COVARIANCE_NUMBERS
 from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, full_name
 

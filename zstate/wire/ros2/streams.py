@@ -10,8 +10,9 @@ from functools import cache
 from typing import NamedTuple
 
 from zstate.errors import InvalidInput
+from zstate.message import Message
 from zstate.plugins import own_streams
-from zstate.streams import Message, StreamName
+from zstate.streams import StreamName
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosType
 

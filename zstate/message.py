@@ -1,0 +1,28 @@
+"""The base classes of messages, and the types of their first fields."""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeAlias
+
+from msgspec import Meta, Struct
+
+Stamp: TypeAlias = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+SessionId: TypeAlias = Annotated[int, Meta(ge=0)]
+"""Below 2^64, as MessagePack has no larger integers."""
+Count: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+"""One more than it can still be encoded: readers echo numbers, and count on from them."""
+
+
+class Message(Struct, frozen=True, array_like=True, gc=False):
+    """Base of the messages of the native wire format."""
+
+
+class StampedMessage(Message, frozen=True, array_like=True, gc=False):
+    """A message of a stream at the instant ``stamp`` [ns].
+
+    ``seq`` grows by one with each message of a ``session``, a random number drawn when a writer starts.
+    """
+
+    stamp: Stamp
+    seq: Count
+    session: SessionId
