@@ -14,7 +14,23 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from zstate.errors import InvalidInput, printable
 
 if TYPE_CHECKING:
-    from zstate.message import Message
+    from zstate.message import Message, StampedMessage
+
+__all__ = [
+    "CLOCK",
+    "CORE",
+    "GRID_CELLS",
+    "JOINT_STREAMS",
+    "KILOBYTE",
+    "LATCHED_BYTES",
+    "MEASUREMENT_BYTES",
+    "MEGABYTE",
+    "SAMPLE_BYTES",
+    "Group",
+    "StampedMessage",
+    "Stream",
+    "StreamName",
+]
 
 StreamName: TypeAlias = str
 """The name of a stream: one chunk of its keys, and the word of every tool for it."""

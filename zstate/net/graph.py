@@ -248,7 +248,7 @@ def discover_ros_graph(session: Session, wire: Ros2Wire) -> RosGraph:
     maps; other topics are left out.
     """
     from zstate.wire.ros2.graph import NodeToken, parse_dds_token, parse_token  # noqa: PLC0415 - ROS only
-    from zstate.wire.ros2.topics import topic_stream  # noqa: PLC0415 - ROS only
+    from zstate.wire.ros2.streams import topic_stream  # noqa: PLC0415 - ROS only
 
     parse = parse_dds_token if wire.name == "ros2dds" else parse_token
     nodes: list[NodeToken] = []
