@@ -72,6 +72,10 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_itemcollected(item: pytest.Item) -> None:
     if not REQUIREMENTS.keys().isdisjoint(marker.name for marker in item.iter_markers()):
         item.add_marker("system")
+    if item.get_closest_marker("long") and not item.get_closest_marker("timeout"):
+        item.add_marker(
+            pytest.mark.timeout(600)
+        )  # what takes half a minute alone takes minutes beside others
 
 
 def pytest_collection_finish() -> None:
