@@ -75,7 +75,7 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     if item.get_closest_marker("long") and not item.get_closest_marker("timeout"):
         item.add_marker(
             pytest.mark.timeout(600)
-        )  # what takes half a minute alone takes minutes beside others
+        )  # minutes, beside others
 
 
 def pytest_collection_finish() -> None:
