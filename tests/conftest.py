@@ -73,9 +73,7 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     if not REQUIREMENTS.keys().isdisjoint(marker.name for marker in item.iter_markers()):
         item.add_marker("system")
     if item.get_closest_marker("long") and not item.get_closest_marker("timeout"):
-        item.add_marker(
-            pytest.mark.timeout(600)
-        )  # minutes, beside others
+        item.add_marker(pytest.mark.timeout(600))  # minutes, beside others
 
 
 def pytest_collection_finish() -> None:
