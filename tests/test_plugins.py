@@ -18,8 +18,12 @@ from zstate import StreamListener, StreamPublisher, plugins
 from zstate.errors import InvalidInput, SecondWriter
 from zstate.net.session import Session
 from zstate.streams import Stream
+from zstate.wire.identity import WriterId
+from zstate.wire.keys import parse_reader_key
+from zstate.wire.native import NativeWire
 
 ROOT = Path(__file__).parents[1]
+WRITER = WriterId("reader", "host", 1, 2, 3)
 
 
 @pytest.fixture
@@ -128,6 +132,13 @@ def test_commands_know_the_stream(sessions: tuple[Session, Session], battery_plu
             assert (check["state"], "as 'main'" in check["text"]) == ("ok", True)
             assert run_cli("battery", "panda").stdout == "80 %\n"
     assert "battery" in run_cli("hz", "--help").stdout
+
+
+@pytest.mark.usefixtures("battery_plugin")
+def test_a_reader_of_several_streams_announces_those_of_others_apart():
+    """A program without the package ignores a token that names its stream."""
+    tokens = NativeWire().reader_tokens("panda", ("battery", "tf", "imu"), WRITER, "zid", lambda: 1)
+    assert [parse_reader_key(token)[1] for token in tokens] == [("tf", "imu"), ("battery",)]
 
 
 def test_plugins_are_listed_with_what_they_bring(battery_plugin: Stream):

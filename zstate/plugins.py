@@ -207,6 +207,11 @@ def own_streams() -> tuple[Stream, ...]:
     return tuple(_REGISTRY.built_in().values())
 
 
+def is_own(name: StreamName) -> bool:
+    """Whether zstate itself brings the stream, so that all programs know it."""
+    return name in _REGISTRY.built_in()
+
+
 def all_streams() -> tuple[Stream, ...]:
     """All rows, those of other packages as well, in the order of liveliness tokens."""
     return tuple(_REGISTRY.all().values())

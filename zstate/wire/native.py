@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.plugins import all_streams, edge_streams, is_named, stream_named
+from zstate.plugins import all_streams, edge_streams, is_named, is_own, stream_named
 from zstate.streams import LATCHED_BYTES, SAMPLE_BYTES, Stream, StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
@@ -305,7 +305,10 @@ class NativeWire:
         self, robot: str, streams: Sequence[StreamName], reader: WriterId, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         identity = replace(reader, session=number()).identity
-        return (keys.reader_key(robot, streams, identity),)
+        # A program that does not know a stream ignores all of its token.
+        own = [stream for stream in streams if is_own(stream)]
+        others = [[stream] for stream in streams if not is_own(stream)]
+        return tuple(keys.reader_key(robot, one, identity) for one in (own, *others) if one)
 
     def expression(self, robot: str, stream: StreamName) -> str:
         return keys.stream_expression(robot, stream)
