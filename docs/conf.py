@@ -41,7 +41,17 @@ myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
 smartquotes = False  # they turn -- of options into dashes
 # Aliases of types; they are shown by name.
-_ALIASES = ("ArrayLike", "ConfigSource", "Floats", "Mode", "OutcomeName", "Points", "Positions", "Stream")
+_ALIASES = (
+    "ArrayLike",
+    "ConfigSource",
+    "Floats",
+    "Group",
+    "Mode",
+    "OutcomeName",
+    "Points",
+    "Positions",
+    "StreamName",
+)
 nitpicky = True
 # Inventories of other projects are on other hosts, so that names of theirs are no links.
 nitpick_ignore_regex = [

@@ -47,6 +47,7 @@ raise SystemExit(run(["demo", "rrbot", "--seconds", "1"]))
 """
 
 
+@pytest.mark.long
 @pytest.mark.processes
 @pytest.mark.parametrize("folder", REMOVABLE)
 def test_without_a_folder_the_rest_starts_and_shows_a_robot(folder: str):

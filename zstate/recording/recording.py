@@ -234,7 +234,7 @@ class Recording(Closeable):
         from zstate.scans.scan import scan_from_message  # noqa: PLC0415 - scans are a plugin
 
         refusals = Refusals("recorded scans")
-        for writer, message, _ in self._messages(robot, "scan", refusals):
+        for writer, message, _ in self._messages(robot, "scan", refusals.count):
             if isinstance(message, LaserScan) and sensor in (None, writer.edge_writer):
                 try:
                     yield scan_from_message(message, writer.robot)
@@ -264,7 +264,7 @@ class Recording(Closeable):
         Its frames are named as in the message.
         """
         refusals = Refusals("recorded odometry")
-        for recorded, message, _ in self._messages(robot, "odometry", refusals):
+        for recorded, message, _ in self._messages(robot, "odometry", refusals.count):
             if isinstance(message, Odometry) and writer in (None, recorded.edge_writer):
                 yield message
 
@@ -272,7 +272,7 @@ class Recording(Closeable):
         self, kind: type[_Measurement], robot: str | None, stream: StreamName, sensor: str | None
     ) -> Iterator[_Measurement]:
         refusals = Refusals(f"recorded {stream}")
-        for writer, message, _ in self._messages(robot, stream, refusals):
+        for writer, message, _ in self._messages(robot, stream, refusals.count):
             if isinstance(message, kind) and sensor in (None, writer.edge_writer):
                 try:
                     yield with_full_names(message, writer.robot)
@@ -290,7 +290,7 @@ class Recording(Closeable):
 
         refusals = Refusals("recorded maps")
         latched = LatchedState()
-        for decoded in self._messages(robot, "map", refusals):
+        for decoded in self._messages(robot, "map", refusals.count):
             writer, message, _ = decoded
             # Repeated for readers that start in the middle; without cells when it was withdrawn.
             if latched.update(decoded) and isinstance(message, OccupancyGrid) and message.cells:
@@ -306,7 +306,9 @@ class Recording(Closeable):
         are all that arrived at the recorder, also those that the driver has refused. Raises InvalidInput for
         a robot that is not in the recording.
         """
-        for _, message, _ in self._messages(robot, "joint_commands", Refusals("recorded joint_commands")):
+        for _, message, _ in self._messages(
+            robot, "joint_commands", Refusals("recorded joint_commands").count
+        ):
             assert isinstance(message, JointCommand)
             yield message
 
@@ -317,7 +319,7 @@ class Recording(Closeable):
         under way and the outcomes of the last ones, the stops that it obeys and why, and the commands that
         it has refused. Raises InvalidInput for a robot that is not in the recording.
         """
-        for _, message, _ in self._messages(robot, "driver", Refusals("recorded states of drivers")):
+        for _, message, _ in self._messages(robot, "driver", Refusals("recorded states of drivers").count):
             assert isinstance(message, DriverState)
             yield message
 
@@ -328,31 +330,35 @@ class Recording(Closeable):
         is in ``driver_states``, and so are releases. Raises InvalidInput for a robot that is not in the
         recording.
         """
-        for writer, message, _ in self._messages(robot, "stop", Refusals("recorded stops")):
+        for writer, message, _ in self._messages(robot, "stop", Refusals("recorded stops").count):
             assert isinstance(message, Stop)
             yield writer.program or "", message
 
     def measurements(
-        self, stream: StreamName, robot: str | None = None, refusals: Refusals | None = None
+        self,
+        stream: str,
+        robot: str | None = None,
+        *,
+        refuse: Callable[[str, str], None] | None = None,
     ) -> Iterator[DecodedMessage]:
         """The messages of ``stream``, one of another package, of ``robot``, by default of all robots.
 
         Each has its writer and the time of its recording [ns]. They are in the order of recording and read
-        one after the other. Messages that cannot be decoded are left out, counted in ``refusals``; the first
-        of each reason is logged. Raises InvalidInput for a stream that no installed package brings, for one
-        that ROS carries, and for a robot that is not in the recording.
+        one after the other. Messages that cannot be decoded are left out: ``refuse(reason, text)`` is called
+        for each, by default the first of each reason is logged. Raises InvalidInput for a stream that no
+        installed package brings, for one that ROS carries, and for a robot that is not in the recording.
         """
         if not carried_as_json(stream_named(stream).name):
             known = ", ".join(json_streams()) or "none is installed"
             raise InvalidInput(
                 f"{stream!r} is no stream of measurements of another package; those are: {known}"
             )
-        return self._messages(robot, stream, refusals or Refusals(f"recorded {stream}"))
+        return self._messages(robot, stream, refuse or Refusals(f"recorded {stream}").count)
 
     def _messages(
-        self, robot: str | None, stream: StreamName, refusals: Refusals
+        self, robot: str | None, stream: StreamName, refuse: Callable[[str, str], None]
     ) -> Iterator[DecodedMessage]:
-        recording = DecodedRecording(self._reader, refusals.count)
+        recording = DecodedRecording(self._reader, refuse)
         robot = robot or self.robot
         robots = None if robot is None else (check_has_robot(recording, robot),)
         return recording.messages(robots, (stream,))

@@ -47,7 +47,7 @@ def export_stream(
     InvalidInput as ``Recording.measurements`` does, without a message, and for an integer beyond 64 bits.
     """
     refusals = Refusals(f"recorded {stream}")
-    messages = recording.measurements(stream, refusals=refusals)
+    messages = recording.measurements(stream, refuse=refusals.count)
     hints = get_type_hints(stream_named(stream).type)
     rows = 0
     with new_table(path, kind, recording, overwrite=overwrite) as table:
