@@ -246,8 +246,9 @@ def test_a_key_given_twice_is_refused(tmp_path: Path):
         (b"\x89PNG\r\n\x1a\n\xff", "is not text in UTF-8; name the YAML file of a map, not its image"),
         (b"#" * 9_000, "has more than 8192 bytes"),
         (b"[" * 8_000, "not YAML"),
-        (b"- " * 4_000, "is one mapping"),
-        (b"image: " + b"[" * 4_000 + b"]" * 4_000, "image is the path of a file"),
+        (b"- " * 900, "is one mapping"),
+        (b"- " * 4_000, "hall.yaml"),
+        (b"image: " + b"[" * 900 + b"]" * 900, "image is the path of a file"),
         (b"a: &a [x, x]\nb: &b [*a, *a]\norigin: [*b, *b, *b]\n", "origin is a finite number"),
     ],
 )

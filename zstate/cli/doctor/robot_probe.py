@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from functools import cache, cached_property
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +52,6 @@ _READERS_WITHIN_S = 0.3
 _REPLY_WITHIN_S = 0.4
 
 
-@cache
 def _measured() -> tuple[StreamName, ...]:
     return (*measured_streams(), "odometry")
 
