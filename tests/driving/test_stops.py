@@ -568,7 +568,7 @@ def test_a_stop_that_others_displace_within_one_tick_is_confirmed(sessions):
             put_stop(sessions[1], session, 0)
         until(lambda: host._stops.current.arrived == 401)
         may_read.set()
-        until(lambda: not host._stops.current.unsaved)
+        until(lambda: host._stops.current.ids == host._stops.current.kept().ids)
         until(lambda: arm.wait_for_driver().stops == host._stops.current.ids)
         assert arm.wait_for_driver().state == "stopped"
         assert (honest.session, 3) in arm.wait_for_driver().stops

@@ -211,23 +211,19 @@ class LatchedStops(NamedTuple):
     """The ``stops`` that are not released, and how many have ``arrived`` until now, the ``newest`` last.
 
     A stop that is released before the next tick is known by these two. ``displaced`` are the last stops for
-    which the substitute stands; those in ``unsaved`` are not kept for a restarted host yet.
+    which the substitute stands. ``ids`` are those that a driver reports as obeyed: each of ``stops`` and
+    ``displaced`` once it is kept, so that a stop that is confirmed holds for the next host as well.
     """
 
     stops: tuple[ActiveStop, ...] = ()
     arrived: int = 0
     newest: ActiveStop | None = None
     displaced: tuple[StopId, ...] = ()
-    unsaved: frozenset[StopId] = frozenset()
+    ids: tuple[StopId, ...] = ()
 
-    @property
-    def ids(self) -> tuple[StopId, ...]:
-        """What a driver reports as obeyed: a stop that is confirmed holds for the next host as well.
-
-        Also a displaced stop is confirmed to its program.
-        """
-        found = (*(one.id for one in self.stops), *self.displaced)
-        return tuple(one for one in found if one not in self.unsaved)
+    def kept(self) -> LatchedStops:
+        """The same once the stops are in the file."""
+        return self._replace(ids=(*(one.id for one in self.stops), *self.displaced))
 
 
 class StopRegister:
@@ -273,7 +269,7 @@ class StopRegister:
         with self._lock:
             if self._is_unsaved:
                 self._save()
-                self.current = self.current._replace(unsaved=frozenset())
+                self.current = self.current.kept()
 
     def release(self, *releases: Release) -> None:
         """End the stops of ``releases``. One that names none counts once there is none."""
@@ -288,9 +284,8 @@ class StopRegister:
             if has_ended:
                 self._save()  # first: a release that is confirmed holds for the next host as well
                 stops = tuple(self._active.values())
-                self.current = self.current._replace(
-                    stops=stops, displaced=tuple(self._displaced_ids), unsaved=frozenset()
-                )
+                left = self.current._replace(stops=stops, displaced=tuple(self._displaced_ids))
+                self.current = left.kept()
 
     def _keep_released(self, ended: Sequence[ActiveStop], named: Sequence[StopId]) -> None:
         """Keep that ``ended`` are released. A cached stop whose release is forgotten stops once more.
@@ -327,8 +322,8 @@ class StopRegister:
         self._active[one.id] = one
         self._is_unsaved = True
         stops, displaced = tuple(self._active.values()), tuple(self._displaced_ids)
-        unsaved = self.current.unsaved | {one.id}
-        self.current = LatchedStops(stops, self.current.arrived + 1, one, displaced, unsaved)
+        arrived, confirmed = self.current.arrived + 1, self.current.ids
+        self.current = LatchedStops(stops, arrived, one, displaced, confirmed)
 
     def _displace(self, stops: Iterable[ActiveStop]) -> None:
         """Let the substitute stand for the oldest of ``stops``. If it keeps the torque off, so does that."""
@@ -438,7 +433,7 @@ class StopLatch(StopRegister, Closeable):
             )
             stops = [self._own_stop(reason, "hold")]
         self._active = {one.id: one for one in stops}
-        self.current = LatchedStops(tuple(stops), len(stops), stops[-1] if stops else None)
+        self.current = LatchedStops(tuple(stops), len(stops), stops[-1] if stops else None).kept()
 
     def _save(self) -> None:
         super()._save()
