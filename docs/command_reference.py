@@ -11,6 +11,7 @@ from itertools import groupby
 import click
 
 from zstate.cli import main
+from zstate.cli.commands import own_commands
 
 _INTRODUCTION = """# Commands
 
@@ -32,7 +33,7 @@ def command_reference() -> str:
     names = main.group.list_commands(top)
     contexts = {name: _context(main.group, name, top) for name in names}
     parts = [_INTRODUCTION]
-    for section, named in groupby(names, key=lambda name: main._COMMANDS[name][0]):
+    for section, named in groupby(names, key=lambda name: own_commands()[name].section):
         parts.append(f"## {section}")
         for name in named:
             parts += _command_parts(contexts[name], "###")

@@ -28,23 +28,39 @@ from zstate.streams import CLOCK, CORE, Stream, StreamName
 GROUP = "zstate.plugins"
 """The group of entry points."""
 
-_BUILT_IN = ("driving", "scans", "odometry")
-"""The folders of zstate with a module ``plugin``."""
+_BUILT_IN = ("driving", "scans", "odometry", "recording", "view", "foxglove", "bridges")
+"""The folders of zstate with a module ``plugin``, in the order of the liveliness tokens of their streams."""
 
 _LOG = logging.getLogger("zstate")
 
 
+class Command(NamedTuple):
+    """A command of the command line.
+
+    ``place`` is ``"module:attribute"`` of its click.Command, which is loaded when it is called. The help of
+    zstate lists its own ones with their ``summary``, in a ``section``.
+    """
+
+    place: str
+    section: str = ""
+    summary: str = ""
+
+
 @dataclass(frozen=True)
 class Plugin:
-    """What one folder or package brings: ``streams``, and ``commands`` of the command line.
+    """What one folder or package brings.
 
-    ``commands`` maps the name of a command to ``"module:attribute"`` of a click.Command, which is loaded when
-    it is called.
+    ``streams``, and ``commands`` of the command line by name: a ``Command``, or only its ``place``.
     """
 
     name: str
     streams: tuple[Stream, ...] = ()
-    commands: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    commands: Mapping[str, str | Command] = field(default_factory=lambda: MappingProxyType({}))
+
+    def command(self, name: str) -> Command:
+        """The command ``name``, which it brings."""
+        found = self.commands[name]
+        return Command(found) if isinstance(found, str) else found
 
 
 class FoundPlugin(NamedTuple):
@@ -59,7 +75,7 @@ class FoundPlugin(NamedTuple):
 
 @cache
 def built_in_plugins() -> tuple[Plugin, ...]:
-    """The plugins of zstate itself that bring streams, without those whose folder is removed."""
+    """The plugins of zstate itself, without those whose folder is removed."""
     found: list[Plugin] = []
     for folder in _BUILT_IN:
         try:

@@ -9,7 +9,7 @@ import pytest
 from helpers.programs import router
 
 from zstate.cli import session
-from zstate.cli.commands import view
+from zstate.view import cli as view
 
 
 @pytest.fixture(autouse=True)

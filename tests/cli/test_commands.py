@@ -5,14 +5,19 @@ from pathlib import Path
 import click
 from click.testing import CliRunner
 
+from zstate.cli.commands import own_commands
 from zstate.cli.main import group
 
-COMMANDS = {path.stem for path in (Path(__file__).parents[2] / "zstate/cli/commands").glob("[a-z]*.py")}
+FILES = {path.stem for path in (Path(__file__).parents[2] / "zstate/cli/commands").glob("[a-z]*.py")}
 
 
 def test_every_file_of_commands_is_a_command():
-    of_two = {"stop"}  # in the file of `zstate move`
-    assert set(group.list_commands(click.Context(group))) - of_two == COMMANDS
+    core = {name for name, one in own_commands().items() if one.place.startswith("zstate.cli.commands.")}
+    assert core == FILES
+
+
+def test_the_help_lists_the_commands_of_plugins_as_well():
+    assert {"demo", "scan", "record", "bridge"} <= set(group.list_commands(click.Context(group)))
 
 
 def test_network_options_follow_the_options_of_the_command():

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from zstate.cli.commands.transform import _parse_line
-from zstate.cli.odometry_file import read_settings
 from zstate.cli.output.logs import text_in
-from zstate.cli.snapshot_file import read_snapshot
 from zstate.cli.up.static_edges import read_calibration
 from zstate.cli.up.template import TomlFile, _parsed_like
 from zstate.errors import ConfigError, InvalidInput
+from zstate.odometry.cli.settings_file import read_settings
+from zstate.recording.cli.snapshot_file import read_snapshot
 
 NESTED = "[" * 50_000
 

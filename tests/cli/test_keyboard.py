@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from zstate.cli.keyboard import FIRST_HOLD_S, HOLD_S, HeldKey, keys_in
+from zstate.driving.cli.keyboard import FIRST_HOLD_S, HOLD_S, HeldKey, keys_in
 
 
 def test_arrow_keys_of_both_modes_of_a_terminal_are_keys_as_letters_are():

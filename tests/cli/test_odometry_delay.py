@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from zstate.cli.odometry_delay import Series, fitted_delay
+from zstate.odometry.cli.delay import Series, fitted_delay
 
 SECONDS = 60.0
 IMU_TIMES = np.arange(0.0, SECONDS, 0.005)

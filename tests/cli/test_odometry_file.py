@@ -6,15 +6,6 @@ from pathlib import Path
 import pytest
 
 from zstate import Transform, TransformBuffer
-from zstate.cli.odometry_file import (
-    LegSettings,
-    OdometrySettings,
-    parse_diff_drive,
-    parse_feet,
-    parse_pose,
-    parse_velocity,
-    read_settings,
-)
 from zstate.errors import ConfigError, InvalidInput
 from zstate.odometry import (
     Ackermann,
@@ -26,6 +17,15 @@ from zstate.odometry import (
     SpeedThresholds,
     VelocityNoise,
     WheelNoise,
+)
+from zstate.odometry.cli.settings_file import (
+    LegSettings,
+    OdometrySettings,
+    parse_diff_drive,
+    parse_feet,
+    parse_pose,
+    parse_velocity,
+    read_settings,
 )
 
 ROVER = """

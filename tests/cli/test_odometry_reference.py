@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from zstate.cli.odometry_reference import Path, ReferenceName, compared, parse_reference
 from zstate.errors import InvalidInput
+from zstate.odometry.cli.reference import Path, ReferenceName, compared, parse_reference
 
 COUNT = 400
 STAMPS = np.arange(COUNT, dtype=np.int64) * 100_000_000

@@ -15,15 +15,6 @@ import pytest
 from helpers.recording_builder import MS, START, STORE, Bag, RecordingBuilder, S, pose
 
 from zstate import Transform, TransformBuffer, load_model
-from zstate.cli.odometry_file import OdometrySettings
-from zstate.cli.odometry_reference import ReferenceName
-from zstate.cli.odometry_replay import (
-    ReplayedOdometry,
-    odometry_figure,
-    replay,
-    report_lines,
-    sigma_factor,
-)
 from zstate.errors import InvalidInput
 from zstate.model.kinematics import Kinematics
 from zstate.odometry import (
@@ -35,6 +26,15 @@ from zstate.odometry import (
     SourceHealth,
     VelocityNoise,
 )
+from zstate.odometry.cli.reference import ReferenceName
+from zstate.odometry.cli.replay import (
+    ReplayedOdometry,
+    odometry_figure,
+    replay,
+    report_lines,
+    sigma_factor,
+)
+from zstate.odometry.cli.settings_file import OdometrySettings
 from zstate.odometry.simulated_rover import ImuReading
 from zstate.sources.square_drive import WheelPair
 from zstate.wire.messages import Imu, Odometry, Pose, Velocity, order_digest, to_block

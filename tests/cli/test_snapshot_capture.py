@@ -11,8 +11,8 @@ from helpers.robots import RRBOT
 
 from zstate import StatePublisher, StaticPublisher, Transform
 from zstate.cli.session import SessionOptions
-from zstate.cli.snapshot_capture import capture
 from zstate.net.session import Session
+from zstate.recording.cli.snapshot_capture import capture
 
 MOUNT = Transform("upper", "camera", (0.1, 0.2, 0.3), (0.0, 0.0, 0.0, 1.0))
 

@@ -39,7 +39,7 @@ SHOULDER, ELBOW = 0.5, -0.2
 
 ROVER = """
 from zstate import connect
-from zstate.cli.rover import run_rover
+from zstate.odometry.cli.rover import run_rover
 with connect() as session:
     print("ready")
     run_rover(session, 100.0)

@@ -37,7 +37,7 @@ PRELOADED = (
     *("zstate", "zstate.cli.main", "zstate.net.session", "zstate.net.presence", "zstate.cli.waiting"),
     *("zstate.nodes.listener", "zstate.nodes.publisher", "zstate.nodes.clock", "zstate.driving"),
     *("zstate.model.pinocchio_solver", "zstate.sources", "zstate.cli.session", "zstate.cli.processes"),
-    *("zstate.odometry", "zstate.scans", "zstate.cli.rover", "zstate.wire.registry"),
+    *("zstate.odometry", "zstate.scans", "zstate.odometry.cli.rover", "zstate.wire.registry"),
 )
 
 

@@ -9,8 +9,8 @@ import pytest
 from helpers.base_motion import IMU_HZ, NOISE, Motion, NoisyImu, mounted, stamp_at
 
 from zstate import Transform, load_model
-from zstate.cli.odometry_file import LegSettings, OdometrySettings
 from zstate.model.kinematics import Kinematics
+from zstate.odometry.cli.settings_file import LegSettings, OdometrySettings
 from zstate.odometry.invariant_filter import Floats
 from zstate.odometry.node import add_imu, add_joints
 from zstate.sources import JointReading

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from zstate.cli.commands import load_command, load_other_command
+from zstate.cli.commands import SECTIONS, load_command, load_other_command, own_commands
 from zstate.cli.output import logs
 from zstate.cli.signals import SignalExit
 from zstate.errors import ZStateError
@@ -31,51 +31,6 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from zstate.net.session import Session
-
-# name: (section of the help, summary)
-_COMMANDS = {
-    "demo": ("Start here", "A robot that moves, its state over Zenoh, and a live table of it."),
-    "publish": ("Write", "Publish a robot's state: its model, fixed edges, and transforms."),
-    "joints": ("Write", "Publish a sine on every joint, and nothing else."),
-    "static": ("Write", "Publish one edge that never moves, until Ctrl-C."),
-    "transform": ("Write", "Publish moving edges: one pose at a rate, or lines of JSON."),
-    "scan": ("Write", "Publish the scans of a simulated or dummy laser."),
-    "map": ("Write", "Publish the map of a place."),
-    "odometry": ("Write", "Publish where the base of a robot is, from its IMU and its wheels."),
-    "drive": ("Drive", "Host the driver of a robot: the program that owns its hardware."),
-    "move": ("Drive", "Move joints of a robot that has a driver, and wait until they are there."),
-    "stop": ("Drive", "Stop a robot that has a driver, until that is released."),
-    "tf": ("Look", "The pose of one frame in another."),
-    "monitor": ("Look", "How samples come in, by edge or by robot: rates, latencies, losses."),
-    "tree": ("Look", "The frames of the announced robots, as a tree."),
-    "ls": ("Look", "The announced robots and their writers."),
-    "graph": ("Look", "The writers and readers of each stream."),
-    "echo": ("Look", "Joint states, transforms, odometry, sensors or maps as documents."),
-    "hz": ("Look", "The rate at which samples come in."),
-    "doctor": ("Look", "What is wrong, and what to do next."),
-    "wait": ("Look", "Wait until a robot, a pose or a router is there."),
-    "config": ("Look", "The settings in effect, and where each comes from."),
-    "view": ("Look", "The robots, drawn in a browser, and moved from there."),
-    "foxglove": ("Look", "The robots, live in Foxglove."),
-    "plot": ("Look", "Joint positions, or the path of a frame, over time."),
-    "check": ("Look", "The contents and findings of a robot model."),
-    "robots": ("Look", "The robots that are known by name, such as panda."),
-    "record": ("Record", "Record robots into MCAP files."),
-    "replay": ("Record", "Publish a recording again."),
-    "recover": ("Record", "A complete file of a recording that was cut off."),
-    "info": ("Record", "The contents of a recording."),
-    "export": ("Record", "The joint states and poses of a recording as a table."),
-    "snapshot": ("Record", "Save the state of robots to a file, and publish it again."),
-    "bridge": ("Run", "Carry robots between zstate and ROS 2, both ways."),
-    "router": ("Run", "A Zenoh router."),
-    "acl": ("Run", "Access control for the configuration of a router."),
-    "certs": ("Run", "Certificates for tests: an authority and identities."),
-    "ros1": ("Run", "A bridge to ROS 1, in either direction."),
-    "up": ("Run", "Start several processes from one file."),
-    "init": ("Run", "Write a commented file for `zstate up`."),
-    "plugins": ("Run", "What other packages add: streams and commands."),
-    "completion": ("Run", "Set up completion in a shell."),
-}
 
 # Commands of other tools, and the equivalent ones of zstate, separated by bars.
 _SYNONYMS = {
@@ -211,10 +166,11 @@ class Commands(click.Group):
     """The commands; ``--help`` imports none of them."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(_COMMANDS)
+        return list(own_commands())
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        command = load_command(cmd_name) if cmd_name in _COMMANDS else load_other_command(cmd_name)
+        is_own = cmd_name in own_commands()
+        command = load_command(cmd_name) if is_own else load_other_command(cmd_name)
         if command is None:
             return None
         for one in (command, *(command.commands.values() if isinstance(command, click.Group) else ())):
@@ -230,8 +186,8 @@ class Commands(click.Group):
         from click.shell_completion import CompletionItem
 
         # As click's own groups do, which import every command for its help.
-        names = [name for name in _COMMANDS if name.startswith(incomplete)]
-        commands = [CompletionItem(name, help=_COMMANDS[name][1]) for name in names]
+        found = {name: one for name, one in own_commands().items() if name.startswith(incomplete)}
+        commands = [CompletionItem(name, help=one.summary) for name, one in found.items()]
         return commands + click.Command.shell_complete(self, ctx, incomplete)
 
     def resolve_command(
@@ -242,19 +198,20 @@ class Commands(click.Group):
             if len(args) == 1:
                 click.echo(ctx.get_help())
                 ctx.exit()
-        is_command = args[0] in _COMMANDS or args[0].startswith("-")
+        is_command = args[0] in own_commands() or args[0].startswith("-")
         if not is_command and load_other_command(args[0]) is None:
             ctx.fail(
                 _ros_static_hint(args)
-                or f"there is no command {args[0]!r}; {command_hint(args[0], _COMMANDS)}"
+                or f"there is no command {args[0]!r}; {command_hint(args[0], own_commands())}"
             )
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        width = max(map(len, _COMMANDS))
-        for section in dict.fromkeys(section for section, _ in _COMMANDS.values()):
+        commands = own_commands()
+        width = max(map(len, commands))
+        for section in SECTIONS:
             rows = [
-                (name.ljust(width), text) for name, (where, text) in _COMMANDS.items() if where == section
+                (name.ljust(width), one.summary) for name, one in commands.items() if one.section == section
             ]
             with formatter.section(section):
                 formatter.write_dl(rows)

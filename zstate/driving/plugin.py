@@ -1,6 +1,6 @@
-"""What driving brings: the streams between commanders and drivers."""
+"""What driving brings: the streams between commanders and drivers; and commands."""
 
-from zstate.plugins import Plugin
+from zstate.plugins import Command, Plugin
 from zstate.streams import SAMPLE_BYTES, Stream
 
 _MESSAGES = "zstate.wire.messages"
@@ -43,4 +43,24 @@ RELAX = Stream(
     max_bytes=SAMPLE_BYTES,
 )
 
-PLUGIN = Plugin("driving", streams=(JOINT_COMMANDS, JOINT_SETPOINTS, DRIVER, STOP, RELAX))
+PLUGIN = Plugin(
+    "driving",
+    streams=(JOINT_COMMANDS, JOINT_SETPOINTS, DRIVER, STOP, RELAX),
+    commands={
+        "drive": Command(
+            "zstate.driving.cli.drive:drive_command",
+            "Drive",
+            "Host the driver of a robot: the program that owns its hardware.",
+        ),
+        "move": Command(
+            "zstate.driving.cli.move:move_command",
+            "Drive",
+            "Move joints of a robot that has a driver, and wait until they are there.",
+        ),
+        "stop": Command(
+            "zstate.driving.cli.move:stop_command",
+            "Drive",
+            "Stop a robot that has a driver, until that is released.",
+        ),
+    },
+)

@@ -1,6 +1,6 @@
-"""What odometry brings: the streams of its sensors, and of its result."""
+"""What odometry brings: the streams of its sensors, and of its result; and commands."""
 
-from zstate.plugins import Plugin
+from zstate.plugins import Command, Plugin
 from zstate.streams import Stream
 
 _MESSAGES = "zstate.wire.messages"
@@ -43,4 +43,14 @@ ODOMETRY = Stream(
     document="zstate.odometry.documents:odometry_document",
 )
 
-PLUGIN = Plugin("odometry", streams=(IMU, VELOCITY, POSE, ODOMETRY))
+PLUGIN = Plugin(
+    "odometry",
+    streams=(IMU, VELOCITY, POSE, ODOMETRY),
+    commands={
+        "odometry": Command(
+            "zstate.odometry.cli.odometry:odometry_command",
+            "Write",
+            "Publish where the base of a robot is, from its IMU and its wheels.",
+        ),
+    },
+)

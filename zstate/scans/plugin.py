@@ -1,6 +1,6 @@
-"""What scans bring: the streams of laser scanners and of maps."""
+"""What scans bring: the streams of laser scanners and of maps; and commands."""
 
-from zstate.plugins import Plugin
+from zstate.plugins import Command, Plugin
 from zstate.streams import LATCHED_BYTES, Stream
 
 _MESSAGES = "zstate.wire.messages"
@@ -29,4 +29,13 @@ MAP = Stream(
     document="zstate.scans.documents:map_document",
 )
 
-PLUGIN = Plugin("scans", streams=(SCAN, MAP))
+PLUGIN = Plugin(
+    "scans",
+    streams=(SCAN, MAP),
+    commands={
+        "scan": Command(
+            "zstate.scans.cli.scan:scan_command", "Write", "Publish the scans of a simulated or dummy laser."
+        ),
+        "map": Command("zstate.scans.cli.map:map_command", "Write", "Publish the map of a place."),
+    },
+)

@@ -10,10 +10,10 @@ from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, missing_libra
 from helpers.processes import Child, until
 
 from zstate import Kinematics, load_model
-from zstate.cli.odometry_file import read_settings
-from zstate.cli.rover import ROVER_BASE, ROVER_JOINTS, ROVER_MODEL, ROVER_WHEELS, settings_file
 from zstate.model import catalog
 from zstate.odometry import DiffDrive, WheelNoise
+from zstate.odometry.cli.rover import ROVER_BASE, ROVER_JOINTS, ROVER_MODEL, ROVER_WHEELS, settings_file
+from zstate.odometry.cli.settings_file import read_settings
 
 
 def publisher_of(demo: Child) -> int:

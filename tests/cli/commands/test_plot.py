@@ -10,8 +10,8 @@ from helpers.cli_runner import RRBOT, failure, missing_library, published_robot,
 from helpers.recording_builder import START, RecordingBuilder
 
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
-from zstate.cli.commands.plot import joint_series, path_series
 from zstate.errors import InvalidInput
+from zstate.recording.cli.plot import joint_series, path_series
 from zstate.wire.messages import OccupancyGrid, to_block
 
 SECOND = 1_000_000_000

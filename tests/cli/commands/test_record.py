@@ -11,9 +11,9 @@ from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run
 from helpers.processes import mounted_disk
 
 from zstate import StatePublisher, connect, load_model
-from zstate.cli.commands import record
-from zstate.cli.commands.record import DiskForecast
 from zstate.clock import MONOTONIC, ManualClock
+from zstate.recording.cli import record
+from zstate.recording.cli.record import DiskForecast
 from zstate.recording.info import read_info
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import RecorderStats

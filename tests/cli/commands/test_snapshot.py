@@ -19,7 +19,7 @@ from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect, discover, load_model
 from zstate.cli.session import SessionOptions
-from zstate.cli.snapshot_file import (
+from zstate.recording.cli.snapshot_file import (
     Configuration,
     RobotSnapshot,
     Snapshot,

@@ -129,7 +129,7 @@ def demo_command(
 
     if program is not None and endpoint is not None:
         with open_session(SessionOptions(connect=(endpoint,))) as session:
-            from zstate.cli.rover import run_rover
+            from zstate.odometry.cli.rover import run_rover
 
             run_rover(session, rate)
         return
@@ -165,7 +165,7 @@ def _swinging_robot(source: str, xacro_args: Mapping[str, str]) -> Demo:
 
 def _rover(xacro_args: Mapping[str, str]) -> Demo:
     """A mobile robot: one program is its hardware, another one its odometry, and one publishes the room."""
-    from zstate.cli import rover
+    from zstate.odometry.cli import rover
 
     if xacro_args:
         raise click.UsageError(f"{_ROVER!r} takes no xacro arguments; got {', '.join(xacro_args)}")

@@ -22,10 +22,10 @@ def plugins_command(*, as_json: bool) -> None:
     zstate plugins
     zstate plugins --json
     """
-    from zstate.cli.commands import command_names
+    from zstate.cli.commands import own_commands
     from zstate.plugins import found_plugins
 
-    own = command_names()
+    own = own_commands()
     facts: list[dict[str, Any]] = []
     for one in found_plugins():
         taken = [name for name in one.plugin.commands if name in own]

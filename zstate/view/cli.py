@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -154,8 +153,9 @@ def view_command(
     zstate view urdf/arm.urdf               # announced robot 'arm', with the meshes near this file
     zstate view --host 0.0.0.0 --port 9000
     """
-    import_module("zstate.view")  # reports a missing viser before anything starts
+    from zstate.view import check_libraries
 
+    check_libraries()  # before anything starts
     from zstate.cli.processes import BackgroundCall
     from zstate.model.load import is_path
     from zstate.view.data_source import ViewSource

@@ -16,15 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.cli.commands.plot import new_figure
-from zstate.cli.odometry_delay import Delay, Motions
-from zstate.cli.odometry_file import OdometrySettings, others_text
-from zstate.cli.odometry_reference import Comparison, Path, ReferenceName, compared, reference_path
 from zstate.cli.output.text_layout import Table
 from zstate.errors import InvalidInput, LookupFailed, NoData, UnknownFrame
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, SourceHealth
+from zstate.odometry.cli.delay import Delay, Motions
+from zstate.odometry.cli.reference import Comparison, Path, ReferenceName, compared, reference_path
+from zstate.odometry.cli.settings_file import OdometrySettings, others_text
 from zstate.odometry.estimator import WHEELS
 from zstate.odometry.fusion import STANDSTILL
 from zstate.odometry.health import WINDOW
@@ -35,6 +34,7 @@ from zstate.odometry.node import (
     pose_covariance,
     velocity_covariance,
 )
+from zstate.recording.cli.plot import new_figure
 from zstate.recording.info import recorded_robots
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.wire.keys import full_name

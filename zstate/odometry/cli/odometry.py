@@ -19,49 +19,49 @@ from zstate.errors import LookupFailed
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from zstate.cli.odometry_file import LegSettings, OdometrySettings, PlanarPose
-    from zstate.cli.odometry_reference import ReferenceName
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
     from zstate.odometry import DiffDrive, OdometryNode, PoseNoise, VelocityNoise
+    from zstate.odometry.cli.reference import ReferenceName
+    from zstate.odometry.cli.settings_file import LegSettings, OdometrySettings, PlanarPose
     from zstate.wire.messages import Imu, Pose, Velocity
 
     SensorMessage = Imu | Velocity | Pose
 
 
 def _parse_diff_drive(text: str) -> DiffDrive:
-    from zstate.cli.odometry_file import parse_diff_drive
+    from zstate.odometry.cli.settings_file import parse_diff_drive
 
     return parse_diff_drive(text)
 
 
 def _parse_feet(text: str) -> LegSettings:
-    from zstate.cli.odometry_file import parse_feet
+    from zstate.odometry.cli.settings_file import parse_feet
 
     return parse_feet(text)
 
 
 def _parse_velocity(text: str) -> tuple[str, VelocityNoise]:
-    from zstate.cli.odometry_file import parse_velocity
+    from zstate.odometry.cli.settings_file import parse_velocity
 
     return parse_velocity(text)
 
 
 def _parse_pose(text: str) -> tuple[str, PoseNoise]:
-    from zstate.cli.odometry_file import parse_pose
+    from zstate.odometry.cli.settings_file import parse_pose
 
     return parse_pose(text)
 
 
 def _parse_reference(text: str) -> ReferenceName:
-    from zstate.cli.odometry_reference import parse_reference
+    from zstate.odometry.cli.reference import parse_reference
 
     return parse_reference(text)
 
 
 def _parse_plot(file: str) -> Path:
-    from zstate.cli.commands.plot import plot_file
+    from zstate.recording.cli.plot import plot_file
 
     return plot_file(file)
 
@@ -205,7 +205,7 @@ def odometry_command(
         with open_session(network) as session:
             _request(session, robot, writer, reset=reset, place=set_pose)
         return
-    from zstate.cli.odometry_file import OdometrySettings, read_settings
+    from zstate.odometry.cli.settings_file import OdometrySettings, read_settings
 
     for option, value in (("--plot", plot), ("--reference", reference)):
         if value is not None and replay is None:
@@ -246,8 +246,8 @@ def _check_request(context: click.Context) -> None:
 
 def _request(session: Session, robot: str, writer: str, *, reset: bool, place: PlanarPose | None) -> None:
     """Send a request to the odometry that runs, and print what it did."""
-    from zstate.cli.odometry_file import planar_transform
     from zstate.odometry import request_odometry
+    from zstate.odometry.cli.settings_file import planar_transform
 
     pose = None if place is None else planar_transform("odom", "base", place)
     request_odometry(session, robot, "reset" if reset else "set_pose", pose, writer=writer)
@@ -307,9 +307,9 @@ def _wait_for_sensors(
     What is missing is printed. There may be no model with ``settings.base`` and without legs. Raises
     InvalidInput for a sensor whose noise is not known.
     """
-    from zstate.cli.odometry_file import others_text
     from zstate.cli.waiting import ConditionWaiter
     from zstate.odometry import SensorListener
+    from zstate.odometry.cli.settings_file import others_text
     from zstate.odometry.node import pose_covariance, velocity_covariance
     from zstate.sources.joint_state_listener import DescriptionSubscriber
     from zstate.wire.keys import full_name
@@ -383,7 +383,7 @@ def _sources_text(settings: OdometrySettings) -> str:
 
 
 def _end_lines(node: OdometryNode) -> Iterator[str]:
-    from zstate.cli.odometry_replay import health_text
+    from zstate.odometry.cli.replay import health_text
 
     yield f"{count_text(node.published, 'sample')} published"
     for one in node.health():
@@ -394,8 +394,8 @@ def _replay(
     path: str, robot: str, settings: OdometrySettings, reference: ReferenceName | None, plot: Path | None
 ) -> None:
     """Print the report of a recording, and draw it. Ends the command if nothing can be estimated."""
-    from zstate.cli.commands.plot import new_figure, save_figure
-    from zstate.cli.odometry_replay import odometry_figure, replay, report_lines
+    from zstate.odometry.cli.replay import odometry_figure, replay, report_lines
+    from zstate.recording.cli.plot import new_figure, save_figure
 
     if plot is not None:
         new_figure("", 1.0)  # reports a missing Matplotlib before it reads the recording

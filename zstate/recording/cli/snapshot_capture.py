@@ -14,14 +14,6 @@ from zstate._util.refusals import Refusals
 from zstate.cli.output.console import fail, print_status
 from zstate.cli.output.wire_text import messages_for
 from zstate.cli.session import SessionOptions
-from zstate.cli.snapshot_file import (
-    FORMAT,
-    Configuration,
-    Numbers,
-    RobotSnapshot,
-    Snapshot,
-    StaticTransformSnapshot,
-)
 from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, JointType, RobotModel
@@ -29,6 +21,14 @@ from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo, announce_reader, discover
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
+from zstate.recording.cli.snapshot_file import (
+    FORMAT,
+    Configuration,
+    Numbers,
+    RobotSnapshot,
+    Snapshot,
+    StaticTransformSnapshot,
+)
 from zstate.sources.joint_state_listener import MAX_AGE_S, DescriptionSubscriber, JointStateReader
 from zstate.streams import StreamName
 from zstate.wire.keys import ANY, MODEL_WRITER

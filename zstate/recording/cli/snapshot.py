@@ -44,7 +44,7 @@ def save_command(
     zstate snapshot save cell.toml
     zstate snapshot save - panda | less
     """
-    from zstate.cli.snapshot_capture import capture
+    from zstate.recording.cli.snapshot_capture import capture
 
     path = Path(file)
     if file != "-" and path.exists() and not force:
@@ -97,7 +97,7 @@ def load_command(
     zstate snapshot load cell.toml --as-saved          # with the session options it was saved with
     zstate snapshot load cell.toml panda --wire ros2
     """
-    from zstate.cli.snapshot_file import publish_snapshot, read_snapshot
+    from zstate.recording.cli.snapshot_file import publish_snapshot, read_snapshot
 
     snapshot = read_snapshot(Path(file))
     selected, edges = snapshot.select(robots)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from importlib import import_module
 
 import click
 
@@ -62,8 +61,9 @@ def foxglove_command(
     zstate foxglove --wire ros2             # robots of ROS 2 nodes that run rmw_zenoh
     zstate foxglove --host 0.0.0.0 --port 9000
     """
-    import_module("zstate.foxglove")  # reports missing websockets before anything starts
+    from zstate.foxglove import check_library
 
+    check_library()  # before anything starts
     from zstate.foxglove.bridge import FoxgloveBridge
     from zstate.foxglove.server import FoxgloveServer
     from zstate.web_access import is_loopback

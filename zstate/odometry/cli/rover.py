@@ -71,11 +71,11 @@ def load_room() -> Grid | None:
 
 def run_rover(session: Session, rate_hz: float) -> None:
     """Host the driver of the rover's wheels, and publish its IMU and its laser, until a signal."""
-    from zstate.cli.commands.drive import run_host
-    from zstate.cli.odometry_file import read_settings
     from zstate.driving import DriverHost, Limits
+    from zstate.driving.cli.drive import run_host
     from zstate.nodes.listener import TransformListener
     from zstate.odometry import ImuPublisher
+    from zstate.odometry.cli.settings_file import read_settings
     from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
     from zstate.sources.square_drive import WheelPair
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli import options
-from zstate.cli.commands.drive import parse_joint_value
 from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
+from zstate.driving.cli.drive import parse_joint_value
 from zstate.errors import (
     InvalidInput,
     MotionRefused,
@@ -302,8 +302,8 @@ def _move_by_keys(
     robot: str, wheels: tuple[str, str] | None, rate: float, timeout_s: float, network: SessionOptions
 ) -> None:
     """Turn the wheels of ``robot`` while keys are held, until q or a signal."""
-    from zstate.cli.keyboard import KEYS_TEXT, HeldKey, KeyReader
     from zstate.driving import Commander
+    from zstate.driving.cli.keyboard import KEYS_TEXT, HeldKey, KeyReader
 
     with KeyReader() as reader, open_session(network) as session, Commander(session, robot) as commander:
         left, right = wheels or _wheels_of(commander.wait_for_driver(timeout_s), robot)

@@ -1,0 +1,10 @@
+"""What Foxglove's server brings: its command."""
+
+from zstate.plugins import Command, Plugin
+
+PLUGIN = Plugin(
+    "foxglove",
+    commands={
+        "foxglove": Command("zstate.foxglove.cli:foxglove_command", "Look", "The robots, live in Foxglove."),
+    },
+)
