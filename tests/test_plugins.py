@@ -13,9 +13,12 @@ from helpers.cli_runner import run_cli
 from helpers.pages import blocks
 from helpers.plugins import BATTERY_FOLDER, forget_plugins
 from helpers.processes import until
+from helpers.prometheus_text import collected, row
 
 from zstate import StreamListener, StreamPublisher, plugins
 from zstate.errors import InvalidInput, SecondWriter
+from zstate.metrics.collectors import PublisherMetrics, WriterMetrics
+from zstate.net.presence import discover
 from zstate.net.session import Session
 from zstate.streams import Stream
 from zstate.wire.identity import WriterId
@@ -49,7 +52,9 @@ def install(folder: Path, name: str, code: str) -> None:
 
 def test_the_guide_shows_the_package_of_these_tests():
     page = (ROOT / "docs/guides/streams.md").read_text()
-    assert blocks("text", page)[0] == (BATTERY_FOLDER / "zstate_battery/__init__.py").read_text()
+    shown = blocks("text", page)
+    assert shown[0] == (BATTERY_FOLDER / "zstate_battery/__init__.py").read_text()
+    assert (BATTERY_FOLDER / "zstate_battery/checks.py").read_text() in shown
 
 
 def test_a_stream_is_published_and_received_with_its_name(
@@ -132,6 +137,51 @@ def test_commands_know_the_stream(sessions: tuple[Session, Session], battery_plu
             assert (check["state"], "as 'main'" in check["text"]) == ("ok", True)
             assert run_cli("battery", "panda").stdout == "80 %\n"
     assert "battery" in run_cli("hz", "--help").stdout
+
+
+def doctors_checks() -> dict[str, tuple[str, str]]:
+    """The state and the text of each check of doctor, by its name."""
+    checks = json.loads(run_cli("doctor", "--json").stdout)["checks"]
+    return {one["name"]: (one["state"], one["text"]) for one in checks}
+
+
+def test_doctor_has_the_checks_of_the_package(sessions: tuple[Session, Session], battery_plugin: Stream):
+    with (
+        StreamPublisher(sessions[0], "panda", battery_plugin, name="main") as publisher,
+        _Repeated(lambda: publisher.publish(voltage=21.0, charge=0.07)),
+    ):
+        assert doctors_checks()["charge"] == ("warning", "'main' is at 7%")
+
+
+@pytest.mark.parametrize("method", ["__init__", "is_complete", "has_data", "checks", "close"])
+def test_a_check_that_fails_is_a_warning_and_costs_no_other_one_anything(
+    sessions: tuple[Session, Session], battery_plugin: Stream, monkeypatch: pytest.MonkeyPatch, method: str
+):
+    from zstate_battery.checks import BatteryChecks
+
+    def fail(*_: object) -> None:
+        raise OSError("no such cell")
+
+    monkeypatch.setattr(BatteryChecks, method, fail)
+    with (
+        StreamPublisher(sessions[0], "panda", battery_plugin, name="main") as publisher,
+        _Repeated(lambda: publisher.publish(voltage=24.1, charge=0.8)),
+    ):
+        found = doctors_checks()
+    assert found["battery"][0] == "ok"
+    if method in ("__init__", "checks"):
+        text = "the checks of zstate-battery have failed: OSError: no such cell"
+        assert found["plugins"] == ("warning", text)
+
+
+def test_metrics_count_its_messages_and_writers(sessions: tuple[Session, Session], battery_plugin: Stream):
+    with StreamPublisher(sessions[0], "panda", battery_plugin, name="main") as publisher:
+        published = PublisherMetrics([publisher])
+        publisher.publish(voltage=24.1, charge=0.8)
+        samples = row("zstate_publisher_samples_total", robot="panda", wire="native", stream="battery")
+        assert collected(published)[samples] == 1
+        writers = collected(WriterMetrics(lambda: discover(sessions[1])))
+        assert writers[row("zstate_writers", robot="panda", stream="battery")] == 1
 
 
 @pytest.mark.usefixtures("battery_plugin")

@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -50,12 +50,16 @@ class Command(NamedTuple):
 class Plugin:
     """What one folder or package brings.
 
-    ``streams``, and ``commands`` of the command line by name: a ``Command``, or only its ``place``.
+    - ``streams``
+    - ``commands`` of the command line by name: a ``Command``, or only its ``place``.
+    - ``checks``: ``"module:class"`` of what `zstate doctor` checks, a subclass of
+      ``zstate.cli.doctor.plugin_checks.PluginChecks``.
     """
 
     name: str
     streams: tuple[Stream, ...] = ()
     commands: Mapping[str, str | Command] = field(default_factory=lambda: MappingProxyType({}))
+    checks: str = ""
 
     def command(self, name: str) -> Command:
         """The command ``name``, which it brings."""
@@ -109,7 +113,7 @@ def found_plugins() -> tuple[FoundPlugin, ...]:
             for name, place in one.plugin.commands.items()
             if _is_free(name, "command", one, commands, problems)
         }
-        plugin = Plugin(one.plugin.name, tuple(streams), own)
+        plugin = replace(one.plugin, streams=tuple(streams), commands=own)
         found.append(one._replace(plugin=plugin, problem="; ".join(problems)))
         for problem in problems:
             _LOG.warning("%s", problem, extra={"event": "plugin"})

@@ -63,4 +63,5 @@ PLUGIN = Plugin(
             "Stop a robot that has a driver, until that is released.",
         ),
     },
+    checks="zstate.driving.cli.checks:DriverChecks",
 )

@@ -38,4 +38,5 @@ PLUGIN = Plugin(
         ),
         "map": Command("zstate.scans.cli.map:map_command", "Write", "Publish the map of a place."),
     },
+    checks="zstate.scans.cli.checks:MapChecks",
 )

@@ -137,7 +137,7 @@ def test_scans_in_a_frame_that_no_robot_places_are_a_finding():
     assert ended.code == 1
     first = json.loads(ended.stdout)["first_broken"]
     assert first["name"] == "scan"
-    assert "the scans of 'front' are in 'rrbot/baze', which no writer places; 'base'" in first["text"]
+    assert "the scan of 'front' is in 'rrbot/baze', which no writer places; 'base'" in first["text"]
 
 
 def test_commands_that_look_show_scans():
@@ -148,7 +148,7 @@ def test_commands_that_look_show_scans():
         assert writer["rate_hz"] == pytest.approx(30.0, rel=0.3)
         assert "rrbot: scan/front (" in run_cli("graph").stdout
         monitored = json.loads(run_cli("monitor", "--robots", "--once", "--json").stdout)
-        assert monitored["scans_hz"] == pytest.approx(30.0, rel=0.3)
+        assert monitored["scan_hz"] == pytest.approx(30.0, rel=0.3)
         assert " scans " in run_cli("monitor", "--robots", "--once").stdout
         ended = run_cli("doctor", "rrbot", "--json")
         checks = [one for one in json.loads(ended.stdout)["checks"] if one["name"] == "scan"]

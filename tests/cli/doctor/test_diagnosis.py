@@ -229,7 +229,7 @@ def test_robot_with_odometry_and_an_imu_is_sound_if_the_frame_of_the_imu_is_plac
         repeated(lambda: imu.publish([0, 0, 0], [0, 0, 9.81])),
     ):
         found = broken_link("cart")
-        assert "the readings of 'chest' are in 'cart/base_imu', which no writer places" in found["text"]
+        assert "the imu of 'chest' is in 'cart/base_imu', which no writer places" in found["text"]
         with StaticPublisher(session, "cart", "mount") as statics:
             statics.set(Transform("base", "base_imu", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
             report = diagnosed("cart", code=0)

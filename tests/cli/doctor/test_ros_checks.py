@@ -185,6 +185,6 @@ def test_scans_of_nodes_in_a_frame_that_no_node_places_are_broken(ros_router: st
     with published_robot(wire="ros2", router=ros_router), scanning(ros_router, "tol"):
         found = Found(code=1)
     assert found.states["scan"] == "broken"
-    text = "the scans of 'front' are in 'tol', which no writer places; 'tool' is similar"
+    text = "the scan of 'front' is in 'tol', which no writer places; 'tool' is similar"
     assert found.texts["scan"] == text
     assert found.next["scan"].startswith("zstate static TARGET tol --xyz X Y Z --wire ros2")

@@ -31,7 +31,7 @@ from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import printable
-from zstate.plugins import edge_streams
+from zstate.plugins import edge_streams, is_own, measured_streams
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import ANY, check_robot
 
@@ -54,8 +54,6 @@ _FIRST_AFTER_S = 1.0
 # Discovery takes less.
 _DISCOVERY_S = 0.3
 _WITHIN_NS = 2_000_000_000
-_OWN_RATES: dict[StreamName, str] = {"transforms": "transforms", "odometry": "odometry", "scan": "scans"}
-"""The streams that have a rate apart from that of the joint states, and its column."""
 
 
 @click.command("monitor")
@@ -132,14 +130,10 @@ def monitor_command(
     ):
         if robots:
             monitor = opened.enter_context(RobotMonitor(session, directory, robot, wire, selected_clock))
-            opened.enter_context(
-                serve_metrics(
-                    metrics,
-                    listener_collector(monitor.robots),
-                    writer_collector(directory),
-                    driver_collector(monitor.drivers),
-                )
-            )
+            collectors = [listener_collector(monitor.robots), writer_collector(directory)]
+            if monitor.drivers is not None:
+                collectors.append(driver_collector(monitor.drivers))
+            opened.enter_context(serve_metrics(metrics, *collectors))
             _report_robots(monitor, once_s, as_json=as_json)
             return
         listener = opened.enter_context(
@@ -309,7 +303,6 @@ class RobotMonitor(Closeable):
     def __init__(
         self, session: Session, directory: RobotDirectory, robot: str, wire: str, clock: Clock | None
     ) -> None:
-        from zstate.driving.driver_state import DriverStateListener
         from zstate.net.status import StatusMonitor
         from zstate.net.topic_statistics import TopicStatistics
         from zstate.wire.registry import get_wire
@@ -321,15 +314,22 @@ class RobotMonitor(Closeable):
         self._listeners: dict[Follow, tuple[TransformListener, MeteredBuffer]] = {}
         self._robots: BoundedDict[str, MonitoredRobot] = BoundedDict()
         self._opened = ExitStack()
-        self.drivers = self._opened.enter_context(DriverStateListener(session, robot))
+        self.drivers: DriverStateListener | None = None
         """Those of the native wire; other wires have none."""
+        if is_own("driver"):
+            from zstate.driving.driver_state import DriverStateListener
+
+            self.drivers = self._opened.enter_context(DriverStateListener(session, robot))
         self._statuses = self._opened.enter_context(StatusMonitor(session, robot))
         counted = TopicStatistics(
             session, get_wire(wire), sources=lambda name, stream, _: ((name, stream),), clock=clock
         )
         self._counted = self._opened.enter_context(counted)
-        # On a ROS wire the edges of odometry are on /tf, which the listener counts.
-        for stream in ("scan",) if is_ros(wire) else _OWN_RATES:
+        # The streams with a rate apart from that of the joint states; on a ROS wire edges are on /tf, which
+        # the listener counts.
+        self._rated = (*edge_streams(), *measured_streams())
+        carried = filter(get_wire(wire).carries, measured_streams()) if is_ros(wire) else self._rated
+        for stream in carried:
             counted.subscribe(stream, robot)
 
     def close(self) -> None:
@@ -387,20 +387,20 @@ class RobotMonitor(Closeable):
     def report(self, *, as_json: bool) -> None:
         from zstate.cli.edge_statistics import time_text
 
-        drivers = self.drivers.states()
+        drivers = {} if self.drivers is None else self.drivers.states()
         for one in self.robots():
             measure, stats = one.buffer.measure(one.robot), one.stats
             driver = drivers.get(one.robot)
             rates = self._own_rates(one.robot, measure)
             faulty = [status for status in self._statuses.recent(one.robot) if status.level != "ok"]
             if as_json:
-                facts = {"robot": one.robot, **asdict(measure), **_rate_facts(rates), **asdict(stats)}
+                facts = {"robot": one.robot, **asdict(measure), **self._rate_facts(rates), **asdict(stats)}
                 facts["driver"] = None if driver is None else _driver_facts(driver)
                 print_json({**facts, "faults": list(map(_fault_facts, faulty))})
                 continue
             rate = _rate_text(one.buffer.statistics_of(one.robot), measure.rate_hz)
             for stream, rate_hz in rates.items():
-                rate += f"  {_OWN_RATES[stream]} {rate_text(rate_hz) if rate_hz else 'silent'}"
+                rate += f"  {stream} {rate_text(rate_hz) if rate_hz else 'silent'}"
             reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
             print_wrapped(
                 f"{one.robot}  {rate}  "
@@ -418,7 +418,7 @@ class RobotMonitor(Closeable):
     def _own_rates(self, robot: str, measure: RobotMeasure) -> dict[StreamName, float]:
         """The rates of streams other than the joint states, 0 for those that are silent."""
         rates: dict[StreamName, float] = {}
-        for stream in _OWN_RATES:
+        for stream in self._rated:
             counted = self._counted.get((robot, stream))
             if counted is not None:
                 window = counted.recent(_WITHIN_NS)
@@ -429,9 +429,8 @@ class RobotMonitor(Closeable):
             rates["transforms"] = measure.transforms_hz
         return rates
 
-
-def _rate_facts(rates: Mapping[StreamName, float]) -> dict[str, float | None]:
-    return {f"{column}_hz": rates.get(stream) for stream, column in _OWN_RATES.items()}
+    def _rate_facts(self, rates: Mapping[StreamName, float]) -> dict[str, float | None]:
+        return {f"{stream}_hz": rates.get(stream) for stream in self._rated}
 
 
 def _program(status: Status) -> str:

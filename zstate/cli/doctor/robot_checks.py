@@ -7,11 +7,10 @@ from collections.abc import Iterable, Iterator, Sequence, Set
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
-from zstate.cli.doctor.robot_probe import RobotProbe, StreamSamples, WriterSamples
+from zstate.cli.doctor.robot_probe import RobotProbe, StreamSamples, WriterSamples, has_frame
 from zstate.cli.frame_checks import similar_frames, without_program_advice
 from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import publish_command_for
-from zstate.driving.driver_state import ReceivedState
 from zstate.errors import LookupFailed, ModelError, format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.model.robot import RobotModel, coordinate_names, representative_links
@@ -22,13 +21,10 @@ from zstate.plugins import is_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import MODEL_WRITER, foreign_edge_problem, full_name
-from zstate.wire.messages import DriverState, Status
+from zstate.wire.messages import Status
 
 _MIN_RECEIVED = 0.8
 """The least ratio of received to sent samples."""
-
-_MAX_SKIPPED = 0.01
-"""The greatest ratio of the skipped to the due ticks of a driver's loop."""
 
 _MIN_RATE = 0.95
 """The least ratio of the achieved to the commanded rate."""
@@ -53,20 +49,18 @@ def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
             yield broken("version", text, "pip install -U zstate" if is_newer else advice)
             break
     yield from _waits_checks(probe)
-    yield from maps_checks(probe, f"zstate doctor {probe.info.name} --timeout 10")
     if probe.is_place:
+        yield from probe.plugin_checks()
         yield statics_check(probe)
         return
     model, check = model_check(probe)
     yield check
-    yield from driver_checks(probe)
+    yield from probe.plugin_checks()
     if probe.info.named("partial_joint_states") and "joint_states" not in probe.streams:
         yield from _parts_checks(probe, model)
     elif not probe.has_only_transforms:
         yield _samples_check(probe)
     yield from named_writers_checks(probe, "transforms", probe.transforms, probe.info.named("transforms"))
-    yield from named_writers_checks(probe, "scan", probe.scans, probe.info.named("scan"))
-    yield from sensor_frames_checks(probe)
     yield from measured_checks(probe)
     yield clocks_check(probe)
     yield stamps_check(probe)
@@ -172,74 +166,6 @@ def model_check(probe: RobotProbe) -> tuple[RobotModel | None, Check]:
     return model, ok("model", text)
 
 
-def driver_checks(probe: RobotProbe) -> Iterator[Check]:
-    """Whether the robot's driver works, which program commands it, and how old its commands are.
-
-    Nothing for a robot without a driver and a commander.
-    """
-    robot, received = probe.info.name, probe.driver
-    commanders = probe.writers("joint_commands")
-    if received is None:
-        if commanders:
-            text = f"{commanders[-1]} commands {robot!r}, which has no driver that publishes its state"
-            yield broken("driver", text, "zstate ls  # start the program with its DriverHost")
-        return
-    yield _driver_check(robot, received)
-    if received.is_live and received.state.state not in ("off", "fault"):
-        yield _commander_check(robot, received.state, commanders)
-        yield _commands_check(received.state)
-
-
-def _driver_check(robot: str, received: ReceivedState) -> Check:
-    """Whether the driver can be commanded, and its loop keeps its rate."""
-    state, monitor = received.state, f"zstate monitor --robots --robot {robot}"
-    text = f"{state.program}: {received}"
-    if state.state == "stopped":
-        return broken("driver", text, f"zstate stop {robot} --release  # when it may move again")
-    if state.state == "fault":
-        return broken("driver", text, f"zstate ls  # restart {state.program}, then release the stop")
-    if state.state == "off" or not received.is_live:
-        return broken("driver", text, f"zstate ls  # shows whether {state.program} runs")
-    text += f"; its loop runs at {state.rate_hz:.1f} Hz"
-    if state.faults:
-        text += f"; {count_text(state.faults, 'call')} of the driver failed, the first is in its log"
-        return warning("driver", text, monitor)
-    if state.skipped > _MAX_SKIPPED * (state.ticks + state.skipped):
-        due = state.ticks + state.skipped
-        text += f", and skipped {state.skipped} of {due} ticks: the driver or the machine is too slow for it"
-        return warning("driver", text, monitor)
-    return ok("driver", text)
-
-
-def _commander_check(robot: str, state: DriverState, commanders: Sequence[WriterId]) -> Check:
-    """Which program commands the driver, and whether its commands can be used."""
-    text = f"none: no program commands {robot!r}"
-    if commanders:
-        text = f"{commanders[-1]}, which has sent no command yet"
-        if state.commander == str(commanders[-1]):
-            text = state.commander
-    if state.refused:
-        refused = ", ".join(f"{reason} {count}" for reason, count in state.refused.items())
-        text += f"; commands were refused ({refused}), the newest: {state.last_refusal}"
-        return warning("commander", text, f"zstate monitor --robots --robot {robot}")
-    return ok("commander", text)
-
-
-def _commands_check(state: DriverState) -> Check:
-    """Whether commands arrive before the last one expires, and in time."""
-    if state.transit_excess is not None and state.transit_excess > state.ttl // 2:
-        waited, ttl = format_duration(state.transit_excess), format_duration(state.ttl)
-        text = f"the newest waited for {waited} on its way, where commands are valid for {ttl} at most"
-        return warning("commands", f"{text}: the link is too slow for them", "zstate monitor --robots")
-    if state.command_age is None:
-        return skipped("commands", "the driver has accepted none yet")
-    age, ttl = format_duration(state.command_age), format_duration(state.ttl)
-    text = f"the newest is {age} old, valid for {ttl} at most"
-    if state.state == "holding":
-        text += ": the joints are held until the next"
-    return ok("commands", text)
-
-
 def _samples_check(probe: RobotProbe) -> Check:
     stream, robot, statistics = probe.followed, probe.info.name, probe.samples.statistics
     writers, window = probe.writers(stream), statistics.window()
@@ -305,11 +231,10 @@ def named_writers_checks(
     stream: StreamName,
     stream_samples: StreamSamples,
     names: Sequence[tuple[str, WriterId]],
-    hz: str | None = None,
 ) -> Iterator[Check]:
-    """Whether each announced writer of a stream with names publishes; ``hz`` is the command for the rate."""
+    """Whether each announced writer of a stream with names publishes."""
     samples = stream_samples.writers
-    hz, what = hz or f"zstate hz {probe.info.name} --stream {stream}", stream.replace("_", " ")
+    hz, what = f"zstate hz{probe.argument} --stream {stream}", stream.replace("_", " ")
     for name, writer in names:
         received, known_as = samples.get(writer.session), f"{writer}, as {name!r}" if name else str(writer)
         if received is None:
@@ -327,51 +252,32 @@ def named_writers_checks(
             yield ok(stream, f"{window.rate_hz:.1f} Hz from {known_as}, newest {silence} ago")
 
 
-def measured_checks(probe: RobotProbe, command: str = "") -> Iterator[Check]:
-    """Whether each writer of odometry and of measurements publishes, but for laser scanners.
-
-    ``command`` shows rates, without its stream; default: that of the native wire.
-    """
+def measured_checks(probe: RobotProbe) -> Iterator[Check]:
+    """Whether each writer of measurements and of odometry publishes, in a frame that the robot has."""
     info = probe.info
     for stream, samples in probe.measured.items():
-        hz = f"{command or f'zstate hz {info.name}'} --stream {stream}"
         unnamed = [("", writer) for one, writer in info.writers if one == stream and not is_named(stream)]
-        yield from named_writers_checks(probe, stream, samples, info.named(stream) or unnamed, hz)
+        names = info.named(stream) or unnamed
+        yield from named_writers_checks(probe, stream, samples, names)
+        if has_frame(stream):
+            yield from _sensor_frames_checks(probe, stream, samples, names)
 
 
-def maps_checks(probe: RobotProbe, patient: str) -> Iterator[Check]:
-    """Whether each announced map has arrived; ``patient`` is the command that waits longer for them."""
-    for name, writer in probe.info.named("map"):
-        grid = probe.maps.get(name)
-        if grid is None:
-            text = f"{writer} announces the map {name!r}, which has not arrived"
-            yield broken("map", text, patient)
-        else:
-            frame = full_name(probe.info.name, grid.frame)
-            size = f"{grid.width} x {grid.height} cells of {grid.resolution:g} m"
-            yield ok("map", f"{name!r}: {size} in {frame!r}, from {writer}")
-
-
-def sensor_frames_checks(probe: RobotProbe) -> Iterator[Check]:
+def _sensor_frames_checks(
+    probe: RobotProbe, stream: StreamName, samples: StreamSamples, names: Sequence[tuple[str, WriterId]]
+) -> Iterator[Check]:
     """Findings for measurements in frames of the robot that it does not have: no reader can place them."""
-    robot, info, measured = probe.info.name, probe.info, probe.measured
+    robot, writers = probe.info.name, samples.writers
     frames = {frame.name for frame in probe.frames}
-    for stream, what, samples, names in (
-        ("scan", "scans", probe.scans.writers, info.named("scan")),
-        ("imu", "readings", measured["imu"].writers, info.named("imu")),
-        ("velocity", "velocities", measured["velocity"].writers, info.named("velocity")),
-    ):
-        for sensor, writer in names:
-            for frame in samples[writer.session].names if writer.session in samples else ():
-                full = full_name(robot, frame)
-                if full.startswith(f"{robot}/") and full not in frames:
-                    near = similar_frames(full, frames)
-                    hint = f"; {near[0]!r} is similar" if near else ""
-                    text = f"the {what} of {sensor!r} are in {full!r}, which no writer places{hint}"
-                    then = (
-                        f"zstate static TARGET {full} --xyz X Y Z  # or start {writer} with another --frame"
-                    )
-                    yield broken(stream, text, then)
+    for sensor, writer in names:
+        for frame in writers[writer.session].names if writer.session in writers else ():
+            full = full_name(robot, frame)
+            if full.startswith(f"{robot}/") and full not in frames:
+                near = similar_frames(full, frames)
+                hint = f"; {near[0]!r} is similar" if near else ""
+                text = f"the {stream} of {sensor!r} is in {full!r}, which no writer places{hint}"
+                then = f"zstate static TARGET {full} --xyz X Y Z  # or start {writer} with another --frame"
+                yield broken(stream, text, then)
 
 
 def _no_writer_check(probe: RobotProbe) -> Check:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.frame_tree import FrameInfo
+from zstate.cli.doctor.check import Check
+from zstate.cli.doctor.plugin_checks import opened_checks
+from zstate.cli.output.wire_text import RosMessages, messages_for
 from zstate.cli.waiting import ConditionWaiter
-from zstate.driving.driver_state import DriverStateListener, ReceivedState
 from zstate.errors import NoClock, Unreachable
 from zstate.ingest.counters import ListenerStats
 from zstate.ingest.events import WriterEvent
@@ -28,20 +30,16 @@ from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, WriterKey
 from zstate.nodes.clock import SimulatedClock
 from zstate.nodes.listener import Follow, TransformListener
-from zstate.plugins import edge_streams, measured_streams
+from zstate.plugins import edge_streams, is_latched, is_measured, measured_streams, stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY
 from zstate.wire.messages import (
-    Imu,
     JointState,
-    LaserScan,
-    OccupancyGrid,
     RobotDescription,
     StampedMessage,
     Status,
     TransformSample,
-    Velocity,
     from_block,
     order_digest,
 )
@@ -53,7 +51,13 @@ _REPLY_WITHIN_S = 0.4
 
 
 def _measured() -> tuple[StreamName, ...]:
-    return (*measured_streams(), "odometry")
+    """The streams of measurements, and of moving edges in messages of their own."""
+    return (*measured_streams(), *(stream for stream in edge_streams() if stream != "transforms"))
+
+
+def has_frame(stream: StreamName) -> bool:
+    """Whether its messages are measured in one frame, their ``frame``."""
+    return is_measured(stream) and "frame" in stream_named(stream).type.__struct_fields__
 
 
 def _native_streams() -> tuple[StreamName, ...]:
@@ -66,13 +70,14 @@ def _ros_streams() -> tuple[StreamName, ...]:
 
 
 class WriterSamples:
-    """Samples of one writer: ``statistics``, ``names`` of joints or frames, and ranges of positions.
+    """Samples of one writer: ``statistics``, the ``newest``, ``names`` of joints or frames, and ranges.
 
     The frames are those that its edges place, or those of its measurements.
     """
 
     def __init__(self, statistics: IntervalStatistics) -> None:
         self.statistics = statistics
+        self.newest: Any = None
         self.names: dict[str, None] = {}
         self._joints: tuple[str, ...] | None = None
         self._order = b""
@@ -80,8 +85,9 @@ class WriterSamples:
 
     def add(self, sample: StampedMessage) -> None:
         """Include ``sample``; positions in another joint order replace all before."""
-        if isinstance(sample, LaserScan | Imu | Velocity):
-            self.names[sample.frame] = None
+        self.newest = sample
+        if isinstance(frame := getattr(sample, "frame", None), str):
+            self.names[frame] = None
         elif isinstance(sample, TransformSample):
             self.names.update(dict.fromkeys(child for _, child in sample.edges or ()))
         elif isinstance(sample, JointState):
@@ -117,7 +123,7 @@ class StreamSamples(NamedTuple):
 
 
 class StreamCollector(Closeable):
-    """Subscribes to all streams of ``robots``, to their models and maps, and to the status of their writers.
+    """Subscribes to all streams of ``robots``, to their models, and to the status of their writers.
 
     One set of subscriptions serves all robots: on the native wire, for more than one robot, that of all
     robots there are. ``on_change()`` is called after each sample and each latched value.
@@ -130,9 +136,7 @@ class StreamCollector(Closeable):
         self.robot = robots[0].name if len(robots) == 1 else ANY
         self.descriptions: dict[str, RobotDescription] = {}
         self.statuses: dict[str, dict[int, Status]] = {info.name: {} for info in robots}
-        self.maps: dict[str, dict[str, OccupancyGrid]] = {info.name: {} for info in robots}
         self.events: dict[str, list[WriterEvent]] = {info.name: [] for info in robots}
-        self.drivers: DriverStateListener | None = None
         self._session, self._on_change = session, on_change
         self._wire = get_wire(wire)
         self._samples: dict[tuple[str, StreamName], dict[int, WriterSamples]] = {}
@@ -140,12 +144,11 @@ class StreamCollector(Closeable):
         followed: dict[Follow, list[str]] = {}
         for info in robots:
             followed.setdefault(followed_stream(info, wire), []).append(info.name)
-        latched: list[StreamName] = ["robot_description"]
-        if any(info.named("map") for info in robots):
-            latched.append("map")
         with ExitStack() as opening:
-            for stream in latched:
-                opening.enter_context(subscribe(session, self._wire, self.robot, stream, self._on_latched))
+            opening.enter_context(
+                subscribe(session, self._wire, self.robot, "robot_description", self._on_descriptions)
+            )
+            self.plugins = opening.enter_context(opened_checks(session, robots, wire, on_change))
             topic = TopicStatistics(session, self._wire, sources=_sources, on_sample=self._on_sample)
             self.topic = opening.enter_context(topic)
             for stream in _native_streams() if self.is_native else _ros_streams():
@@ -155,7 +158,6 @@ class StreamCollector(Closeable):
                 topic.subscribe("tf", name)
             if self.is_native:
                 opening.enter_context(StatusSubscriber(session, self.robot, self._on_status))
-                self.drivers = opening.enter_context(DriverStateListener(session, self.robot))
             for follow, names in followed.items():
                 of = self.robot if follow == "joint_states" else names
                 listener = TransformListener(session, of, wire=wire, follow=follow, on_event=self._on_event)
@@ -205,12 +207,10 @@ class StreamCollector(Closeable):
         writer.add(sample)
         self._on_change()
 
-    def _on_latched(self, received: list[Received]) -> None:
-        for robot, key, message in received:
+    def _on_descriptions(self, received: list[Received]) -> None:
+        for robot, _, message in received:
             if isinstance(message, RobotDescription):
                 self.descriptions[robot] = message
-            elif isinstance(message, OccupancyGrid) and robot in self.maps:
-                self.maps[robot][self._wire.edge_writer_name(key) or ""] = message
         self._on_change()
 
     def _on_status(self, robot: str, status: Status) -> None:
@@ -259,9 +259,10 @@ class RobotProbe:
     """What ``collector`` has of the robot ``info``.
 
     ``neighbours`` are all announced robots. ``nodes`` are the samples of each stream by ROS node, on a ROS
-    wire; ``transforms`` and ``parts``, the partial joint states, are those of the native wire. ``scans`` are
-    those of its laser scanners, ``measured`` those of its other sensors and its odometry. ``waits`` are the
-    streams without a writer that programs of this robot read, with these programs.
+    wire; ``transforms`` and ``parts``, the partial joint states, are those of the native wire. ``measured``
+    are those of its sensors and its odometry. ``waits`` are the streams without a writer that programs of
+    this robot read, with these programs. ``argument`` is the robot in the commands of findings; empty if the
+    wire is that of one robot.
     """
 
     def __init__(
@@ -270,15 +271,18 @@ class RobotProbe:
         info: RobotInfo,
         neighbours: Sequence[RobotInfo],
         readers: Sequence[Announcement] = (),
+        *,
+        is_only: bool = False,
     ) -> None:
         self.info, self.neighbours = info, neighbours
+        self.argument = "" if is_only else f" {info.name}"
         self.streams = frozenset(stream for stream, _ in info.writers)
         self.followed: Follow = followed_stream(info, "native" if collector.is_native else "")
         self.offsets: tuple[MeasuredOffset, ...] = ()
         self.unresponsive: set[WriterId] = set()
         self.waits = unwritten_streams(info, readers)
         self.collector = collector
-        self.statuses, self.maps = collector.statuses[info.name], collector.maps[info.name]
+        self.statuses = collector.statuses[info.name]
         self.events = collector.events[info.name]
         self._listener = collector.listener(self.followed)
 
@@ -303,14 +307,15 @@ class RobotProbe:
         return self._of("partial_joint_states")
 
     @property
-    def scans(self) -> StreamSamples:
-        """Those of laser scanners."""
-        return self._of("scan")
-
-    @property
     def measured(self) -> dict[StreamName, StreamSamples]:
-        """Those of other sensors than laser scanners, and of odometry."""
-        return {stream: self._of(stream) for stream in _measured() if stream != "scan"}
+        """Those of sensors, and of odometry."""
+        return {stream: self._of(stream) for stream in _measured()}
+
+    def newest(self, stream: StreamName) -> dict[str, Any]:
+        """The newest message of each announced writer of ``stream``, by the writer's name."""
+        writers = self._of(stream).writers
+        names = self.info.named(stream)
+        return {name: writers[one.session].newest for name, one in names if one.session in writers}
 
     @property
     def nodes(self) -> dict[StreamName, StreamSamples]:
@@ -369,24 +374,21 @@ class RobotProbe:
         names = {writer.session: str(writer) for _, writer in self.info.writers}
         return names.get(session, "an unannounced writer")
 
-    @property
-    def driver(self) -> ReceivedState | None:
-        """The newest state of the robot's driver; None if none has arrived."""
-        drivers = self.collector.drivers
-        return None if drivers is None else drivers.get(self.info.name)
+    def plugin_checks(self) -> Iterator[Check]:
+        """The checks of plugins."""
+        for plugin in self.collector.plugins:
+            yield from plugin.checks(self)
 
     @property
     def is_incomplete(self) -> bool:
         """Whether announced data has not arrived yet."""
         if "robot_description" in self.streams and self.description is None:
             return True
-        for samples, names in (
-            (self.parts, self.info.named("partial_joint_states")),
-            (self.scans, self.info.named("scan")),
-        ):
-            if not {one.session for _, one in names} <= samples.writers.keys():
+        # The frames of measurements are checked, for which one of each sensor is needed.
+        for stream in ("partial_joint_states", *filter(has_frame, self.streams)):
+            if not {one.session for _, one in self.info.named(stream)} <= self._of(stream).writers.keys():
                 return True
-        if not {name for name, _ in self.info.named("map")} <= self.maps.keys():
+        if not all(plugin.is_complete(self.info) for plugin in self.collector.plugins):
             return True
         if self.followed not in self.streams:
             return False
@@ -403,25 +405,28 @@ class RobotProbe:
     def is_silent(self) -> bool:
         """Whether nothing has arrived except announcements."""
         frames = any(frame.kind == "static" for frame in self.frames)
-        has_replied = self.description or self.statuses or self.offsets or self.maps
-        return not (has_replied or self.sample_count or frames)
+        has_replied = self.description or self.statuses or self.offsets
+        has_data = any(plugin.has_data(self.info.name) for plugin in self.collector.plugins)
+        return not (has_replied or has_data or self.sample_count or frames)
 
     @property
     def sample_count(self) -> int:
         """How many joint states, transforms, odometry and messages of sensors have arrived."""
-        all_samples = [self.samples, self.transforms, self.parts, self.scans, *self.measured.values()]
+        all_samples = [self.samples, self.transforms, self.parts, *self.measured.values()]
         return sum(one.statistics.count for samples in all_samples for one in samples.writers.values())
 
     def statistics(self) -> list[IntervalStatistics]:
         """Those of the followed stream, and of each writer of partial joint states or of moving edges."""
-        moving = self.parts, self.transforms, self.measured["odometry"]
+        moving = (self.parts, *map(self._of, edge_streams()))
         writers = [writer for samples in moving for writer in samples.writers.values()]
         return [self.samples.statistics, *(writer.statistics for writer in writers)]
 
     @property
     def is_place(self) -> bool:
-        """Whether it has a map, and nothing that moves."""
-        return "map" in self.streams and self.streams <= {"map", "tf_static"}
+        """Whether it has maps, or other latched values of a plugin, and nothing that moves."""
+        latched = frozenset(stream for stream in self.streams if is_latched(stream))
+        is_described = "robot_description" in latched
+        return latched == self.streams and not is_described and bool(latched - {"tf_static"})
 
     @property
     def has_only_transforms(self) -> bool:
@@ -491,14 +496,15 @@ def collected_probes(
     Waits at least 1.2 s and at most ``timeout_s`` [s] for it, and as long again for the replies of writers of
     which nothing has arrived.
     """
-    waiter, is_native = ConditionWaiter(), wire == "native"
+    waiter, is_native, messages = ConditionWaiter(), wire == "native", messages_for(wire)
     deadline_s = time.monotonic() + timeout_s
     with ExitStack() as opened:
         probes: list[RobotProbe] = []
         readers = discover_readers(session, _READERS_WITHIN_S) if is_native else ()
         for group in [selected] if is_native else [[info] for info in selected]:
             collector = opened.enter_context(StreamCollector(session, group, wire, waiter.notify))
-            probes += [RobotProbe(collector, info, robots, readers) for info in group]
+            is_only = isinstance(messages, RosMessages) and messages.robot is not None
+            probes += [RobotProbe(collector, info, robots, readers, is_only=is_only) for info in group]
         window_end_s = time.monotonic() + min(_MIN_WINDOW_S, timeout_s)
         if is_native:
             offsets: dict[str, list[MeasuredOffset]] = {}

@@ -10,13 +10,10 @@ from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import stamps_check
 from zstate.cli.doctor.robot_checks import (
     limits_check,
-    maps_checks,
     measured_checks,
     model_check,
-    named_writers_checks,
     poses_check,
     refused_check,
-    sensor_frames_checks,
     statics_check,
 )
 from zstate.cli.doctor.robot_probe import RobotProbe
@@ -38,8 +35,7 @@ def ros_checks(probe: RobotProbe, messages: RosMessages, model_name: str) -> Ite
 class _RosChecks:
     def __init__(self, probe: RobotProbe, messages: RosMessages) -> None:
         self._probe, self._messages = probe, messages
-        # Commands need a robot's name only if the namespace is open.
-        self._robot = "" if messages.robot else f" {probe.info.name}"
+        self._robot = probe.argument
         self._publish = "zstate publish FILE" + (f" --name {probe.info.name}" if self._robot else "")
         self._by_node = {stream: nodes.writers for stream, nodes in probe.nodes.items()}
 
@@ -56,19 +52,17 @@ class _RosChecks:
             why = "no node publishes, or the router denies reading"
             yield broken("writers", f"{names} announced, but no message arrives: {why}", "zstate ls")
             return
-        yield from maps_checks(probe, f"zstate doctor{self._robot} --timeout 10")
         if probe.is_place:
+            yield from probe.plugin_checks()
             yield statics_check(probe)
             return
         model, check = self._model_check(model_name)
         yield check
+        yield from probe.plugin_checks()
         nodes, publishers = self._by_node["joint_states"], self._by_node["tf"]
         yield self._joints_check(model) if nodes else self._no_joints_check(model)
         yield self._transforms_check() if publishers else self._no_transforms_check()
-        hz = f"zstate hz{self._robot} --stream scan"
-        yield from named_writers_checks(probe, "scan", probe.scans, probe.info.named("scan"), hz)
-        yield from sensor_frames_checks(probe)
-        yield from measured_checks(probe, f"zstate hz{self._robot}")
+        yield from measured_checks(probe)
         yield stamps_check(probe)
         if model is not None:
             yield from limits_check(probe, model, nodes.values(), f"zstate echo{self._robot}")

@@ -12,4 +12,9 @@ class Battery(StampedMessage, frozen=True, array_like=True, gc=False):
 
 
 BATTERY = Stream("battery", Battery, named=True, summary="voltage and charge of a battery")
-PLUGIN = Plugin("battery", streams=(BATTERY,), commands={"battery": "zstate_battery.cli:battery_command"})
+PLUGIN = Plugin(
+    "battery",
+    streams=(BATTERY,),
+    commands={"battery": "zstate_battery.cli:battery_command"},
+    checks="zstate_battery.checks:BatteryChecks",
+)
