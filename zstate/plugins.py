@@ -28,7 +28,7 @@ from zstate.streams import CLOCK, CORE, Stream, StreamName
 GROUP = "zstate.plugins"
 """The group of entry points."""
 
-_BUILT_IN = ("driving", "scans", "odometry", "recording", "view", "foxglove", "bridges")
+_BUILT_IN = ("driving", "scans", "odometry", "recording", "view", "foxglove", "bridges", "metrics")
 """The folders of zstate with a module ``plugin``, in the order of the liveliness tokens of their streams."""
 
 _LOG = logging.getLogger("zstate")
@@ -54,12 +54,14 @@ class Plugin:
     - ``commands`` of the command line by name: a ``Command``, or only its ``place``.
     - ``checks``: ``"module:class"`` of what `zstate doctor` checks, a subclass of
       ``zstate.cli.doctor.plugin_checks.PluginChecks``.
+    - ``needs``: of zstate itself, the folders of other plugins without which it does not work.
     """
 
     name: str
     streams: tuple[Stream, ...] = ()
     commands: Mapping[str, str | Command] = field(default_factory=lambda: MappingProxyType({}))
     checks: str = ""
+    needs: tuple[str, ...] = ()
 
     def command(self, name: str) -> Command:
         """The command ``name``, which it brings."""
@@ -79,15 +81,18 @@ class FoundPlugin(NamedTuple):
 
 @cache
 def built_in_plugins() -> tuple[Plugin, ...]:
-    """The plugins of zstate itself, without those whose folder is removed."""
-    found: list[Plugin] = []
+    """The plugins of zstate itself, without those whose folder, or another one that it needs, is removed."""
+    found: dict[str, Plugin] = {}
     for folder in _BUILT_IN:
         try:
-            found.append(import_module(f"zstate.{folder}.plugin").PLUGIN)
+            plugin: Plugin = import_module(f"zstate.{folder}.plugin").PLUGIN
         except ModuleNotFoundError as error:
             if error.name not in (f"zstate.{folder}", f"zstate.{folder}.plugin"):
                 raise
-    return tuple(found)
+        else:
+            if found.keys() >= set(plugin.needs):
+                found[folder] = plugin
+    return tuple(found.values())
 
 
 @cache

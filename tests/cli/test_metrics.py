@@ -124,7 +124,7 @@ def test_missing_library_is_reported_with_the_package_to_install():
 def test_commands_without_it_load_no_library():
     code = (
         "import sys\n"
-        "import zstate.cli.commands.monitor, zstate.cli.commands.publish, zstate.metrics.buffer\n"
+        "import zstate.cli.commands.monitor, zstate.cli.commands.publish, zstate.nodes.metered_buffer\n"
         "print('prometheus_client' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout == b"False\n"

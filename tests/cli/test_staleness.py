@@ -15,9 +15,9 @@ from zstate.cli.edge_statistics import EdgeRow, EdgeStatistics, path_text
 from zstate.cli.output.drawing import ALARM, draw
 from zstate.clock import SystemClock
 from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale
-from zstate.metrics.buffer import MeteredBuffer
 from zstate.net.presence import RobotInfo
 from zstate.net.topic_statistics import Received, TopicStatistics
+from zstate.nodes.metered_buffer import MeteredBuffer
 from zstate.wire.identity import WriterId
 from zstate.wire.messages import JointState, order_digest
 from zstate.wire.registry import get_wire

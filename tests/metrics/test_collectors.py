@@ -14,7 +14,6 @@ from prometheus_client.core import CounterMetricFamily
 from zstate.driving import Commander
 from zstate.driving.driver_state import DriverStateListener
 from zstate.errors import InFuture, InvalidInput
-from zstate.metrics.buffer import InstrumentedBuffer
 from zstate.metrics.collectors import (
     MAX_ROBOTS,
     ConnectionMetrics,
@@ -30,6 +29,7 @@ from zstate.net.presence import RobotInfo, connections, discover, local_writer
 from zstate.net.session import connect
 from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
+from zstate.nodes.metered_buffer import InstrumentedBuffer
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import SineSource
 from zstate.wire.messages import JointState

@@ -161,7 +161,7 @@ def test_a_used_port_and_a_remote_host_are_refused():
 def test_a_missing_library_error_names_the_package():
     code = (
         "import sys; sys.modules['prometheus_client'] = None\n"
-        "import zstate.metrics.buffer, zstate.metrics.collectors\n"
+        "import zstate.nodes.metered_buffer, zstate.metrics.collectors\n"
         "from zstate.errors import LibraryMissing\n"
         "try:\n"
         "    from zstate.metrics.endpoint import MetricsEndpoint\n"

@@ -21,7 +21,7 @@ from helpers.recording_builder import (
 )
 from rosbags.rosbag2 import StoragePlugin
 
-from zstate.recording.decode import SCAN_STREAMS, STREAMS, DecodedMessage, DecodedRecording
+from zstate.recording.decode import STREAMS, DecodedMessage, DecodedRecording
 from zstate.recording.mcap.recover import recover
 from zstate.recording.reader import RecordingReader
 from zstate.transform import Transform
@@ -44,6 +44,8 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.streams import ros_stream
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import JOINT_STATE, LASER_SCAN, OCCUPANCY_GRID
+
+SCAN_STREAMS = ("scan", "map")
 
 STORAGES = (StoragePlugin.SQLITE3, StoragePlugin.MCAP)
 

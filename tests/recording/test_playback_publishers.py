@@ -25,7 +25,7 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
-from zstate.recording.decode import ODOMETRY_STREAMS, SCAN_STREAMS, DecodedRecording
+from zstate.recording.decode import DecodedRecording
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
@@ -47,6 +47,9 @@ from zstate.wire.native import ENCODINGS, decode
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
+
+SCAN_STREAMS = ("scan", "map")
+ODOMETRY_STREAMS = ("imu", "velocity", "pose", "odometry")
 
 COUNT = 20
 SENSORS = ("imu/chest", "velocity/flow", "pose/mocap", "odometry/wheels")

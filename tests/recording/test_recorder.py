@@ -35,7 +35,6 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
-from zstate.recording.decode import ODOMETRY_STREAMS
 from zstate.recording.info import read_info, recorded_robots
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
@@ -58,6 +57,8 @@ from zstate.wire.messages import (
 from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
+
+ODOMETRY_STREAMS = ("imu", "velocity", "pose", "odometry")
 
 PERIOD = 1_000_000
 ROS_KEYS = RmwKeys(Ros2Options())

@@ -14,4 +14,5 @@ PLUGIN = Plugin(
             "zstate.bridges.cli.ros1:ros1_command", "Run", "A bridge to ROS 1, in either direction."
         ),
     },
+    needs=("odometry",),
 )

@@ -289,8 +289,8 @@ class FoxgloveBridge(Closeable):
             return ()
         # As streams of the topics and of their messages.
         carried: list[tuple[StreamName, StreamName]] = [(stream, stream)]
-        if stream == "odometry" and stream in self._wire.edges:
-            carried.append(("tf", "odometry"))
+        if stream != "transforms" and stream in self._wire.edges:
+            carried.append(("tf", stream))
         if stream == "joint_states" and "driver" in self._streams:
             carried.extend(zip(_OF_DRIVERS, _OF_DRIVERS, strict=True))
         topics: list[tuple[str, ChannelType, Feed]] = []

@@ -7,4 +7,5 @@ PLUGIN = Plugin(
     commands={
         "foxglove": Command("zstate.foxglove.cli:foxglove_command", "Look", "The robots, live in Foxglove."),
     },
+    needs=("recording",),
 )

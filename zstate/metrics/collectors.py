@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Protocol
 from zstate._util.bounded import BoundedDict
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import ListenerStats
-from zstate.metrics.buffer import Histogram, InstrumentedBuffer
 from zstate.net.presence import connections
+from zstate.nodes.metered_buffer import Histogram, InstrumentedBuffer
 from zstate.wire.keys import ANY
 
 if TYPE_CHECKING:

@@ -19,6 +19,7 @@ from zstate.net.presence import announce
 from zstate.net.queryable import query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
+from zstate.plugins import stream_named
 from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.joint_order import SampleLayout
@@ -124,7 +125,9 @@ class WireWriter(Closeable):
     def open_latched(self, stream: StreamName, name: str = "") -> LatchedWriter:
         """Open and announce ``stream`` for a latched value; static edges under ``name``."""
         encoder = self._encoder(stream, name)
-        return self._announced(LatchedWriter(self._session, encoder, is_large=stream == "map"))
+        return self._announced(
+            LatchedWriter(self._session, encoder, is_large=stream_named(stream).group == "measurement")
+        )
 
     def _encoder(self, stream: StreamName, name: str = "") -> StreamEncoder:
         return self._wire.stream_encoder(self._node, stream, self._session.next_number(), name)

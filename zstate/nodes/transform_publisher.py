@@ -156,7 +156,7 @@ class EdgePublisher(SamplePublisher):
 
 def _carried(sample: WriterTransforms, stream: StreamName) -> WriterTransforms:
     """``sample`` on ``stream``: without the velocity where that has transforms alone."""
-    return edge_of(sample) if isinstance(sample, Odometry) and stream != "odometry" else sample
+    return edge_of(sample) if isinstance(sample, Odometry) and stream in ("tf", "transforms") else sample
 
 
 class TransformSource(Protocol):

@@ -14,7 +14,7 @@ from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import stream_named
+from zstate.plugins import stream_named, streams_where
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance, is_covariance_topic
 from zstate.recording.driver_messages import DRIVER_TYPES, decode_command, decode_status, driver_stream
 from zstate.recording.encode import POSED_FRAME, TOPICS, StaticAccumulator
@@ -34,7 +34,7 @@ from zstate.wire.messages import (
 )
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.streams import has_named_topics, ros_streams
+from zstate.wire.ros2.streams import has_named_topics, has_sensor_topics, ros_streams
 from zstate.wire.ros2.topics import SHARED, FrameNames, robot_from_topic
 
 _TOPICS: tuple[StreamName, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
@@ -43,11 +43,16 @@ STREAMS: tuple[StreamName, ...] = (*_TOPICS, *TOPICS)
 with the name of a writer, and those of their covariances; ``partial_joint_states`` channels of the topic
 joint_states with such a name."""
 
-SCAN_STREAMS: tuple[StreamName, ...] = ("scan", "map")
-"""Further streams that can be decoded: the channels of these types, whatever their topic is."""
 
-ODOMETRY_STREAMS: tuple[StreamName, ...] = ("imu", "velocity", "pose", "odometry")
-"""Likewise. The edges of odometry are recorded on tf as well, and read from there."""
+def further_streams() -> tuple[StreamName, ...]:
+    """Further streams that can be decoded: the channels of these types, whatever their topic is.
+
+    The edges of odometry are recorded on tf as well, and read from there.
+    """
+    return streams_where(
+        lambda row: row.group == "measurement" or (row.group == "edges" and row.name not in TOPICS)
+    )
+
 
 _NAMED: dict[StreamName, StreamName] = {topic: named for named, topic in TOPICS.items()}
 
@@ -82,8 +87,8 @@ class RecordedWriter:
     def from_channel(cls, channel: Channel, robots: Collection[str] = ()) -> RecordedWriter | None:
         """The writer of ``channel``; None if it is no stream of a robot.
 
-        Topics of IMUs, velocities, poses and odometry in a bag are those of one of ``robots``, or of "ros":
-        their namespace may be that of a sensor.
+        Topics below those of sensors (``has_sensor_topics``) in a bag are those of one of ``robots``, or of
+        "ros".
         """
         stream: StreamName = "transforms"
         name, facts = channel.topic.rpartition("/")[2], channel.metadata
@@ -108,7 +113,7 @@ class RecordedWriter:
         robot = robot_from_topic(channel.topic) if foreign else facts.get(ROBOT, "")
         if foreign and stream == "pose" and is_covariance_topic(channel.topic):
             return None
-        if foreign and stream in ODOMETRY_STREAMS:
+        if foreign and has_sensor_topics(stream):
             robot, name = _sensor_from_topic(channel.topic, robots)
         return cls(
             robot="" if stream == "clock" else robot,
@@ -132,7 +137,7 @@ def _sensor_from_topic(topic: str, robots: Collection[str]) -> tuple[str, str]:
 def _robots_of(channels: Sequence[Channel]) -> frozenset[str]:
     """The robots of ``channels``, without namespaces that may be those of sensors."""
     writers = filter(None, map(RecordedWriter.from_channel, channels))
-    return frozenset(writer.robot for writer in writers if writer.stream not in ODOMETRY_STREAMS)
+    return frozenset(writer.robot for writer in writers if not has_sensor_topics(writer.stream))
 
 
 def recorded_writers(channels: Sequence[Channel]) -> list[RecordedWriter | None]:

@@ -20,14 +20,13 @@ from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
 from zstate.plugins import latched_streams
 from zstate.recording.decode import (
-    ODOMETRY_STREAMS,
-    SCAN_STREAMS,
     STREAMS,
     DecodedMessage,
     DecodedRecording,
     LatchedState,
     check_has_robot,
     first_descriptions,
+    further_streams,
     recorded_model,
     robot_with_joint_states,
 )
@@ -38,7 +37,6 @@ from zstate.recording.player_clock import Lateness, PlayerClock
 from zstate.recording.reader import RecordingReader
 from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.wire.joint_order import JointNumbers
-from zstate.wire.json_form import json_streams
 from zstate.wire.messages import ClockMessage, JointState, StampedMessage
 from zstate.wire.registry import as_wire_names
 
@@ -248,7 +246,7 @@ class Player(Closeable):
             self._player_clock.start(begin)
             has_clock = any(writer.stream == "clock" for writer in writers)
             ticks = None if has_clock else _ClockTicks(clock, begin, self._player_clock.rate)
-            streams = (*STREAMS, *SCAN_STREAMS, *ODOMETRY_STREAMS, *json_streams())
+            streams = (*STREAMS, *further_streams())
             for decoded in self._recording.messages(self.robots, streams, begin, self._end):
                 if not self._advance(decoded.log_time, ticks):
                     return

@@ -407,7 +407,7 @@ class RecordingLoader:
             else:
                 self._set_name(joints.whole, writer)
                 joints.insert(writer, message)
-        elif isinstance(message, TransformSample) and writer.stream != "odometry":
+        elif isinstance(message, TransformSample) and writer.stream in ("tf", "transforms"):
             self._insert_transforms(writer, message)
         elif isinstance(message, StaticTransforms):
             self._insert_statics(writer, message)

@@ -9,4 +9,5 @@ PLUGIN = Plugin(
             "zstate.view.cli:view_command", "Look", "The robots, drawn in a browser, and moved from there."
         ),
     },
+    needs=("driving", "recording", "scans"),
 )

@@ -23,6 +23,7 @@ from zstate.ingest.deadline import PERIODS, is_stale
 from zstate.recording.decode import DecodedMessage, DecodedRecording, LatchedState
 from zstate.recording.reader import RecordingReader
 from zstate.scans.grid import Grid, grid_from_message
+from zstate.scans.plugin import MAP, SCAN
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.streams import StreamName
 from zstate.view.world_source import TIME_JUMP_NS, WriterName
@@ -230,14 +231,14 @@ class RecordedWorld(Closeable):
         return {name: grid for name, grid in grids.items() if grid is not None}
 
     def _read_scans(self, name: WriterName, begin: int, end: int) -> Iterator[Scan]:
-        for decoded in self._messages(name, "scan", begin, end):
+        for decoded in self._messages(name, SCAN.name, begin, end):
             scan = self._to_scan(decoded)
             if scan is not None:
                 yield scan
 
     def _read_map(self, name: WriterName, log_time: int) -> Grid | None:
         grid: Message | None = None
-        for decoded in self._messages(name, "map", log_time, log_time + 1):
+        for decoded in self._messages(name, MAP.name, log_time, log_time + 1):
             grid = decoded.message
         try:
             return grid_from_message(grid, name.robot) if isinstance(grid, OccupancyGrid) else None

@@ -21,6 +21,7 @@ from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.scans.grid import Grid, grid_from_message
+from zstate.scans.plugin import MAP, SCAN
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.wire.keys import ANY, shortened
 from zstate.wire.messages import LaserScan, OccupancyGrid
@@ -38,6 +39,9 @@ _UNKNOWN_S = 10.0
 _TOO_MANY_SENSORS = "too many sensors"
 _TOO_MANY_MAPS = "too many maps"
 _FURTHER = {_TOO_MANY_SENSORS: "scans of further sensors", _TOO_MANY_MAPS: "further maps"}
+WORLD_STREAMS = SCAN.name, MAP.name
+"""What surrounds robots."""
+
 TIME_JUMP_NS = 1_000_000_000
 """A scan that is so much older than the last one begins again."""
 
@@ -226,19 +230,19 @@ class WorldSource(Closeable):
             if session is not None:
                 robot = robots[0] if len(robots) == 1 else ANY
                 count = self._refusals.count
-                scans = subscribe(session, self._wire, robot, "scan", self._on_scans, on_error=count)
+                scans = subscribe(session, self._wire, robot, SCAN.name, self._on_scans, on_error=count)
                 opening.enter_context(scans)
                 maps = subscribe(
                     session,
                     self._wire,
                     ANY,
-                    "map",
+                    MAP.name,
                     self._on_maps,
                     on_error=count,
                     on_withdrawn=self._on_withdrawn,
                 )
                 opening.enter_context(maps)
-                for announcement in announce_reader(session, self._wire, robot, ("scan", "map")):
+                for announcement in announce_reader(session, self._wire, robot, WORLD_STREAMS):
                     opening.enter_context(announcement)
             self._opened = opening.pop_all()
 

@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from zstate.cli.processes import ChildProcess
-    from zstate.metrics.buffer import MeteredBuffer, SampleKind
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.net.topic_statistics import IntervalStatistics
     from zstate.nodes.listener import TransformListener
+    from zstate.nodes.metered_buffer import MeteredBuffer, SampleKind
     from zstate.transform import Transform
 
 _DEFAULT = "panda"
@@ -243,8 +243,8 @@ def _named(children: Sequence[ChildProcess]) -> str:
 
 
 def _show_transforms(endpoint: str, demo: Demo, ended: threading.Event, seconds: float | None) -> None:
-    from zstate.metrics.buffer import MeteredBuffer
     from zstate.nodes.listener import TransformListener
+    from zstate.nodes.metered_buffer import MeteredBuffer
 
     buffer = MeteredBuffer()
     with (

@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     from zstate.clock import Clock
     from zstate.driving.driver_state import ReceivedState
     from zstate.ingest.counters import ListenerStats
-    from zstate.metrics.buffer import MeteredBuffer, RobotMeasure
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.session import Session
     from zstate.net.topic_statistics import IntervalStatistics
     from zstate.nodes.listener import Follow, TransformListener
+    from zstate.nodes.metered_buffer import MeteredBuffer, RobotMeasure
     from zstate.wire.messages import Status
 
 _FIRST_AFTER_S = 1.0
@@ -356,8 +356,8 @@ class RobotMonitor(Closeable):
 
     def _follow(self, robot: str, streams: frozenset[StreamName]) -> None:
         """Follow a robot that has appeared, or whose joint states have."""
-        from zstate.metrics.buffer import MeteredBuffer
         from zstate.nodes.listener import TransformListener
+        from zstate.nodes.metered_buffer import MeteredBuffer
 
         follow: Follow = "tf" if JOINT_STREAMS.isdisjoint(streams) else "joint_states"
         if is_ros(self._wire) and "tf" in streams:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate.cli.doctor.check import Check, warning
@@ -13,11 +13,27 @@ from zstate.errors import printable
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
 from zstate.plugins import built_in_plugins, found_plugins
-
-if TYPE_CHECKING:
-    from zstate.cli.doctor.robot_probe import RobotProbe
+from zstate.streams import StreamName
+from zstate.wire.identity import WriterId
 
 T = TypeVar("T")
+
+
+class ProbedRobot(Protocol):
+    """What a plugin may ask of a robot, of which doctor has collected the samples of a second or more."""
+
+    info: RobotInfo
+    """Its name, and its announced writers."""
+    argument: str
+    """The robot in the commands of findings, after a space; empty if the wire is that of one robot."""
+
+    def writers(self, stream: StreamName) -> list[WriterId]:
+        """The announced writers of ``stream``, the newest last."""
+        ...
+
+    def newest(self, stream: StreamName) -> dict[str, Any]:
+        """The newest message of each announced writer of ``stream``, by the writer's name."""
+        ...
 
 
 class PluginChecks(Closeable):
@@ -40,8 +56,8 @@ class PluginChecks(Closeable):
         """Whether anything has arrived of ``robot``."""
         return False
 
-    def checks(self, probe: RobotProbe) -> Iterator[Check]:
-        """The checks of the robot ``probe.info``, of which ``probe`` has collected the samples."""
+    def checks(self, probe: ProbedRobot) -> Iterator[Check]:
+        """The checks of the robot ``probe.info``."""
         yield from ()
 
     def close(self) -> None:
@@ -64,7 +80,7 @@ class _Guarded(PluginChecks):
         checks = self._checks
         return checks is not None and self._attempted(lambda: checks.has_data(robot), False)
 
-    def checks(self, probe: RobotProbe) -> Iterator[Check]:
+    def checks(self, probe: ProbedRobot) -> Iterator[Check]:
         checks, found = self._checks, list[Check]()
         if checks is not None:
             found = self._attempted(lambda: list(checks.checks(probe)), found)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
-from zstate.cli.doctor.plugin_checks import PluginChecks
-from zstate.cli.doctor.robot_probe import RobotProbe
+from zstate.cli.doctor.plugin_checks import PluginChecks, ProbedRobot
 from zstate.cli.output.console import count_text
 from zstate.driving.driver_state import DriverStateListener, ReceivedState
 from zstate.errors import format_duration
@@ -35,7 +34,7 @@ class DriverChecks(PluginChecks):
         if self._drivers is not None:
             self._drivers.close()
 
-    def checks(self, probe: RobotProbe) -> Iterator[Check]:
+    def checks(self, probe: ProbedRobot) -> Iterator[Check]:
         robot, commanders = probe.info.name, probe.writers("joint_commands")
         received = None if self._drivers is None else self._drivers.get(robot)
         if received is None:

@@ -25,6 +25,7 @@ from typing import Any
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import user_config
 from zstate.net.security.credentials import check_identity
+from zstate.plugins import is_named, latched_streams
 from zstate.wire.keys import (
     CLOCK_KEY,
     MOTION_CHUNK,
@@ -126,7 +127,10 @@ def _native_rules(roles: AclRoles) -> Grants:
     root = f"{roles.namespace}/zstate" if roles.namespace else "zstate"
     everything, clock = _below(root), root.removesuffix("zstate") + CLOCK_KEY
     latched = tuple(
-        f"{root}/*/{stream}/*{end}" for stream in ("tf_static", "map") for end in ("", "/@adv/**")
+        f"{root}/*/{stream}/*{end}"
+        for stream in latched_streams()
+        if is_named(stream)
+        for end in ("", "/@adv/**")
     )
     # A program that may stop a driver reads whether that has stopped.
     drivers = tuple(f"{root}/*/driver{end}" for end in ("", "/@adv/**"))

@@ -141,7 +141,7 @@ def _show(player: Player, call: BackgroundCall[PlayerReport]) -> PlayerReport:
 def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequence[str]) -> list[str]:
     """Writers on the network of streams that a replay of ``robots`` would publish."""
     from zstate.net.presence import discover
-    from zstate.plugins import measured_streams
+    from zstate.recording.decode import further_streams
     from zstate.streams import JOINT_STREAMS
     from zstate.wire.registry import get_wire
 
@@ -154,9 +154,7 @@ def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequenc
             *JOINT_STREAMS,
             "robot_description",
             "tf",
-            "map",
-            "odometry",
-            *measured_streams(),
+            *further_streams(),
         } - wire.shared
         for info in discover(session, wire=name):
             writers = {str(writer) for stream, writer in info.writers if stream in replayed}

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from zstate.cli.doctor.check import Check, broken, ok
-from zstate.cli.doctor.plugin_checks import PluginChecks
-from zstate.cli.doctor.robot_probe import RobotProbe
+from zstate.cli.doctor.plugin_checks import PluginChecks, ProbedRobot
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
@@ -45,7 +44,7 @@ class MapChecks(PluginChecks):
     def has_data(self, robot: str) -> bool:
         return robot in self._maps
 
-    def checks(self, probe: RobotProbe) -> Iterator[Check]:
+    def checks(self, probe: ProbedRobot) -> Iterator[Check]:
         info = probe.info
         for name, writer in info.named(MAP.name):
             grid = self._maps.get(info.name, {}).get(name)

@@ -180,7 +180,8 @@ def _triangle(block: bytes, size: int) -> bytes | None:
     return to_block(matrix[np.triu_indices(size)])
 
 
-IMU_STREAM = RosStream(IMU, Qos(depth=10), is_named=True, decode=decode_imu)
-VELOCITY_STREAM = RosStream(TWIST_WITH_COVARIANCE, Qos(depth=10), is_named=True, decode=decode_velocity)
-POSE_STREAM = RosStream(POSE_WITH_COVARIANCE, Qos(depth=10), is_named=True, decode=decode_pose)
-ODOMETRY_STREAM = RosStream(ODOMETRY, Qos(depth=10), is_named=True, decode=decode_odometry)
+_OF_SENSOR = {"is_named": True, "is_of_sensor": True}
+IMU_STREAM = RosStream(IMU, Qos(depth=10), decode=decode_imu, **_OF_SENSOR)
+VELOCITY_STREAM = RosStream(TWIST_WITH_COVARIANCE, Qos(depth=10), decode=decode_velocity, **_OF_SENSOR)
+POSE_STREAM = RosStream(POSE_WITH_COVARIANCE, Qos(depth=10), decode=decode_pose, **_OF_SENSOR)
+ODOMETRY_STREAM = RosStream(ODOMETRY, Qos(depth=10), decode=decode_odometry, **_OF_SENSOR)

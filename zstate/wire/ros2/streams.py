@@ -21,13 +21,15 @@ class RosStream(NamedTuple):
     """The ``type`` of a stream's topics, and the ``qos`` that its writers offer.
 
     Topics with ``is_named`` have the name of the sensor, or of the writer, and are found by their type. Their
-    messages are made by ``decode(payload, session, seq, names)``; those of others by ``RosDecoder``.
+    messages are made by ``decode(payload, session, seq, names)``; those of others by ``RosDecoder``. With
+    ``is_of_sensor`` their namespace may be that of the sensor: /r1/imu/data is a topic of the robot r1.
     """
 
     type: RosType
     qos: Qos
     is_named: bool = False
     decode: Callable[..., Message] | None = None
+    is_of_sensor: bool = False
 
 
 # The QoS of robot_state_publisher, tf2 and map_server, and of the broadcasters of ros2_control: readers of
@@ -66,6 +68,12 @@ def has_named_topics(stream: StreamName) -> bool:
     """Whether the topics of the stream have the names of its writers."""
     carried = ros_streams().get(stream)
     return carried is not None and carried.is_named
+
+
+def has_sensor_topics(stream: StreamName) -> bool:
+    """Whether the namespace of the stream's topics may be that of a sensor."""
+    carried = ros_streams().get(stream)
+    return carried is not None and carried.is_of_sensor
 
 
 def topic_stream(topic: str, dds_type: str) -> StreamName | None:

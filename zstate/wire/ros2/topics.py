@@ -51,8 +51,8 @@ class RmwKeys:
     def topic(self, robot: str, stream: StreamName, name: str = "") -> str:
         """The full ROS name of the topic, with its leading slash.
 
-        ``name`` is that of a sensor or a map, by default "scan" and "map". Raises InvalidInput if it is no
-        ROS name.
+        ``name`` is that of a sensor or a map, by default the stream's. Raises InvalidInput if it is no ROS
+        name.
         """
         last_name = stream
         if has_named_topics(stream) and name:

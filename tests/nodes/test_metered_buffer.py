@@ -10,7 +10,7 @@ from helpers.robots import RRBOT, SECOND, STAMP, UPRIGHT
 
 from zstate.clock import ManualClock
 from zstate.errors import Disconnected, InFuture, UnknownFrame
-from zstate.metrics.buffer import Histogram, InstrumentedBuffer, MeteredBuffer
+from zstate.nodes.metered_buffer import Histogram, InstrumentedBuffer, MeteredBuffer
 from zstate.transform import Transform
 
 NOW = 1_789_000_000 * SECOND
