@@ -17,9 +17,8 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.checks import real_numbers
 from zstate.driving.commands import check_named
-from zstate.driving.driver_state import SILENT_S
+from zstate.driving.driver_state import SILENT_S, cached_state
 from zstate.driving.motion import Motion, Points, rows_block
-from zstate.driving.stops import wait_for_state
 from zstate.driving.transit import REQUEST_TTL_NS, CommandWindow, DriverClock
 from zstate.errors import (
     Closed,
@@ -283,8 +282,7 @@ class Commander(Closeable):
         """
         deadline = time.monotonic() + check_timeout(timeout_s)
         # Not the newest state that has arrived here, which may be from before a stop that is confirmed.
-        present = wait_for_state(self._session, self.robot, lambda _: True, timeout_s)
-        known = present or self.wait_for_driver(timeout_s)
+        known = cached_state(self._session, self.robot, timeout_s) or self.wait_for_driver(timeout_s)
         while True:
             with self._lock:
                 self._releases.put(encode(Release(*self._next_head(), known.stops)))

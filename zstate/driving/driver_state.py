@@ -188,17 +188,27 @@ class SetpointPublisher(Closeable):
 def check_only_host(session: Session, robot: str) -> None:
     """Raise SecondWriter if a driver of ``robot`` is hosted already."""
     wait_for_discovery(session)
-    for value in cached_values(session, driver_key(robot), _CACHES_WITHIN_S):
+    other = cached_state(session, robot, _CACHES_WITHIN_S)
+    if other is not None:
+        first = WriterId(other.program, "", 0, 0, other.session)
+        raise SecondWriter(
+            f"{other.program!r} already drives {', '.join(other.joint_names)} of {robot!r}; a robot has "
+            "one driver host: stop the first, or give one driver all joints",
+            robot=robot,
+            stream="driver",
+            first=first,
+        )
+
+
+def cached_state(session: Session, robot: str, timeout_s: float) -> DriverState | None:
+    """The state that the driver of ``robot`` has published last; None if none replies within ``timeout_s``.
+
+    What a subscriber receives first may be older: a sample that is still under way.
+    """
+    for value in cached_values(session, driver_key(robot), timeout_s):
         with suppress(MessageError):
-            other = decode(value.payload, value.encoding, DriverState)
-            first = WriterId(other.program, "", 0, 0, other.session)
-            raise SecondWriter(
-                f"{other.program!r} already drives {', '.join(other.joint_names)} of {robot!r}; a robot has "
-                "one driver host: stop the first, or give one driver all joints",
-                robot=robot,
-                stream="driver",
-                first=first,
-            )
+            return decode(value.payload, value.encoding, DriverState)
+    return None
 
 
 class ReceivedState(NamedTuple):

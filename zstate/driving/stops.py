@@ -65,7 +65,7 @@ _MOST_WAITING = 1024
 
 _STEP_BITS = 32
 _REPEAT_S = 0.25
-"""A stop that is not confirmed within that is sent again, with another number; then after twice that, ..."""
+"""A stop that is not confirmed within that is sent again, as it was; then after twice that, ..."""
 
 STAYS_LATCHED = "The stop stays latched while this session is open"
 
@@ -118,18 +118,19 @@ class _Stopper:
         session = self._session()
         assert session is not None, "the caller has it"
         is_held, pause_s = False, _REPEAT_S
-        first: int | None = None
+        with self._lock:
+            messages = self._messages(how, reason)
 
         def is_obeyed(state: DriverState) -> bool:
             nonlocal is_held
-            assert first is not None, "a stop has been sent"
-            is_held = self._is_obeyed(state, first, "hold")
-            return is_held and self._is_obeyed(state, first, how)
+            is_held = self._is_obeyed(state, messages[0].seq, "hold")
+            return is_held and self._is_obeyed(state, messages[0].seq, how)
 
         while True:
+            # With the same numbers, which a release ends once and for all, however late the last one arrives.
             with self._lock:
-                number = self._send(session, how, reason)
-            first = number if first is None else first
+                for message in messages:
+                    self._publisher(session, message.how).set(encode(message))
             left_s = deadline - time.monotonic()
             confirmed = wait_for_state(session, self._robot, is_obeyed, max(0.0, min(left_s, pause_s)))
             if confirmed is not None:
@@ -138,21 +139,16 @@ class _Stopper:
                 raise self._unconfirmed(timeout_s, is_held=is_held)
             pause_s *= 2.0
 
-    def _send(self, session: Session, how: StopMode, reason: str) -> int:
-        """Send a stop, and return the number of its first message; with the lock.
-
-        A program that may not relax a driver stops it all the same.
-        """
+    def _messages(self, how: StopMode, reason: str) -> list[Stop]:
+        """Those of a new stop; with the lock. A program that may not relax a driver stops it all the same."""
         hows: tuple[StopMode, ...] = ("relax", "hold") if how == "relax" else ("hold",)
-        numbers: list[int] = []
+        messages: list[Stop] = []
         for one in hows:
             # Others that may write this key cannot send a stop with the next number before this program does.
             self._seq += 1 + secrets.randbits(_STEP_BITS)
-            message = Stop(time.time_ns(), self._seq, self._writer.session, one, reason)
-            self._publisher(session, one).set(encode(message))
+            messages.append(Stop(time.time_ns(), self._seq, self._writer.session, one, reason))
             self._sent = (*self._sent[1 - _MOST_SENT :], (self._seq, one))
-            numbers.append(self._seq)
-        return numbers[0]
+        return messages
 
     def _publisher(self, session: Session, how: StopMode) -> LatchedPublisher:
         if how not in self._publishers:
@@ -239,7 +235,7 @@ class StopRegister:
         self._active: dict[StopId, ActiveStop] = {}
         """The oldest first."""
         self._released: dict[int, list[int]] = {}
-        """The numbers of the last released stops of each session, which its program may still cache."""
+        """The numbers of the last stops of each session that are over, which its program may still send."""
         self._is_unsaved = False
         self._own_seq = -1
         self._substitute: ActiveStop | None = None
@@ -293,10 +289,7 @@ class StopRegister:
         Displaced stops that are ``named`` are no longer reported, also if the substitute stays for others.
         """
         for one in ended:
-            seqs = self._released.pop(one.session, [])
-            self._released[one.session] = [*seqs[1 - _MOST_RELEASED :], one.seq]  # newest last
-        while len(self._released) > _MOST_STOPS:
-            del self._released[next(iter(self._released))]
+            self._ignore(one)
         if self._substitute in ended:
             self._substitute, self._displaced = None, 0
             self._displaced_ids.clear()
@@ -304,6 +297,13 @@ class StopRegister:
             released = set(named)
             kept = (stop_id for stop_id in self._displaced_ids if stop_id not in released)
             self._displaced_ids = deque(kept, _MOST_DISPLACED)
+
+    def _ignore(self, one: ActiveStop) -> None:
+        """Ignore further messages of ``one``."""
+        seqs = self._released.pop(one.session, [])
+        self._released[one.session] = [*seqs[1 - _MOST_RELEASED :], one.seq]  # newest last
+        while len(self._released) > _MOST_STOPS:
+            del self._released[next(iter(self._released))]
 
     def _own_stop(self, reason: str, how: StopMode) -> ActiveStop:
         self._own_seq += 1
@@ -313,8 +313,9 @@ class StopRegister:
         """Latch ``one``. It replaces one that reads alike, or, of too many, the oldest."""
         same = [kept for kept in self._active.values() if kept.session == one.session]
         alike = [kept for kept in same if (kept.how, str(kept)) == (one.how, str(one))]
-        if alike:  # a program that repeats its stop; a release from before does not end it
+        if alike:  # a program that stops again; a release from before does not end that
             del self._active[alike[0].id]
+            self._ignore(alike[0])  # one that is still under way; the newer one stands for it
         elif len(same) >= _MOST_OF_SESSION:
             self._displace(same)
         elif len(self._active) >= _MOST_STOPS - 1:
