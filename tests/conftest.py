@@ -46,13 +46,13 @@ settings.load_profile("zstate")
 
 LEFT_OUT = pytest.StashKey[Counter[str]]()
 SYSTEM = "need system packages, root, a browser or other interpreters; `pytest --system` runs them"
-LONG = "compute for seconds each; `pytest --long` runs them"
+LONG = "compute for a second or more; `pytest --long` runs them"
 SOAK = "are trials by the hundred; `pytest --soak` runs them"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--system", action="store_true", help="also tests that need more than pip's packages")
-    parser.addoption("--long", action="store_true", help="also tests that compute for seconds each")
+    parser.addoption("--long", action="store_true", help="also tests that compute for a second or more")
     parser.addoption("--soak", action="store_true", help="also trials by the hundred")
 
 

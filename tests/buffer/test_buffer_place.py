@@ -104,6 +104,7 @@ def scans(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
 
 @settings(deadline=None)
 @given(st.lists(positions, min_size=1, max_size=4), st.sampled_from([1.0, 0.01, 0.0]), links, links, scans())
+@pytest.mark.long
 def test_points_on_every_type_of_joint_are_placed_as_looked_up(
     samples, size: float, source: str, target: str, scan: tuple[np.ndarray, np.ndarray]
 ) -> None:

@@ -169,6 +169,7 @@ class Crowd:
 
 
 @pytest.mark.parametrize("seconds", [2.0, pytest.param(20.0, marks=pytest.mark.soak)])
+@pytest.mark.long
 def test_readers_and_writers_at_full_speed_get_correct_transforms_or_errors(seconds: float) -> None:
     buffer, track = every_joint()
     write_pairs(buffer, 0)

@@ -29,6 +29,7 @@ def test_live_samples_and_the_past_are_not_copied_for_each_sample(make: type[His
 
 @HISTORIES
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 5))])
+@pytest.mark.long
 def test_samples_in_any_order_are_sorted_and_leave_earlier_views_unchanged(make: type[History], seed: int):
     choose, span = random.Random(seed), 400
     history = make(2, span)

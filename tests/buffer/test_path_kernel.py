@@ -144,6 +144,7 @@ instants = st.lists(st.integers(-1, 32).map(lambda n: NOW + n * S // 8), max_siz
 
 @settings(deadline=None)
 @given(st.lists(positions, max_size=4), links, links, instants)
+@pytest.mark.long
 def test_paths_over_every_type_of_joint_agree(samples, target: str, source: str, asked: list[int]) -> None:
     buffer, _ = a_robot(samples)
     try:

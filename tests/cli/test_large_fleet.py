@@ -75,6 +75,7 @@ def test_ctrl_c_ends_a_command(
     child.wait()
 
 
+@pytest.mark.long
 def test_doctor_examines_every_robot_of_a_large_fleet_though_most_are_silent(fleet: None):
     ended = run_cli("doctor", "--json")
     assert ended.code == 1, ended.stderr  # drivers are announced, and silent

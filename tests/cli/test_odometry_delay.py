@@ -36,6 +36,7 @@ def test_delay_is_found_in_spite_of_scale_and_bias(delay_s: float, rate_hz: floa
     assert found.delay_s == pytest.approx(delay_s, abs=1e-3)
 
 
+@pytest.mark.long
 def test_standard_deviation_is_that_of_the_errors():
     """Of 100 sources that slip: a sum of squares of 100 is from 0.62 to 1.49 in 99.9 % of all cases."""
     errors: list[float] = []

@@ -124,6 +124,7 @@ def recorded(path: Path, *, covariance: float = 0.0) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_table_has_used_rejected_nis_sigma_and_delay_of_each_source(tmp_path: Path):
     settings = replace(SETTINGS, velocity={"flow": VelocityNoise(sigma=0.5 * FLOW_SIGMA, scale=0.0)})
     replayed = replay(str(recorded(tmp_path / "r.mcap")), "r1", settings)

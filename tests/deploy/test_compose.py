@@ -14,6 +14,7 @@ from zstate.net.security.credentials import Credentials
 pytestmark = pytest.mark.processes
 
 
+@pytest.mark.long
 def test_reader_of_the_compose_file_receives_its_moving_robot(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     deployment.start(spawn, "robot").line()

@@ -35,6 +35,7 @@ def router_command(contains: str, certs: Path) -> list[str]:
     return [str(certs) if word in ("certs", "/etc/zstate/certs") else word for word in options]
 
 
+@pytest.mark.long
 def test_router_configuration_is_generated_by_the_readme_command(certs: Path, tmp_path):
     acl = tmp_path / "acl.json5"
     acl.write_text(output("acl", "--robot", "r1", "--viewer", "desk"))

@@ -509,6 +509,7 @@ def test_only_commanders_may_request_motions(tmp_path):
             assert replies_to(desk, selector, request) == []
 
 
+@pytest.mark.long
 def test_random_motions_commands_stops_and_takeovers_make_no_step_too_long(sessions):
     driver = Written()
     random = np.random.default_rng(7)

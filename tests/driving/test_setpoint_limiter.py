@@ -83,6 +83,7 @@ def test_take_overs_replacements_stops_and_restarts_never_step_above_the_limits(
     acceleration=st.floats(0.5, 100.0) | st.just(math.inf),
     steps=st.lists(st.floats(5e-4, 0.02), min_size=1, max_size=20),
 )
+@pytest.mark.long
 def test_a_joint_at_rest_reaches_a_target_without_overshoot_in_steps_of_any_length(
     target: float, velocity: float, acceleration: float, steps: list[float]
 ):

@@ -250,6 +250,7 @@ class MovingHistory:
 
 @pytest.mark.parametrize("shows_first", [True, False])
 @pytest.mark.parametrize("size", [1000, 10_000])
+@pytest.mark.long
 def test_samples_of_a_gap_of_moving_edges_are_not_inserted_one_by_one(
     single_inserts: list[int], size: int, shows_first: bool
 ):

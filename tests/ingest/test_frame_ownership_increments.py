@@ -114,6 +114,7 @@ class Writers:
 
 
 @pytest.mark.parametrize("is_shared", [False, True])
+@pytest.mark.long
 def test_result_is_that_of_a_comparison_of_all_edges(is_shared: bool):
     refused = 0
     for seed in range(60):

@@ -76,6 +76,7 @@ def test_backlog_after_more_than_two_seconds_starts_with_its_own_least_age(caplo
     assert warning_count(caplog, [1.0, 2.9], every_s=pause_s) == expected
 
 
+@pytest.mark.long
 def test_threads_share_the_checks(monkeypatch: pytest.MonkeyPatch):
     """The streams of a listener have a thread each; a bounded dict alone loses entries of another thread."""
     monkeypatch.setattr("zstate._util.bounded.MAX_ENTRIES", 8)

@@ -37,6 +37,7 @@ BELOW_QUADRATIC = 8.0
 """Four times the size takes four times as long, or sixteen times if each element looks at all others."""
 
 
+@pytest.mark.long
 def test_ten_thousand_links_are_refused_in_a_time_that_grows_with_their_number():
     assert errors(chain(10_000)) == [(None, "the robot has 10000 links; the limit is 2000")]
     assert growth(chain, 2_500) < BELOW_QUADRATIC
@@ -64,6 +65,7 @@ def test_velocities_have_a_limit_in_which_mimics_count():
         assert errors(text) == [(None, "the robot has 201 velocities; the limit is 200")]
 
 
+@pytest.mark.long
 def test_xml_nesting_and_size_have_limits():
     deep = robot(ARM + "<a>" * 100 + "</a>" * 100)
     ((line, message),) = errors(deep)

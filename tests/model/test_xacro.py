@@ -102,6 +102,7 @@ def test_a_failed_expansion_has_its_cause_in_one_line(inner: str, words: str):
         ("<link name=\"${'%1000000000d' % 1 * 3}\"/>", "_MEMORY_BYTES", "needs more than 2 GiB of memory"),
     ],
 )
+@pytest.mark.long
 def test_an_expansion_has_limits_of_time_and_memory(inner: str, limit: str, words: str, monkeypatch):
     pytest.importorskip("xacro")
     # A smaller limit in the process of the expansion; the texts keep the shipped one.

@@ -145,6 +145,7 @@ def some_endings(row: int) -> list[int]:
         *(pytest.param(name, range(4), marks=pytest.mark.soak) for name in PROGRAMS),
     ],
 )
+@pytest.mark.long
 def test_program_that_closes_nothing_keeps_its_exit_code(spawn, name: str, endings: Sequence[int]):
     children: list[tuple[Child, int]] = []
     for number in endings:

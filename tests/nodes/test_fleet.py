@@ -84,6 +84,7 @@ def test_reader_of_three_robots_receives_no_more_bytes_if_there_are_ten_times_as
     assert running < 1.25 * running_alone
 
 
+@pytest.mark.long
 def test_joining_a_fleet_costs_the_same_bytes_for_each_robot_of_forty_as_of_ten(free_port: int):
     with fleet(free_port, 10) as robots:
         joining_ten, running_ten = link_bytes(robots, free_port, "*")
@@ -102,6 +103,7 @@ def test_listener_of_several_robots_has_no_more_threads_than_of_two(sessions: tu
     assert threads(20) == threads(2)
 
 
+@pytest.mark.long
 def test_no_sample_is_lost_while_a_listener_joins_a_fleet(free_port: int):
     with (
         fleet(free_port, 150) as robots,

@@ -297,6 +297,7 @@ def interrupt(receiver: Receiver, action: int, writer: Writer, stream: str) -> N
         ("joint_states", "transforms", WriterTransforms),
     ],
 )
+@pytest.mark.long
 def test_any_messages_give_the_same_buffer_counts_and_events(sessions, robot, follow, stream, kind):
     """Writers reorder, repeat, lose and forge messages; clocks jump; other threads change the buffer."""
     key = "zstate/r1/transforms/odometry" if stream == "transforms" else f"zstate/r1/{stream}"

@@ -331,6 +331,7 @@ def test_feet_on_the_ground_push_the_base_forward():
     assert health_of(base, "feet").accepted > 380
 
 
+@pytest.mark.long
 def test_a_robot_that_stands_on_all_feet_measures_the_bias_of_its_gyro():
     legs = Legs(load_model(LEGGED), ["foot1", "foot2"], imu="base_link")
     base = estimator(legs=legs)
@@ -373,6 +374,7 @@ def wander(compass: bool, hard_iron: float) -> tuple[float, float, BaseEstimator
     return error, math.sqrt(state.covariance.pose[5, 5]), base
 
 
+@pytest.mark.long
 def test_a_compass_with_hard_iron_of_35_degrees_is_no_worse_than_none():
     without, _, _ = wander(compass=False, hard_iron=0.0)
     error, sigma, base = wander(compass=True, hard_iron=math.radians(35.0))

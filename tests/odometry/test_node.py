@@ -106,6 +106,7 @@ def rover_with_odometry(
         yield rover, node, listener, reading
 
 
+@pytest.mark.long
 def test_odometry_follows_the_truth_and_is_a_moving_edge_with_a_covariance():
     with rover_with_odometry() as (rover, node, listener, _):
         rover.truth.drive((5.0, 8.0))
@@ -197,6 +198,7 @@ def test_rate_limits_the_samples_of_a_faster_imu(sessions):
     assert set(np.diff(stamps)) == {50_000_000}
 
 
+@pytest.mark.long
 def test_sentences_on_the_sources_are_in_the_status_of_the_writer_and_logged_once(caplog):
     with (
         rover_with_odometry(velocities={"flow": VelocityNoise()}) as (_, _, _, session),
@@ -250,6 +252,7 @@ def test_poses_have_the_noise_of_their_messages_or_the_stated_one():
         pose_covariance("mocap", Pose(1, 0, 1, "odom", "", placed), PoseNoise())
 
 
+@pytest.mark.long
 def test_measured_poses_place_the_base():
     with (
         rover_with_odometry(poses={"mocap": PoseNoise()}) as (_, node, listener, session),
@@ -383,6 +386,7 @@ def test_readings_of_other_sources_are_published_once_the_imu_is_silent_for_more
         assert node.published == count
 
 
+@pytest.mark.long
 def test_time_that_goes_back_is_published_from_there_on(sessions):
     stamps: list[int] = []
     first = STAMP - 10**11

@@ -73,6 +73,7 @@ def test_lookups_of_an_edge_give_the_covariance_of_its_samples(tmp_path: Path, a
     check(tmp_path / "r.mcap")
 
 
+@pytest.mark.long
 def test_covariances_belong_to_their_samples_across_split_files(tmp_path: Path):
     write(tmp_path / "r.mcap", count=1000, max_bytes=MIN_BYTES)
     assert len(list(tmp_path.iterdir())) > 5

@@ -428,6 +428,7 @@ def test_a_withdrawn_map_ends_with_a_grid_without_cells_and_keeps_edges_of_its_n
     assert len(case.read("/tf_static")) == 2
 
 
+@pytest.mark.long
 def test_maps_beyond_128_mib_are_in_one_file_only_and_counted(case: EncoderCase):
     side = 4096
     floor = OccupancyGrid(1, NOW, "map", 0.5, side, side, to_block([0, 0, 0, 0, 0, 0, 1]), bytes(side * side))

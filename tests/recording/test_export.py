@@ -189,6 +189,7 @@ def test_rows_are_lookups_in_the_whole_recording(tmp_path: Path, later: str, opt
 
 
 @pytest.mark.usefixtures("small_windows")
+@pytest.mark.long
 def test_buffer_holds_the_samples_around_one_window(tmp_path: Path):
     with RecordingBuilder(tmp_path / "r.mcap") as builder:
         builder.describe("arm")

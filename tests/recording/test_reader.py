@@ -361,6 +361,7 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     end=st.floats(0.3, 1),
 )
 @settings(max_examples=300, deadline=None)
+@pytest.mark.long
 def test_damage_anywhere_is_refused_or_read_without_crash(
     scratch: Path, originals: list[bytes], kind: int, edits: list[tuple[float, int]], end: float
 ):

@@ -138,6 +138,7 @@ def ten_thousand(sessions, tmp_path: Path, panda: RobotModel) -> tuple[Path, lis
 
 
 @pytest.mark.robots
+@pytest.mark.long
 def test_other_readers_get_ten_thousand_identical_transforms(ten_thousand, panda: RobotModel):
     path, sent = ten_thousand
     moving = MovingEdges(panda)
@@ -169,6 +170,7 @@ def test_other_readers_get_joint_states_bit_for_bit(ten_thousand, panda: RobotMo
 
 
 @pytest.mark.robots
+@pytest.mark.long
 def test_recording_has_the_model_and_its_fixed_edges(ten_thousand, panda: RobotModel):
     path, _ = ten_thousand
     for reader in OTHERS:

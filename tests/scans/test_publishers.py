@@ -269,6 +269,7 @@ def receive_late(wire: str, **options: Any) -> None:
 
 
 @pytest.mark.parametrize("wire", ["native", "ros2"])
+@pytest.mark.long
 def test_large_map_reaches_early_and_late_readers_in_its_process(sessions, wire: str):
     writer, reader = sessions
     early = Maps(reader, wire)

@@ -245,6 +245,7 @@ def test_unsupported_format_error_lists_supported_formats(tmp_path):
 
 @pytest.mark.robots
 @pytest.mark.parametrize("name", ["panda", "talos", "ur5", "anymal_c"])
+@pytest.mark.long
 def test_all_meshes_of_known_robots_are_found(name):
     meshes = Meshes()
     for one in read_shapes(load_model(name))[0]:

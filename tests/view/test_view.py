@@ -78,6 +78,7 @@ def test_drawing_error_is_logged_once_shown_on_the_page_and_retried(page, caplog
     assert "test_view.py, line" in logged
 
 
+@pytest.mark.long
 def test_robots_can_appear_disappear_and_restart_while_they_are_drawn(page, sessions, caplog):
     """Random publishers of two models, and static edges that change their parent."""
     random = np.random.default_rng(7)

@@ -431,6 +431,7 @@ def test_a_deflated_grid_cut_off_anywhere_is_truncated():
     assert {reason(payload[:n], ENCODINGS[OccupancyGrid], OccupancyGrid) for n in lengths} == {"truncated"}
 
 
+@pytest.mark.long
 def test_a_grid_that_inflates_beyond_the_limit_is_refused_without_inflating_it():
     bomb = zlib.compress(bytes(2**28), 9)
     assert len(bomb) < 300_000

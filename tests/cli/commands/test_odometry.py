@@ -88,6 +88,7 @@ def walker(session: Session) -> Generator[threading.Event]:
             thread.join()
 
 
+@pytest.mark.long
 def test_feet_that_slide_back_under_a_walker_move_it_ahead():
     with connect() as session, TransformListener(session, "walker") as listener, walker(session) as walks:
 

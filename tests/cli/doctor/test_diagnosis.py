@@ -520,6 +520,7 @@ def test_another_program_at_the_rendezvous_address_is_detected(monkeypatch: pyte
 
 
 @pytest.mark.processes
+@pytest.mark.long
 def test_stopped_program_that_blocks_the_rendezvous_is_reported(
     spawn: Spawn, rendezvous: str, free_port: int, monkeypatch: pytest.MonkeyPatch
 ):

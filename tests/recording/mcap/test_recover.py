@@ -45,6 +45,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[int], lis
     return path.read_bytes(), flushed, [DESCRIPTION, *(payload for _, payload in joint_states(60))]
 
 
+@pytest.mark.long
 def test_every_flushed_message_survives_any_cut_and_latched_ones_come_first(
     tmp_path: Path, run: tuple[bytes, list[int], list[bytes]]
 ):

@@ -297,6 +297,7 @@ def corner_of(pose) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("seed", range(8))
+@pytest.mark.long
 def test_each_robot_is_drawn_once_at_its_pose_after_random_changes(server, seed: int):
     changes = RandomChanges(server, seed)
     for step in range(150):

@@ -250,6 +250,7 @@ def test_any_payload_is_decoded_or_refused_with_a_reason(stream, given_, namespa
     st.sampled_from(["", "r1", "*"]),
     st.sampled_from(["r1", "*"]),
 )
+@pytest.mark.long
 def test_any_token_is_parsed_or_ignored(token: str, namespace: str, robot: str):
     for one in (wire(namespace=namespace), Ros2DdsWire(Ros2Options(namespace=namespace))):
         one.parse_token(token, robot)
