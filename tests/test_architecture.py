@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from zstate.plugins import built_in_plugins
+
 PACKAGE = Path(__file__).parent.parent / "zstate"
 
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
@@ -269,6 +271,39 @@ def loaded_by(code: str) -> set[str]:
     ask = f"{code}\nimport sys\nprint(*(set(sys.modules) & {set(HOMES)!r}))"
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
+
+
+def page_rows(title: str) -> list[list[str]]:
+    """The cells of the first table below ``title`` in the page on the architecture, without its head."""
+    page = (PACKAGE.parent / "docs" / "architecture.md").read_text()
+    lines = page.split(f"## {title}\n")[1].split("\n## ")[0].splitlines()
+    rows = [line.strip("|").split("|") for line in lines if line.startswith("|")]
+    return [[cell.strip() for cell in row] for row in rows[2:]]
+
+
+def test_the_page_shows_the_floors():
+    floors = [set(rooms) - {"_kernel"} for rooms in reversed(FLOORS)]
+    for layer, packages in page_rows("Layers"):
+        shown = {
+            _room(name.removesuffix("/").removesuffix(".py").removeprefix("zstate/").split("/"))
+            for name in re.findall(r"`([^`]+)`", packages)
+        }
+        while shown and floors and floors[0] <= shown:
+            shown -= floors.pop(0)
+        assert shown == set(), layer
+    assert floors == []
+
+
+def test_the_page_shows_what_plugins_bring_and_need():
+    shown = {row[0].strip("`/"): row for row in page_rows("Plugins")}
+    assert list(shown) == [plugin.name for plugin in built_in_plugins()]
+    for plugin in built_in_plugins():
+        _, brings, needs, _ = shown[plugin.name]
+        names = ", ".join(row.name for row in plugin.streams)
+        commands = " ".join(f"`{name}`" for name in plugin.commands)
+        if names or commands:
+            assert brings == "; ".join(filter(None, (names, commands)))
+        assert needs == (", ".join(plugin.needs) or "-")
 
 
 def test_importing_zstate_loads_no_library():
