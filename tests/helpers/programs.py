@@ -84,7 +84,7 @@ class _DummyLaser:
 
 
 @contextmanager
-def scanner(robot: str, frame: str, sensor: str = "scan") -> Iterator[None]:
+def scanner(robot: str, frame: str, sensor: str = "scan", wire: str = "native") -> Iterator[None]:
     """The scans of `zstate scan --dummy`: 30 Hz, 1081 rays."""
     geometry = {
         **{"angle_min": DUMMY_ANGLE_MIN, "angle_increment": DUMMY_ANGLE_INCREMENT},
@@ -92,7 +92,7 @@ def scanner(robot: str, frame: str, sensor: str = "scan") -> Iterator[None]:
     }
     with (
         connect() as session,
-        ScanPublisher(session, robot, sensor, frame=frame, program="laser", **geometry) as publisher,
+        ScanPublisher(session, robot, sensor, wire, frame=frame, program="laser", **geometry) as publisher,
         _in_thread(lambda: publisher.run(_DummyLaser(publisher.frame)), publisher.close),
     ):
         yield
