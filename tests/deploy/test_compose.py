@@ -11,9 +11,8 @@ from zstate import StatePublisher, connect, discover, load_model
 from zstate.errors import AccessDenied
 from zstate.net.security.credentials import Credentials
 
-pytestmark = pytest.mark.processes
 
-
+@pytest.mark.processes
 def test_reader_of_the_compose_file_receives_its_moving_robot(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     deployment.start(spawn, "robot").line()
@@ -22,12 +21,14 @@ def test_reader_of_the_compose_file_receives_its_moving_robot(deployment: Deploy
     assert "r1" in deployment.start(spawn, "reader").line()
 
 
+@pytest.mark.processes
 def test_health_checks_fail_without_router_and_without_robot(deployment: Deployment, spawn: Any):
     assert not deployment.is_healthy("robot")
     deployment.start_router(spawn).line()
     assert not deployment.is_healthy("reader")
 
 
+@pytest.mark.processes
 def test_compose_router_refuses_writes_of_other_identities(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     endpoint = f"tls/localhost:{deployment.port}"
@@ -46,6 +47,7 @@ def test_compose_router_refuses_writes_of_other_identities(deployment: Deploymen
             assert discover(other, 0.3) == ()  # r2 has a certificate, but no rule
 
 
+@pytest.mark.processes
 def test_client_without_certificate_is_refused(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     ca = Credentials(ca=deployment.certs / "ca.pem")
