@@ -62,10 +62,11 @@ def moving_edge(
     *,
     writer: str | None = None,
     rate_hz: float = 50.0,
+    wire: str = "native",
 ) -> Iterator[None]:
     """A pose that is published all the time, as by `zstate transform`."""
     stop = threading.Event()
-    with connect() as session, TransformPublisher(session, robot, writer) as publisher:
+    with connect() as session, TransformPublisher(session, robot, writer, wire) as publisher:
 
         def publish() -> None:
             for stamp in Rate(rate_hz, SystemClock(), stop):
