@@ -37,7 +37,7 @@ def router(
 
 
 @contextmanager
-def driver(robot: str = "rrbot", name: str | None = None) -> Iterator[DriverHost]:
+def driver(robot: str = "rrbot", name: str | None = None, *, ttl_s: float = 10.0) -> Iterator[DriverHost]:
     """The driver of `zstate drive sim`, ready; commands are valid for 10 s, as a busy commander may pause."""
     model = load_model(robot)
     with (
@@ -45,7 +45,7 @@ def driver(robot: str = "rrbot", name: str | None = None) -> Iterator[DriverHost
         DriverHost(
             *(session, SimulatedDriver(model), model, name or robot),
             rate_hz=100.0,
-            ttl_s=10.0,
+            ttl_s=ttl_s,
             limits=Limits.of(model),
         ) as host,
         _in_thread(host.run, host.close),
