@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import sys
 import urllib.request
@@ -23,6 +22,7 @@ from helpers.cli_runner import (
 )
 
 from zstate import StatePublisher, Transform, TransformListener, TransformPublisher, connect, load_model
+from zstate.web_access import listen
 
 
 def address(line: str) -> str:
@@ -42,14 +42,16 @@ def test_view_prints_the_address_to_open(spawn):
     assert child.stderr == ""
 
 
-@pytest.mark.processes
-def test_without_a_port_it_takes_the_first_free_one_and_a_taken_one_is_an_error(spawn):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        text = failure("view", "--port", str(port))
-    assert f"port {port} is taken at '127.0.0.1'" in text
-    first, second = started(spawn, "view"), started(spawn, "view")
-    assert address(first.line()) != address(second.line())
+def test_without_a_port_it_takes_the_first_free_one_and_a_taken_one_is_an_error():
+    from zstate.view.server import PORT
+
+    with listen("127.0.0.1", None, PORT) as first:
+        port = first.getsockname()[1]
+        assert f"port {port} is taken at '127.0.0.1'" in failure("view", "--port", str(port))
+        ended, _ = run_until(lambda: True, "view")
+    found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/?", address(ended.stdout.splitlines()[0]))
+    assert found
+    assert int(found[1]) != port
 
 
 def test_view_beyond_loopback_has_a_token_in_its_address_and_a_warning():
