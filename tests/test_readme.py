@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from helpers.cli_runner import run_cli
 from helpers.pages import commands, programs, section
 from helpers.processes import DEADLINE_S, Child
 
 from zstate import TransformListener, connect
-
-pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -43,6 +42,7 @@ def test_every_python_block_is_a_program_tested_here() -> None:
     assert set(PROGRAMS) == {"publish.py", "lookup.py", "buffer.py"}
 
 
+@pytest.mark.processes
 def test_publisher_and_lookup_connect_from_two_processes(
     spawn: Callable[..., Child],
 ) -> None:
@@ -52,12 +52,14 @@ def test_publisher_and_lookup_connect_from_two_processes(
     assert lookup.wait() == 0, lookup.stderr
 
 
+@pytest.mark.processes
 def test_buffer_works_without_a_network(spawn: Callable[..., Child]) -> None:
     buffer = spawn(PROGRAMS["buffer.py"])
     assert "500.0 ms after the newest sample of 'map' -> 'base'" in buffer.line()
     assert buffer.wait() == 0, buffer.stderr
 
 
+@pytest.mark.processes
 @pytest.mark.robots
 def test_three_terminals_print_the_pose_of_the_hand(
     start: Callable[[list[str]], subprocess.Popen[str]],
@@ -77,6 +79,7 @@ def test_three_terminals_print_the_pose_of_the_hand(
         assert "Traceback" not in process.communicate()[1]
 
 
+@pytest.mark.processes
 @pytest.mark.robots
 @pytest.mark.long
 def test_view_with_sliders_prints_its_address(start: Callable[[list[str]], subprocess.Popen[str]]) -> None:
@@ -86,6 +89,7 @@ def test_view_with_sliders_prints_its_address(start: Callable[[list[str]], subpr
     assert view.stdout.readline().startswith("the view is at http://127.0.0.1:")
 
 
+@pytest.mark.processes
 @pytest.mark.robots
 @pytest.mark.long
 def test_robots_of_the_picture_are_published_in_the_hall(
@@ -104,8 +108,5 @@ def test_robots_of_the_picture_are_published_in_the_hall(
 def test_every_command_named_exists() -> None:
     pages = "".join(path.read_text() for path in (ROOT / "docs").rglob("*.md"))
     named = set(re.findall(r"`zstate (\w+)", TEXT + pages))
-    listed = subprocess.run(
-        [sys.executable, "-m", "zstate", "--help"], capture_output=True, text=True, check=True
-    ).stdout
-    known = set(re.findall(r"^  (\w+) ", listed, re.MULTILINE))
+    known = set(re.findall(r"^  (\w+) ", run_cli("--help").stdout, re.MULTILINE))
     assert named <= known, named - known

@@ -18,12 +18,10 @@ from bench.scenario import Scenario
 from bench.subjects import subject_named
 from bench.trial import run_trial
 
-pytestmark = [
-    pytest.mark.processes,
-    pytest.mark.skipif(sys.platform != "linux", reason="the harness reads /proc"),
-]
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the harness reads /proc")
 
 
+@pytest.mark.processes
 @pytest.mark.robots
 def test_floor_at_50_hz_loses_nothing_and_reports_its_costs() -> None:
     rates: list[float] = []
@@ -41,6 +39,7 @@ def test_floor_at_50_hz_loses_nothing_and_reports_its_costs() -> None:
     assert facts["bytes_per_s"] > 50 * 8 * 8  # eight joints
 
 
+@pytest.mark.processes
 @pytest.mark.robots
 @pytest.mark.long
 def test_zstate_answers_correctly_and_a_late_joiner_gets_the_whole_tree() -> None:
@@ -56,6 +55,7 @@ def test_zstate_answers_correctly_and_a_late_joiner_gets_the_whole_tree() -> Non
     assert 0.0 < joins["connected_ms"][0] <= joins["whole_ms"][0]
 
 
+@pytest.mark.processes
 @pytest.mark.robots
 def test_failed_worker_fails_the_run_with_its_last_output() -> None:
     subject = replace(subject_named("raw_zenoh"), name="no_such_subject")
@@ -63,6 +63,7 @@ def test_failed_worker_fails_the_run_with_its_last_output() -> None:
     assert "No module named 'bench.subjects.no_such_subject'" in facts["failed"]
 
 
+@pytest.mark.processes
 def test_cpu_time_of_a_process_equals_its_own_measurement(spawn: Callable[..., Child]) -> None:
     child = spawn(
         """
@@ -90,6 +91,7 @@ def test_loopback_traffic_is_counted() -> None:
     assert after.packets - before.packets >= 10
 
 
+@pytest.mark.processes
 def test_stopping_a_process_ends_its_descendants() -> None:
     script = "sleep 60 & echo started; wait"
     process = Process("shell", ["sh", "-c", script], {}, is_service=True)
@@ -107,6 +109,7 @@ def _is_alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.processes
 def test_service_that_ends_early_is_reported_with_its_last_output() -> None:
     process = Process("router", ["sh", "-c", "echo port is busy; exit 1"], {}, is_service=True)
     with pytest.raises(

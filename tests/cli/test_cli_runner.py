@@ -11,11 +11,24 @@ from pathlib import Path
 
 import click
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, in_terminal, missing_library, run_cli, run_process, run_until
+from helpers.cli_runner import (
+    RRBOT,
+    Command,
+    Spawn,
+    in_terminal,
+    missing_library,
+    run_cli,
+    run_process,
+    run_until,
+    run_watched,
+)
 from helpers.processes import DEADLINE_S
 
+from zstate import StatePublisher, connect, load_model
 from zstate.cli.main import group
 from zstate.cli.output import logs
+
+TABLE = '<robot name="table"><link name="top"/></robot>'
 
 
 def state() -> list[object]:
@@ -56,6 +69,39 @@ def test_a_command_that_is_interrupted_in_process_leaves_it_as_it_was():
 def test_a_failure_of_what_an_interrupted_command_waits_for_ends_it():
     with pytest.raises(ZeroDivisionError):
         run_until(lambda: 1 / 0, "joints", RRBOT)
+
+
+def test_a_command_that_is_watched_is_read_line_by_line_and_leaves_the_process_as_it_was():
+    before, lines = state(), list[str]()
+    ended = run_watched(lambda command: lines.append(command.line()), "joints", RRBOT)
+    assert lines == ["rrbot: a sine on 2 joints, 100 Hz, on zstate/rrbot/joint_states"]
+    assert ended.code == 130
+    assert ended.stdout.startswith(f"{lines[0]}\n")
+    assert state() == before
+
+
+def test_a_command_may_end_by_itself_while_it_is_watched():
+    def watch(command: Command) -> None:
+        assert command.is_over()
+        assert command.line() == "ready: 'r1' (1 frame)"
+        with pytest.raises(AssertionError, match="it has ended"):
+            command.line()
+
+    with connect() as session, StatePublisher(session, load_model(TABLE), "r1"):
+        run_watched(watch, "wait", "robot", "r1", code=0)
+        with pytest.raises(AssertionError, match="code=0"):
+            run_watched(watch, "wait", "robot", "r1")
+
+
+def test_a_failure_of_what_watches_a_command_ends_it_and_has_its_output():
+    def fail(command: Command) -> None:
+        command.line()
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError) as failed:
+        run_watched(fail, "joints", RRBOT)
+    (note,) = failed.value.__notes__
+    assert note.startswith(f"zstate joints {RRBOT} wrote:\nrrbot: a sine on 2 joints")
 
 
 @pytest.mark.processes

@@ -6,10 +6,20 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, run_cli, started
+from helpers.cli_runner import (
+    RRBOT,
+    Command,
+    Spawn,
+    failure,
+    interrupted,
+    published_robot,
+    run_cli,
+    run_watched,
+    started,
+)
 from helpers.processes import repeated, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
@@ -62,14 +72,15 @@ def test_publish_uses_the_simulated_time_for_stamps_and_rate():
         assert listener.stats.off_clock == 0
 
 
-@pytest.mark.processes
-def test_missing_simulated_time_is_waited_for_with_a_note(spawn: Spawn):
-    child = started(spawn, "joints", RRBOT, "--clock", "sim")
-    until(lambda: "waiting for the simulated time on zstate/clock" in child.stderr)
-    with simulation():
-        assert child.line().startswith("rrbot: a sine on 2 joints")
-        until(lambda: "received zstate/clock: it is " in child.stderr)
-        interrupted(child)
+def test_missing_simulated_time_is_waited_for_with_a_note():
+    def watch(command: Command) -> None:
+        until(lambda: "waiting for the simulated time on zstate/clock" in command.stderr)
+        time_of_all.enter_context(simulation())
+        assert command.line().startswith("rrbot: a sine on 2 joints")
+        until(lambda: "received zstate/clock: it is " in command.stderr)
+
+    with ExitStack() as time_of_all:
+        run_watched(watch, "joints", RRBOT, "--clock", "sim")
 
 
 @pytest.mark.processes
@@ -109,17 +120,17 @@ def test_tf_measures_ages_with_the_clock_of_the_robot():
     assert known["age_s"] == pytest.approx(2.0)
 
 
-@pytest.mark.processes
-def test_robots_on_another_clock_are_received_without_ages(spawn: Spawn):
-    with simulation(), published_robot():
-        listening = started(spawn, "monitor", "--robots", "--clock", "sim", "--json")
-
+def test_robots_on_another_clock_are_received_without_ages():
+    def watch(command: Command) -> None:
         def is_followed() -> bool:
-            report = json.loads(listening.line())
+            report = json.loads(command.line())
             assert (report["age_s"], report["refused"]) == (None, {})
             return report["received"] > 0
 
         until(is_followed)
+
+    with simulation(), published_robot():
+        run_watched(watch, "monitor", "--robots", "--clock", "sim", "--json")
 
 
 def test_first_robot_on_another_clock_does_not_exclude_others():
@@ -128,24 +139,17 @@ def test_first_robot_on_another_clock_does_not_exclude_others():
             assert json.loads(run_cli("tf", "b1/world", "b1/tool", "--once", "--json").stdout)["age_s"] < 60.0
 
 
-@pytest.mark.processes
-def test_listen_counts_stamps_that_are_off_the_clock(spawn: Spawn):
-    stop = threading.Event()
-    with connect() as session, StatePublisher(session, load_model(RRBOT), "rrbot") as robot:
+def test_listen_counts_stamps_that_are_off_the_clock():
+    def watch(command: Command) -> None:
+        until(lambda: "  off the clock " in command.line())
+        until(lambda: "the writer gives seconds where nanoseconds are meant" in command.stderr)
 
-        def publish() -> None:
-            while not stop.wait(0.01):
-                robot.publish([0.5, 0.5], stamp=time.time_ns() // SECOND)
-
-        thread = threading.Thread(target=publish)
-        thread.start()
-        try:
-            listening = started(spawn, "monitor", "--robots")
-            until(lambda: "  off the clock " in listening.line())
-            until(lambda: "the writer gives seconds where nanoseconds are meant" in listening.stderr)
-        finally:
-            stop.set()
-            thread.join()
+    with (
+        connect() as session,
+        StatePublisher(session, load_model(RRBOT), "rrbot") as robot,
+        repeated(lambda: robot.publish([0.5, 0.5], stamp=time.time_ns() // SECOND)),
+    ):
+        run_watched(watch, "monitor", "--robots")
 
 
 def test_unknown_clock_is_wrong_usage():

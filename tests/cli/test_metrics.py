@@ -1,4 +1,4 @@
-"""--metrics PORT: scraped from real processes."""
+"""--metrics PORT: scraped from commands that run."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from pathlib import Path
 import pytest
 from helpers.cli_runner import (
     RRBOT,
+    Command,
     Spawn,
     failure,
     interrupted,
     missing_library,
     published_robot,
+    run_watched,
     started,
 )
 from helpers.processes import Child, until
 from helpers.prometheus_text import Row, row, scraped
 
 
-def url_of(command: Child) -> str:
+def url_of(command: Child | Command) -> str:
     until(lambda: "metrics at " in command.stderr)
     match = re.search(r"metrics at (http://127\.0\.0\.1:\d+/metrics)", command.stderr)
     assert match
@@ -51,61 +53,63 @@ def test_publisher_serves_its_metrics(spawn: Spawn):
     interrupted(command)
 
 
-@pytest.mark.processes
-def test_listener_serves_its_counts(spawn: Spawn):
-    command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--json", "--metrics", "0")
-    url = url_of(command)
-    with published_robot():
-        until(lambda: row("zstate_listener_received_total", robot="rrbot") in scraped(url))
-        rows = grown(url, row("zstate_listener_received_total", robot="rrbot"))
-        received = rows[row("zstate_listener_received_total", robot="rrbot")]
-        in_buckets = rows[row("zstate_listener_latency_seconds_count", robot="rrbot")]
-        # It goes on while it is read.
-        assert received <= in_buckets <= received + 100
-        assert rows[row("zstate_writers", robot="rrbot", stream="joint_states")] == 1
-        assert rows[row("zstate_listener_missed_total", robot="rrbot")] == 0
-        until(lambda: scraped(url)[row("zstate_listener_rate_hertz", robot="rrbot")] > 10.0)
-    until(lambda: scraped(url)[row("zstate_robots")] == 0)
-    interrupted(command)
+def test_listener_serves_its_counts():
+    def scrape(command: Command) -> None:
+        url = url_of(command)
+        with published_robot():
+            until(lambda: row("zstate_listener_received_total", robot="rrbot") in scraped(url))
+            rows = grown(url, row("zstate_listener_received_total", robot="rrbot"))
+            received = rows[row("zstate_listener_received_total", robot="rrbot")]
+            in_buckets = rows[row("zstate_listener_latency_seconds_count", robot="rrbot")]
+            # It goes on while it is read.
+            assert received <= in_buckets <= received + 100
+            assert rows[row("zstate_writers", robot="rrbot", stream="joint_states")] == 1
+            assert rows[row("zstate_listener_missed_total", robot="rrbot")] == 0
+            until(lambda: scraped(url)[row("zstate_listener_rate_hertz", robot="rrbot")] > 10.0)
+        until(lambda: scraped(url)[row("zstate_robots")] == 0)
+
+    run_watched(scrape, "monitor", "--robots", "--robot", "rrbot", "--json", "--metrics", "0")
 
 
-@pytest.mark.processes
-def test_router_serves_its_connections_and_writers(spawn: Spawn, free_port: int):
+def test_router_serves_its_connections_and_writers(free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    command = started(spawn, "router", "--listen", endpoint, "--metrics", "0")
-    url = url_of(command)
-    assert scraped(url)[row("zstate_router_sessions", mode="client")] == 0
-    with published_robot(router=endpoint):
-        until(lambda: scraped(url).get(row("zstate_writers", robot="rrbot", stream="joint_states")) == 1)
-        rows = scraped(url)
-    assert rows[row("zstate_router_sessions", mode="client")] == 1
-    assert rows[row("zstate_router_links", protocol="tcp")] == 1
-    interrupted(command)
+
+    def scrape(command: Command) -> None:
+        url = url_of(command)
+        assert scraped(url)[row("zstate_router_sessions", mode="client")] == 0
+        with published_robot(router=endpoint):
+            until(lambda: scraped(url).get(row("zstate_writers", robot="rrbot", stream="joint_states")) == 1)
+            rows = scraped(url)
+        assert rows[row("zstate_router_sessions", mode="client")] == 1
+        assert rows[row("zstate_router_links", protocol="tcp")] == 1
+
+    run_watched(scrape, "router", "--listen", endpoint, "--metrics", "0")
 
 
-@pytest.mark.processes
-def test_recorder_serves_its_metrics(spawn: Spawn, tmp_path: Path):
-    with published_robot():
-        command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0")
+def test_recorder_serves_its_metrics(tmp_path: Path):
+    def scrape(command: Command) -> None:
         url = url_of(command)
         messages = row("zstate_recorder_messages_total", robot="rrbot", stream="joint_states")
         until(lambda: messages in scraped(url))
         rows = grown(url, messages)
-    assert rows[row("zstate_recorder_files")] == 1
-    assert rows[row("zstate_recorder_size_bytes")] > 0
-    interrupted(command)
+        assert rows[row("zstate_recorder_files")] == 1
+        assert rows[row("zstate_recorder_size_bytes")] > 0
+
+    with published_robot():
+        run_watched(scrape, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0")
 
 
-@pytest.mark.processes
-def test_bridge_serves_the_carried_robots(spawn: Spawn, ros_router: str, monkeypatch: pytest.MonkeyPatch):
+def test_bridge_serves_the_carried_robots(ros_router: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ZSTATE_CONNECT")
     monkeypatch.delenv("ZSTATE_WIRE")
-    command = started(spawn, "bridge", "rrbot", "--ros", ros_router, "--metrics", "0")
-    url = url_of(command)
-    with published_robot():
+
+    def scrape(command: Command) -> None:
+        url = url_of(command)
         carried = row("zstate_bridge_carried", robot="rrbot", way="native to ROS")
         until(lambda: scraped(url).get(carried) == 1)
-    interrupted(command)
+
+    with published_robot():
+        run_watched(scrape, "bridge", "rrbot", "--ros", ros_router, "--metrics", "0")
 
 
 def test_busy_port_and_invalid_address_are_reported():

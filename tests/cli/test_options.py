@@ -5,9 +5,9 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, run_cli, started
+from helpers.cli_runner import RRBOT, Spawn, failure, found_pose, run_cli, run_until, started
 
-from zstate import TransformListener, connect
+from zstate import StatePublisher, TransformListener, connect, load_model
 from zstate.cli.options import load_robot, parse_models
 
 ARM = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -63,12 +63,26 @@ def test_an_argument_of_another_form_or_without_a_model_is_wrong_usage():
     assert "'prefix:=left_' is a xacro argument; name the model before it" in message
 
 
-@pytest.mark.processes
-def test_publish_and_joints_expand_the_model_with_the_arguments(spawn: Spawn, arm: str):
-    started(spawn, "publish", arm, "prefix:=left_").line()
-    started(spawn, "joints", arm, "prefix:=left_").line()
+def test_publish_expands_the_model_with_the_arguments(arm: str):
     with connect() as session, TransformListener(session, "arm") as listener:
-        assert listener.buffer.wait("left_base", "left_tip", timeout_s=10.0).kind != "static"
+        _, pose = run_until(
+            lambda: found_pose(listener, "left_base", "left_tip"),
+            *("publish", arm, "prefix:=left_", "--source", "sine"),
+        )
+    assert pose.kind != "static"
+
+
+def test_joints_expand_the_model_with_the_arguments(arm: str):
+    model = load_model(arm, xacro_args={"prefix": "left_"})
+    with (
+        connect() as session,
+        StatePublisher(session, model, "arm", streams=("robot_description", "tf_static")),
+        TransformListener(session, "arm") as listener,
+    ):
+        _, pose = run_until(
+            lambda: found_pose(listener, "left_base", "left_tip"), "joints", arm, "prefix:=left_"
+        )
+    assert pose.kind != "static"
 
 
 @pytest.mark.processes

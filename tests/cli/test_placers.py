@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from helpers.cli_runner import Spawn, failure, published_robot, started
-from helpers.processes import until
+from helpers.cli_runner import failure, published_robot, run_until
 
 from zstate import StaticPublisher, Transform, connect
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize(
     "command",
     [
@@ -19,13 +17,16 @@ from zstate import StaticPublisher, Transform, connect
         "plot --path rrbot/base rrbot/tool --seconds 60",
     ],
 )
-def test_a_robot_that_is_not_among_the_placers_is_refused(spawn: Spawn, command: str):
+def test_a_robot_that_is_not_among_the_placers_is_refused(command: str):
     if command.startswith("plot"):
         pytest.importorskip("matplotlib", reason="pip install 'zstate[plot]'")
     with published_robot(), connect() as session, StaticPublisher(session, "thief", "edges") as statics:
         statics.set(Transform("thief/x", "rrbot/world", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
-        child = started(spawn, *command.split(), "--placer", "site", "--placer", "fleet")
-        until(lambda: "which is not among the placers ('fleet', 'site')" in child.stderr)
+        run_until(
+            lambda: True,
+            *(*command.split(), "--placer", "site", "--placer", "fleet"),
+            after="which is not among the placers ('fleet', 'site')",
+        )
 
 
 @pytest.mark.parametrize(

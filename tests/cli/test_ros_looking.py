@@ -4,7 +4,7 @@ import json
 import math
 
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, run_cli, started
+from helpers.cli_runner import ELBOW, SHOULDER, Command, failure, published_robot, run_cli, run_watched
 from helpers.processes import until
 from helpers.robots import wait_for_reader
 
@@ -26,19 +26,19 @@ def test_tf_needs_no_model_and_calls_frames_as_ros_does(ros_router: str):
     assert answer["translation"] == pytest.approx(BASE_FROM_LOWER, abs=1e-12)
 
 
-@pytest.mark.processes
-def test_tf_reports_missing_topics_in_ros_terms(spawn: Spawn, ros_router: str):
-    command = started(spawn, "tf", "base", "lower", "--rate", "20")
-    until(lambda: "waiting: no node publishes /tf in domain 0" in command.stderr)
-    assert "`zstate ls --wire ros2`" in command.stderr
-    with published_robot(wire="ros2", router=ros_router):
-        assert command.line() == "pose of lower in base"
-        assert command.line().startswith("At time ")
-        until(lambda: "receiving /tf: " in command.stderr)
-    until(lambda: "no new sample of 'base' -> 'upper'" in command.stderr)
-    interrupted(command)
+def test_tf_reports_missing_topics_in_ros_terms(ros_router: str):
+    def watch(command: Command) -> None:
+        until(lambda: "waiting: no node publishes /tf in domain 0" in command.stderr)
+        assert "`zstate ls --wire ros2`" in command.stderr
+        with published_robot(wire="ros2", router=ros_router):
+            assert command.line() == "pose of lower in base"
+            assert command.line().startswith("At time ")
+            until(lambda: "receiving /tf: " in command.stderr)
+        until(lambda: "no new sample of 'base' -> 'upper'" in command.stderr)
+
+    ended = run_watched(watch, "tf", "base", "lower", "--rate", "20")
     for unknown_to_ros in ("zstate joints", "zstate publish", "ros/"):
-        assert unknown_to_ros not in command.stderr
+        assert unknown_to_ros not in ended.stderr
 
 
 def test_tf_between_two_trees_names_the_command_that_joins_them(ros_router: str):
@@ -87,19 +87,21 @@ def test_echo_needs_no_robot_and_no_description(ros_router: str):
     assert document["positions"] == {"shoulder": SHOULDER, "elbow": ELBOW}
 
 
-@pytest.mark.processes
-def test_unmeasured_values_are_null_in_json(spawn: Spawn, ros_router: str):
-    command = started(spawn, "echo", "--json")
+def test_unmeasured_values_are_null_in_json(ros_router: str):
     unmeasured = JointState(
         5, 0, 1, order_digest(("a",)), to_block([0.5]), None, to_block([math.nan]), ("a",)
     )
-    wire = Ros2Wire()
-    with connect(mode="client", endpoints=ros_router) as session:
-        node = WriterNode("r", WriterId("driver", "", 0, 0, 1), session.zid, 0)
-        encoder = wire.stream_encoder(node, "joint_states", number=1)
-        wait_for_reader(session, encoder.key)
-        session.zenoh.put(encoder.key, encoder.encode(unmeasured), attachment=encoder.attachment(5))
-        document = json.loads(command.line(), parse_constant=pytest.fail)
+
+    def send(command: Command) -> None:
+        with connect(mode="client", endpoints=ros_router) as session:
+            node = WriterNode("r", WriterId("driver", "", 0, 0, 1), session.zid, 0)
+            encoder = Ros2Wire().stream_encoder(node, "joint_states", number=1)
+            wait_for_reader(session, encoder.key)
+            session.zenoh.put(encoder.key, encoder.encode(unmeasured), attachment=encoder.attachment(5))
+            command.line()
+
+    (line,) = run_watched(send, "echo", "--json").stdout.splitlines()
+    document = json.loads(line, parse_constant=pytest.fail)
     assert document["positions"] == {"a": 0.5}
     assert document["efforts"] == {"a": None}
 
@@ -131,13 +133,14 @@ def test_hz_measures_all_nodes_of_a_topic_together(ros_router: str):
             assert measured["missed"] == 0
 
 
-@pytest.mark.processes
-def test_robots_are_monitored_by_tf_and_a_selected_one_by_its_joints(spawn: Spawn, ros_router: str):
+def test_robots_are_monitored_by_tf_and_a_selected_one_by_its_joints(ros_router: str):
+    def watch(command: Command) -> None:
+        until(lambda: json.loads(command.line())["received"] > 0)
+
+    monitor = ("monitor", "--robots", "--json")
     with published_robot(wire="ros2", router=ros_router):
-        monitor = ("monitor", "--robots", "--json")
-        everybody, one = started(spawn, *monitor), started(spawn, *monitor, "--robot", "rrbot")
-        until(lambda: json.loads(everybody.line())["received"] > 0)
-        until(lambda: json.loads(one.line())["received"] > 0)
+        everybody = run_watched(watch, *monitor)
+        one = run_watched(watch, *monitor, "--robot", "rrbot")
     assert "following ROS 2 topic /tf (domain 0)" in everybody.stderr
     assert "following ROS 2 topic /joint_states (domain 0)" in one.stderr
 
@@ -148,31 +151,24 @@ def test_invalid_wire_is_wrong_usage_with_the_reason():
     assert "'native'" in failure("ls", "--wire", "ros3", code=2)
 
 
-# Another default router: port 7447 of the test machine may be in use.
-ELSEWHERE = """
-import sys
-import zstate.net.config as config
-config.ROUTER_ENDPOINT = sys.argv.pop(1)
-from zstate.cli.main import main
-main()
-"""
+DEFAULT_ROUTER = "zstate.net.config.ROUTER_ENDPOINT"
+"""Its port 7447 of the test machine may be in use."""
 
 
-@pytest.mark.processes
-def test_ros_commands_join_the_router_of_this_host(
-    spawn: Spawn, ros_router: str, monkeypatch: pytest.MonkeyPatch
-):
+def test_ros_commands_join_the_router_of_this_host(ros_router: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ZSTATE_CONNECT")
+    monkeypatch.setattr(DEFAULT_ROUTER, ros_router)
     with published_robot(wire="ros2:node=driver", router=ros_router):
-        command = spawn(ELSEWHERE, ros_router, "ls")
-        assert [command.line(), command.line()] == ["1 node in domain 0", "  /driver"]
+        listed = run_cli("ls").stdout
+    assert listed.startswith("1 node in domain 0\n  /driver\n")
 
 
-@pytest.mark.processes
-def test_missing_router_is_reported_with_the_commands_that_start_one(spawn: Spawn, free_port: int):
+def test_missing_router_is_reported_with_the_commands_that_start_one(
+    free_port: int, monkeypatch: pytest.MonkeyPatch
+):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    command = spawn(ELSEWHERE, endpoint, "ls", "--wire", "ros2")
-    assert command.wait() == 1
-    assert f"zstate: nothing answers at {endpoint!r}" in command.stderr
+    monkeypatch.setattr(DEFAULT_ROUTER, endpoint)
+    message = failure("ls", "--wire", "ros2")
+    assert message.startswith(f"zstate: nothing answers at {endpoint!r}")
     for advice in ("ros2 run rmw_zenoh_cpp rmw_zenohd", "zstate router --ros2", "--connect"):
-        assert advice in command.stderr
+        assert advice in message

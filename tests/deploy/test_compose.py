@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import zenoh
+from helpers.cli_runner import Command, run_watched
 from helpers.deployment import DEPLOY, Deployment
 from helpers.processes import until
 
@@ -11,10 +12,9 @@ from zstate import StatePublisher, connect, discover, load_model
 from zstate.errors import AccessDenied
 from zstate.net.security.credentials import Credentials
 
-pytestmark = pytest.mark.processes
-
 
 @pytest.mark.long
+@pytest.mark.processes
 def test_reader_of_the_compose_file_receives_its_moving_robot(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     deployment.start(spawn, "robot").line()
@@ -23,35 +23,41 @@ def test_reader_of_the_compose_file_receives_its_moving_robot(deployment: Deploy
     assert "r1" in deployment.start(spawn, "reader").line()
 
 
-def test_health_checks_fail_without_router_and_without_robot(deployment: Deployment, spawn: Any):
+def test_health_checks_fail_without_router_and_without_robot(deployment: Deployment):
     assert not deployment.is_healthy("robot")
-    deployment.start_router(spawn).line()
-    assert not deployment.is_healthy("reader")
+    with connect(str(deployment.router_file)):
+        assert not deployment.is_healthy("reader")
 
 
-def test_compose_router_refuses_writes_of_other_identities(deployment: Deployment, spawn: Any):
-    deployment.start_router(spawn).line()
+def test_compose_router_refuses_writes_of_other_identities(deployment: Deployment):
     endpoint = f"tls/localhost:{deployment.port}"
 
     def join(name: str) -> Any:
         credentials = Credentials.from_folder(deployment.certs, name)
         return connect(mode="client", endpoints=endpoint, credentials=credentials)
 
-    model = load_model("rrbot")
-    with join("r1") as robot, join("r2") as other, join("desk") as viewer:
-        for session in (other, viewer):
-            with pytest.raises(AccessDenied, match="'r1 writes'"):
-                StatePublisher(session, model, "r1")
-        with StatePublisher(robot, model, "r1"):
-            until(lambda: [info.name for info in discover(viewer)] == ["r1"])
-            assert discover(other, 0.3) == ()  # r2 has a certificate, but no rule
+    def write(router: Command) -> None:
+        router.line()
+        model = load_model("rrbot")
+        with join("r1") as robot, join("r2") as other, join("desk") as viewer:
+            for session in (other, viewer):
+                with pytest.raises(AccessDenied, match="'r1 writes'"):
+                    StatePublisher(session, model, "r1")
+            with StatePublisher(robot, model, "r1"):
+                until(lambda: [info.name for info in discover(viewer)] == ["r1"])
+                assert discover(other, 0.3) == ()  # r2 has a certificate, but no rule
+
+    run_watched(write, "router", "--config", str(deployment.router_file))
 
 
-def test_client_without_certificate_is_refused(deployment: Deployment, spawn: Any):
-    deployment.start_router(spawn).line()
-    ca = Credentials(ca=deployment.certs / "ca.pem")
-    with pytest.raises(AccessDenied, match="requires a certificate"):
-        connect(mode="client", endpoints=f"tls/localhost:{deployment.port}", credentials=ca)
+def test_client_without_certificate_is_refused(deployment: Deployment):
+    def join(router: Command) -> None:
+        router.line()
+        ca = Credentials(ca=deployment.certs / "ca.pem")
+        with pytest.raises(AccessDenied, match="requires a certificate"):
+            connect(mode="client", endpoints=f"tls/localhost:{deployment.port}", credentials=ca)
+
+    run_watched(join, "router", "--config", str(deployment.router_file))
 
 
 def test_every_service_restarts_and_waits_for_the_router(deployment: Deployment):

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
-import pytest
+from helpers.cli_runner import run_cli
 from helpers.deployment import DEPLOY
-from helpers.processes import DEADLINE_S
-
-pytestmark = pytest.mark.processes
 
 
 def output(*arguments: str) -> str:
-    command = [sys.executable, "-m", "zstate", *arguments]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-    assert ended.returncode == 0, ended.stderr
+    ended = run_cli(*arguments)
+    assert ended.code == 0, ended.stderr
     return ended.stdout
 
 

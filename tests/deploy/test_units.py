@@ -13,6 +13,7 @@ import pytest
 from helpers.cli_runner import published_robot
 from helpers.deployment import DEPLOY
 from helpers.processes import Child, find_free_port, until
+from helpers.programs import router
 
 from zstate.recording.info import read_info
 
@@ -92,13 +93,13 @@ def test_programs_of_the_units_connect_and_exit_as_expected(spawn: Any, tmp_path
         )
         return spawn(code, *(values.get(word, word) for word in arguments))
 
-    router = start("zstate-router.service")
-    router.line()
+    routing = start("zstate-router.service")
+    routing.line()
     robot = start("zstate-publish@.service")
     robot.line()
-    ends = [("zstate-publish@.service", robot), ("zstate-router.service", router)]
+    ends = [("zstate-publish@.service", robot), ("zstate-router.service", routing)]
     for name, child in ends:
-        if child is router:
+        if child is routing:
             driver = start("zstate-drive@.service")
             driver.line()
             os.kill(driver.process.pid, signal.SIGTERM)
@@ -128,9 +129,7 @@ def test_recorder_that_is_killed_and_started_again_makes_a_second_file(spawn: An
         until(lambda: recorder.line().endswith("  rrbot"))
         return recorder
 
-    router = spawn("from zstate.cli.main import main; main()", "router", "--listen", endpoint)
-    router.line()
-    with published_robot(router=endpoint):
+    with router(endpoint), published_robot(router=endpoint):
         record().kill()
         (first,) = tmp_path.iterdir()
         before = first.read_bytes()

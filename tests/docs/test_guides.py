@@ -11,8 +11,6 @@ from helpers.pages import blocks, languages, programs
 from helpers.processes import find_free_port
 from helpers.tutorial_terminal import TutorialPage, check_page
 
-pytestmark = pytest.mark.processes
-
 ROOT = Path(__file__).parents[2]
 GUIDES = {path.stem: path.read_text() for path in sorted((ROOT / "docs" / "guides").glob("*.md"))}
 
@@ -42,6 +40,7 @@ def test_every_file_of_a_guide_is_used_in_its_terminals(guide: str) -> None:
     assert [name for name in files(GUIDES[guide]) if name not in " ".join(used)] == []
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("guide", GUIDES)
 @pytest.mark.long
 def test_terminals_print_what_the_guide_shows(

@@ -65,6 +65,42 @@ class Ended:
     stderr: str
 
 
+class Command:
+    """A command in this process, for a thread beside it: what it has written so far, and its end."""
+
+    def __init__(self, stdout: Callable[[], str], stderr: Callable[[], str]) -> None:
+        self._stdout, self._stderr = stdout, stderr
+        self._lines_read = 0
+        self._is_over = threading.Event()
+
+    @property
+    def stdout(self) -> str:
+        return self._stdout()
+
+    @property
+    def stderr(self) -> str:
+        return self._stderr()
+
+    def line(self, timeout_s: float = DEADLINE_S) -> str:
+        """The next line of its output."""
+        deadline = time.monotonic() + timeout_s
+        while (text := self.stdout).count("\n") <= self._lines_read:
+            assert not self.is_over(0.002), "it has ended"
+            assert time.monotonic() < deadline, f"silent for {timeout_s} s"
+        self._lines_read += 1
+        return text.split("\n")[self._lines_read - 1]
+
+    def is_over(self, timeout_s: float = DEADLINE_S) -> bool:
+        """Waits for its end; returns whether it has come."""
+        return self._is_over.wait(timeout_s)
+
+    def end(self) -> None:
+        """Called when it has ended: its streams are about to be closed."""
+        stdout, stderr = self.stdout, self.stderr
+        self._stdout, self._stderr = (lambda: stdout), (lambda: stderr)
+        self._is_over.set()
+
+
 def run_cli(*arguments: str, stdin: bytes = b"") -> Ended:
     """Run a command that ends by itself, in this process; what it changes in the process is restored.
 
@@ -74,8 +110,8 @@ def run_cli(*arguments: str, stdin: bytes = b"") -> Ended:
     return _run(arguments, stdin, lambda _: None)
 
 
-def _run(arguments: Sequence[str], stdin: bytes, on_start: Callable[[Callable[[], str]], object]) -> Ended:
-    """``on_start`` is called before the command with what returns all that it has written so far."""
+def _run(arguments: Sequence[str], stdin: bytes, on_start: Callable[[Command], object]) -> Ended:
+    """``on_start`` is called before the command, in this thread."""
     assert threading.current_thread() is threading.main_thread(), "one command at a time; see run_process"
     library = logging.getLogger("zstate")
     before = library.handlers.copy(), library.level, library.propagate
@@ -95,9 +131,10 @@ def _run(arguments: Sequence[str], stdin: bytes, on_start: Callable[[Callable[[]
             sys.stderr.flush()
             return stream.getvalue().decode()
 
+        command = Command(lambda: stdout.getvalue().decode(), lambda: stderr.getvalue().decode())
         try:
             logs.use_environment_format()
-            on_start(lambda: stdout.getvalue().decode() + stderr.getvalue().decode())
+            on_start(command)
             code = run(arguments)
         except BaseException as error:
             error.add_note(f"zstate {shlex.join(arguments)} wrote:\n{written(stdout)}{written(stderr)}")
@@ -107,6 +144,7 @@ def _run(arguments: Sequence[str], stdin: bytes, on_start: Callable[[Callable[[]
             library.setLevel(before[1])
             for number, handler in handlers.items():
                 signal.signal(number, handler)
+            command.end()
         return Ended(int(code), written(stdout), written(stderr))
 
 
@@ -116,39 +154,65 @@ def run_until(find: Callable[[], T | None], *arguments: str, after: str = "\n") 
     Returns the end of the command, whose exit code must be 130, and the value. ``find`` is called in another
     thread, once the command has written ``after``, by default a line.
     """
-    is_over, found, written = threading.Event(), list[T](), list[Callable[[], str]]()
-    failures: list[Exception] = []
+    found: list[T] = []
 
-    def look() -> None:
+    def look(command: Command) -> None:
         deadline = time.monotonic() + DEADLINE_S
-        while not found and time.monotonic() < deadline and not is_over.wait(0.005):
-            has_begun = bool(written) and after in written[0]()
+        while not found and time.monotonic() < deadline and not command.is_over(0.005):
+            has_begun = after in command.stdout or after in command.stderr
             if has_begun and (value := find()) is not None:
                 found.append(value)
 
-    def interrupt() -> None:
+    ended = _run_beside(look, arguments)
+    assert found, f"nothing within {DEADLINE_S} s: {ended}"
+    assert ended.code == 130, ended
+    return ended, found[0]
+
+
+def run_watched(watch: Callable[[Command], object], *arguments: str, code: int = 130) -> Ended:
+    """Run a command in this process while ``watch(command)`` runs in another thread; then it gets Ctrl-C.
+
+    Its exit code must be ``code``, which is that of a command that has ended by itself before, if so.
+    """
+    ended = _run_beside(watch, arguments)
+    assert ended.code == code, ended
+    return ended
+
+
+def _run_beside(watch: Callable[[Command], object], arguments: Sequence[str]) -> Ended:
+    """Ctrl-C must end the command before Zenoh gives up a neighbour, without a traceback."""
+    failures: list[Exception] = []
+    interrupted_at: list[float] = []
+
+    def follow(command: Command) -> None:
         try:
-            look()
+            watch(command)
         except Exception as failure:
+            failure.add_note(f"zstate {shlex.join(arguments)} wrote:\n{command.stdout}{command.stderr}")
             failures.append(failure)
-        if not is_over.is_set():
+        if not command.is_over(0.0):
+            interrupted_at.append(time.monotonic())
             os.kill(os.getpid(), signal.SIGINT)
 
+    threads: list[threading.Thread] = []
+
+    def start(command: Command) -> None:
+        threads.append(threading.Thread(target=follow, args=(command,)))
+        threads[0].start()
+
     before = signal.signal(signal.SIGINT, _end)  # as in main()
-    thread = threading.Thread(target=interrupt)
-    thread.start()
     try:
-        ended = _run(arguments, b"", written.append)
+        ended = _run(arguments, b"", start)
     finally:
-        is_over.set()
-        thread.join()
+        ended_at = time.monotonic()
+        for thread in threads:
+            thread.join()
         signal.signal(signal.SIGINT, before)
     if failures:
         raise failures[0]
-    assert found, f"nothing within {DEADLINE_S} s: {ended}"
-    assert ended.code == 130, ended
+    assert all(ended_at - instant < ZENOH_CLOSE_S for instant in interrupted_at)
     assert "Traceback" not in ended.stderr
-    return ended, found[0]
+    return ended
 
 
 def found_pose(listener: TransformListener, target: str, source: str) -> Transform | None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
-from helpers.processes import DEADLINE_S, Child, find_free_port
+import pytest
+from helpers.cli_runner import run_cli
+from helpers.processes import Child, find_free_port
 from ruamel.yaml import YAML
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
@@ -36,7 +35,7 @@ class Deployment:
 
     def environment(self, service: str) -> dict[str, str]:
         variables = self.services[service].get("environment", {})
-        return {**os.environ, **{name: self.localized(value) for name, value in variables.items()}}
+        return {name: self.localized(value) for name, value in variables.items()}
 
     def start(self, spawn: Any, service: str) -> Child:
         """Starts the command of the container of ``service``."""
@@ -51,9 +50,9 @@ class Deployment:
         """Whether the health check of ``service`` passes."""
         kind, program, *arguments = self.services[service]["healthcheck"]["test"]
         assert (kind, program) == ("CMD", "zstate")
-        command = [sys.executable, "-m", "zstate", *arguments]
-        ended = subprocess.run(
-            command, env=self.environment(service), capture_output=True, timeout=DEADLINE_S, check=False
-        )
-        assert b"Traceback" not in ended.stderr
-        return ended.returncode == 0
+        with pytest.MonkeyPatch.context() as container:
+            for name, value in self.environment(service).items():
+                container.setenv(name, value)
+            ended = run_cli(*arguments)
+        assert "Traceback" not in ended.stderr
+        return ended.code == 0

@@ -37,7 +37,7 @@ def router(
 
 
 @contextmanager
-def driver(robot: str = "rrbot", name: str | None = None) -> Iterator[DriverHost]:
+def driver(robot: str = "rrbot", name: str | None = None, *, ttl_s: float = 10.0) -> Iterator[DriverHost]:
     """The driver of `zstate drive sim`, ready; commands are valid for 10 s, as a busy commander may pause."""
     model = load_model(robot)
     with (
@@ -45,7 +45,7 @@ def driver(robot: str = "rrbot", name: str | None = None) -> Iterator[DriverHost
         DriverHost(
             *(session, SimulatedDriver(model), model, name or robot),
             rate_hz=100.0,
-            ttl_s=10.0,
+            ttl_s=ttl_s,
             limits=Limits.of(model),
         ) as host,
         _in_thread(host.run, host.close),
@@ -62,10 +62,11 @@ def moving_edge(
     *,
     writer: str | None = None,
     rate_hz: float = 50.0,
+    wire: str = "native",
 ) -> Iterator[None]:
     """A pose that is published all the time, as by `zstate transform`."""
     stop = threading.Event()
-    with connect() as session, TransformPublisher(session, robot, writer) as publisher:
+    with connect() as session, TransformPublisher(session, robot, writer, wire) as publisher:
 
         def publish() -> None:
             for stamp in Rate(rate_hz, SystemClock(), stop):
@@ -84,7 +85,7 @@ class _DummyLaser:
 
 
 @contextmanager
-def scanner(robot: str, frame: str, sensor: str = "scan") -> Iterator[None]:
+def scanner(robot: str, frame: str, sensor: str = "scan", wire: str = "native") -> Iterator[None]:
     """The scans of `zstate scan --dummy`: 30 Hz, 1081 rays."""
     geometry = {
         **{"angle_min": DUMMY_ANGLE_MIN, "angle_increment": DUMMY_ANGLE_INCREMENT},
@@ -92,7 +93,7 @@ def scanner(robot: str, frame: str, sensor: str = "scan") -> Iterator[None]:
     }
     with (
         connect() as session,
-        ScanPublisher(session, robot, sensor, frame=frame, program="laser", **geometry) as publisher,
+        ScanPublisher(session, robot, sensor, wire, frame=frame, program="laser", **geometry) as publisher,
         _in_thread(lambda: publisher.run(_DummyLaser(publisher.frame)), publisher.close),
     ):
         yield

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 from urllib.request import urlopen
 
 import pytest
-from helpers.cli_runner import started
+from helpers.cli_runner import Command, published_robot, run_watched
 from helpers.processes import until
+from helpers.programs import router
 
 from zstate import StatePublisher, connect, load_model
 
@@ -69,25 +70,37 @@ ROWS = {
 """By command: each metric with the names of its labels."""
 
 
-@pytest.mark.processes
-def test_names_of_metrics_and_their_labels(spawn: Any, tmp_path: Path, free_port: int):
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    # The bridge needs a router for ROS; a publisher connects to it for the rows of its connections.
-    router = started(spawn, "router", "--ros2", "--listen", endpoint, "--metrics", "0")
-    router.line()
-    commands = {
-        "router": router,
-        "publish": started(spawn, "publish", "rrbot", "--source", "sine", "--metrics", "0"),
-        "monitor": started(spawn, "monitor", "--robots", "--robot", "rrbot", "--metrics", "0"),
-        "record": started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0"),
-        "bridge": started(spawn, "bridge", "rrbot", "--ros", endpoint, "--metrics", "0"),
-    }
-    with connect(mode="client", endpoints=endpoint) as far, StatePublisher(far, load_model("rrbot"), "far"):
-        for name, command in commands.items():
-            until(lambda: "metrics at " in command.stderr)  # noqa: B023 - called in this round
-            url = re.findall(r"metrics at (http:\S+)", command.stderr)[0]
-            until(lambda: set(ROWS[name]) <= set(metric_rows(url)))  # noqa: B023 - as above
-            assert metric_rows(url) == ROWS[name], name
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("router", "--ros2", "--listen", "ENDPOINT"),
+        ("publish", "rrbot", "--source", "sine"),
+        ("monitor", "--robots", "--robot", "rrbot"),
+        ("record", "FILE", "rrbot"),
+        ("bridge", "rrbot", "--ros", "ENDPOINT"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_names_of_metrics_and_their_labels(tmp_path: Path, free_port: int, command: tuple[str, ...]):
+    name, endpoint = command[0], f"tcp/127.0.0.1:{free_port}"
+    given = {"ENDPOINT": endpoint, "FILE": str(tmp_path / "run.mcap")}
+
+    def scrape(running: Command) -> None:
+        until(lambda: "metrics at " in running.stderr)
+        url = re.findall(r"metrics at (http:\S+)", running.stderr)[0]
+        with (
+            # For the rows of the router's connections.
+            connect(mode="client", endpoints=endpoint) as far,
+            StatePublisher(far, load_model("rrbot"), "far"),
+        ):
+            until(lambda: set(ROWS[name]) <= set(metric_rows(url)))
+            assert metric_rows(url) == ROWS[name]
+
+    with (
+        nullcontext() if name == "router" else router(endpoint, ros2=True),
+        nullcontext() if name == "publish" else published_robot(),
+    ):
+        run_watched(scrape, *(given.get(word, word) for word in command), "--metrics", "0")
 
 
 def metric_rows(url: str) -> list[str]:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.processes import until
-from helpers.ros1_processes import JOINTS, RRBOT, Spawn
+from helpers.cli_runner import failure, missing_library
+from helpers.ros1_processes import JOINTS, RRBOT
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
@@ -148,24 +148,16 @@ def test_each_number_of_a_floating_joint_has_a_name_in_ros():
     assert read.efforts is None
 
 
-@pytest.mark.processes
-def test_without_rospy_the_error_names_the_packages_to_install(spawn: Spawn):
-    child = spawn(
-        "import sys; sys.modules['rospy'] = None; from zstate.cli.main import main; main()",
-        *("ros1", "rrbot", "--to-ros"),
-    )
-    assert child.wait() == 1
-    until(lambda: child.stderr)
-    assert "apt-get install python3-rospy" in child.stderr
-    assert "--system-site-packages" in child.stderr
-    assert "Traceback" not in child.stderr
+def test_without_rospy_the_error_names_the_packages_to_install():
+    with missing_library("rospy"):
+        message = failure("ros1", "rrbot", "--to-ros")
+    assert "apt-get install python3-rospy" in message
+    assert "--system-site-packages" in message
+    assert "Traceback" not in message
 
 
-@pytest.mark.processes
-def test_a_direction_must_be_chosen(spawn: Spawn):
-    child = spawn("from zstate.cli.main import main; main()", "ros1", "rrbot")
-    assert child.wait() == 2
-    assert "--to-ros, --from-ros, or both" in child.stderr
+def test_a_direction_must_be_chosen():
+    assert "--to-ros, --from-ros, or both" in failure("ros1", "rrbot", code=2)
 
 
 NOETIC = get_typestore(Stores.ROS1_NOETIC)

@@ -3,7 +3,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started
+from helpers.cli_runner import (
+    ELBOW,
+    SHOULDER,
+    Command,
+    Spawn,
+    failure,
+    interrupted,
+    published_robot,
+    run_watched,
+    started,
+)
 from helpers.programs import router
 
 from zstate import TransformListener, connect, load_model
@@ -19,18 +29,12 @@ def ros(free_port: int) -> Iterator[str]:
         yield endpoint
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize("given", [["rrbot"], [], ["--wire", EACH]], ids=["named", "alone", "all"])
-def test_native_robot_is_carried_to_ros_with_a_line_at_start_and_end(
-    spawn: Spawn, ros: str, given: list[str]
-):
+def test_native_robot_is_carried_to_ros_with_a_line_at_start_and_end(ros: str, given: list[str]):
     wire = EACH if EACH in given else "ros2"
-    with (
-        connect(mode="client", endpoints=ros) as session,
-        TransformListener(session, "rrbot", wire=wire) as listener,
-    ):
+
+    def watch(command: Command) -> None:
         with published_robot():
-            command = started(spawn, "bridge", *given, "--ros", ros)
             assert command.line().startswith(f"bridging {'every robot' if wire == EACH else repr('rrbot')} ")
             assert command.line() == "carrying 'rrbot': native to ROS"
             tool = listener.buffer.wait("world", "tool", timeout_s=10.0)
@@ -38,7 +42,12 @@ def test_native_robot_is_carried_to_ros_with_a_line_at_start_and_end(
             poses = dict(zip(model.links, Kinematics(model).link_poses([SHOULDER, ELBOW]), strict=True))
             assert tool.translation == pytest.approx(poses["tool"][:3] - poses["world"][:3], abs=1e-12)
         assert command.line() == "'rrbot' is no longer carried"
-    interrupted(command)
+
+    with (
+        connect(mode="client", endpoints=ros) as session,
+        TransformListener(session, "rrbot", wire=wire) as listener,
+    ):
+        run_watched(watch, "bridge", *given, "--ros", ros)
 
 
 @pytest.mark.processes

@@ -9,7 +9,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
+from helpers.cli_runner import RRBOT, Command, Spawn, failure, interrupted, run_cli, run_watched, started
 from helpers.processes import DEADLINE_S, Child, until
 from helpers.programs import driver
 from helpers.raw_ros_nodes import COMMANDS, announced_publisher
@@ -105,7 +105,7 @@ def arm(tmp_path: Path) -> str:
     return str(file)
 
 
-def line_with(child: Child, text: str) -> str:
+def line_with(child: Child | Command, text: str) -> str:
     while text not in (line := child.line()):
         pass
     return line
@@ -223,24 +223,27 @@ def test_parameters_have_the_types_that_the_driver_annotates(arm: str, tmp_path:
     assert log.read_text() == "[1, 2] '0042'closed"
 
 
-@pytest.mark.processes
-def test_ros_nodes_command_the_joints_as_a_controller_and_receive_them(spawn: Spawn):
+def test_ros_nodes_command_the_joints_as_a_controller_and_receive_them():
+    def send(command: Command) -> None:
+        assert command.line().startswith("driving 'rrbot' (2 joints, sim)")
+        assert line_with(command, "ROS 2 nodes") == (
+            "ROS 2 nodes command shoulder, elbow, in this order, on /forward_position_controller/commands "
+            "and /forward_position_controller/joint_trajectory"
+        )
+        readings: list[JointReading] = []
+        with (
+            connect() as session,
+            JointStateListener(
+                session, "rrbot", load_model("rrbot"), wire="ros2", on_reading=readings.append
+            ),
+            announced_publisher(session, "teleop", COMMANDS) as node,
+        ):
+            node.numbers([0.0, 0.1])
+            until(lambda: readings and abs(readings[-1].positions[1] - 0.1) < 1e-3)
+        assert "active, commanded by /teleop" in line_with(command, "active")
+
     given = ("drive", "sim", "rrbot", "--wire", "native", "--wire", "ros2", "--ttl", "10")
-    child = started(spawn, *given, "--ros2-controller", "forward_position_controller")
-    assert child.line().startswith("driving 'rrbot' (2 joints, sim)")
-    assert line_with(child, "ROS 2 nodes") == (
-        "ROS 2 nodes command shoulder, elbow, in this order, on /forward_position_controller/commands and "
-        "/forward_position_controller/joint_trajectory"
-    )
-    readings: list[JointReading] = []
-    with (
-        connect() as session,
-        JointStateListener(session, "rrbot", load_model("rrbot"), wire="ros2", on_reading=readings.append),
-        announced_publisher(session, "teleop", COMMANDS) as node,
-    ):
-        node.numbers([0.0, 0.1])
-        until(lambda: readings and abs(readings[-1].positions[1] - 0.1) < 1e-3)
-    assert "active, commanded by /teleop" in line_with(child, "active")
+    run_watched(send, *given, "--ros2-controller", "forward_position_controller")
 
 
 def test_device_sets_the_pace_of_the_loop(arm: str, tmp_path: Path):

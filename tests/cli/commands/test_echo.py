@@ -10,7 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, run_cli, started
+from helpers.cli_runner import (
+    ELBOW,
+    SHOULDER,
+    Command,
+    Spawn,
+    failure,
+    interrupted,
+    published_robot,
+    run_cli,
+    run_watched,
+    started,
+)
 from helpers.processes import DEADLINE_S, repeated, until
 from helpers.programs import moving_edge
 from helpers.robots import SampleCollector, wait_for_reader
@@ -76,11 +87,10 @@ def test_json_is_one_object_a_line():
     assert "velocities" not in document
 
 
-@pytest.mark.processes
-def test_csv_has_one_line_of_names(spawn: Spawn):
-    command = started(spawn, "echo", "rrbot", "--csv")
+def test_csv_has_one_line_of_names():
     with published_robot():
-        names, first, second = csv.reader([command.line() for _ in range(3)])
+        ended = run_watched(lambda command: [command.line() for _ in range(3)], "echo", "rrbot", "--csv")
+    names, first, second, *_ = csv.reader(ended.stdout.splitlines())
     assert names == ["stamp", "seq", "positions.shoulder", "positions.elbow"]
     assert first[2:] == second[2:] == [str(SHOULDER), str(ELBOW)]
     assert int(second[1]) == int(first[1]) + 1
@@ -95,20 +105,20 @@ def test_a_field_is_printed_alone(field: str, printed: str):
         assert run_cli("echo", "rrbot", "--once", "--field", field).stdout == f"{printed}\n"
 
 
-@pytest.mark.processes
-def test_changed_prints_only_changed_documents(spawn: Spawn):
-    command = started(spawn, "echo", "rrbot", "--changed", "--json")
-    with published_robot():
-        first = json.loads(command.line())
-        with connect() as reader:
-            settle = SampleCollector(reader, "zstate/rrbot/joint_states")
-            settle.payloads(20)
-            settle.close()
-    with published_robot(positions=(SHOULDER, 0.25)):
-        second = json.loads(command.line())
-    assert first["positions"]["elbow"] == ELBOW
-    assert second["positions"] == {"shoulder": SHOULDER, "elbow": 0.25}
-    interrupted(command)
+def test_changed_prints_only_changed_documents():
+    def change(command: Command) -> None:
+        with published_robot():
+            first = json.loads(command.line())
+            with connect() as reader:
+                settle = SampleCollector(reader, "zstate/rrbot/joint_states")
+                settle.payloads(20)
+                settle.close()
+        with published_robot(positions=(SHOULDER, 0.25)):
+            second = json.loads(command.line())
+        assert first["positions"]["elbow"] == ELBOW
+        assert second["positions"] == {"shoulder": SHOULDER, "elbow": 0.25}
+
+    run_watched(change, "echo", "rrbot", "--changed", "--json")
 
 
 def test_by_accepts_only_larger_differences():
@@ -155,14 +165,14 @@ def test_numbers_without_a_description_have_no_names():
     assert "`zstate publish rrbot` publishes it" in ended.stderr
 
 
-@pytest.mark.processes
-def test_echo_waits_for_a_robot_and_prints_the_reason(spawn: Spawn):
-    command = started(spawn, "echo", "rrbot", "--field", "elbow")
-    until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
-    with published_robot():
-        assert command.line() == str(ELBOW)
-    assert "received zstate/rrbot/joint_states" in command.stderr
-    interrupted(command)
+def test_echo_waits_for_a_robot_and_prints_the_reason():
+    def watch(command: Command) -> None:
+        until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
+        with published_robot():
+            assert command.line() == str(ELBOW)
+        assert "received zstate/rrbot/joint_states" in command.stderr
+
+    run_watched(watch, "echo", "rrbot", "--field", "elbow")
 
 
 def test_once_gives_up_with_the_reason():
@@ -195,18 +205,18 @@ def test_a_reader_that_leaves_ends_it_quietly():
         assert process.stderr.read() == b""
 
 
-@pytest.mark.processes
-def test_undecodable_messages_are_reported_once_and_skipped(spawn: Spawn):
-    command = started(spawn, "echo", "rrbot", "--field", "elbow")
-    with published_robot(), connect() as stranger:
-        command.line()
-        wait_for_reader(stranger, "zstate/rrbot/joint_states")
-        for _ in range(3):
-            stranger.zenoh.put("zstate/rrbot/joint_states", b"hello", encoding="text/plain")
-        until(lambda: "text/plain" in command.stderr)
-        assert [command.line() for _ in range(50)] == [str(ELBOW)] * 50
-    assert command.stderr.count("text/plain") == 1
-    interrupted(command)
+def test_undecodable_messages_are_reported_once_and_skipped():
+    def disturb(command: Command) -> None:
+        with published_robot(), connect() as stranger:
+            command.line()
+            wait_for_reader(stranger, "zstate/rrbot/joint_states")
+            for _ in range(3):
+                stranger.zenoh.put("zstate/rrbot/joint_states", b"hello", encoding="text/plain")
+            until(lambda: "text/plain" in command.stderr)
+            assert [command.line() for _ in range(50)] == [str(ELBOW)] * 50
+        assert command.stderr.count("text/plain") == 1
+
+    run_watched(disturb, "echo", "rrbot", "--field", "elbow")
 
 
 def test_a_name_that_no_robot_can_have_is_refused():

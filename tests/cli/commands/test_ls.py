@@ -9,11 +9,13 @@ import pytest
 from helpers.cli_runner import (
     ALL_STREAMS,
     RRBOT,
+    Command,
     Spawn,
     failure,
     interrupted,
     published_robot,
     run_cli,
+    run_watched,
     started,
 )
 from helpers.processes import find_free_port, until
@@ -104,13 +106,11 @@ def test_watch_prints_the_list_again_after_each_change(spawn: Spawn):
     interrupted(command)
 
 
-@pytest.mark.processes
-def test_watch_as_json_prints_a_document_a_second(spawn: Spawn):
+def test_watch_as_json_prints_a_document_a_second():
     with published_robot():
-        command = started(spawn, "ls", "--watch", "--json")
-        documents = [json.loads(command.line()) for _ in range(2)]
-    assert [robot["robot"] for robot in documents[-1]] == ["rrbot"]
-    interrupted(command)
+        ended = run_watched(lambda command: [command.line() for _ in range(2)], "ls", "--watch", "--json")
+    documents = [json.loads(line) for line in ended.stdout.splitlines()]
+    assert [robot["robot"] for robot in documents[1]] == ["rrbot"]
 
 
 def test_narrow_terminal_abbreviates_start_times_and_ages():
@@ -128,13 +128,13 @@ def test_narrow_terminal_abbreviates_start_times_and_ages():
     assert narrowest.split() == ["joint_states", "driver@jetson", "pid", "412"]
 
 
-@pytest.mark.processes
-def test_on_ros_side_the_list_is_watched_too(ros_router: str, spawn: Spawn):
-    command = started(spawn, "ls", "--watch")
-    assert command.line().startswith("no ROS 2 node")
-    with published_robot(wire="ros2", router=ros_router):
-        until(lambda: "/joint_states" in command.line())
-    interrupted(command)
+def test_on_ros_side_the_list_is_watched_too(ros_router: str):
+    def watch(command: Command) -> None:
+        assert command.line().startswith("no ROS 2 node")
+        with published_robot(wire="ros2", router=ros_router):
+            until(lambda: "/joint_states" in command.line())
+
+    run_watched(watch, "ls", "--watch")
 
 
 def test_writers_of_transforms_have_their_names_and_rates():

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from helpers.cli_runner import Spawn, failure, interrupted, run_cli, run_until, started
 
-from zstate import connect
+from zstate import StreamListener, connect, discover
 from zstate.scans import Grid, MapPublisher, load_map
+from zstate.wire.messages import OccupancyGrid
 
 # Two rows of three cells: two occupied, three free, one unknown.
 CELLS = [[100, 0, 0], [-1, 0, 100]]
@@ -39,15 +40,21 @@ def test_map_is_published_under_the_name_of_the_file_until_ctrl_c(spawn: Spawn, 
     assert "robot 'hall' is not announced" in failure("hz", "hall", "--once", "--timeout", "1")
 
 
-@pytest.mark.processes
-def test_name_frame_and_writer_are_those_given(spawn: Spawn, hall: str):
-    options = ("--name", "r1", "--frame", "odom", "--writer", "slam")
-    assert "in odom, on zstate/r1/map/slam" in started(spawn, "map", hall, *options).line()
-    listed = json.loads(run_cli("ls", "--json").stdout)
-    (writer,) = listed[0]["writers"]
-    assert (listed[0]["robot"], writer["stream"], writer["names"]) == ("r1", "map", ["slam"])
-    assert "map/slam" in run_cli("ls").stdout
-    assert "r1: map/slam" in run_cli("graph").stdout
+def test_name_frame_and_writer_are_those_given(hall: str):
+    with connect() as session:
+        options = ("--name", "r1", "--frame", "odom", "--writer", "slam")
+        ended, (robot,) = run_until(lambda: discover(session) or None, "map", hall, *options)
+    assert "in odom, on zstate/r1/map/slam" in ended.stdout
+    assert (robot.name, [name for name, _ in robot.named("map")]) == ("r1", ["slam"])
+
+
+def test_map_is_listed_with_its_writer(hall: str):
+    with connect() as session, MapPublisher(session, "r1", load_map(hall), writer="slam"):
+        listed = json.loads(run_cli("ls", "--json").stdout)
+        (writer,) = listed[0]["writers"]
+        assert (listed[0]["robot"], writer["stream"], writer["names"]) == ("r1", "map", ["slam"])
+        assert "map/slam" in run_cli("ls").stdout
+        assert "r1: map/slam" in run_cli("graph").stdout
 
 
 def test_name_of_a_file_becomes_that_of_a_place(hall: str):
@@ -94,10 +101,24 @@ def test_missing_file_and_bad_names_are_refused(hall: str):
     assert "'a/b'" in failure("map", hall, "--writer", "a/b")
 
 
-@pytest.mark.processes
-def test_ros_wire_has_the_map_on_its_topic(spawn: Spawn, ros_router: str, hall: str):
-    assert "ROS 2 topic /map" in started(spawn, "map", hall).line()
-    found = json.loads(run_cli("echo", "--stream", "map", "--once", "--json").stdout)
+def test_ros_wire_has_the_map_on_its_topic(ros_router: str, hall: str):
+    with (
+        connect(mode="client", endpoints=ros_router) as session,
+        StreamListener(session, "hall", "map", wire="ros2") as maps,
+    ):
+        ended, received = run_until(lambda: maps.get(0.0), "map", hall)
+    assert "ROS 2 topic /map" in ended.stdout
+    grid = received.message
+    assert isinstance(grid, OccupancyGrid)
+    assert (grid.frame, grid.width, grid.height) == ("map", 3, 2)
+
+
+def test_map_of_a_ros_topic_is_in_a_frame_of_ros(ros_router: str, hall: str):
+    with (
+        connect(mode="client", endpoints=ros_router) as session,
+        MapPublisher(session, "hall", load_map(hall), "ros2"),
+    ):
+        found = json.loads(run_cli("echo", "--stream", "map", "--once", "--json").stdout)
     assert (found["width"], found["occupied"], found["frame"]) == (3, 2, "ros/map")
 
 

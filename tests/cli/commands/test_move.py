@@ -1,4 +1,4 @@
-"""zstate move and zstate stop, of drivers in other processes."""
+"""zstate move and zstate stop, of drivers in this process and in others."""
 
 from __future__ import annotations
 
@@ -15,27 +15,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import ROVER, Spawn, failure, interrupted, run_cli, started
+from helpers.cli_runner import ROVER, Command, Spawn, failure, interrupted, run_cli, run_watched, started
 from helpers.processes import DEADLINE_S, Child, repeated, until
 from helpers.programs import driver
 
 from zstate import JointReading, TransformListener, connect
-from zstate.driving import Commander
+from zstate.driving import Commander, stop
 from zstate.net.latched import LatchedSubscriber
 from zstate.sources import JointStateListener
 from zstate.wire.keys import driver_key
 from zstate.wire.messages import DriverState, state_text
 from zstate.wire.native import decode
 from zstate.wire.protocol import SerializedSample
-
-
-def driven(spawn: Spawn, name: str = "rrbot") -> Child:
-    """A simulated driver of ``name`` that is ready; on a busy machine a commander may pause."""
-    robot = "diffbot" if name == "diffbot" else "rrbot"
-    child = started(spawn, "drive", "sim", robot, "--name", name, "--ttl", "10")
-    assert child.line().startswith(f"driving {name!r}")
-    line_with(child, "ready")
-    return child
 
 
 @contextmanager
@@ -151,33 +142,34 @@ def test_wheels_keep_a_velocity_for_some_seconds_and_brake():
 
 @pytest.mark.processes
 def test_ctrl_c_brakes_wheels(spawn: Spawn):
-    driven(spawn, "diffbot")
-    child = started(spawn, "move", "diffbot", "--velocity", "left_wheel_joint=2", "--seconds", "60")
-    until(lambda: "moving" in child.stderr)
-    interrupted(child)
-    with connect() as session, JointStateListener(session, "diffbot") as joints:
-        until(lambda: (reading := joints.read(0)) and abs(reading.velocities[0]) < 1e-3)
+    with driver("diffbot"):
+        child = started(spawn, "move", "diffbot", "--velocity", "left_wheel_joint=2", "--seconds", "60")
+        until(lambda: "moving" in child.stderr)
+        interrupted(child)
+        with connect() as session, JointStateListener(session, "diffbot") as joints:
+            until(lambda: (reading := joints.read(0)) and abs(reading.velocities[0]) < 1e-3)
 
 
 @pytest.mark.processes
 def test_ctrl_c_cancels_a_motion_and_the_joints_brake(spawn: Spawn):
-    host = driven(spawn)
-    child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
-    assert host.line().startswith("active, commanded by zstate-move@")
-    until(lambda: "moving" in child.stderr)
-    interrupted(child)
+    with driver(), states_of("rrbot") as lines:
+        child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
+        until(lambda: any(line.startswith("active, commanded by zstate-move@") for line in lines))
+        until(lambda: "moving" in child.stderr)
+        interrupted(child)
     assert "cancelled: the joints of 'rrbot' brake" in child.stderr
 
 
-@pytest.mark.processes
-def test_motion_ends_with_the_stop_of_another_program(spawn: Spawn):
-    host = driven(spawn)
-    child = started(spawn, "move", "rrbot", "shoulder=2", "--seconds", "60")
-    assert host.line().startswith("active, commanded by zstate-move@")
-    printed("stop", "rrbot", "--reason", "door open")
-    assert child.wait() == 1
-    assert "the motion of 'rrbot' was stopped: " in child.stderr
-    assert "door open" in child.stderr
+def test_motion_ends_with_the_stop_of_another_program(a_driver: None):
+    def open_door(command: Command) -> None:
+        with states_of("rrbot") as lines, connect() as session:
+            until(lambda: any(line.startswith("active, commanded by zstate-move@") for line in lines))
+            stop(session, "rrbot", "door open", timeout_s=DEADLINE_S)
+            assert command.is_over()
+
+    ended = run_watched(open_door, "move", "rrbot", "shoulder=2", "--seconds", "60", code=1)
+    assert "the motion of 'rrbot' was stopped: " in ended.stderr
+    assert "door open" in ended.stderr
     assert "door open" in failure("move", "rrbot", "shoulder=0")
 
 
@@ -197,7 +189,8 @@ def test_motions_without_a_driver_or_joints_are_refused(tmp_path: Path):
 
 @pytest.mark.processes
 def test_stop_is_latched_over_a_restart_of_the_driver_until_the_release(spawn: Spawn):
-    host = driven(spawn)
+    host = started(spawn, "drive", "sim", "rrbot")
+    line_with(host, "ready")
     assert printed("stop", "rrbot", "--reason", "door open").startswith("rrbot: stopped by zstate-stop@")
     stopped = host.line()
     assert stopped.startswith("stopped by zstate-stop@")
@@ -282,10 +275,13 @@ def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: 
 
 @pytest.mark.processes
 @pytest.mark.parametrize("end", ["q", "signal"])
-def test_wheels_stop_at_once_when_the_program_of_the_keys_ends(spawn: Spawn, end: str):
-    # By its ttl the driver would turn the wheels for longer than this test waits.
-    line_with(started(spawn, "drive", "sim", "diffbot", "--ttl", f"{4 * DEADLINE_S}"), "ready")
-    with connect() as session, JointStateListener(session, "diffbot") as joints:
+def test_wheels_stop_at_once_when_the_program_of_the_keys_ends(end: str):
+    with (
+        # By its ttl the driver would turn the wheels for longer than this test waits.
+        driver("diffbot", ttl_s=4 * DEADLINE_S),
+        connect() as session,
+        JointStateListener(session, "diffbot") as joints,
+    ):
         measured = rates_of(joints)
         with keys_moving("diffbot") as (keyboard, move):
             with repeated(lambda: os.write(keyboard, b"w")):
@@ -298,10 +294,9 @@ def test_wheels_stop_at_once_when_the_program_of_the_keys_ends(spawn: Spawn, end
 
 
 @pytest.mark.processes
-def test_keys_need_a_terminal_and_joints_that_are_wheels(spawn: Spawn):
+def test_keys_need_a_terminal_and_joints_that_are_wheels(a_driver: None):
     assert "reads the keys of a terminal, and standard input is none" in failure("move", "rrbot", "--keys")
     assert "--keys goes with --wheels" in failure("move", "rrbot", "--keys", "elbow=1", code=2)
-    driven(spawn)
     with keys_moving("rrbot") as (_, move):
         assert move.wait(DEADLINE_S) == 1
         assert move.stderr is not None

@@ -3,12 +3,22 @@ from __future__ import annotations
 import re
 import shutil
 import time
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
-from helpers.processes import mounted_disk
+from helpers.cli_runner import (
+    Command,
+    Spawn,
+    failure,
+    interrupted,
+    published_robot,
+    run_cli,
+    run_watched,
+    started,
+)
+from helpers.processes import mounted_disk, until
 
 from zstate import StatePublisher, connect, load_model
 from zstate.clock import MONOTONIC, ManualClock
@@ -50,16 +60,16 @@ def test_a_duration_ends_it_and_only_the_chosen_robot_is_recorded(tmp_path: Path
         }
 
 
-@pytest.mark.processes
-def test_record_prints_the_reason_while_it_waits_and_the_start(spawn: Spawn, tmp_path: Path):
-    command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot")
-    assert command.line().endswith("  no robot yet")
-    with published_robot("rrbot"):
-        while not command.line().endswith("  rrbot"):
-            pass
-        interrupted(command)
+def test_record_prints_the_reason_while_it_waits_and_the_start(tmp_path: Path):
+    def watch(command: Command) -> None:
+        assert command.line().endswith("  no robot yet")
+        publisher.enter_context(published_robot("rrbot"))
+        until(lambda: command.line().endswith("  rrbot"))
+
+    with ExitStack() as publisher:
+        ended = run_watched(watch, "record", str(tmp_path / "run.mcap"), "rrbot")
     waiting, recording = (
-        next(number for number, line in enumerate(command.stderr.splitlines()) if line.startswith(word))
+        next(number for number, line in enumerate(ended.stderr.splitlines()) if line.startswith(word))
         for word in ("waiting: robot 'rrbot' is not announced", "recording rrbot: ")
     )
     assert waiting < recording

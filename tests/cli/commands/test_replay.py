@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, run_until, started
 from helpers.processes import until
 from helpers.recording_builder import LATENCY, MS, START, Bag, RecordingBuilder, S, swing_positions
 
@@ -49,13 +49,9 @@ def test_listener_receives_the_recorded_stamps(file: str, spawn: Spawn):
     assert child.line().startswith("replayed ")
 
 
-@pytest.mark.processes
-def test_writers_have_the_name_of_their_command(file: str, spawn: Spawn):
-    child = started(spawn, "replay", file, "--rate", "0.001")
-    child.line()
+def test_writers_have_the_name_of_their_command(file: str):
     with connect() as session:
-        until(lambda: discover(session))
-        (robot,) = discover(session)
+        _, (robot,) = run_until(lambda: discover(session) or None, "replay", file, "--rate", "0.001")
     assert robot.name == "arm"
     assert {writer.program for _, writer in robot.writers} == {"zstate-replay"}
 
@@ -113,17 +109,14 @@ def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):
     assert "is not a recording" in failure("replay", str(tmp_path / "x.mcap"))
 
 
-@pytest.mark.processes
-def test_maps_alone_are_published_until_the_command_is_interrupted(tmp_path: Path, spawn: Spawn):
+def test_maps_alone_are_published_until_the_command_is_interrupted(tmp_path: Path):
     path = tmp_path / "maps.mcap"
     grid = OccupancyGrid(4, START, "map", 0.5, 1, 1, to_block([0, 0, 0, 0, 0, 0, 1]), b"\x64")
     with RecordingBuilder(path) as builder:
         builder.encoder.write_message("hall", grid, START, "floor")
-    child = started(spawn, "replay", str(path))
-    assert child.line().endswith("no samples; what is latched is published until Ctrl-C")
     with connect() as session:
-        until(lambda: discover(session))
-        (place,) = discover(session)
+        ended, (place,) = run_until(lambda: discover(session) or None, "replay", str(path))
+    first, last = ended.stdout.splitlines()
+    assert first.endswith("no samples; what is latched is published until Ctrl-C")
     assert [name for name, _ in place.named("map")] == ["floor"]
-    interrupted(child)
-    assert child.line() == "replayed what is latched"
+    assert last == "replayed what is latched"

@@ -6,7 +6,17 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, run_cli, started
+from helpers.cli_runner import (
+    Command,
+    Spawn,
+    failure,
+    interrupted,
+    published_robot,
+    run_cli,
+    run_until,
+    run_watched,
+    started,
+)
 from helpers.processes import until
 from helpers.programs import router
 from helpers.robots import SampleCollector
@@ -21,9 +31,8 @@ def test_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = started(spawn, "router", "--listen", endpoint)
     assert child.line().endswith(f" listens at {endpoint}")
-    client = ("--mode", "client", "--connect", endpoint)
-    started(spawn, "publish", RRBOT, "--source", "sine", *client).line()
     with (
+        published_robot(router=endpoint),
         connect(mode="client", endpoints=endpoint) as session,
         TransformListener(session, "rrbot") as listener,
     ):
@@ -52,29 +61,30 @@ def ros_node(port: int) -> zenoh.Session:
     return zenoh.open(config)
 
 
-@pytest.mark.processes
-def test_ros_nodes_and_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
+def test_ros_nodes_and_clients_communicate_through_the_router(free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    child = started(spawn, "router", "--ros2", "--listen", endpoint)
-    assert child.line().endswith(f" listens at {endpoint}")
     received: set[tuple[str, str]] = set()
-    with ExitStack() as opened:
-        sessions = {name: opened.enter_context(ros_node(free_port)) for name in ("node", "other")}
-        sessions["client"] = opened.enter_context(connect(mode="client", endpoints=endpoint)).zenoh
-        for name, session in sessions.items():
 
-            def on_sample(sample: zenoh.Sample, reader: str = name) -> None:
-                received.add((str(sample.key_expr), reader))
-
-            session.declare_subscriber("from/**", on_sample)
-
-        def all_received_all() -> bool:
+    def communicate(command: Command) -> None:
+        assert command.line().endswith(f" listens at {endpoint}")
+        with ExitStack() as opened:
+            sessions = {name: opened.enter_context(ros_node(free_port)) for name in ("node", "other")}
+            sessions["client"] = opened.enter_context(connect(mode="client", endpoints=endpoint)).zenoh
             for name, session in sessions.items():
-                session.put(f"from/{name}", b"something")
-            return len(received) == len(sessions) ** 2
 
-        until(all_received_all)
-    interrupted(child)
+                def on_sample(sample: zenoh.Sample, reader: str = name) -> None:
+                    received.add((str(sample.key_expr), reader))
+
+                session.declare_subscriber("from/**", on_sample)
+
+            def all_received_all() -> bool:
+                for name, session in sessions.items():
+                    session.put(f"from/{name}", b"something")
+                return len(received) == len(sessions) ** 2
+
+            until(all_received_all)
+
+    run_watched(communicate, "router", "--ros2", "--listen", endpoint)
 
 
 def test_its_settings_for_ros_and_a_file_exclude_each_other(tmp_path):
@@ -83,34 +93,37 @@ def test_its_settings_for_ros_and_a_file_exclude_each_other(tmp_path):
     assert "--config" in failure("router", "--ros2", "--config", str(file), code=2)
 
 
-@pytest.mark.processes
-def test_router_runs_its_printed_configuration(spawn: Spawn, free_port: int, tmp_path):
+def test_router_runs_its_printed_configuration(free_port: int, tmp_path: Path):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     printed = run_cli("router", "--listen", endpoint, "--print")
     file = tmp_path / "router.json5"
     file.write_text(printed.stdout)
-    assert (
-        started(spawn, "router", "--config", str(file))
-        .line()
-        .endswith(f"listens at the endpoints in '{file}'")
-    )
-    with connect(mode="client", endpoints=endpoint) as session:
-        assert session.zenoh.info.routers_zid()
+
+    def routers() -> list[zenoh.ZenohId]:
+        with connect(mode="client", endpoints=endpoint) as session:
+            return list(session.zenoh.info.routers_zid())
+
+    ended, found = run_until(routers, "router", "--config", str(file))
+    assert ended.stdout.endswith(f"listens at the endpoints in '{file}'\n")
+    assert found
 
 
-@pytest.mark.processes
-def test_router_downsamples_streams_to_neighbours(spawn: Spawn, free_port: int):
+def test_router_downsamples_streams_to_neighbours(free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     options = ("--downsample", "joint_states=5", "--robot", "rrbot", "--wan", "lo")
-    started(spawn, "router", "--listen", endpoint, *options).line()
-    started(spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint).line()
-    with (
-        connect(mode="client", endpoints=endpoint) as session,
-        TransformListener(session, "rrbot") as listener,
-    ):
-        until(lambda: listener.stats.received >= 5)
-        # A hundred a second are written; what was left out on the way is counted.
-        assert listener.stats.missed > 10 * listener.stats.received
+
+    def listen(command: Command) -> None:
+        command.line()
+        with (
+            published_robot(router=endpoint),
+            connect(mode="client", endpoints=endpoint) as session,
+            TransformListener(session, "rrbot") as listener,
+        ):
+            until(lambda: listener.stats.received >= 5)
+            # A hundred a second are written; what was left out on the way is counted.
+            assert listener.stats.missed > 10 * listener.stats.received
+
+    run_watched(listen, "router", "--listen", endpoint, *options)
 
 
 @pytest.mark.parametrize(
@@ -134,10 +147,7 @@ def test_a_file_is_the_whole_configuration(tmp_path):
         assert "exclude each other" in message
 
 
-@pytest.mark.processes
-def test_router_with_access_control_does_not_connect_peers_to_each_other(
-    spawn: Spawn, free_port: int, tmp_path: Path
-):
+def test_router_with_access_control_does_not_connect_peers_to_each_other(free_port: int, tmp_path: Path):
     """Over a direct link a robot could write another robot's keys."""
     pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
     certs, acl, endpoint = str(tmp_path / "pki"), tmp_path / "acl.json5", f"tls/127.0.0.1:{free_port}"
@@ -146,28 +156,31 @@ def test_router_with_access_control_does_not_connect_peers_to_each_other(
     )
     acl.write_text(run_cli("acl", "--robot", "ra", "--robot", "rb", "--viewer", "desk").stdout)
     options = ("--listen", endpoint, "--certs", certs, "--identity", "router", "--acl", str(acl))
-    started(spawn, "router", *options).line()
 
     def join(mode: str, name: str) -> Session:
         return connect(mode=mode, endpoints=endpoint, credentials=Credentials.from_folder(certs, name))
 
-    with (
-        join("peer", "rb") as victim,
-        join("peer", "ra") as intruder,
-        join("client", "rb") as own,
-        join("client", "desk") as viewer,
-    ):
-        direct = SampleCollector(victim, "zstate/rb/joint_commands")
-        routed = SampleCollector(viewer, "zstate/*/tf_static/*")
+    def join_all(command: Command) -> None:
+        command.line()
+        with (
+            join("peer", "rb") as victim,
+            join("peer", "ra") as intruder,
+            join("client", "rb") as own,
+            join("client", "desk") as viewer,
+        ):
+            direct = SampleCollector(victim, "zstate/rb/joint_commands")
+            routed = SampleCollector(viewer, "zstate/*/tf_static/*")
 
-        def is_routed() -> bool:
-            intruder.zenoh.put("zstate/rb/joint_commands", b"go")
-            own.zenoh.put("zstate/rb/tf_static/model", b"from rb")
-            return len(routed.arrivals) >= 100
+            def is_routed() -> bool:
+                intruder.zenoh.put("zstate/rb/joint_commands", b"go")
+                own.zenoh.put("zstate/rb/tf_static/model", b"from rb")
+                return len(routed.arrivals) >= 100
 
-        until(is_routed)
-        assert direct.arrivals == []
-        assert list(victim.zenoh.info.peers_zid()) == []
+            until(is_routed)
+            assert direct.arrivals == []
+            assert list(victim.zenoh.info.peers_zid()) == []
+
+    run_watched(join_all, "router", *options)
 
 
 def test_password_is_in_the_output_file_but_masked_in_print(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

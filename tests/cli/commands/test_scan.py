@@ -10,12 +10,24 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, published_robot, run_cli, started
-from helpers.processes import SOON_S, repeated, until
+from helpers.cli_runner import (
+    Command,
+    Spawn,
+    failure,
+    interrupted,
+    published_robot,
+    run_cli,
+    run_until,
+    run_watched,
+    started,
+)
+from helpers.processes import DEADLINE_S, SOON_S, repeated, until
 from helpers.programs import scanner
 
-from zstate import StaticPublisher, Transform, TransformPublisher, connect
+from zstate import StaticPublisher, StreamListener, Transform, TransformPublisher, connect
 from zstate.scans import Grid, ScanListener
+from zstate.scans.scan import scan_from_message
+from zstate.wire.messages import LaserScan
 
 WALL_M = 3.0
 
@@ -30,15 +42,15 @@ def hall(tmp_path: Path) -> str:
     return str(path)
 
 
-def documents(stream_of: str, *options: str) -> dict:
-    return json.loads(run_cli("echo", stream_of, "--stream", "scan", "--once", "--json", *options).stdout)
+def document(*robot: str) -> dict:
+    return json.loads(run_cli("echo", *robot, "--stream", "scan", "--once", "--json").stdout)
 
 
 @pytest.mark.processes
 def test_dummy_scans_have_the_pattern_of_dummy_laser(spawn: Spawn):
     child = started(spawn, "scan", "r1", "--frame", "laser", "--dummy", "--sensor", "front")
     assert child.line() == "r1: scans in laser, 30 Hz, on zstate/r1/scan/front"
-    found = documents("r1")
+    found = document("r1")
     assert (found["frame"], found["rays"], found["valid"], found["ray_ns"]) == ("r1/laser", 1081, 1081, 0)
     # |sin| of 3 rad/s of the stamp; its phase is that of pi / 3 s.
     expected = abs(np.sin(np.pi * (found["stamp"] % round(np.pi / 3 * 1e9)) / round(np.pi / 3 * 1e9)))
@@ -67,8 +79,7 @@ def drive(publisher: TransformPublisher) -> None:
     publisher.publish([Transform("odom", "laser", (math.sin(angle), 0.5, 0.0), rotation, stamp)])
 
 
-@pytest.mark.processes
-def test_simulated_scans_hit_the_walls_while_the_robot_drives(spawn: Spawn, hall: str):
+def test_simulated_scans_hit_the_walls_while_the_robot_drives(hall: str):
     """Placed by the transforms of the network, each point is on a wall, wherever the laser was."""
     with (
         connect() as session,
@@ -76,11 +87,12 @@ def test_simulated_scans_hit_the_walls_while_the_robot_drives(spawn: Spawn, hall
         repeated(lambda: drive(publisher)),
         ScanListener(session, "r1", "odom") as scans,
     ):
-        child = started(spawn, "scan", "r1", "--frame", "laser", "--simulate", hall)
-        assert child.line() == "r1: scans in laser, 30 Hz, on zstate/r1/scan/scan"
-        until(lambda: "the map stands in r1/odom" in child.stderr)
-        until(lambda: len(scans) >= 10)
-        placed = list(islice(scans, 10))
+        ended, placed = run_until(
+            lambda: list(islice(scans, 10)) if len(scans) >= 10 else None,
+            *("scan", "r1", "--frame", "laser", "--simulate", hall),
+            after="the map stands in r1/odom",
+        )
+    assert ended.stdout.startswith("r1: scans in laser, 30 Hz, on zstate/r1/scan/scan\n")
     for one in placed:
         # One turn of 1440 rays in each thirtieth of a second.
         assert one.scan.ray_ns == round(1e9 / 30 / 1440)
@@ -92,41 +104,49 @@ def test_simulated_scans_hit_the_walls_while_the_robot_drives(spawn: Spawn, hall
     assert scans.dropped == {}
 
 
-@pytest.mark.processes
-def test_a_laser_that_is_outside_the_map_is_a_warning(spawn: Spawn, hall: str):
-    with connect() as session, StaticPublisher(session, "r1", "mount") as statics:
+def test_a_laser_that_is_outside_the_map_is_a_warning(hall: str):
+    def leave(command: Command) -> None:
         statics.set(Transform.from_rpy("r1/base", "r1/laser", (3.1, 0.0, 0.3), (0.0, 0.0, 0.0)))
-        child = started(spawn, "scan", "r1", "--frame", "laser", "--simulate", hall)
-        child.line()
-        documents("r1")
-        assert "is outside the map" not in child.stderr
+        command.line()
+        assert scans.get(DEADLINE_S)
+        assert "is outside the map" not in command.stderr
         statics.set(Transform.from_rpy("r1/base", "r1/laser", (3.3, 0.0, 0.3), (0.0, 0.0, 0.0)))
-        until(lambda: "laser is outside the map, which stands in r1/base" in child.stderr)
+        until(lambda: "laser is outside the map, which stands in r1/base" in command.stderr)
+
+    with (
+        connect() as session,
+        StaticPublisher(session, "r1", "mount") as statics,
+        StreamListener(session, "r1", "scan") as scans,
+    ):
+        run_watched(leave, "scan", "r1", "--frame", "laser", "--simulate", hall)
 
 
-@pytest.mark.processes
-def test_map_stands_in_its_frame_once_the_robot_has_that(spawn: Spawn, hall: str):
+def test_map_stands_in_its_frame_once_the_robot_has_that(hall: str):
     """The hall's axes are turned by a quarter against the robot's root, and 1 m in front of it."""
-    with connect() as session, StaticPublisher(session, "r1", "mount") as statics:
+    with (
+        connect() as session,
+        StaticPublisher(session, "r1", "mount") as statics,
+        StreamListener(session, "r1", "scan") as scans,
+    ):
         statics.set(Transform.from_rpy("hall/map", "r1/base", (1.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)))
         statics.set(Transform.from_rpy("r1/base", "r1/laser", (0.0, 0.0, 0.3), (0.0, 0.0, 0.0)))
         options = ("--simulate", hall, "--map-frame", "hall/map")
-        child = started(spawn, "scan", "r1", "--frame", "laser", *options)
-        child.line()
-        assert "the map stands in hall/map" in child.stderr
-        ranges = documents("r1")["ranges"]
+        ended, received = run_until(lambda: scans.get(0.0), "scan", "r1", "--frame", "laser", *options)
+    assert "the map stands in hall/map" in ended.stderr
+    assert isinstance(received.message, LaserScan)
+    ranges = scan_from_message(received.message, "r1").ranges
     # At x = 1 m in the map, the laser's x axis is the map's y axis: the walls are 3 m ahead, 2 m to its right
     # (-90 degrees, ray 180) and 4 m to its left (90 degrees, ray 900).
     assert [ranges[540], ranges[180], ranges[900]] == pytest.approx([3.0, 2.0, 4.0], abs=1e-4)
 
 
-@pytest.mark.processes
-def test_simulated_scan_waits_for_the_robot_and_its_frame(spawn: Spawn, hall: str):
-    child = started(spawn, "scan", "rrbot", "--frame", "nozzle", "--simulate", hall)
-    until(lambda: "waiting: robot 'rrbot' is not announced" in child.stderr)
-    with published_robot():
-        until(lambda: "'rrbot/nozzle'" in child.stderr)
-        interrupted(child)
+def test_simulated_scan_waits_for_the_robot_and_its_frame(hall: str):
+    def watch(command: Command) -> None:
+        until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
+        with published_robot():
+            until(lambda: "'rrbot/nozzle'" in command.stderr)
+
+    run_watched(watch, "scan", "rrbot", "--frame", "nozzle", "--simulate", hall)
     message = failure("scan", "r9", "--frame", "laser", "--simulate", hall, "--seconds", "1")
     assert "no scan in 1 s: robot 'r9' is not announced" in message
 
@@ -155,18 +175,19 @@ def test_commands_that_look_show_scans():
         assert [one["state"] for one in checks] == ["ok"]
 
 
-@pytest.mark.processes
-def test_metrics_count_scans(spawn: Spawn):
-    child = started(spawn, "scan", "r1", "--frame", "laser", "--dummy", "--metrics", "0")
-    until(lambda: "metrics at " in child.stderr)
-    url = re.search(r"metrics at (\S+)", child.stderr)
-    assert url is not None
+def test_metrics_count_scans():
+    def scrape(command: Command) -> None:
+        until(lambda: "metrics at " in command.stderr)
+        url = re.search(r"metrics at (\S+)", command.stderr)
+        assert url is not None
 
-    def has_counts() -> bool:
-        with urlopen(url[1], timeout=SOON_S) as reply:
-            return 'stream="scan"' in reply.read().decode()
+        def has_counts() -> bool:
+            with urlopen(url[1], timeout=SOON_S) as reply:
+                return 'stream="scan"' in reply.read().decode()
 
-    until(has_counts)
+        until(has_counts)
+
+    run_watched(scrape, "scan", "r1", "--frame", "laser", "--dummy", "--metrics", "0")
 
 
 def test_wrong_usage_is_refused(hall: str):
@@ -179,11 +200,22 @@ def test_wrong_usage_is_refused(hall: str):
     assert "'a/b'" in failure("scan", "r1", "--frame", "f", "--dummy", "--sensor", "a/b")
 
 
-@pytest.mark.processes
-def test_ros_wire_has_scans_on_the_topic_of_the_sensor(spawn: Spawn, ros_router: str):
-    child = started(spawn, "scan", "r1", "--frame", "laser", "--dummy")
-    assert "ROS 2 topic /scan" in child.line()
-    found = json.loads(run_cli("echo", "--stream", "scan", "--once", "--json").stdout)
+def test_ros_wire_has_scans_on_the_topic_of_the_sensor(ros_router: str):
+    with (
+        connect(mode="client", endpoints=ros_router) as session,
+        StreamListener(session, "r1", "scan", wire="ros2") as scans,
+    ):
+        ended, received = run_until(lambda: scans.get(0.0), "scan", "r1", "--frame", "laser", "--dummy")
+    assert "ROS 2 topic /scan" in ended.stdout
+    assert isinstance(received.message, LaserScan)
+    scan = scan_from_message(received.message, "r1")
+    assert (len(scan.ranges), received.message.frame) == (1081, "laser")
+
+
+@pytest.mark.usefixtures("ros_router")
+def test_scans_of_a_ros_topic_are_in_a_frame_of_ros():
+    with scanner("r1", "laser", wire="ros2"):
+        found = document()
     assert (found["rays"], found["frame"]) == (1081, "ros/laser")
 
 

@@ -8,14 +8,17 @@ from helpers.cli_runner import (
     ELBOW,
     RRBOT,
     SHOULDER,
+    Command,
     Spawn,
     failure,
     interrupted,
     published_robot,
     run_cli,
+    run_watched,
     started,
 )
 from helpers.processes import until
+from helpers.programs import router
 
 from zstate import StaticPublisher, Transform, TransformListener, connect, discover, load_model
 from zstate.cli.session import SessionOptions
@@ -71,9 +74,8 @@ def test_invalid_snapshot_error_names_the_place_in_the_file(tmp_path: Path, text
     assert error in failure("snapshot", "load", str(file))
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize("suffix", ["toml", "json"])
-def test_loaded_robot_has_the_saved_poses(spawn: Spawn, tmp_path: Path, suffix: str):
+def test_loaded_robot_has_the_saved_poses(tmp_path: Path, suffix: str):
     file = tmp_path / f"cell.{suffix}"
     edge = Transform("lower", "camera", (0.0, 0.1, 0.2), (0.0, 0.0, 0.6, 0.8))
     with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "calibration") as static:
@@ -86,16 +88,18 @@ def test_loaded_robot_has_the_saved_poses(spawn: Spawn, tmp_path: Path, suffix: 
     (shot,) = read_snapshot(file).robot
     assert shot.positions == {"shoulder": SHOULDER, "elbow": ELBOW}
     assert shot.model().digest == load_model(RRBOT).digest
-    child = started(spawn, "snapshot", "load", str(file))
-    assert child.line().startswith("rrbot: its model, 2 joints standing still")
-    with connect() as session, TransformListener(session, "rrbot") as listener:
-        again = listener.buffer.wait("world", "camera", timeout_s=10.0)
-        assert again.pose7 == pytest.approx(there.pose7)
-        (info,) = discover(session)
-        assert "calibration" in {name for name, _ in info.named("tf_static")}
-        count = listener.stats.received
-        until(lambda: listener.stats.received > count)
-    interrupted(child)
+
+    def look(command: Command) -> None:
+        assert command.line().startswith("rrbot: its model, 2 joints standing still")
+        with connect() as session, TransformListener(session, "rrbot") as listener:
+            again = listener.buffer.wait("world", "camera", timeout_s=10.0)
+            assert again.pose7 == pytest.approx(there.pose7)
+            (info,) = discover(session)
+            assert "calibration" in {name for name, _ in info.named("tf_static")}
+            count = listener.stats.received
+            until(lambda: listener.stats.received > count)
+
+    run_watched(look, "snapshot", "load", str(file))
 
 
 @pytest.mark.parametrize(
@@ -125,18 +129,18 @@ def test_saved_session_options_can_be_used_again(saved, options: str, network: S
 
 @pytest.mark.processes
 def test_snapshot_is_loaded_on_this_host_unless_as_saved(spawn: Spawn, tmp_path: Path, free_port: int):
-    file, router = tmp_path / "cell.toml", f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--listen", router).line()
-    with published_robot(router=router):
-        assert run_cli("snapshot", "save", str(file), "--connect", router).code == 0
-    here = run_cli("snapshot", "load", str(file), "--seconds", "0.1").stderr
-    assert f"with --mode client --connect {router}; --as-saved uses the same options" in here
-    child = started(spawn, "snapshot", "load", str(file), "--as-saved")
-    child.line()
-    with connect(mode="client", endpoints=router) as session:
-        until(lambda: [info.name for info in discover(session)] == ["rrbot"])
-    assert f": --mode client --connect {router}" in child.stderr
-    interrupted(child)
+    file = tmp_path / "cell.toml"
+    with router(f"tcp/127.0.0.1:{free_port}") as endpoint:
+        with published_robot(router=endpoint):
+            assert run_cli("snapshot", "save", str(file), "--connect", endpoint).code == 0
+        here = run_cli("snapshot", "load", str(file), "--seconds", "0.1").stderr
+        assert f"with --mode client --connect {endpoint}; --as-saved uses the same options" in here
+        child = started(spawn, "snapshot", "load", str(file), "--as-saved")
+        child.line()
+        with connect(mode="client", endpoints=endpoint) as session:
+            until(lambda: [info.name for info in discover(session)] == ["rrbot"])
+        assert f": --mode client --connect {endpoint}" in child.stderr
+        interrupted(child)
 
 
 def test_only_the_named_robots_are_saved_and_loaded(tmp_path: Path):

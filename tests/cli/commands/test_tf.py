@@ -9,12 +9,14 @@ import pytest
 from helpers.cli_runner import (
     ELBOW,
     SHOULDER,
+    Command,
     Ended,
     Spawn,
     failure,
     interrupted,
     published_robot,
     run_cli,
+    run_watched,
     started,
 )
 from helpers.processes import until
@@ -117,14 +119,14 @@ def test_tf_prints_the_reason_while_it_waits_and_the_end_of_the_wait(spawn: Spaw
     interrupted(command)
 
 
-@pytest.mark.processes
-def test_tf_reports_when_samples_stop(spawn: Spawn):
-    command = started(spawn, "tf", "base", "lower", "--rate", "20")
-    with published_robot():
-        command.line()
-        assert command.line().startswith("At time ")
-    until(lambda: "no new sample of 'rrbot/base' -> 'rrbot/upper'" in command.stderr)
-    interrupted(command)
+def test_tf_reports_when_samples_stop():
+    def watch(command: Command) -> None:
+        with published_robot():
+            command.line()
+            assert command.line().startswith("At time ")
+        until(lambda: "no new sample of 'rrbot/base' -> 'rrbot/upper'" in command.stderr)
+
+    run_watched(watch, "tf", "base", "lower", "--rate", "20")
 
 
 def test_once_gives_up_with_the_reason():

@@ -84,12 +84,23 @@ def test_second_writer_of_an_edge_is_refused_with_the_first():
         assert "'wheels'" in failure("static", *edge, "--writer", "lidar")
 
 
-@pytest.mark.processes
-def test_ros_wire_has_messages_that_tf_reads(spawn: Spawn, ros_router: str):
-    options = ("--wire", "ros2", "--connect", ros_router)
-    child = started(spawn, "transform", "odom", "base_link", "--xyz", "4", "0", "0", *options)
-    assert "ROS 2 topic /tf" in child.line()
-    found = run_cli("tf", "odom", "base_link", "--once", "--json", *options)
+def test_ros_wire_has_messages_that_listeners_read(ros_router: str):
+    with (
+        connect(mode="client", endpoints=ros_router) as session,
+        TransformListener(session, wire="ros2") as listener,
+    ):
+        ended, found = run_until(
+            lambda: found_pose(listener, "odom", "base_link"),
+            *("transform", "odom", "base_link", "--xyz", "4", "0", "0"),
+            *("--wire", "ros2", "--connect", ros_router),
+        )
+    assert "ROS 2 topic /tf" in ended.stdout
+    assert found.translation.tolist() == [4.0, 0.0, 0.0]
+
+
+def test_transforms_on_the_ros_wire_are_read_by_tf(ros_router: str):
+    with moving_edge("ros", "odom", "base_link", (4.0, 0.0, 0.0), wire="ros2"):
+        found = run_cli("tf", "odom", "base_link", "--once", "--json")
     assert json.loads(found.stdout)["translation"] == [4.0, 0.0, 0.0]
 
 

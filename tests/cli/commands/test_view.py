@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import sys
 import urllib.request
@@ -11,10 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import RRBOT, failure, interrupted, missing_library, published_robot, run_cli, started
-from helpers.processes import until
+from helpers.cli_runner import (
+    RRBOT,
+    failure,
+    found_pose,
+    interrupted,
+    missing_library,
+    published_robot,
+    run_until,
+    started,
+)
 
-from zstate import StatePublisher, Transform, TransformPublisher, connect, load_model
+from zstate import StatePublisher, Transform, TransformListener, TransformPublisher, connect, load_model
+from zstate.web_access import listen
 
 
 def address(line: str) -> str:
@@ -34,41 +42,36 @@ def test_view_prints_the_address_to_open(spawn):
     assert child.stderr == ""
 
 
-@pytest.mark.processes
-def test_without_a_port_it_takes_the_first_free_one_and_a_taken_one_is_an_error(spawn):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        text = failure("view", "--port", str(port))
-    assert f"port {port} is taken at '127.0.0.1'" in text
-    first, second = started(spawn, "view"), started(spawn, "view")
-    assert address(first.line()) != address(second.line())
+def test_without_a_port_it_takes_the_first_free_one_and_a_taken_one_is_an_error():
+    from zstate.view.server import PORT
+
+    with listen("127.0.0.1", None, PORT) as first:
+        port = first.getsockname()[1]
+        assert f"port {port} is taken at '127.0.0.1'" in failure("view", "--port", str(port))
+        ended, _ = run_until(lambda: True, "view")
+    found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/?", address(ended.stdout.splitlines()[0]))
+    assert found
+    assert int(found[1]) != port
 
 
-@pytest.mark.processes
-def test_view_beyond_loopback_has_a_token_in_its_address_and_a_warning(spawn):
-    child = started(spawn, "view", "--host", "0.0.0.0", "--port", "0")
-    assert re.search(r":\d+/\?token=[\w-]{20,}$", address(child.line()))
-    until(lambda: "unencrypted" in child.stderr)
-    interrupted(child)
+def test_view_beyond_loopback_has_a_token_in_its_address_and_a_warning():
+    ended, _ = run_until(lambda: True, "view", "--host", "0.0.0.0", "--port", "0", after="unencrypted")
+    assert re.search(r":\d+/\?token=[\w-]{20,}$", address(ended.stdout.splitlines()[0]))
 
 
-@pytest.mark.processes
-def test_robot_moved_by_sliders_is_published(spawn):
-    child = started(spawn, "view", RRBOT, "--sliders", "--port", "0")
-    child.line()
-    text = run_cli("tf", "base", "tool", "--once", "--json").stdout
-    assert '"target": "base"' in text
-    interrupted(child)
+def test_robot_moved_by_sliders_is_published():
+    with connect() as session, TransformListener(session) as listener:
+        _, pose = run_until(
+            lambda: found_pose(listener, "base", "tool"), "view", RRBOT, "--sliders", "--port", "0"
+        )
+    assert (pose.target, pose.kind) == ("base", "exact")
 
 
-@pytest.mark.processes
-def test_sliders_do_not_move_a_robot_with_another_writer_and_name_it(spawn):
+def test_sliders_do_not_move_a_robot_with_another_writer_and_name_it():
     with published_robot():
-        child = started(spawn, "view", "rrbot", "--sliders", "--port", "0")
-        child.line()
-        interrupted(child)
-    assert "'rrbot' is not moved: " in child.stderr
-    assert "joint_states of 'rrbot'" in child.stderr
+        ended, _ = run_until(lambda: True, "view", "rrbot", "--sliders", "--port", "0")
+    assert "'rrbot' is not moved: " in ended.stderr
+    assert "joint_states of 'rrbot'" in ended.stderr
 
 
 @pytest.mark.parametrize(

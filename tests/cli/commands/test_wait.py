@@ -1,23 +1,29 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers.cli_runner import (
     ALL_STREAMS,
     RRBOT,
+    Command,
     Spawn,
     failure,
     interrupted,
     published_robot,
     run_cli,
+    run_watched,
     started,
 )
-from helpers.processes import Child, until
+from helpers.processes import DEADLINE_S, Child, until
+from helpers.programs import router
 
 from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.cli.commands.wait import wait_command
+from zstate.net.session import Session
 
 
 def waited(*arguments: str, code: int) -> dict[str, object]:
@@ -26,8 +32,8 @@ def waited(*arguments: str, code: int) -> dict[str, object]:
     return json.loads(ended.stdout)
 
 
-def await_text(child: Child, text: str) -> None:
-    until(lambda: text in child.stderr)
+def await_text(command: Command | Child, text: str) -> None:
+    until(lambda: text in command.stderr)
 
 
 def test_available_robot_is_ready_at_once():
@@ -37,16 +43,17 @@ def test_available_robot_is_ready_at_once():
     assert ended.stderr == ""
 
 
-@pytest.mark.processes
-def test_a_robot_is_ready_when_it_moves_and_not_before(spawn: Spawn):
-    child = started(spawn, "wait", "robot", "rrbot")
-    await_text(child, "robot 'rrbot' is not announced")
-    with connect() as session, StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]):
-        await_text(child, "joint_states of 'rrbot' has no writer")
-        assert child.process.poll() is None
-        with published_robot(streams=("joint_states",)):
-            assert child.line() == "ready: 'rrbot' (7 frames)"
-            assert child.wait() == 0
+def test_a_robot_is_ready_when_it_moves_and_not_before():
+    def move(command: Command) -> None:
+        await_text(command, "robot 'rrbot' is not announced")
+        with connect() as session, StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]):
+            await_text(command, "joint_states of 'rrbot' has no writer")
+            assert not command.is_over(0.0)
+            with published_robot(streams=("joint_states",)):
+                assert command.is_over()
+
+    ended = run_watched(move, "wait", "robot", "rrbot", code=0)
+    assert ended.stdout == "ready: 'rrbot' (7 frames)\n"
 
 
 def test_every_named_robot_is_waited_for():
@@ -85,23 +92,34 @@ def test_only_placers_place_the_root_of_the_robot_of_a_pose(placer: str, timeout
     assert outcome["ready"] is (code == 0)
 
 
-@pytest.mark.processes
-def test_a_router_may_come_late(spawn: Spawn, free_port: int):
+def test_a_router_may_come_late(free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    child = started(spawn, "wait", "router", endpoint)
-    await_text(child, f"waiting: no answer yet at '{endpoint}'")
-    started(spawn, "router", "--listen", endpoint)
-    assert child.line() == f"ready: the router at '{endpoint}'"
-    assert child.wait() == 0
+
+    def come(command: Command) -> None:
+        await_text(command, f"waiting: no answer yet at '{endpoint}'")
+        with router(endpoint):
+            assert command.is_over()
+
+    ended = run_watched(come, "wait", "router", endpoint, code=0)
+    assert ended.stdout == f"ready: the router at '{endpoint}'\n"
 
 
-@pytest.mark.processes
-def test_robot_behind_a_late_router_is_waited_for(spawn: Spawn, free_port: int):
+def test_robot_behind_a_late_router_is_waited_for(free_port: int, monkeypatch: pytest.MonkeyPatch):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    child = started(spawn, "wait", "robot", "rrbot", "--connect", endpoint)
-    started(spawn, "router", "--listen", endpoint).line()
-    with published_robot(router=endpoint):
-        assert child.line() == "ready: 'rrbot' (7 frames)"
+    is_connecting = threading.Event()
+
+    def noted_connect(*given: Any, **named: Any) -> Session:
+        is_connecting.set()
+        return connect(*given, **named)
+
+    def come(command: Command) -> None:
+        assert is_connecting.wait(DEADLINE_S)
+        with router(endpoint), published_robot(router=endpoint):
+            assert command.is_over()
+
+    monkeypatch.setattr("zstate.net.session.connect", noted_connect)
+    ended = run_watched(come, "wait", "robot", "rrbot", "--connect", endpoint, code=0)
+    assert ended.stdout == "ready: 'rrbot' (7 frames)\n"
 
 
 def test_missing_router_ends_the_wait_by_its_timeout_and_not_after_the_default_one(free_port: int):

@@ -163,13 +163,12 @@ def test_joints_of_another_model_are_refused_with_the_reason(tmp_path: Path):
 
 @pytest.mark.processes
 def test_stopped_writer_is_distinguished_from_a_closed_one(spawn: Spawn, free_port: int):
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    started(spawn, "router", "--listen", endpoint).line()
-    child = started(spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint)
-    child.line()
-    assert run_cli("wait", "robot", "rrbot", "--connect", endpoint).code == 0
-    child.freeze()
-    found = broken_link("rrbot", "--connect", endpoint)
+    with router(f"tcp/127.0.0.1:{free_port}") as endpoint:
+        child = started(spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint)
+        child.line()
+        assert run_cli("wait", "robot", "rrbot", "--connect", endpoint).code == 0
+        child.freeze()
+        found = broken_link("rrbot", "--connect", endpoint)
     assert found["name"] == "writers"
     assert "stopped" in found["text"]
     assert str(child.process.pid) in found["next"]

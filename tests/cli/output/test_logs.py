@@ -13,7 +13,7 @@ import time
 from datetime import UTC, datetime
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, started
+from helpers.cli_runner import RRBOT, Command, Spawn, failure, published_robot, run_until, run_watched
 from helpers.processes import DEADLINE_S, until
 
 from zstate import connect
@@ -56,43 +56,50 @@ def test_unknown_format_is_refused():
     assert "'jason' is not one of 'text', 'json'" in failure("joints", RRBOT, "--log-format", "jason", code=2)
 
 
-@pytest.mark.processes
-def test_every_line_of_a_running_command_is_json(spawn: Spawn):
-    command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
-    until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
-    with published_robot() as publisher:
-        command.line()
-        output = entries(command.stderr)
-    interrupted(command)
-    assert {entry["level"] for entry in output} == {"info"}
-    assert {entry.get("robot") for entry in output if "following" in str(entry["text"])} == {publisher.robot}
+MONITOR = ("monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
 
 
-@pytest.mark.processes
-def test_standard_output_of_a_service_is_json_too(spawn: Spawn, free_port: int):
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    router = started(spawn, "router", "--listen", endpoint, "--log-format", "json")
-    publisher = started(
-        spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint, "--log-format", "json"
-    )
-    for service, text in ((router, "listens at"), (publisher, "publishing 'rrbot'")):
-        (entry,) = entries(service.line())
-        assert (entry["level"], entry["event"]) == ("info", "result")
-        assert text in str(entry["text"])
+def test_every_line_of_a_running_command_is_json():
+    def watch(command: Command) -> None:
+        until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
+        with published_robot() as publisher:
+            command.line()
+            output = entries(command.stderr)
+        assert {entry["level"] for entry in output} == {"info"}
+        following = [entry for entry in output if "following" in str(entry["text"])]
+        assert {entry.get("robot") for entry in following} == {publisher.robot}
+
+    run_watched(watch, *MONITOR)
 
 
-@pytest.mark.processes
-def test_library_warning_has_its_event_and_reason(spawn: Spawn):
-    command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
-    key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]
-    with published_robot(), connect() as session, KeyPublisher(session, key, encoding) as noise:
-        command.line()
-        until(lambda: noise.has_readers)
-        noise.put(b"noise")
-        until(lambda: '"level": "warning"' in command.stderr)
-    (warning,) = [entry for entry in entries(command.stderr) if entry["level"] == "warning"]
-    assert (warning["event"], warning["reason"]) == ("refused", "malformed")
-    interrupted(command)
+@pytest.mark.parametrize(
+    ("service", "text"),
+    [
+        (("router", "--listen", "ENDPOINT"), "listens at"),
+        (("publish", RRBOT, "--source", "sine"), "publishing 'rrbot'"),
+    ],
+    ids=["router", "publish"],
+)
+def test_standard_output_of_a_service_is_json_too(free_port: int, service: tuple[str, ...], text: str):
+    given = [word.replace("ENDPOINT", f"tcp/127.0.0.1:{free_port}") for word in service]
+    ended, _ = run_until(lambda: True, *given, "--log-format", "json")
+    entry, *_ = entries(ended.stdout)
+    assert (entry["level"], entry["event"]) == ("info", "result")
+    assert text in str(entry["text"])
+
+
+def test_library_warning_has_its_event_and_reason():
+    def disturb(command: Command) -> None:
+        key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]
+        with published_robot(), connect() as session, KeyPublisher(session, key, encoding) as noise:
+            command.line()
+            until(lambda: noise.has_readers)
+            noise.put(b"noise")
+            until(lambda: '"level": "warning"' in command.stderr)
+        (warning,) = [entry for entry in entries(command.stderr) if entry["level"] == "warning"]
+        assert (warning["event"], warning["reason"]) == ("refused", "malformed")
+
+    run_watched(disturb, *MONITOR)
 
 
 @pytest.mark.processes

@@ -112,7 +112,7 @@ def size_text(size: float) -> str:
     """A number of bytes with a unit."""
     amount = float(size)
     for unit in ("B", "kB", "MB"):
-        if amount < 1000.0:
+        if amount < 999.5:  # beyond it is rounded to 1000
             return f"{amount:.0f} {unit}" if unit == "B" else f"{amount:.3g} {unit}"
         amount /= 1000.0
     return f"{amount:,.2f} GB"
