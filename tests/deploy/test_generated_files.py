@@ -6,6 +6,7 @@ import re
 import shlex
 from pathlib import Path
 
+import pytest
 from helpers.cli_runner import run_cli
 from helpers.deployment import DEPLOY
 

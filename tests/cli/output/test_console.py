@@ -1,4 +1,4 @@
-"""Names and texts from the network cannot steer the terminal that a command prints them on."""
+"""Texts of sizes; and names and texts from the network cannot steer the terminal that prints them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from helpers.cli_runner import RRBOT, run_cli
 from helpers.processes import repeated
 
 from zstate import StatePublisher, connect, load_model
+from zstate.cli.output.console import size_text
 from zstate.cli.output.logs import without_controls
 from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import announce
@@ -67,3 +68,19 @@ def test_escapes_are_shown_as_text_and_own_colours_are_kept():
     assert without_controls("\x1b[31mred\x1b[0m") == r"\x1b[31mred\x1b[0m"
     assert without_controls("\x1b[31mred\x1b[0m\x1b[2J", colors=True) == "\x1b[31mred\x1b[0m" + r"\x1b[2J"
     assert without_controls("\x9b2J\x7f\u202e") == r"\x9b2J\x7f\u202e"
+
+
+@pytest.mark.parametrize(
+    ("size", "text"),
+    [
+        (0, "0 B"),
+        (999, "999 B"),
+        (999.7, "1 kB"),
+        (1_234, "1.23 kB"),
+        (999_400, "999 kB"),
+        (999_600, "1 MB"),
+        (1_500_000_000, "1.50 GB"),
+    ],
+)
+def test_a_size_has_three_digits_and_the_unit_that_it_is_rounded_to(size: float, text: str):
+    assert size_text(size) == text

@@ -169,7 +169,7 @@ def test_commands_that_look_show_scans():
         assert "rrbot: scan/front (" in run_cli("graph").stdout
         monitored = json.loads(run_cli("monitor", "--robots", "--once", "--json").stdout)
         assert monitored["scan_hz"] == pytest.approx(30.0, rel=0.3)
-        assert " scans " in run_cli("monitor", "--robots", "--once").stdout
+        assert " scan " in run_cli("monitor", "--robots", "--once").stdout
         ended = run_cli("doctor", "rrbot", "--json")
         checks = [one for one in json.loads(ended.stdout)["checks"] if one["name"] == "scan"]
         assert [one["state"] for one in checks] == ["ok"]
