@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.output.console import fail
+from zstate.cli.output.console import GRACE_S, fail, print_status
 from zstate.cli.output.logs import warn_on_standard_error
 from zstate.cli.output.wire_text import is_ros
 from zstate.errors import Unreachable
 
 if TYPE_CHECKING:
+    from zstate.cli.processes import BackgroundCall
     from zstate.net.security.credentials import Credentials
     from zstate.net.session import Session
 
@@ -80,7 +81,8 @@ def open_session(
 ) -> Generator[Session]:
     """A session for commands on ``wires``; connecting to a router may take ``timeout_s``, or a few seconds.
 
-    From now on, warnings of the library go to standard error.
+    With ``timeout_s`` a line says after a moment what is waited for. From now on, warnings of the library
+    go to standard error.
     """
     from zstate.cli.processes import BackgroundCall
 
@@ -93,11 +95,11 @@ def open_session(
     # In a background thread: a signal interrupts waiting for it, but not Zenoh's own wait.
     call = BackgroundCall("zstate connect", lambda: options.open(within_s))
     try:
-        session = call.result()
+        session = _result(call, options.connect, timeout_s)
     except Unreachable as error:
         if not all(map(is_ros, wires)):
             raise _with_advice(error) from None
-        where = " or ".join(map(repr, error.endpoints)) or "the configured endpoints"
+        where = endpoints_text(error.endpoints)
         fail(
             f"nothing answers at {where}, where the router of the ROS 2 nodes should be; start one "
             "(`ros2 run rmw_zenoh_cpp rmw_zenohd`, or `zstate router --ros2`), or set its address: "
@@ -105,6 +107,23 @@ def open_session(
         )
     with session:
         yield session
+
+
+def _result(call: BackgroundCall[Session], endpoints: Sequence[str], timeout_s: float | None) -> Session:
+    """What ``call`` returns. Unless that is soon, a command with ``timeout_s`` says that it waits."""
+    if timeout_s is not None:
+        try:
+            return call.result(min(GRACE_S, timeout_s))
+        except Unreachable:
+            raise
+        except TimeoutError:
+            print_status(f"waiting: no answer yet at {endpoints_text(endpoints)}", event="waiting")
+    return call.result()
+
+
+def endpoints_text(endpoints: Sequence[str]) -> str:
+    """Where a session connects."""
+    return " or ".join(map(repr, endpoints)) or "the configured endpoints"
 
 
 def _with_advice(error: Unreachable) -> Unreachable:

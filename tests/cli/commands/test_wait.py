@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import json
-import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 from helpers.cli_runner import (
@@ -18,12 +16,11 @@ from helpers.cli_runner import (
     run_watched,
     started,
 )
-from helpers.processes import DEADLINE_S, Child, until
+from helpers.processes import Child, until
 from helpers.programs import router
 
 from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.cli.commands.wait import wait_command
-from zstate.net.session import Session
 
 
 def waited(*arguments: str, code: int) -> dict[str, object]:
@@ -104,20 +101,14 @@ def test_a_router_may_come_late(free_port: int):
     assert ended.stdout == f"ready: the router at '{endpoint}'\n"
 
 
-def test_robot_behind_a_late_router_is_waited_for(free_port: int, monkeypatch: pytest.MonkeyPatch):
+def test_robot_behind_a_late_router_is_waited_for(free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    is_connecting = threading.Event()
-
-    def noted_connect(*given: Any, **named: Any) -> Session:
-        is_connecting.set()
-        return connect(*given, **named)
 
     def come(command: Command) -> None:
-        assert is_connecting.wait(DEADLINE_S)
+        await_text(command, f"waiting: no answer yet at '{endpoint}'")
         with router(endpoint), published_robot(router=endpoint):
             assert command.is_over()
 
-    monkeypatch.setattr("zstate.net.session.connect", noted_connect)
     ended = run_watched(come, "wait", "robot", "rrbot", "--connect", endpoint, code=0)
     assert ended.stdout == "ready: 'rrbot' (7 frames)\n"
 

@@ -9,9 +9,9 @@ from functools import partial
 import click
 
 from zstate.cli import options
-from zstate.cli.output.console import GRACE_S, count_text, fail, print_json, print_result, print_status
-from zstate.cli.session import SessionOptions, open_session
-from zstate.errors import Unreachable, ZStateError
+from zstate.cli.output.console import count_text, fail, print_json, print_result
+from zstate.cli.session import SessionOptions, endpoints_text, open_session
+from zstate.errors import ZStateError
 
 
 @click.command("wait")
@@ -117,23 +117,8 @@ def _wait_for_pose(
 
 
 def _wait_for_router(network: SessionOptions, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
-    from zstate.cli.processes import BackgroundCall
     from zstate.net.config import ROUTER_ENDPOINT
 
     endpoints = names or network.connect or (() if network.is_explicit else (ROUTER_ENDPOINT,))
-    client = replace(network, mode="client", connect=endpoints)
-    where = " or ".join(map(repr, endpoints)) or "the configured endpoints"
-
-    def connect() -> None:
-        with open_session(client, timeout_s=timeout_s):
-            pass
-
-    call = BackgroundCall("zstate wait", connect)
-    try:
-        call.result(min(GRACE_S, timeout_s))
-    except Unreachable:
-        raise
-    except TimeoutError:
-        print_status(f"waiting: no answer yet at {where}", event="waiting")
-        call.result()
-    return f"ready: the router at {where}"
+    with open_session(replace(network, mode="client", connect=endpoints), timeout_s=timeout_s):
+        return f"ready: the router at {endpoints_text(endpoints)}"
