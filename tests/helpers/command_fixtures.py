@@ -9,7 +9,6 @@ import pytest
 from helpers.programs import router
 
 from zstate.cli import session
-from zstate.view import cli as view
 
 
 @pytest.fixture(autouse=True)
@@ -31,6 +30,6 @@ def ros_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands of this process give up on routers and robots that are not there in a tenth of the time."""
-    for module, name in ((session, "_ROUTER_WITHIN_S"), (session, "_LOCAL_ROUTER_WITHIN_S")):
-        monkeypatch.setattr(module, name, 0.5)
-    monkeypatch.setattr(view, "_ANNOUNCED_WITHIN_S", 0.5)
+    monkeypatch.setattr(session, "_ROUTER_WITHIN_S", 0.5)
+    monkeypatch.setattr(session, "_LOCAL_ROUTER_WITHIN_S", 0.5)
+    monkeypatch.setattr("zstate.view.cli._ANNOUNCED_WITHIN_S", 0.5)
