@@ -20,6 +20,10 @@ from zstate.plugins import built_in_plugins
 
 PACKAGE = Path(__file__).parent.parent / "zstate"
 
+# The plugins that stand on others; below the rest is only the core.
+_ABOVE = {"recording", "bridges", "metrics", "foxglove", "view"}
+_PLUGINS = {plugin.name for plugin in built_in_plugins()}
+
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
 FLOORS = (
     {"_util", "_kernel"},
@@ -34,12 +38,12 @@ FLOORS = (
     {"net"},
     {"sources"},
     {"nodes"},
-    {"scans", "driving", "odometry"},
+    _PLUGINS - _ABOVE,
     {"bridges", "recording"},
     {"zstate"},
     {"metrics", "foxglove"},
     {"view", "cli"},
-    {"bridges.cli", "driving.cli", "foxglove.cli", "odometry.cli", "recording.cli", "scans.cli", "view.cli"},
+    {f"{plugin}.cli" for plugin in _PLUGINS - {"metrics"}},
     {"__main__"},
 )
 NEIGHBOURS = {

@@ -67,7 +67,7 @@ class Stream:
     - ``version``: of its messages, in their Zenoh encoding. Fields may be appended within a version.
     - ``start``: how to start a writer, for the tools that miss one; ``{robot}`` in it is the robot's name.
     - ``document``: ``"module:function"`` that makes a dict of a message and the name of its robot, as `zstate
-      echo` prints it; by default of all fields.
+      echo` prints it; by default of all fields, a ``frame`` with its full name.
     - ``ros``: ``"module:name"`` of how ROS 2 carries it (zstate.wire.ros2.streams.RosStream); empty if it
       does not.
 
@@ -130,7 +130,10 @@ class Stream:
         """What `zstate echo` prints of ``message``."""
         if self.document:
             return _loaded(self.document)(message, robot)
-        return {name: getattr(message, name) for name in message.__struct_fields__ if name != "session"}
+        document = {name: getattr(message, name) for name in message.__struct_fields__ if name != "session"}
+        if isinstance(frame := document.get("frame"), str):
+            document["frame"] = _loaded("zstate.wire.keys:full_name")(robot, frame)
+        return document
 
 
 def _loaded(place: str) -> Any:

@@ -236,12 +236,11 @@ def failure(*arguments: str, code: int = 1, stdin: bytes = b"") -> str:
 
 
 @contextmanager
-def missing_library(name: str, *users: str) -> Iterator[None]:
-    """An interpreter that cannot import ``name``, nor has imported the packages ``users``, which do."""
-    packages = (name, *users)
+def missing_library(name: str) -> Iterator[None]:
+    """An interpreter that cannot import ``name``."""
     with pytest.MonkeyPatch.context() as restored:
         for module in [*sys.modules]:
-            if any(module == package or module.startswith(f"{package}.") for package in packages):
+            if module == name or module.startswith(f"{name}."):
                 restored.delitem(sys.modules, module)
         restored.setitem(sys.modules, name, None)
         yield

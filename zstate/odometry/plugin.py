@@ -11,7 +11,7 @@ IMU = Stream(
     summary="angular velocity and acceleration of a sensor",
     named=True,
     start="start the program of the sensor, with its zstate.odometry.ImuPublisher",
-    ros="zstate.wire.ros2.odometry:IMU_STREAM",
+    ros="zstate.odometry.ros2:IMU_STREAM",
     document="zstate.odometry.documents:imu_document",
 )
 VELOCITY = Stream(
@@ -20,7 +20,7 @@ VELOCITY = Stream(
     summary="measured velocity of a frame",
     named=True,
     start="start the program of the sensor, with its zstate.odometry.VelocityPublisher",
-    ros="zstate.wire.ros2.odometry:VELOCITY_STREAM",
+    ros="zstate.odometry.ros2:VELOCITY_STREAM",
     document="zstate.odometry.documents:velocity_document",
 )
 POSE = Stream(
@@ -29,7 +29,7 @@ POSE = Stream(
     summary="measured pose of a frame",
     named=True,
     start="start the program of the sensor, with its zstate.odometry.PosePublisher",
-    ros="zstate.wire.ros2.odometry:POSE_STREAM",
+    ros="zstate.odometry.ros2:POSE_STREAM",
     document="zstate.odometry.documents:pose_document",
 )
 ODOMETRY = Stream(
@@ -39,7 +39,7 @@ ODOMETRY = Stream(
     group="edges",
     named=True,
     start="start one: `zstate odometry {robot} --imu SENSOR`",
-    ros="zstate.wire.ros2.odometry:ODOMETRY_STREAM",
+    ros="zstate.odometry.ros2:ODOMETRY_STREAM",
     document="zstate.odometry.documents:odometry_document",
 )
 

@@ -14,7 +14,7 @@ SCAN = Stream(
     named=True,
     max_bytes=_SCAN_BYTES,
     start="start one: `zstate scan {robot} --frame FRAME --dummy`",
-    ros="zstate.wire.ros2.decoder:SCAN_STREAM",
+    ros="zstate.scans.ros2:SCAN_STREAM",
     document="zstate.scans.documents:scan_document",
 )
 MAP = Stream(
@@ -25,7 +25,7 @@ MAP = Stream(
     latched=True,
     max_bytes=LATCHED_BYTES,
     start="start one: `zstate map FILE.yaml --name {robot}`",
-    ros="zstate.wire.ros2.decoder:MAP_STREAM",
+    ros="zstate.scans.ros2:MAP_STREAM",
     document="zstate.scans.documents:map_document",
 )
 

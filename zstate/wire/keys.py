@@ -7,12 +7,8 @@
 ``zstate/<robot>/tf_static/<writer>``             StaticTransforms, latched
 ``zstate/<robot>/transforms/<writer>``            WriterTransforms, each sample; likewise
 ``zstate/<robot>/robot_description``              RobotDescription, latched
-``zstate/<robot>/scan/<sensor>``                  LaserScan, each scan; the sensor is the writer's name
-``zstate/<robot>/imu/<sensor>``                   Imu, each reading; the sensor is the writer's name
-``zstate/<robot>/velocity/<sensor>``              Velocity, each measurement; likewise
-``zstate/<robot>/pose/<sensor>``                  Pose, each measurement; likewise
-``zstate/<robot>/odometry/<writer>``              Odometry, each sample; a query returns a HistoryPage
-``zstate/<robot>/map/<writer>``                   OccupancyGrid, latched
+``zstate/<robot>/<stream>/<writer>``              any other stream with names, such as ``imu`` and ``scan``;
+                                                  on ``odometry``, a query returns a HistoryPage
 ``zstate/<robot>/joint_commands``                 JointCommand, to a driver
 ``zstate/<robot>/joint_setpoints``                JointState with joint names, of a driver, while read
 ``zstate/<robot>/driver``                         DriverState, latched

@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.plugins import all_streams, edge_streams, is_named, is_own, stream_named
+from zstate.plugins import all_streams, edge_streams, find_stream, is_named, is_own, stream_named
 from zstate.streams import LATCHED_BYTES, SAMPLE_BYTES, Stream, StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
@@ -291,7 +291,7 @@ class NativeWire:
         return edge_streams()
 
     def carries(self, stream: StreamName) -> bool:
-        return True
+        return find_stream(stream) is not None
 
     def node_token(self, node: WriterNode) -> None:
         return None

@@ -110,10 +110,7 @@ class WriterTokens(Protocol):
 class Wire(WriterTokens, Protocol):
     """One wire format for the streams of a robot: keys, encodings and bytes.
 
-    A stream carries the same messages in each: JointState on ``joint_states``, TransformSample on ``tf``,
-    StaticTransforms on ``tf_static``, RobotDescription on ``robot_description``, LaserScan on ``scan``,
-    OccupancyGrid on ``map``, Imu on ``imu``, Velocity on ``velocity``, Pose on ``pose``, Odometry on
-    ``odometry``, Clock on ``clock``.
+    A stream carries the same messages in each, those of the type in its row (``zstate.streams``).
     Decoding may keep state, so each reader has an instance of its own.
     """
 

@@ -54,5 +54,5 @@ def test_hosts_ports_and_names_that_cannot_be_used_are_refused():
 
 
 def test_missing_websockets_error_names_the_extra_to_install():
-    with missing_library("websockets", "zstate.foxglove"):
+    with missing_library("websockets"):
         assert "pip install 'zstate[foxglove]'" in failure("foxglove")

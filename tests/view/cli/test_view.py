@@ -95,7 +95,7 @@ def test_wrong_arguments_are_reported_on_one_line(arguments: list[str], code: in
 
 
 def test_missing_viser_error_names_the_package_to_install():
-    with missing_library("viser", "zstate.view"):
+    with missing_library("viser"):
         assert "pip install 'zstate[view]'" in failure("view")
 
 

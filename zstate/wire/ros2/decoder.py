@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
 from collections.abc import Sequence
 from hashlib import blake2b
-from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +17,7 @@ from zstate.wire.messages import (
     Edges,
     JointState,
     JointTrajectory,
-    LaserScan,
     Message,
-    OccupancyGrid,
     RobotDescription,
     StampedMessage,
     StaticTransforms,
@@ -40,15 +36,12 @@ from zstate.wire.ros2.cdr import (
     decode_string,
     unpack_stamps,
 )
-from zstate.wire.ros2.qos import Qos
-from zstate.wire.ros2.streams import RosStream, ros_stream
+from zstate.wire.ros2.streams import ros_stream
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
     FLOAT64_MULTI_ARRAY,
     JOINT_STATE,
     JOINT_TRAJECTORY,
-    LASER_SCAN,
-    OCCUPANCY_GRID,
     TF_MESSAGE,
 )
 
@@ -301,46 +294,6 @@ def read_tf_message(reader: CdrReader) -> RosTransforms:
     return RosTransforms(shared, tuple(stamps), tuple(edges), b"".join(poses))
 
 
-def decode_scan(payload: bytes, session: int, seq: int, names: FrameNames) -> LaserScan:
-    """The scan in ``payload``; its ``angle_max`` is ignored.
-
-    Raises MessageError with the reason "truncated" or "malformed".
-    """
-    reader = CdrReader(payload, LASER_SCAN.name)
-    stamp, frame = reader.stamp(), names.to_zstate(reader.text())
-    angle_min, _, angle_increment, ray_s, scan_s, range_min, range_max = _floats(reader, _SCAN_FLOATS)
-    ranges, intensities = reader.sequence(FLOAT_BYTES), reader.sequence(FLOAT_BYTES)
-    if not (isfinite(ray_s) and isfinite(scan_s)):
-        raise reader.malformed(f"its time_increment is {ray_s}, and its scan_time {scan_s} [s]")
-    times = round(ray_s * 1e9), round(scan_s * 1e9)
-    geometry = angle_min, angle_increment, *times, range_min, range_max
-    try:
-        return LaserScan(stamp, seq, session, frame, *geometry, ranges, intensities or None)
-    except InvalidInput as error:
-        raise reader.malformed(str(error)) from None
-
-
-def decode_grid(payload: bytes, session: int, seq: int, names: FrameNames) -> OccupancyGrid:
-    """The grid in ``payload``, which has no ``seq``; its ``map_load_time`` is ignored.
-
-    Raises as ``decode_scan`` does.
-    """
-    reader = CdrReader(payload, OCCUPANCY_GRID.name)
-    stamp, frame = reader.stamp(), names.to_zstate(reader.text())
-    reader.stamp()
-    (resolution,) = _floats(reader, 1)
-    width, height, origin = reader.count(), reader.count(), reader.numbers(_POSE_NUMBERS)
-    cells = reader.sequence(CELL_BYTES)
-    try:
-        return OccupancyGrid(session, stamp, frame, resolution, width, height, origin, cells)
-    except InvalidInput as error:
-        raise reader.malformed(str(error)) from None
-
-
-def _floats(reader: CdrReader, count: int) -> tuple[float, ...]:
-    return struct.unpack(f"<{count}f", reader.numbers(count, FLOAT_BYTES))
-
-
 def decode_numbers(payload: bytes) -> NDArray[np.float64]:
     """The data of a Float64MultiArray: (n,), read-only. Its layout is ignored, as by ros2_control.
 
@@ -382,9 +335,3 @@ def decode_trajectory(payload: bytes, session: int, seq: int) -> JointTrajectory
         return JointTrajectory(stamp, seq, session, names, *numbers, start=stamp or None)
     except InvalidInput as error:
         raise reader.malformed(str(error)) from None
-
-
-SCAN_STREAM = RosStream(LASER_SCAN, Qos("best_effort", depth=5), is_named=True, decode=decode_scan)
-MAP_STREAM = RosStream(
-    OCCUPANCY_GRID, Qos(durability="transient_local", depth=1), is_named=True, decode=decode_grid
-)

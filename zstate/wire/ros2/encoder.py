@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import product
@@ -17,30 +16,23 @@ from zstate.wire.messages import (
     POSE_BYTES,
     ClockMessage,
     Edges,
-    Imu,
     JointState,
-    LaserScan,
     Message,
-    OccupancyGrid,
-    Odometry,
-    Pose,
     RobotDescription,
+    StampedMessage,
     StaticTransforms,
     TransformSample,
-    Velocity,
     from_block,
     to_block,
 )
 from zstate.wire.ros2.cdr import CdrReader, CdrTemplate, CdrWriter, encode_clock, encode_string, pack_stamp
 from zstate.wire.ros2.decoder import (
-    CELL_BYTES,
-    FLOAT_BYTES,
     duplicate_text,
     read_joint_state,
     read_tf_message,
 )
 from zstate.wire.ros2.graph import pack_attachment
-from zstate.wire.ros2.odometry import encode_imu, encode_odometry, encode_pose, encode_velocity
+from zstate.wire.ros2.streams import ros_encoder
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
@@ -102,34 +94,20 @@ class RosStreamEncoder:
         """
         if isinstance(message, JointState):
             return self._encode_joints(message)
-        if isinstance(message, LaserScan | Imu | Velocity | Pose | Odometry):
-            return self._encode_measurement(message)
+        if (encode := ros_encoder(type(message))) is not None:
+            if isinstance(message, StampedMessage):
+                _checked_stamp(message.stamp)
+            return encode(message, self._names)
         if isinstance(message, TransformSample):
             edges = self._sample_names.moving_edges if message.edges is None else message.edges
             return self._encode_edges(edges, _checked_stamp(message.stamp), message.poses)
         if isinstance(message, StaticTransforms):
             return self._encode_edges(message.edges, 0, message.poses)
-        if isinstance(message, OccupancyGrid):
-            payload = encode_grid(message, self._names)
-        elif isinstance(message, RobotDescription):
-            payload = encode_string(message.urdf)
-        elif isinstance(message, ClockMessage):
-            payload = encode_clock(message.stamp)
-        else:
-            raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
-        return payload
-
-    def _encode_measurement(self, message: LaserScan | Imu | Velocity | Pose | Odometry) -> bytes:
-        _checked_stamp(message.stamp)
-        if isinstance(message, Imu):
-            return encode_imu(message, self._names)
-        if isinstance(message, Velocity):
-            return encode_velocity(message, self._names)
-        if isinstance(message, Pose):
-            return encode_pose(message, self._names)
-        if isinstance(message, Odometry):
-            return encode_odometry(message, self._names)
-        return encode_scan(message, self._names)
+        if isinstance(message, RobotDescription):
+            return encode_string(message.urdf)
+        if isinstance(message, ClockMessage):
+            return encode_clock(message.stamp)
+        raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
 
     def _encode_joints(self, state: JointState) -> bytes:
         names = self._sample_names.coordinates if state.names is None else state.names
@@ -259,50 +237,3 @@ class TfMessageEncoder:
                 f"not {len(poses)}"
             )
         return self._template.join(self._fixed, pack_stamp(stamp) * count + poses)
-
-
-def encode_scan(scan: LaserScan, names: FrameNames) -> bytes:
-    """The payload of ``scan``.
-
-    ROS has float32 where it has float64 (angles, range limits), and seconds in float32 where it has
-    nanoseconds: ``time_increment`` is ``ray_ns``, ``scan_time`` is ``scan_ns``. ``angle_max`` is the angle of
-    the last ray. Raises InvalidInput for a number that float32 cannot represent, and for a stamp outside 1901
-    to 2038.
-    """
-    last_ray = max(0, len(scan.ranges) // FLOAT_BYTES - 1)
-    angle_max = scan.angle_min + last_ray * scan.angle_increment
-    angles = scan.angle_min, angle_max, scan.angle_increment
-    times_s = scan.ray_ns * 1e-9, scan.scan_ns * 1e-9
-    writer = CdrWriter()
-    writer.stamp(scan.stamp)
-    writer.text(names.to_ros(scan.frame))
-    writer.numbers(_float32(*angles, *times_s, scan.range_min, scan.range_max), FLOAT_BYTES)
-    writer.sequence(scan.ranges, FLOAT_BYTES)
-    writer.sequence(scan.intensities or b"", FLOAT_BYTES)
-    return writer.payload()
-
-
-def encode_grid(grid: OccupancyGrid, names: FrameNames) -> bytes:
-    """The payload of ``grid``, with a resolution of float32; its stamp is also ``map_load_time``.
-
-    Raises InvalidInput as ``encode_scan`` does.
-    """
-    writer = CdrWriter()
-    writer.stamp(grid.stamp)
-    writer.text(names.to_ros(grid.frame))
-    writer.stamp(grid.stamp)
-    writer.numbers(_float32(grid.resolution), FLOAT_BYTES)
-    writer.count(grid.width)
-    writer.count(grid.height)
-    writer.numbers(grid.origin)
-    writer.sequence(grid.cells, CELL_BYTES)
-    return writer.payload()
-
-
-def _float32(*numbers: float) -> bytes:
-    try:
-        return struct.pack(f"<{len(numbers)}f", *numbers)
-    except OverflowError:
-        raise InvalidInput(
-            f"ROS 2 has float32 for {', '.join(map(str, numbers))}, and one of them is too large for it"
-        ) from None

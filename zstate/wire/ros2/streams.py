@@ -1,6 +1,6 @@
 """How ROS 2 carries the streams: the type and the QoS of their topics, as ``Stream.ros`` names them.
 
-Those of sensors and maps are beside the functions that encode and decode their messages.
+Those of plugins are in their folders, beside the functions that encode and decode their messages.
 """
 
 from __future__ import annotations
@@ -20,14 +20,17 @@ from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosTy
 class RosStream(NamedTuple):
     """The ``type`` of a stream's topics, and the ``qos`` that its writers offer.
 
-    Topics with ``is_named`` have the name of the sensor, or of the writer, and are found by their type. Their
-    messages are made by ``decode(payload, session, seq, names)``; those of others by ``RosDecoder``. With
+    Topics with ``is_named`` have the name of the sensor, or of the writer, and are found by their type.
+    ``encode(message, names)`` makes the payload of a message, ``decode(payload, session, seq, names)`` the
+    message in one, with the frames as ``names`` has them (FrameNames); those of the streams of the core are
+    in ``RosStreamEncoder`` and ``RosDecoder``. With
     ``is_of_sensor`` their namespace may be that of the sensor: /r1/imu/data is a topic of the robot r1.
     """
 
     type: RosType
     qos: Qos
     is_named: bool = False
+    encode: Callable[..., bytes] | None = None
     decode: Callable[..., Message] | None = None
     is_of_sensor: bool = False
 
@@ -57,6 +60,17 @@ def ros_stream(stream: StreamName) -> RosStream:
             f"the stream {stream!r} is not carried by ROS 2; carried are {', '.join(map(repr, carried))}"
         )
     return carried[stream]
+
+
+@cache
+def _encoders() -> dict[type[Message], Callable[..., bytes]]:
+    rows = [row for row in own_streams() if row.ros and row.ros_form.encode is not None]
+    return {row.type: row.ros_form.encode for row in rows}
+
+
+def ros_encoder(kind: type[Message]) -> Callable[..., bytes] | None:
+    """``RosStream.encode`` for messages of the type ``kind``; None for those of the core."""
+    return _encoders().get(kind)
 
 
 def ros_type(stream: StreamName) -> RosType:

@@ -9,11 +9,7 @@ joint_states         sensor_msgs/JointState                    ``/r1/joint_state
 robot_description    std_msgs/String                           ``/r1/robot_description``
 tf, tf_static        tf2_msgs/TFMessage                        ``/tf``; ``/r1/tf`` with ``tf=namespace``
 scan                 sensor_msgs/LaserScan                     ``/r1/<sensor>``, such as ``/r1/scan``
-imu                  sensor_msgs/Imu                           ``/r1/<sensor>``, such as ``/r1/imu``
-velocity             geometry_msgs/TwistWithCovarianceStamped  ``/r1/<sensor>``, such as ``/r1/velocity``
-pose                 geometry_msgs/PoseWithCovarianceStamped   ``/r1/<sensor>``, such as ``/r1/pose``
-odometry             nav_msgs/Odometry                         ``/r1/<name>``, such as ``/r1/odom``
-map                  nav_msgs/OccupancyGrid                    ``/r1/<name>``, such as ``/r1/map``
+others of sensors    that of their row (``RosStream.type``)    likewise
 clock                rosgraph_msgs/Clock                       ``/clock``
 ===================  ========================================  ===========================================
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from hashlib import sha256
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
-# The fields of each package/type, as (type, name) in the notation of .msg files.
-_FIELDS: dict[str, tuple[tuple[str, str], ...]] = {
+Fields: TypeAlias = tuple[tuple[str, str], ...]
+"""The type and the name of each field of a message, in the notation of .msg files."""
+
+# By package/type.
+_FIELDS: dict[str, Fields] = {
     "builtin_interfaces/Time": (("int32", "sec"), ("uint32", "nanosec")),
     "std_msgs/Header": (("builtin_interfaces/Time", "stamp"), ("string", "frame_id")),
     "std_msgs/String": (("string", "data"),),
@@ -126,19 +129,23 @@ class RosType(NamedTuple):
     schema_encoding = "ros2msg"
 
     @classmethod
-    def from_fields(cls, short: str) -> RosType:
-        """The type ``short`` (package/type), from its fields and those of the types within."""
+    def from_fields(cls, short: str, fields: Fields | None = None) -> RosType:
+        """The type ``short`` (package/type), from its ``fields`` and those of the types within.
+
+        Fields are pairs of a type and a name, as in a .msg file. Those of the types below are known.
+        """
+        known = _FIELDS if fields is None else {**_FIELDS, short: fields}
         package, kind = short.split("/")
-        names = tuple(dict.fromkeys(_with_parts(short)))
+        names = tuple(dict.fromkeys(_with_parts(short, known)))
         # The SHA-256 of the fields in the one form of JSON that REP-2016 prescribes.
         described = {
-            "type_description": _description(short),
-            "referenced_type_descriptions": [_description(part) for part in sorted(names[1:])],
+            "type_description": _description(short, known),
+            "referenced_type_descriptions": [_description(part, known) for part in sorted(names[1:])],
         }
         type_hash = f"RIHS01_{sha256(json.dumps(described).encode()).hexdigest()}"
-        fields = ["".join(f"{kind} {name}\n" for kind, name in _FIELDS[part]) for part in names]
-        parts = [f"MSG: {part}\n{text}" for part, text in zip(names[1:], fields[1:], strict=True)]
-        definition = f"{_SEPARATOR}\n".join([fields[0], *parts])
+        texts = ["".join(f"{kind} {name}\n" for kind, name in known[part]) for part in names]
+        parts = [f"MSG: {part}\n{text}" for part, text in zip(names[1:], texts[1:], strict=True)]
+        definition = f"{_SEPARATOR}\n".join([texts[0], *parts])
         return cls(_full(short), f"{package}::msg::dds_::{kind}_", type_hash, definition)
 
 
@@ -146,24 +153,24 @@ def _full(short: str) -> str:
     return short.replace("/", "/msg/")
 
 
-def _with_parts(short: str) -> Iterator[str]:
+def _with_parts(short: str, known: Mapping[str, Fields]) -> Iterator[str]:
     """A type, then recursively the types of its fields; some more than once."""
     yield short
-    for kind, _ in _FIELDS[short]:
-        if (part := kind.partition("[")[0]) in _FIELDS:
-            yield from _with_parts(part)
+    for kind, _ in known[short]:
+        if (part := kind.partition("[")[0]) in known:
+            yield from _with_parts(part, known)
 
 
-def _description(short: str) -> dict[str, Any]:
+def _description(short: str, known: Mapping[str, Fields]) -> dict[str, Any]:
     fields: list[dict[str, Any]] = []
-    for kind, name in _FIELDS[short]:
+    for kind, name in known[short]:
         item, bracket, length = kind.removesuffix("]").partition("[")
         several = 0 if not bracket else _ARRAY if length else _UNBOUNDED_SEQUENCE
         field_type = {
             "type_id": _PRIMITIVES.get(item, _NESTED) + several,
             "capacity": int(length or 0),
             "string_capacity": 0,
-            "nested_type_name": _full(item) if item in _FIELDS else "",
+            "nested_type_name": _full(item) if item in known else "",
         }
         fields.append({"name": name, "type": field_type})
     return {"type_name": _full(short), "fields": fields}

@@ -181,7 +181,10 @@ def _triangle(block: bytes, size: int) -> bytes | None:
 
 
 _OF_SENSOR = {"is_named": True, "is_of_sensor": True}
-IMU_STREAM = RosStream(IMU, Qos(depth=10), decode=decode_imu, **_OF_SENSOR)
-VELOCITY_STREAM = RosStream(TWIST_WITH_COVARIANCE, Qos(depth=10), decode=decode_velocity, **_OF_SENSOR)
-POSE_STREAM = RosStream(POSE_WITH_COVARIANCE, Qos(depth=10), decode=decode_pose, **_OF_SENSOR)
-ODOMETRY_STREAM = RosStream(ODOMETRY, Qos(depth=10), decode=decode_odometry, **_OF_SENSOR)
+_QOS = Qos(depth=10)
+IMU_STREAM = RosStream(IMU, _QOS, encode=encode_imu, decode=decode_imu, **_OF_SENSOR)
+VELOCITY_STREAM = RosStream(
+    TWIST_WITH_COVARIANCE, _QOS, encode=encode_velocity, decode=decode_velocity, **_OF_SENSOR
+)
+POSE_STREAM = RosStream(POSE_WITH_COVARIANCE, _QOS, encode=encode_pose, decode=decode_pose, **_OF_SENSOR)
+ODOMETRY_STREAM = RosStream(ODOMETRY, _QOS, encode=encode_odometry, decode=decode_odometry, **_OF_SENSOR)
