@@ -82,10 +82,10 @@ class ScanPublisher(MeasurementPublisher):
         measurement is inf without an echo, -inf if it is too near, and NaN if it is invalid (REP 117). Raises
         InvalidInput for other shapes, SecondWriter and Closed. If it raises, nothing was sent.
         """
-        with self._refusals_counted():
+        with self._refusals:
             stamp = self._first_stamp(self._clock.now(), ranges) if stamp is None else check_stamp(stamp)
             scan = self._scan(stamp, ranges, intensities)
-            self._publish_message(scan_to_message(scan, scan_ns=self._scan_ns()))
+            self._send(scan_to_message(scan, scan_ns=self._scan_ns()))
 
     def _first_stamp(self, last: int, ranges: ArrayLike) -> int:
         """The instant of the first ray of a sweep whose last ray is at ``last``."""
