@@ -91,7 +91,7 @@ class RobotWriter(Closeable):
             raise
 
     def own(self, claimed: Sequence[Announcement]) -> None:
-        """Own ``claimed``, and reply to readers that measure the clock, unless it is simulated.
+        """Own ``claimed``, if any, and reply to readers that measure the clock, unless it is simulated.
 
         Called before the writer is announced: readers that see its token measure its clock at once. Raises
         SecondWriter.
