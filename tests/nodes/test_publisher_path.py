@@ -64,7 +64,7 @@ def test_payloads_numbers_cache_and_counts_are_those_of_the_slow_way(sessions, r
         publisher.publish(POSITIONS, *rates, stamp=STAMP + 1)
         publisher.publish(SLOW, *rates, stamp=STAMP + 2)
         publisher.publish(POSITIONS, *rates, stamp=STAMP + 3)
-        digest, session = order_digest(RRBOT.joint_names), publisher._session_id
+        digest, session = order_digest(RRBOT.joint_names), publisher._out.session_id
         blocks = [None if one is None else one.tobytes() for one in rates]
         expected = [
             encode(JointState(STAMP + seq, seq, session, digest, POSITIONS.tobytes(), *blocks))
@@ -86,7 +86,7 @@ def test_payloads_numbers_cache_and_counts_are_those_of_the_slow_way(sessions, r
 def test_ros_payloads_and_attachments_are_those_of_the_slow_way(sessions, wire: str, rates: Any):
     writer, reader = sessions
     with open_publisher(writer, wires=(wire,)) as publisher:
-        stream = publisher._writers[wire, "joint_states"]
+        stream = publisher._out.streams[wire, "joint_states"]
         encoder: Any = stream.encoder
         tap = SampleCollector(reader, encoder.key)
         wait_for_reader(writer, encoder.key)

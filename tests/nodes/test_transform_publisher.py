@@ -368,7 +368,7 @@ def test_samples_that_arrive_after_their_writer_left_join_its_history(sessions):
             for step in range(2):
                 odometry.publish([pose("odom", "base_link")], stamp + step)
             until(lambda: counts() == [2])
-            session = odometry._session_id
+            session = odometry._out.session_id
         until(lambda: [event.kind for event in listener.events()] == ["joined", "left"])
         late = WriterTransforms(stamp + 2, 2, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
         with KeyPublisher(writer, key, ENCODINGS[WriterTransforms]) as stream:
@@ -472,7 +472,7 @@ def test_writer_with_a_clock_set_back_restarts_only_its_own_edges(sessions):
         until(lambda: counts() == {"r1/base_link": 2, "r1/ball": 5})
         until(lambda: "set back" in [event.kind for event in listener.events()])
         (event,) = [event for event in listener.events() if event.kind == "set back"]
-        assert (event.stream, event.writer and event.writer.session) == ("transforms", wheels._session_id)
+        assert (event.stream, event.writer and event.writer.session) == ("transforms", wheels._out.session_id)
 
 
 def test_publish_from_many_threads_numbers_the_samples_and_close_ends_them(sessions):

@@ -107,7 +107,7 @@ class WireWriter(Closeable):
         sample_names: SampleLayout | None = None,
     ) -> None:
         self._session = session
-        self._wire = wire
+        self.wire = wire
         names = sample_names or SampleLayout()
         self._node = WriterNode(robot, writer, session.zid, session.next_number(), names)
         self._is_permitted = wire.name == "ros2dds"  # the permissions of these are the bridges' own
@@ -130,7 +130,7 @@ class WireWriter(Closeable):
         )
 
     def _encoder(self, stream: StreamName, name: str = "") -> StreamEncoder:
-        return self._wire.stream_encoder(self._node, stream, self._session.next_number(), name)
+        return self.wire.stream_encoder(self._node, stream, self._session.next_number(), name)
 
     def _announced(self, writer: W) -> W:
         self._opened.enter_context(writer)
@@ -147,7 +147,7 @@ class WireWriter(Closeable):
         self._waiting = tokens = []
         yield
         self._waiting = None
-        for token in self._wire.joined_tokens(tokens):
+        for token in self.wire.joined_tokens(tokens):
             self._announce(token)
 
     def _announce(self, token: str) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
@@ -14,13 +12,12 @@ from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.clock import SET_BACK_NS, SIMULATED, Clock, MonotonicClock, check_stamp, wait_interruptible
 from zstate.errors import Closed, MessageError, NoClock, format_duration
-from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.net.writer import WireWriter, write_all
+from zstate.nodes.robot_writer import RobotWriter
 from zstate.wire.messages import ClockMessage
 from zstate.wire.protocol import SerializedSample
-from zstate.wire.registry import as_wire_names, get_wire
+from zstate.wire.registry import get_wire
 from zstate.wire.ros2.topics import SHARED
 
 _LOG = logging.getLogger("zstate")
@@ -40,34 +37,23 @@ class ClockPublisher(Closeable):
     """
 
     def __init__(self, session: Session, wires: str | Sequence[str] = ("native",)) -> None:
-        self._session_id = secrets.randbits(32)
-        self._seq = 0
-        self._lock = fork_safe_lock()
-        writer = local_writer(self._session_id)
-        with ExitStack() as opening:
-            # Time belongs to no robot; on a ROS wire its topic is that of the shared namespace.
-            self._writers = [
-                opening.enter_context(WireWriter(session, get_wire(wire), SHARED, writer)).open_stream(
-                    "clock"
-                )
-                for wire in as_wire_names(wires)
-            ]
-            self._opened = opening.pop_all()
-        self._is_open = True
+        # Time belongs to no robot; on a ROS wire its topic is that of the shared namespace.
+        self._out = out = RobotWriter(session, SHARED, wires)
+        out.title = "the clock's publisher"
+        with out.opening():
+            for wire in out.open_wires():
+                out.open_stream(wire, "clock")
 
     def publish(self, stamp: int) -> None:
         """Publish the time ``stamp`` [ns]. Raises Closed, and InvalidInput if a wire cannot represent it."""
-        with self._lock:
-            if not self._is_open:
-                raise Closed("the clock's publisher is closed")
-            write_all(self._writers, ClockMessage(check_stamp(stamp), self._seq, self._session_id))
-            self._seq += 1
+        out = self._out
+        with out.lock:
+            out.check()
+            out.send(ClockMessage(check_stamp(stamp), out.seq, out.session_id))
 
     def close(self) -> None:
         """Stop publishing. A second call does nothing."""
-        with self._lock:
-            self._is_open = False
-            self._opened.close()
+        self._out.close()
 
 
 class SimulatedClock(Closeable):

@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Sequence
-from contextlib import ExitStack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.clock import Clock, check_stamp
-from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.errors import SecondWriter
 from zstate.model.joint_limits import JointLimits
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
-from zstate.net.ownership import WriterClaim, claim_edges
-from zstate.net.presence import local_writer
-from zstate.net.sample_history import SampleCache, serve_history
+from zstate.net.ownership import claim_edges
 from zstate.net.session import Session
-from zstate.net.status import StatusPublisher
-from zstate.net.writer import WireWriter
 from zstate.nodes.publisher import Positions, positions_block
-from zstate.nodes.publisher_status import LimitWatch, StatusReporter
+from zstate.nodes.publisher_status import LimitWatch
 from zstate.nodes.sample_publisher import SamplePublisher
-from zstate.nodes.static_publisher import edge_writer_name
 from zstate.rate import RateReport
 from zstate.sources.joint_source import JointReading, JointSource
-from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.identity import Announcement
 from zstate.wire.messages import JointState, order_digest, to_block
-from zstate.wire.native import encode
-from zstate.wire.registry import get_wire
 
 
 class PartialStatePublisher(SamplePublisher):
@@ -63,56 +54,47 @@ class PartialStatePublisher(SamplePublisher):
         program: str = "",
         cache_s: float = 2.0,
     ) -> None:
-        identity = local_writer(secrets.randbits(32), program)
-        super().__init__(robot or model.name, wires, clock, identity.session)
+        super().__init__(session, robot or model.name, wires, clock, program)
+        out = self._out
+        out.title = f"the publisher of joints of {self.robot!r}"
         self.model = model.part(joints)
         """The part of the model that this publisher moves; its ``joint_names`` are the joints in order."""
-        self.writer = edge_writer_name(writer, identity)
+        self.writer = out.edge_writer_name(writer)
         self._names = coordinate_names(self.model)
         self._order = order_digest(self._names)
         self._slots = np.array(velocity_columns_by_position(self.model), dtype=np.intp)
         limits = JointLimits(self.model)
         self._limits = LimitWatch(limits, self.robot) if limits else None
-        self._claim: WriterClaim | None = None
-        self._cache: SampleCache | None = None
-        with ExitStack() as opening:
-            if "native" in self._wires:
-                self._own_joints(session, identity, cache_s, opening)
-            for name in self._wires:
-                wire = get_wire(name)
-                wire_writer = opening.enter_context(WireWriter(session, wire, self.robot, identity))
-                stream = wire.partial_joint_states
-                self._writers[name, stream] = wire_writer.open_stream(stream, self.writer)
-            if self._cache is not None:
-                status = StatusReporter(identity, lambda: self.stats).status
-                opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
-            self._opened = opening.pop_all()
+        announced = out.announcement("partial_joint_states", self.writer)
+        with out.opening():
+            out.own([announced])
+            # Its queryable is also how writers that claim joints at the same time find each other.
+            out.open_cache(cache_s, 3 * self.model.position_count)
+            out.serve_history("partial_joint_states", self.writer)
+            if out.is_native:
+                self._own_joints(announced)
+            for name, wire_writer in out.open_wires().items():
+                out.open_stream(name, wire_writer.wire.partial_joint_states, self.writer)
+            out.report_status(lambda: self.stats)
 
     def __repr__(self) -> str:
-        closed = ", closed" if self._stop.is_set() else ""
+        closed = ", closed" if self._out.is_closed else ""
         joints = ", ".join(self.model.joint_names)
-        return f"<PartialStatePublisher of {joints} of {self.robot!r}: {self._seq} samples{closed}>"
+        return f"<PartialStatePublisher of {joints} of {self.robot!r}: {self._sent} samples{closed}>"
 
-    def _own_joints(self, session: Session, identity: WriterId, cache_s: float, opening: ExitStack) -> None:
-        """Become the one writer of the joints on the native wire, until ``opening`` is closed."""
-        announced = Announcement(self.robot, "partial_joint_states", identity, self.writer)
-        self._claim = opening.enter_context(WriterClaim(session, [announced]))
-        self._serve_clock(session, identity, opening)
-        # Its queryable is also how writers that claim joints at the same time find each other.
-        numbers = 3 * self.model.position_count
-        self._cache = self._new_cache(cache_s, numbers)
-        history = serve_history(session, self.robot, "partial_joint_states", self._cache, writer=self.writer)
-        opening.enter_context(history)
+    def _own_joints(self, announced: Announcement) -> None:
+        """Become the one writer of the joints on the native wire. Raises SecondWriter."""
         movers = {f"{self.robot}/{joint.child}": joint for joint in self.model.joints}
         edges = [(f"{self.robot}/{joint.parent}", child) for child, joint in movers.items()]
         try:
-            opening.enter_context(claim_edges(session, announced, edges))
+            self._out.opened.enter_context(claim_edges(self._out.session, announced, edges))
         except SecondWriter as error:
             assert error.edge is not None
             joint = self.model.mimic_of(movers[error.edge[1]]).joint
             raise SecondWriter(
                 f"{str(error.first)!r} already publishes the joint {joint!r} of {self.robot!r}; refused: "
-                f"{str(identity)!r}; one joint has one writer: stop the first, or leave that joint to it",
+                f"{str(announced.writer)!r}; one joint has one writer: stop the first, or leave that joint "
+                "to it",
                 robot=self.robot,
                 stream="partial_joint_states",
                 first=error.first,
@@ -133,36 +115,18 @@ class PartialStatePublisher(SamplePublisher):
         outside joint limits are published, counted in ``stats``, and logged once. Raises InvalidInput as
         ``StatePublisher.publish``; SecondWriter; and Closed. If it raises, nothing was sent.
         """
-        try:
+        with self._refusals:
             block = positions_block(self.model, positions)
             rates = None if velocities is None else self._spread(self.model.check_velocities(velocities))
             forces = None if efforts is None else self._spread(self.model.check_efforts(efforts))
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
-            with self._lock:
-                if self._stop.is_set():
-                    raise Closed(f"the publisher of joints of {self.robot!r} is closed")
-                if self._claim is not None:
-                    self._claim.check()
-                head = (stamp, self._seq, self._session_id, self._order)
-                state = JointState(*head, block, rates, forces, self._names)
-                # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
-                payloads = {place: writer.encoder.encode(state) for place, writer in self._writers.items()}
-                native = payloads.get(("native", "partial_joint_states")) or encode(state)
-                self._seq += 1
-                if self._cache is not None:
-                    # Before sending: a reader that misses this sample can then request it as history.
-                    self._cache.append(stamp, state.seq, native)
-                for place, writer in self._writers.items():
-                    writer.write(payloads[place])
-            if self._limits is not None:
-                self._limits.add(stamp, native)
-        except InvalidInput as error:
-            self._count_refusal(error)
-            raise
-        except SecondWriter:
-            with self._lock:
-                self._opened.close()
-            raise
+            out = self._out
+            with out.lock:
+                out.check()
+                head = (stamp, out.seq, out.session_id, self._order)
+                out.send(JointState(*head, block, rates, forces, self._names))
+        if self._limits is not None:
+            self._limits.add(stamp, block)
 
     def _spread(self, numbers: NDArray[np.float64]) -> bytes:
         """One number for each coordinate: a floating joint has fewer velocities than positions."""

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import secrets
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, TypeAlias
@@ -14,25 +12,20 @@ from numpy.typing import ArrayLike
 
 from zstate._util.fork_safe import fork_safe
 from zstate.clock import Clock, SystemClock, check_stamp
-from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.errors import InvalidInput
 from zstate.extension import kernel
 from zstate.model.joint_limits import JointLimits
 from zstate.model.joint_transforms import edge_forms
 from zstate.model.kinematics import MovingEdges
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
-from zstate.net.ownership import WriterClaim
-from zstate.net.presence import local_writer
-from zstate.net.sample_history import SampleCache, serve_history
 from zstate.net.session import Session
-from zstate.net.status import StatusPublisher
-from zstate.net.writer import SampleWriter, WireWriter, write_all
+from zstate.net.writer import SampleWriter, write_all
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
-from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter
+from zstate.nodes.publisher_status import LimitWatch, PublisherStats
 from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.rate import RateReport
 from zstate.sources.joint_source import JointReading, JointSource
 from zstate.streams import StreamName
-from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import MODEL_WRITER, wire_name
 from zstate.wire.messages import (
@@ -44,8 +37,7 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
-from zstate.wire.native import decode_joint_state, encode
-from zstate.wire.registry import get_wire
+from zstate.wire.native import decode_joint_state, encode, joint_positions
 
 if TYPE_CHECKING or kernel == "c":
     from zstate._kernel import JointStateEncoder, PublishPath
@@ -153,38 +145,28 @@ class StatePublisher(SamplePublisher):
         takeover: bool = False,
         cache_s: float = 2.0,
     ) -> None:
-        super().__init__(robot or model.name, wires, clock, secrets.randbits(32))
+        super().__init__(session, robot or model.name, wires, clock, program)
         self.model = model
         self._session = session
         self._path: PublishPath | None = None
-        self._encoder = RobotEncoder(model, self.robot, self._session_id)
-        wires = self._wires
+        out = self._out
+        self._encoder = RobotEncoder(model, self.robot, out.session_id)
         for stream in streams:
             if stream not in STREAMS:
                 raise InvalidInput(f"{stream!r} is not one of the streams {', '.join(map(repr, STREAMS))}")
-        self._edges = _moving_edges(model) if "tf" in streams and wires else None
+        self._edges = _moving_edges(model) if "tf" in streams and out.wires else None
         limits = JointLimits(model)
-        self._limits = LimitWatch(limits, self.robot) if limits and wires else None
+        self._limits = LimitWatch(limits, self.robot, joint_positions) if limits and out.wires else None
         sample_names = SampleLayout(
             coordinate_names(model), velocity_columns_by_position(model), self._encoder.names
         )
-        writer = local_writer(self._session_id, program)
-        with ExitStack() as opening:
-            # ROS topics may have several writers, so ownership is checked on the native wire only.
-            self._claim = None
-            if "native" in wires and streams and not takeover:
-                announced = [
-                    Announcement(self.robot, stream, writer, MODEL_WRITER if stream == "tf_static" else "")
-                    for stream in streams
-                ]
-                self._claim = opening.enter_context(WriterClaim(session, announced))
-            if "native" in wires:
-                self._serve_clock(session, writer, opening)
-            wire_writers = [
-                opening.enter_context(WireWriter(session, get_wire(wire), self.robot, writer, sample_names))
-                for wire in wires
-            ]
-            for wire, wire_writer in zip(wires, wire_writers, strict=True):
+        # ROS topics may have several writers, so ownership is checked on the native wire only.
+        claimed = [
+            out.announcement(stream, MODEL_WRITER if stream == "tf_static" else "") for stream in streams
+        ]
+        with out.opening():
+            out.own([] if takeover else claimed)
+            for wire, wire_writer in out.open_wires(sample_names).items():
                 with wire_writer.announced_together():
                     if "robot_description" in streams:
                         description = wire_writer.open_latched("robot_description", MODEL_WRITER)
@@ -193,47 +175,41 @@ class StatePublisher(SamplePublisher):
                         write_all([wire_writer.open_latched("tf_static", MODEL_WRITER)], self.statics())
                     for stream in _SAMPLED:
                         if stream in streams:
-                            self._writers[wire, stream] = wire_writer.open_stream(stream)
-            self._native = self._writers.get(("native", "joint_states"))
-            joints = [one for (_, stream), one in self._writers.items() if stream == "joint_states"]
+                            out.open_stream(wire, stream)
+            self._native = out.streams.get(("native", "joint_states"))
+            joints = [one for (_, stream), one in out.streams.items() if stream == "joint_states"]
             self._ros_joints = [one for one in joints if one is not self._native]
-            self._transforms = [one for (_, stream), one in self._writers.items() if stream == "tf"]
-            if "native" in wires and self._writers:
-                status = StatusReporter(writer, lambda: self.stats).status
-                opening.enter_context(StatusPublisher(session, self.robot, writer.identity, status))
-            self._recent = self._open_cache(session, cache_s, opening)
-            self.cache = self._recent if cache_s else None
-            if self._recent is not None and self._writers:
-                recent = RecentBuffer(model, self.robot, self._recent)
-                opening.enter_context(LookupService(session, recent.buffer, self.robot))
-            self._path = self._open_path()
-            self._opened = opening.pop_all()
+            self._transforms = [one for (_, stream), one in out.streams.items() if stream == "tf"]
+            if out.streams:
+                out.report_status(lambda: self.stats)
+            self._open_cache(cache_s)
+            self._path = self._open_path(joints)
+            out.opened.callback(self._stop_path)
 
     def __repr__(self) -> str:
-        closed = ", closed" if self._stop.is_set() else ""
-        return f"<StatePublisher of {self.robot!r} on {', '.join(self._wires)}: {self._sent} samples{closed}>"
+        wires, closed = ", ".join(self._out.wires), ", closed" if self._out.is_closed else ""
+        return f"<StatePublisher of {self.robot!r} on {wires}: {self._sent} samples{closed}>"
 
-    def _open_path(self) -> PublishPath | None:
+    def _open_path(self, joints: Sequence[SampleWriter]) -> PublishPath | None:
         """What publishes usual samples in one call; None without the extension, or with several wires."""
-        encoder = self._encoder.compiled
-        writers = [one for (_, stream), one in self._writers.items() if stream == "joint_states"]
-        if encoder is None or len(writers) != 1:
+        out, encoder = self._out, self._encoder.compiled
+        if encoder is None or len(joints) != 1:
             return None
-        ros = writers[0].encoder.compile_joint_states()
+        ros = joints[0].encoder.compile_joint_states()
         if ros is None and self._native is None:
             return None
         path = PublishPath(
             encoder,
             ros,
-            None if self._recent is None else self._recent.ring,
-            writers[0].zenoh_put,
+            None if out.cache is None else out.cache.ring,
+            joints[0].zenoh_put,
             *JointLimits(self.model).bounds(self.model.position_count),
             None if self._limits is None else self._limits.add_outside,
             type(self._clock) is SystemClock,
         )
-        writers[0].path = path
-        if self._claim is not None:
-            self._claim.on_change = path.pause
+        joints[0].path = path
+        if out.claim is not None:
+            out.claim.on_change = path.pause
         for writer in self._transforms:
             writer.on_readers = path.pause
         fork_safe(self)
@@ -242,26 +218,29 @@ class StatePublisher(SamplePublisher):
     def _at_fork_reinit(self) -> None:
         self._path = None  # another thread may have been in it, and the session is closed here
 
-    def _open_cache(self, session: Session, cache_s: float, opening: ExitStack) -> SampleCache | None:
-        if "native" not in self._wires:
-            return None
-        numbers = self.model.position_count + 2 * self.model.velocity_count
-        cache = self._new_cache(cache_s, numbers)
-        if cache_s:
-            if self._native is not None:
-                opening.enter_context(serve_history(session, self.robot, "joint_states", cache))
-            if transforms := self._writers.get(("native", "tf")):
+    def _open_cache(self, cache_s: float) -> None:
+        """Open the cache, and what is answered from it."""
+        out, model = self._out, self.model
+        out.open_cache(cache_s, model.position_count + 2 * model.velocity_count)
+        self.cache = out.cache if cache_s else None
+        if self.cache is not None and self._native is not None:
+            out.serve_history("joint_states")
+        if self.cache is not None and (transforms := out.streams.get(("native", "tf"))):
 
-                def convert(payload: bytes) -> bytes:
-                    return transforms.encoder.encode(self._transform_sample(decode_joint_state(payload)))
+            def convert(payload: bytes) -> bytes:
+                return transforms.encoder.encode(self._transform_sample(decode_joint_state(payload)))
 
-                opening.enter_context(serve_history(session, self.robot, "tf", cache, convert))
-        return cache
+            out.serve_history("tf", convert=convert)
+        if out.cache is not None and out.streams:
+            recent = RecentBuffer(model, self.robot, out.cache)
+            out.opened.enter_context(LookupService(self._session, recent.buffer, self.robot))
 
     def description(self) -> RobotDescription:
         """The robot's model and conventions, latched for listeners."""
         model, names, domain = self.model, self._encoder.names, self._clock.domain
-        return RobotDescription(self._session_id, model.urdf, model.digest, model.joint_names, names, domain)
+        return RobotDescription(
+            self._out.session_id, model.urdf, model.digest, model.joint_names, names, domain
+        )
 
     def statics(self) -> StaticTransforms:
         """The robot's fixed edges, latched for listeners without its model."""
@@ -296,55 +275,38 @@ class StatePublisher(SamplePublisher):
             and path.publish(positions, velocities, efforts, stamp)
         ):
             return
-        try:
+        out = self._out
+        with self._refusals:
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
-            with self._lock:
-                self._check_open()
-                self._seq = self._stop_path()
+            with out.lock:
+                out.check()
+                out.seq = self._stop_path()
                 # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
-                payload = self._encoder.encode(positions, velocities, efforts, stamp, self._seq)
+                payload = self._encoder.encode(positions, velocities, efforts, stamp, out.seq)
+                payloads = [] if self._native is None else [(self._native, payload)]
                 readable = [writer for writer in self._transforms if writer.has_readers]
-                derived = self._encode_derived(payload, readable) if readable or self._ros_joints else ()
-                if self._recent is not None:
-                    # Before sending: a reader that misses this sample can then request it as history.
-                    self._recent.append(stamp, self._seq, payload)
-                self._seq += 1
-                if self._native is not None:
-                    self._native.write(payload)
-                for writer, other in derived:
-                    writer.write(other)
-                self._resume_path()
-            if self._limits is not None:
-                self._limits.add(stamp, payload)
-        except InvalidInput as error:
-            self._count_refusal(error)
-            raise
-        except SecondWriter:
-            with self._lock:
-                self._opened.close()  # latched values too
-            raise
-
-    def _check_open(self) -> None:
-        """Raise Closed or SecondWriter."""
-        if self._stop.is_set():
-            raise Closed(f"the publisher of {self.robot!r} is closed")
-        self._session.check()
-        if self._claim is not None:
-            self._claim.check()
+                if readable or self._ros_joints:
+                    payloads += self._encode_derived(payload, readable)
+                out.write(stamp, payload, payloads)
+                if not readable:
+                    self._resume_path()
+        if self._limits is not None:
+            self._limits.add(stamp, payload)
 
     def _stop_path(self) -> int:
         """Wait for the end of a call of the path in another thread. Returns the next sequence number."""
-        return self._seq if self._path is None else max(self._seq, self._path.stop())
+        return self._out.seq if self._path is None else max(self._out.seq, self._path.stop())
 
     def _resume_path(self) -> None:
         """Publish the next samples in one call each, while joint states are all that is sent."""
         if self._path is None:
             return
-        self._path.resume(self._seq)
+        self._path.resume(self._out.seq)
         # Checked after that: what changes now pauses the path.
         is_alone = False
         try:
-            is_owner = self._claim is None or self._claim.is_settled
+            claim = self._out.claim
+            is_owner = claim is None or claim.is_settled
             is_alone = is_owner and not any(writer.has_readers for writer in self._transforms)
         finally:
             if not is_alone:
@@ -352,7 +314,7 @@ class StatePublisher(SamplePublisher):
 
     @property
     def _sent(self) -> int:
-        return self._seq if self._path is None else max(self._seq, self._path.seq)
+        return self._out.seq if self._path is None else max(self._out.seq, self._path.seq)
 
     def _encode_derived(
         self, payload: bytes, readable: Sequence[SampleWriter]
@@ -384,13 +346,6 @@ class StatePublisher(SamplePublisher):
             self.publish(reading.positions, reading.velocities, reading.efforts, stamp)
 
         return self._publish_at(rate_hz, seconds, source.read, publish)
-
-    def close(self) -> None:
-        """Stop publishing; ``run`` returns. A second call does nothing."""
-        self._stop.set()
-        with self._lock:
-            self._seq = self._stop_path()
-        super().close()
 
 
 def _moving_edges(model: RobotModel) -> MovingEdges:

@@ -12,13 +12,12 @@ import numpy as np
 
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import html_of_fields
-from zstate.errors import format_duration
+from zstate.errors import InvalidInput, format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.rate import RateReport
 from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.messages import Level, Status, from_block
-from zstate.wire.native import joint_positions
 
 _LOG = logging.getLogger("zstate")
 
@@ -66,43 +65,61 @@ class PublisherStats:
         return html_of_fields(self)
 
 
+class RefusalCount:
+    """Counts each InvalidInput that is raised inside ``with`` it; ``newest`` is the text of the last one."""
+
+    count = 0
+    newest = ""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if isinstance(error, InvalidInput):
+            self.newest = str(error)
+            self.count += 1
+
+
 class LimitWatch:
     """Counts the samples whose positions exceed joint limits, and logs the first.
 
     The first sample is checked at once, later ones in groups, which takes about 0.3 us per sample. Publishers
-    call it without a lock: a handler of the warning may publish, or close the publisher.
+    call it without a lock: a handler of the warning may publish, or close the publisher. ``positions`` reads
+    the block of positions in a sample; by default it is the sample.
     """
 
-    def __init__(self, limits: JointLimits, robot: str) -> None:
+    def __init__(
+        self, limits: JointLimits, robot: str, positions: Callable[[bytes], bytes | memoryview] = bytes
+    ) -> None:
         self._count = 0
         self._last = ""
         self._lock = fork_safe_lock()
-        self._limits, self._robot = limits, robot
-        self._payloads: list[bytes] = []
+        self._limits, self._robot, self._positions = limits, robot, positions
+        self._samples: list[bytes] = []
         self._began = self._due = 0
 
-    def add(self, stamp: int, payload: bytes) -> None:
-        """Count the JointState with ``stamp`` [ns] in ``payload``, now or with its group."""
+    def add(self, stamp: int, sample: bytes) -> None:
+        """Count the ``sample`` with ``stamp`` [ns], now or with its group."""
         with self._lock:
-            self._payloads.append(payload)
-            if self._began <= stamp < self._due and len(self._payloads) < _CHECKED_AT_ONCE:
+            self._samples.append(sample)
+            if self._began <= stamp < self._due and len(self._samples) < _CHECKED_AT_ONCE:
                 return
             self._began, self._due = stamp, stamp + _CHECKED_EVERY_NS
             first = self._check()
         self._log(first)
 
-    def add_outside(self, payload: bytes) -> None:
-        """Count the JointState in ``payload``, which is known to be outside: the first now."""
+    def add_outside(self, sample: bytes) -> None:
+        """Count a ``sample`` that is known to be outside: the first now."""
         with self._lock:
-            self._payloads.append(payload)
-            is_due = not self._count or len(self._payloads) >= _CHECKED_AT_ONCE
+            self._samples.append(sample)
+            is_due = not self._count or len(self._samples) >= _CHECKED_AT_ONCE
             first = self._check() if is_due else ""
         self._log(first)
 
     def counted(self) -> tuple[int, str]:
         """How many samples were outside until now, and the joints of the newest."""
         with self._lock:
-            first = self._check() if self._payloads else ""
+            first = self._check() if self._samples else ""
             counted = self._count, self._last
         self._log(first)
         return counted
@@ -113,9 +130,9 @@ class LimitWatch:
 
     def _check(self) -> str:
         """Count the samples that are outside; the text of the first ever, else empty."""
-        block = b"".join(map(joint_positions, self._payloads))
-        positions = from_block(block).reshape(len(self._payloads), -1)
-        self._payloads.clear()
+        block = b"".join(map(self._positions, self._samples))
+        positions = from_block(block).reshape(len(self._samples), -1)
+        self._samples.clear()
         # Usually nothing is outside, and these two rows are sufficient to show it.
         extremes = np.stack((positions.min(axis=0), positions.max(axis=0)))
         if not self._limits.are_exceeded(extremes).any():

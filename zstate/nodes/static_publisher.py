@@ -5,86 +5,44 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import ClassVar
-from urllib.parse import quote
 
 from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import check_names
-from zstate.errors import Closed, InvalidInput, SecondWriter
-from zstate.net.ownership import WriterClaim, check_readers, claim_edges
-from zstate.net.presence import local_writer
+from zstate.errors import InvalidInput
+from zstate.net.ownership import check_readers, claim_edges
 from zstate.net.session import Session
-from zstate.net.writer import WireWriter, write_all
+from zstate.net.writer import write_all
+from zstate.nodes.robot_writer import RobotWriter
+from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
-from zstate.wire.messages import Message, StaticTransforms, to_block
-from zstate.wire.registry import as_wire_names, get_wire
+from zstate.wire.keys import full_name
+from zstate.wire.messages import StaticTransforms, to_block
 
 
 class ValuePublisher(Closeable):
-    """Base of the publishers of one latched value of a robot: that of ``announced``, on all ``wires``.
+    """Base of the publishers of one latched value of a robot, on ``stream`` under the name ``writer``.
 
     On the native wire it owns the value, unless another writer may take it over (``owns`` is False).
     """
 
-    _KIND: ClassVar[str]
-    """Used in errors, such as "static publisher"."""
-
-    def __init__(
-        self, session: Session, announced: Announcement, wires: str | Sequence[str], *, owns: bool = True
-    ) -> None:
-        self.robot = announced.robot
-        self.writer = announced.name
-        self._announced = announced
-        self._closed = False
-        self._lock = fork_safe_lock()
-        self._claim: WriterClaim | None = None
-        names = as_wire_names(wires)
-        with ExitStack() as opening:
-            if owns and "native" in names:  # in ROS any node may write it
-                self._claim = opening.enter_context(WriterClaim(session, [announced]))
-            opened = [
-                opening.enter_context(WireWriter(session, get_wire(name), self.robot, announced.writer))
-                for name in names
-            ]
-            self._latched = [one.open_latched(announced.stream, self.writer) for one in opened]
-            if self._claim is not None:
-                self._claim.confirm()
-            self._opened = opening.pop_all()
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise Closed(f"the {self._KIND} {self.writer!r} is closed")
-
-    def _send(self, message: Message) -> None:
-        """Replace the value. Raises InvalidInput if a wire cannot represent it: then none sends it."""
-        write_all(self._latched, message)
+    def __init__(self, out: RobotWriter, stream: StreamName, writer: str, *, owns: bool = True) -> None:
+        self.robot = out.robot
+        self.writer = writer
+        self._out = out
+        self._announced = out.announcement(stream, writer)
+        with out.opening():
+            if owns:  # on the native wire; in ROS any node may write it
+                out.own([self._announced])
+            self._latched = [one.open_latched(stream, writer) for one in out.open_wires().values()]
+            if out.claim is not None:
+                out.claim.confirm()
 
     def close(self) -> None:
         """Withdraw the value. A second call does nothing."""
-        with self._lock:
-            if self._closed:
-                return
-            self._closed = True
-            for latched in self._latched:
-                latched.withdraw()
-            self._opened.close()
-
-
-def edge_writer_name(writer: str | None, identity: WriterId) -> str:
-    """The name under which a writer publishes edges. Raises InvalidInput if it cannot be one."""
-    if writer is None:
-        # A script name may have blanks, which a key cannot.
-        writer = f"{quote(identity.program, safe='')}.{identity.pid}.{identity.session:08x}"
-    if check_writer(writer) == MODEL_WRITER:
-        raise InvalidInput(f"the writer name {MODEL_WRITER!r} belongs to the robot's own model")
-    return writer
+        self._out.close(self._latched)
 
 
 class StaticPublisher(ValuePublisher):
@@ -102,8 +60,6 @@ class StaticPublisher(ValuePublisher):
     ``takeover``.
     """
 
-    _KIND = "static publisher"
-
     def __init__(
         self,
         session: Session,
@@ -114,17 +70,16 @@ class StaticPublisher(ValuePublisher):
         program: str = "",
         takeover: bool = False,
     ) -> None:
-        identity = local_writer(secrets.randbits(32), program)
-        name = edge_writer_name(writer, identity)
-        self._session = session
         self._edges: dict[str, Transform] = {}
         # Raises here, where the mistake is made, what every listener would refuse.
         self._check = TransformBuffer()
-        announced = Announcement(check_robot(robot), "tf_static", identity, name)
-        super().__init__(session, announced, wires, owns=not takeover)
+        out = RobotWriter(session, robot, wires, program)
+        name = out.edge_writer_name(writer)
+        out.title = f"the static publisher {name!r}"
+        super().__init__(out, "tf_static", name, owns=not takeover)
 
     def __repr__(self) -> str:
-        closed = ", closed" if self._closed else ""
+        closed = ", closed" if self._out.is_closed else ""
         return f"<StaticPublisher {self.writer!r} of {self.robot!r}: {len(self._edges)} edges{closed}>"
 
     def set(self, transform: Transform) -> None:
@@ -137,18 +92,15 @@ class StaticPublisher(ValuePublisher):
         """
         parent = full_name(self.robot, transform.target)
         child = full_name(self.robot, transform.source)
-        with self._lock, ExitStack() as placed:
-            self._check_open()
-            if self._claim is not None:
-                if child not in self._edges:
-                    check_readers(self._session, self._announced, [(parent, child)])
-                    placed.enter_context(claim_edges(self._session, self._announced, [(parent, child)]))
-                # Last: an earlier writer that answered above has announced itself by now.
-                try:
-                    self._claim.check()
-                except SecondWriter:
-                    self._opened.close()  # without withdrawing: the value of this name is the first writer's
-                    raise
+        out, announced = self._out, self._announced
+        with out.lock, ExitStack() as placed:
+            out.check_open()
+            if out.claim is not None and child not in self._edges:
+                check_readers(out.session, announced, [(parent, child)])
+                placed.enter_context(claim_edges(out.session, announced, [(parent, child)]))
+            # Last: an earlier writer that answered above has announced itself by now. One of the same name
+            # closes this publisher, which does not withdraw the value: it is the first writer's.
+            out.check()
             self._check.insert_static(
                 Transform(parent, child, transform.translation, transform.rotation), writer=self.writer
             )
@@ -159,8 +111,8 @@ class StaticPublisher(ValuePublisher):
         """Withdraw the edge that places ``child``. Raises InvalidInput if this writer has none."""
         check_names(child)
         name = full_name(self.robot, child)
-        with self._lock:
-            self._check_open()
+        with self._out.lock:
+            self._out.check_open()
             if name not in self._edges:
                 ours = ", ".join(map(repr, self._edges)) or "none"
                 raise InvalidInput(
@@ -173,4 +125,4 @@ class StaticPublisher(ValuePublisher):
     def _send_edges(self) -> None:
         edges = tuple((edge.target, edge.source) for edge in self._edges.values())
         poses = to_block([edge.pose7 for edge in self._edges.values()])
-        self._send(StaticTransforms(self._announced.writer.session, edges, poses))
+        write_all(self._latched, StaticTransforms(self._out.session_id, edges, poses))

@@ -52,9 +52,9 @@ class StreamPublisher(MeasurementPublisher):
         Raises InvalidInput for fields that the message does not have, that are missing, or of other types;
         SecondWriter; and Closed. If it raises, nothing was sent.
         """
-        with self._refusals_counted():
+        with self._refusals:
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
-            self._publish_message(new_message(self._row, stamp, fields))
+            self._send(new_message(self._row, stamp, fields))
 
 
 def checked_stream(stream: Stream | str) -> Stream:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import ClassVar, Protocol, cast
@@ -15,25 +14,17 @@ import numpy as np
 from zstate._util.bounded import BoundedDict
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import Clock, check_stamp
-from zstate.errors import Closed, InvalidInput
+from zstate.errors import InvalidInput
 from zstate.net.edge_monitor import EdgeMonitor
-from zstate.net.ownership import Edge, WriterClaim, check_readers, claim_edges
-from zstate.net.presence import local_writer
-from zstate.net.sample_history import SampleCache, serve_history
+from zstate.net.ownership import Edge, check_readers, claim_edges
 from zstate.net.session import Session
-from zstate.net.status import StatusPublisher
-from zstate.net.writer import WireWriter
-from zstate.nodes.publisher_status import StatusReporter
 from zstate.nodes.sample_publisher import SamplePublisher
-from zstate.nodes.static_publisher import edge_writer_name
 from zstate.rate import RateReport
 from zstate.streams import StreamName
 from zstate.transform import UPPER_TRIANGLE, Transform
-from zstate.wire.identity import Announcement
 from zstate.wire.keys import full_name
-from zstate.wire.messages import Edges, Odometry, WriterTransforms, edge_of, order_digest, to_block
+from zstate.wire.messages import Edges, WriterTransforms, edge_of, order_digest, to_block
 from zstate.wire.protocol import carrier
-from zstate.wire.registry import get_wire
 
 # Edges of a sample for which the cache has room for 2000 samples.
 _TYPICAL_EDGES = 16
@@ -42,32 +33,31 @@ _IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class EdgePublisher(SamplePublisher):
-    """Base of the publishers of moving edges on ``stream`` under the name ``writer``, which own the edges.
+    """Base of the publishers of moving edges under the name ``writer``, which own the edges.
 
     On the ROS wires the transforms are on /tf.
     """
 
-    _kind: ClassVar[str]
-    """What it is, for errors."""
+    _stream: ClassVar[StreamName]
+    _numbers: ClassVar[int]
+    """Of a sample, for which the cache has room for 2000."""
 
     def __init__(
         self,
         session: Session,
         robot: str,
-        stream: StreamName,
+        writer: str | None = None,
+        wires: str | Sequence[str] = ("native",),
         *,
-        writer: str | None,
-        wires: str | Sequence[str],
-        clock: Clock | None,
-        program: str,
-        cache_s: float,
-        numbers: int,
+        clock: Clock | None = None,
+        program: str = "",
+        cache_s: float = 2.0,
     ) -> None:
-        identity = local_writer(secrets.randbits(32), program)
-        super().__init__(robot, wires, clock, identity.session)
-        self.writer = edge_writer_name(writer, identity)
-        self._session = session
-        self._announced = Announcement(self.robot, stream, identity, self.writer)
+        super().__init__(session, robot, wires, clock, program)
+        out, stream = self._out, self._stream
+        self.writer = out.edge_writer_name(writer)
+        out.title = f"the {stream.removesuffix('s')} publisher {self.writer!r}"
+        self._announced = out.announcement(stream, self.writer)
         # The digests of the edges that were published together.
         self._orders: BoundedDict[Edges, bytes] = BoundedDict()
         # Raises here, where the mistake is made, what every listener would refuse.
@@ -75,63 +65,35 @@ class EdgePublisher(SamplePublisher):
         self._placed: set[Edge] = set()
         self._edge_tokens = ExitStack()
         self._edge_monitor: EdgeMonitor | None = None
-        self._cache: SampleCache | None = None
-        with ExitStack() as opening:
-            if "native" in self._wires:
-                claim = opening.enter_context(WriterClaim(session, [self._announced]))
-                self._edge_monitor = opening.enter_context(EdgeMonitor(session, self._announced))
-                self._claims = claim.check, self._edge_monitor.check
-                self._serve_clock(session, identity, opening)
-            for name in self._wires:
-                wire = get_wire(name)
-                wire_writer = opening.enter_context(WireWriter(session, wire, self.robot, identity))
-                on_tf = (wire.transforms,) if wire.shared else ()
-                for carrying in dict.fromkeys((carrier(wire, stream), *on_tf)):
-                    self._writers[name, carrying] = wire_writer.open_stream(carrying, self.writer)
-            if "native" in self._wires:
-                status = StatusReporter(identity, lambda: self.stats).status
-                opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
-                # Its queryable is also how writers that claim edges at the same time find each other.
-                self._cache = self._new_cache(cache_s, numbers)
-                opening.enter_context(
-                    serve_history(session, self.robot, stream, self._cache, writer=self.writer)
-                )
-            opening.enter_context(self._edge_tokens)
-            self._opened = opening.pop_all()
+        with out.opening():
+            out.own([self._announced])
+            if out.is_native:
+                self._edge_monitor = out.opened.enter_context(EdgeMonitor(session, self._announced))
+                out.checks.append(self._edge_monitor.check)
+            for name, wire_writer in out.open_wires().items():
+                wire = wire_writer.wire
+                carrying = carrier(wire, stream)
+                out.open_stream(name, carrying, self.writer)
+                if wire.shared and carrying != wire.transforms:
+                    out.open_stream(name, wire.transforms, self.writer, edge_of)
+            out.report_status(lambda: self.stats)
+            # Its queryable is also how writers that claim edges at the same time find each other.
+            out.open_cache(cache_s, self._numbers)
+            out.serve_history(stream, self.writer)
+            out.opened.enter_context(self._edge_tokens)
 
     def __repr__(self) -> str:
-        closed = ", closed" if self._stop.is_set() else ""
-        return f"<{type(self).__name__} {self.writer!r} of {self.robot!r}: {self._seq} samples{closed}>"
+        closed = ", closed" if self._out.is_closed else ""
+        return f"<{type(self).__name__} {self.writer!r} of {self.robot!r}: {self._sent} samples{closed}>"
 
-    def _head(self, stamp: int, names: Edges) -> tuple[int, int, int, bytes]:
-        """The first fields of the next sample, of the edges ``names``, which this writer owns then.
+    def _order(self, names: Edges) -> bytes:
+        """The digest of the edges ``names``, which are checked, and owned from their first sample on.
 
-        Called with the lock. Raises Closed, SecondWriter, InvalidInput and InsertRefused.
+        Called with the lock. Raises SecondWriter, InvalidInput and InsertRefused.
         """
-        if self._stop.is_set():
-            raise Closed(f"the {self._kind} {self.writer!r} is closed")
-        self._check_ownership()
         order = self._orders.get(names)
-        if order is None:
-            order = self._orders[names] = self._place(names)
-        return stamp, self._seq, self._session_id, order
-
-    def _send(self, sample: WriterTransforms) -> None:
-        """Publish the next sample. Called with the lock."""
-        # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
-        payloads = {
-            place: writer.encoder.encode(_carried(sample, place[1]))
-            for place, writer in self._writers.items()
-        }
-        self._seq += 1
-        if self._cache is not None:
-            # Before sending: a reader that misses this sample can then request it as history.
-            self._cache.append(sample.stamp, sample.seq, payloads["native", self._announced.stream])
-        for place, payload in payloads.items():
-            self._writers[place].write(payload)
-
-    def _place(self, names: Edges) -> bytes:
-        """Check edges that are published together for the first time, and own them. Returns their digest."""
+        if order is not None:
+            return order
         edges = [(full_name(self.robot, parent), full_name(self.robot, child)) for parent, child in names]
         children = {child for _, child in edges}
         if not edges or len(children) < len(edges):
@@ -142,21 +104,17 @@ class EdgePublisher(SamplePublisher):
         with ExitStack() as claims:
             fresh = [edge for edge in edges if edge not in self._placed]
             if self._edge_monitor is not None and fresh:
-                check_readers(self._session, self._announced, fresh)
-                claims.enter_context(claim_edges(self._session, self._announced, fresh))
+                check_readers(self._out.session, self._announced, fresh)
+                claims.enter_context(claim_edges(self._out.session, self._announced, fresh))
                 # An earlier writer that answered above has announced itself by now.
-                self._check_ownership()
+                self._out.check()
             self._check.insert_many(edges, 0, [_IDENTITY] * len(edges), writer=self.writer)
             self._placed.update(fresh)
             if self._edge_monitor is not None and fresh:
                 self._edge_monitor.add(fresh)
             self._edge_tokens.push(claims.pop_all().__exit__)
-        return order_digest(names)
-
-
-def _carried(sample: WriterTransforms, stream: StreamName) -> WriterTransforms:
-    """``sample`` on ``stream``: without the velocity where that has transforms alone."""
-    return edge_of(sample) if isinstance(sample, Odometry) and stream in ("tf", "transforms") else sample
+        order = self._orders[names] = order_digest(names)
+        return order
 
 
 class TransformSource(Protocol):
@@ -186,30 +144,8 @@ class TransformPublisher(EdgePublisher):
     from any thread.
     """
 
-    _kind = "transform publisher"
-
-    def __init__(
-        self,
-        session: Session,
-        robot: str,
-        writer: str | None = None,
-        wires: str | Sequence[str] = ("native",),
-        *,
-        clock: Clock | None = None,
-        program: str = "",
-        cache_s: float = 2.0,
-    ) -> None:
-        super().__init__(
-            session,
-            robot,
-            "transforms",
-            writer=writer,
-            wires=wires,
-            clock=clock,
-            program=program,
-            cache_s=cache_s,
-            numbers=_TYPICAL_EDGES * 28,
-        )
+    _stream = "transforms"
+    _numbers = 28 * _TYPICAL_EDGES
 
     def publish(self, transforms: Sequence[Transform], stamp: int | None = None) -> None:
         """Publish one sample: each transform places its ``source`` on its ``target``, at ``stamp`` [ns].
@@ -224,14 +160,17 @@ class TransformPublisher(EdgePublisher):
         places a frame of another robot if that robot, or a third one, places it; SecondWriter; and Closed. If
         it raises, nothing was sent.
         """
-        with self._refusals_counted():
+        with self._refusals:
             _check_transforms(transforms)
             stamp = self._stamp(transforms) if stamp is None else check_stamp(stamp)
             poses = to_block([transform.pose7 for transform in transforms])
             covariances = covariance_block(transforms)
             names = tuple([(transform.target, transform.source) for transform in transforms])
-            with self._lock:
-                self._send(WriterTransforms(*self._head(stamp, names), poses, names, covariances))
+            out = self._out
+            with out.lock:
+                out.check()
+                head = (stamp, out.seq, out.session_id, self._order(names))
+                out.send(WriterTransforms(*head, poses, names, covariances))
 
     def _stamp(self, transforms: Sequence[Transform]) -> int:
         """The one stamp of ``transforms``; now if they have none."""

@@ -67,13 +67,12 @@ class ImuPublisher(MeasurementPublisher):
         known. Raises InvalidInput for numbers that are not finite, for other shapes and for a quaternion
         whose length is not 1; SecondWriter; and Closed. If it raises, nothing was sent.
         """
-        with self._refusals_counted():
+        with self._refusals:
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
             turn = None if orientation is None else _numbers(orientation, "orientation", 4)
             turn_covariance = _covariance(orientation_covariance, "orientation_covariance", 3)
             vectors = _numbers(gyro, "gyro", 3), _numbers(accel, "accel", 3)
-            message = Imu(stamp, 0, 0, self.frame, *vectors, turn, *self._covariances, turn_covariance)
-            self._publish_message(message)
+            self._send(Imu(stamp, 0, 0, self.frame, *vectors, turn, *self._covariances, turn_covariance))
 
 
 class VelocityPublisher(MeasurementPublisher):
@@ -112,12 +111,12 @@ class VelocityPublisher(MeasurementPublisher):
         measured. ``covariance`` is (3, 3) of ``linear``, or (6, 6) of both; leave it out if it is not known.
         Raises as ``ImuPublisher.publish``.
         """
-        with self._refusals_counted():
+        with self._refusals:
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
             turn = None if angular is None else _numbers(angular, "angular", 3)
             triangle = _covariance(covariance, "covariance", 3 if angular is None else 6)
             vector = _numbers(linear, "linear", 3)
-            self._publish_message(Velocity(stamp, 0, 0, self.frame, vector, turn, triangle))
+            self._send(Velocity(stamp, 0, 0, self.frame, vector, turn, triangle))
 
 
 class PosePublisher(MeasurementPublisher):
@@ -146,7 +145,7 @@ class PosePublisher(MeasurementPublisher):
         The default stamp is that of the transform, or now if it has none. Bare frame names are the robot's
         own. Raises as ``ImuPublisher.publish``.
         """
-        with self._refusals_counted():
+        with self._refusals:
             if stamp is None:
                 stamp = self._clock.now() if parent_from_child.stamp is None else parent_from_child.stamp
             check_stamp(stamp)
@@ -155,7 +154,7 @@ class PosePublisher(MeasurementPublisher):
                 full_name(self.robot, frame)
             pose, covariance = to_block(parent_from_child.pose7), parent_from_child.covariance
             triangle = None if covariance is None else to_block(covariance[UPPER_TRIANGLE])
-            self._publish_message(Pose(stamp, 0, 0, parent, child, pose, triangle))
+            self._send(Pose(stamp, 0, 0, parent, child, pose, triangle))
 
 
 class OdometryPublisher(EdgePublisher):
@@ -166,7 +165,8 @@ class OdometryPublisher(EdgePublisher):
     ROS wires it is a nav_msgs/Odometry on a topic of the name ``writer``, and the edge on /tf.
     """
 
-    _kind = "odometry publisher"
+    _stream = "odometry"
+    _numbers = 60
 
     def __init__(
         self,
@@ -179,17 +179,7 @@ class OdometryPublisher(EdgePublisher):
         program: str = "",
         cache_s: float = 2.0,
     ) -> None:
-        super().__init__(
-            session,
-            robot,
-            "odometry",
-            writer=writer,
-            wires=wires,
-            clock=clock,
-            program=program,
-            cache_s=cache_s,
-            numbers=_NUMBERS,
-        )
+        super().__init__(session, robot, writer, wires, clock=clock, program=program, cache_s=cache_s)
 
     def publish(
         self,
@@ -206,23 +196,19 @@ class OdometryPublisher(EdgePublisher):
         the base's origin relative to the odometry frame, and ``angular`` [rad/s] are x y z in the axes of the
         base; ``twist_covariance`` is (6, 6) of both. Raises as ``TransformPublisher.publish``.
         """
-        with self._refusals_counted():
+        with self._refusals:
             if stamp is None:
                 stamp = self._clock.now() if odom_from_base.stamp is None else odom_from_base.stamp
             check_stamp(stamp)
             pose, names = to_block(odom_from_base.pose7), ((odom_from_base.target, odom_from_base.source),)
             twist = _numbers(linear, "linear", 3) + _numbers(angular, "angular", 3)
-            covariances = (
-                covariance_block([odom_from_base]),
-                _covariance(twist_covariance, "twist_covariance", 6),
-            )
-            with self._lock:
-                head = self._head(stamp, names)
-                self._send(Odometry(*head, pose, names, covariances[0], twist, covariances[1]))
-
-
-_NUMBERS = 60
-"""Of a sample, for which the cache has room for 2000."""
+            covariances = covariance_block([odom_from_base])
+            spread = _covariance(twist_covariance, "twist_covariance", 6)
+            out = self._out
+            with out.lock:
+                out.check()
+                head = (stamp, out.seq, out.session_id, self._order(names))
+                out.send(Odometry(*head, pose, names, covariances, twist, spread))
 
 
 def _numbers(values: ArrayLike, name: str, count: int) -> bytes:

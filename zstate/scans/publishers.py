@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -11,15 +10,15 @@ from numpy.typing import ArrayLike
 
 from zstate.clock import Clock, check_stamp
 from zstate.errors import InvalidInput
-from zstate.net.presence import local_writer
 from zstate.net.session import Session
+from zstate.net.writer import write_all
+from zstate.nodes.robot_writer import RobotWriter
 from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.static_publisher import ValuePublisher
 from zstate.rate import RateReport
 from zstate.scans.grid import Grid, grid_to_message
 from zstate.scans.scan import Scan, scan_to_message
-from zstate.wire.identity import Announcement
-from zstate.wire.keys import check_robot, check_writer, full_name
+from zstate.wire.keys import check_writer, full_name
 
 
 class RangeSource(Protocol):
@@ -82,10 +81,10 @@ class ScanPublisher(MeasurementPublisher):
         measurement is inf without an echo, -inf if it is too near, and NaN if it is invalid (REP 117). Raises
         InvalidInput for other shapes, SecondWriter and Closed. If it raises, nothing was sent.
         """
-        with self._refusals_counted():
+        with self._refusals:
             stamp = self._first_stamp(self._clock.now(), ranges) if stamp is None else check_stamp(stamp)
             scan = self._scan(stamp, ranges, intensities)
-            self._publish_message(scan_to_message(scan, scan_ns=self._scan_ns()))
+            self._send(scan_to_message(scan, scan_ns=self._scan_ns()))
 
     def _first_stamp(self, last: int, ranges: ArrayLike) -> int:
         """The instant of the first ray of a sweep whose last ray is at ``last``."""
@@ -144,8 +143,6 @@ class MapPublisher(ValuePublisher):
     names the first writer, is raised if another active writer publishes this map. A context manager.
     """
 
-    _KIND = "map publisher"
-
     def __init__(
         self,
         session: Session,
@@ -157,25 +154,23 @@ class MapPublisher(ValuePublisher):
         writer: str = "map",
         program: str = "",
     ) -> None:
-        identity = local_writer(secrets.randbits(32), program)
         self._frame = frame
-        announced = Announcement(check_robot(robot), "map", identity, check_writer(writer))
-        super().__init__(session, announced, wires)
-        try:
+        out = RobotWriter(session, robot, wires, program)
+        out.title = f"the map publisher {writer!r}"
+        super().__init__(out, "map", check_writer(writer))
+        with out.opening():
             self.set(grid)
-        except BaseException:
-            self._opened.close()
-            raise
 
     def __repr__(self) -> str:
-        closed = ", closed" if self._closed else ""
+        closed = ", closed" if self._out.is_closed else ""
         return f"<MapPublisher {self.writer!r} of {self.robot!r}: {self.grid!r}{closed}>"
 
     def set(self, grid: Grid) -> None:
         """Replace the map. Raises InvalidInput if it is larger than a message may be, and Closed."""
-        with self._lock:
-            self._check_open()
+        out = self._out
+        with out.lock:
+            out.check_open()
             if self._frame not in (None, grid.frame):
                 grid = Grid(grid.cells, grid.resolution, grid.origin.pose7, self._frame, grid.stamp)
-            self._send(grid_to_message(grid, self._announced.writer.session))
+            write_all(self._latched, grid_to_message(grid, out.session_id))
             self.grid = grid

@@ -271,8 +271,7 @@ class NativeStreamEncoder:
         identity = Announcement(robot, stream, writer, name if is_named(stream) else "").identity
         self.token = None if stream == "clock" else keys.writer_key(robot, stream, identity)
 
-    def encode(self, message: Message) -> bytes:
-        return encode(message)
+    encode = staticmethod(encode)
 
     def compile_joint_states(self) -> None:
         return None
