@@ -16,7 +16,7 @@ from zstate.clock import ManualClock
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
 from zstate.net.presence import announce, discover
 from zstate.net.session import connect
-from zstate.net.status import StatusSubscriber
+from zstate.net.status_monitor import StatusSubscriber
 from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher

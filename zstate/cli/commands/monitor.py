@@ -310,7 +310,7 @@ class RobotMonitor(Closeable):
         self, session: Session, directory: RobotDirectory, robot: str, wire: str, clock: Clock | None
     ) -> None:
         from zstate.driving.driver_state import DriverStateListener
-        from zstate.net.status import StatusMonitor
+        from zstate.net.status_monitor import StatusMonitor
         from zstate.net.topic_statistics import TopicStatistics
         from zstate.wire.registry import get_wire
 
