@@ -105,8 +105,8 @@ class Receiver:
             with ingest._lock:  # takes over what the fast path has advanced
                 late = None if ingest._last_late is None else ingest._last_late.seq
                 newest = getattr(ingest, "_newest_by_order", ingest._newest)
-                missing = list(ingest._missing._ranges)
-                ingests.append((ingest.robot, ingest.session, ingest._next_seq, newest, late, missing))
+                missing = list(ingest._numbers.missing._ranges)
+                ingests.append((ingest.robot, ingest.session, ingest._numbers.next, newest, late, missing))
         events = [(event.kind, event.robot, event.stream, event.text) for event in self.listener.events()]
         stats = astuple(self.listener.stats)
         return {

@@ -66,7 +66,6 @@ class StateReader(Closeable):
             buffer, counters, wire, follow, placers=placers, diagnostics=self._diagnostics
         )
         self._history: HistoryReader | None = None
-        self._other_tf: OtherTfSubscription | None = None
         self._observers: tuple[Callable[[], object], ...] = ()
         with ExitStack() as opening:
             latched: dict[StreamName, Callable[[SerializedSample], None]] = {
@@ -75,14 +74,7 @@ class StateReader(Closeable):
             }
             for stream, handle in latched.items():
                 opening.enter_context(LatchedSubscriber(session, self._keys(stream), self._observed(handle)))
-            streams = tuple(self.ingests.streams)
-            if len(streams) > 1 and wire.shared:
-                opening.enter_context(self._subscribe([follow]))
-                self._other_tf = opening.enter_context(
-                    OtherTfSubscription(partial(self._subscribe, [wire.transforms]))
-                )
-            else:
-                opening.enter_context(self._subscribe(streams))
+            self._other_tf = self._subscribe_to_samples(opening)
             if history_on_join and wire.name == "native":
                 on_history = self._observed(self._on_history)
                 self._history = opening.enter_context(
@@ -92,7 +84,7 @@ class StateReader(Closeable):
             on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
             opening.enter_context(WriterWatch(session, robots, on_writer, wire, on_cut_off))
             for name in robots:
-                for announcement in announce_reader(session, wire, name, (*latched, *streams)):
+                for announcement in announce_reader(session, wire, name, (*latched, *self.ingests.streams)):
                     opening.enter_context(announcement)
             self._opened = opening.pop_all()
 
@@ -119,6 +111,15 @@ class StateReader(Closeable):
     def _keys(self, stream: StreamName) -> list[str]:
         """The key expressions of ``stream`` of the robots."""
         return [self._wire.expression(robot, stream) for robot in self._robots]
+
+    def _subscribe_to_samples(self, opening: ExitStack) -> OtherTfSubscription | None:
+        """Receive all streams of samples; in ROS /tf only while nodes add edges to those of models."""
+        streams = tuple(self.ingests.streams)
+        if len(streams) == 1 or not self._wire.shared:
+            opening.enter_context(self._subscribe(streams))
+            return None
+        opening.enter_context(self._subscribe([self._follow]))
+        return opening.enter_context(OtherTfSubscription(partial(self._subscribe, [self._wire.transforms])))
 
     def _subscribe(self, streams: Sequence[StreamName]) -> ExitStack:
         """Receive the samples of ``streams`` until the stack is closed."""
