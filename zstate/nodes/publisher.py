@@ -30,7 +30,6 @@ from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter
 from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.rate import RateReport
-from zstate.sources.joint_source import JointReading, JointSource
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import SampleLayout
@@ -46,6 +45,9 @@ from zstate.wire.messages import (
 )
 from zstate.wire.native import decode_joint_state, encode
 from zstate.wire.registry import get_wire
+
+if TYPE_CHECKING:
+    from zstate.sources.joint_source import JointReading, JointSource
 
 if TYPE_CHECKING or kernel == "c":
     from zstate._kernel import JointStateEncoder, PublishPath
