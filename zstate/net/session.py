@@ -35,10 +35,10 @@ from zstate.net.config import (
     user_config,
 )
 from zstate.net.open import ProbeSession, connect_timeout, open_with_retry
-from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_addresses
 
 if TYPE_CHECKING:
     from zstate.net.connection_monitor import ConnectionMonitor
+    from zstate.net.rendezvous import Rendezvous
     from zstate.net.security.credentials import Credentials
 
 CLOSE_TIMEOUT_S = 0.8
@@ -173,6 +173,9 @@ def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Sessio
             "(--connect) or listen= (--listen)",
             path="credentials",
         )
+    # Sessions with endpoints do not meet there.
+    from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_addresses  # noqa: PLC0415
+
     addresses = rendezvous_addresses()
     if mode == "loopback":
         check_loopback_only([f"tcp/{host}:{port}" for host, port in addresses])
