@@ -58,10 +58,10 @@ class RobotIngests:
         self.writers = self._ownership.live
         """The printed names of the announced writers, by robot and session."""
         self.followed = StreamIngests(follow, is_shared=follow in wire.shared)
-        """Those of the robots; the first message of any kind of a robot makes one."""
+        """The ingests of ``follow``; that of a robot is made for its first message of any kind."""
         self._parts = StreamIngests(wire.partial_joint_states, is_shared=True, has_parts=True)
         self.streams: dict[StreamName, StreamIngests] = {}
-        """Those of samples, by the stream that carries them."""
+        """The ingests of samples, by the stream that carries them."""
         for stream in sample_streams(wire, follow):
             if stream == self._parts.stream:
                 self.streams[stream] = self._parts  # in ROS any joint state may be a part
