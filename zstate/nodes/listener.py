@@ -6,7 +6,6 @@ import os
 import weakref
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING
 
 from zstate._util.closeable import Closeable
 from zstate._util.format import did_you_mean
@@ -14,6 +13,7 @@ from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.clock import Clock
 from zstate.errors import InvalidInput
 from zstate.ingest.counters import Counters, ListenerStats
+from zstate.ingest.diagnostics import WriterEvent
 from zstate.ingest.robot_ingests import Follow
 from zstate.net.presence import announced_robots
 from zstate.net.session import Session
@@ -21,9 +21,6 @@ from zstate.nodes.state_reader import StateReader
 from zstate.wire.keys import ANY, check_robot, shortened
 from zstate.wire.protocol import Wire, selected_robots
 from zstate.wire.registry import get_wire
-
-if TYPE_CHECKING:
-    from zstate.ingest.events import WriterEvent
 
 
 class TransformListener(Closeable):

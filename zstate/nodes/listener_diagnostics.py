@@ -10,8 +10,8 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM
 from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
-from zstate.ingest.diagnostics import Diagnostics
-from zstate.ingest.events import EventLog, WriterEvent
+from zstate.ingest.diagnostics import Diagnostics, WriterEvent
+from zstate.ingest.events import EventLog
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.ingest.robot_ingests import Follow, sample_streams
 from zstate.ingest.stamp_checks import StampCheck
@@ -59,7 +59,6 @@ class ListenerDiagnostics(Diagnostics, Closeable):
         self._opened.close()
 
     def events(self) -> tuple[WriterEvent, ...]:
-        """The last 1024 events, oldest first."""
         return self._events.recent()
 
     def on_samples(
