@@ -104,6 +104,21 @@ GUESTS = {
     ("scans/map_metadata.py", "yaml"),
 }
 
+# Not in what the two nodes load when they are imported: a reader of "joint positions in, poses out" passes
+# them by. Plugins, security, and what observes readers and writers.
+PLUGINS = _PLUGINS | {"cli"}
+OBSERVERS = {
+    "ingest.deadline",
+    "ingest.events",
+    "ingest.stamp_checks",
+    "net.clock_offset",
+    "net.connection_monitor",
+    "net.graph",
+    "net.status_monitor",
+    "net.topic_statistics",
+    "nodes.listener_diagnostics",
+}
+
 # Distributions, for the names of imports that differ.
 DISTRIBUTIONS = {
     "PIL": "pillow",
@@ -270,9 +285,9 @@ def test_a_file_that_breaks_the_rule_is_seen(rule, path: str, text: str):
     assert list(rule(Source(path, text)))
 
 
-def loaded_by(code: str) -> set[str]:
-    """Which of the libraries with a home a fresh interpreter has loaded after ``code``."""
-    ask = f"{code}\nimport sys\nprint(*(set(sys.modules) & {set(HOMES)!r}))"
+def modules_after(code: str) -> set[str]:
+    """The modules that a fresh interpreter has loaded after ``code``."""
+    ask = f"{code}\nimport sys\nprint(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
 
@@ -308,6 +323,39 @@ def test_the_page_shows_what_plugins_bring_and_need():
         if names or commands:
             assert brings == "; ".join(filter(None, (names, commands)))
         assert needs == (", ".join(plugin.needs) or "-")
+
+
+def loaded_by(code: str) -> set[str]:
+    """Which of the libraries with a home a fresh interpreter has loaded after ``code``."""
+    return modules_after(code) & set(HOMES)
+
+
+def outside_of_the_core(loaded: set[str]) -> set[str]:
+    """Which of the modules ``loaded`` are of a plugin, of security, or an observer."""
+    own = {name.removeprefix("zstate.") for name in loaded if name.startswith("zstate.")}
+    apart = {*OBSERVERS, "net.security"}
+    return {
+        name
+        for name in own
+        if name.split(".")[0] in PLUGINS or any(f"{name}.".startswith(f"{one}.") for one in apart)
+    }
+
+
+def test_the_two_nodes_load_no_plugin_no_security_and_no_observer():
+    loaded = modules_after("import zstate.nodes.publisher, zstate.nodes.listener")
+    assert "zstate.nodes.state_reader" in loaded
+    assert outside_of_the_core(loaded) == set()
+
+
+def test_a_session_without_credentials_loads_no_security():
+    code = "import zstate\nzstate.connect(listen='tcp/127.0.0.1:0').close()"
+    assert outside_of_the_core(modules_after(code)) == set()
+
+
+def test_modules_outside_of_the_core_exist_and_are_seen():
+    names = {"net.security", "net.security.acl", "scans.listener", *OBSERVERS}
+    assert {f"zstate.{name}" for name in names} <= modules().keys()
+    assert outside_of_the_core({"json", "zstate.net.open", *(f"zstate.{name}" for name in names)}) == names
 
 
 def test_importing_zstate_loads_no_library():

@@ -130,14 +130,15 @@ def __getattr__(name: str) -> object:
     if name == "errors":
         return import_module("zstate.errors")
     if name not in __all__:
-        if name.startswith("__"):
+        from pathlib import Path  # noqa: PLC0415 - as below
+
+        folder = Path(__file__).parent
+        if name.startswith("_") or (folder / f"{name}.py").exists():
+            # ``from zstate import se3`` looks for this attribute, and then imports the module.
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        # Loaded for mistakes alone.
-        from pathlib import Path  # noqa: PLC0415
+        from zstate._util.other_names import missing_name  # noqa: PLC0415 - for mistakes alone
 
-        from zstate._util.other_names import missing_name  # noqa: PLC0415
-
-        raise missing_name(__name__, Path(__file__).parent, name)
+        raise missing_name(__name__, folder, name)
     value: object = getattr(import_module(f"{__name__}.{_HOMES.get(name, 'errors')}"), name)
     globals()[name] = value
     return value

@@ -32,6 +32,12 @@ MONOTONIC = "monotonic"
 SET_BACK_NS = 100_000_000
 """A clock that is behind its newest stamp by more than this [ns] was set back; by less, samples are late."""
 
+LATE_NS = 1_000_000_000
+"""Samples of a smaller age are on time: a shorter wait is no backlog."""
+
+FAR_NS = 60_000_000_000
+"""No network delays a sample by this much; a larger difference is a clock that was never set."""
+
 
 class ClockOffset(NamedTuple):
     """Offset of another clock ahead of this host's, and its uncertainty [ns]."""

@@ -48,9 +48,9 @@ from bench.process import Process, free_ports
 from zstate import JointReading, RobotModel, connect, load_model
 from zstate.driving import Commander, DriverHost, Limits, Setpoint, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
+from zstate.driving.pace import Realtime
 from zstate.driving.simulated_driver import Plant
 from zstate.net.session import Session
-from zstate.rate import Realtime
 
 ROBOT = "panda"
 JOINT = "panda_joint1"

@@ -34,6 +34,12 @@ def test_other_missing_names_have_the_usual_error(name: str) -> None:
     assert str(caught.value) == f"module 'zstate' has no attribute {name!r}"
 
 
+def test_importing_a_module_of_the_package_searches_for_no_name() -> None:
+    code = "from zstate import extension, se3\nimport sys\nprint('zstate._util.other_names' in sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout == "False\n"
+
+
 def test_python_suggests_the_most_similar_name() -> None:
     program = "import zstate; zstate.TransformListner"
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)

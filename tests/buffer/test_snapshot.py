@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.snapshot import FramePoses, FrameTable, TimeSpan
+from zstate.buffer.snapshot import FramePoses, FrameTable
+from zstate.buffer.tracks import TimeSpan
 from zstate.clock import ManualClock
 from zstate.errors import UnknownFrame
 from zstate.transform import Transform

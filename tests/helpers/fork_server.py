@@ -35,7 +35,8 @@ _CODE = struct.Struct("<i")
 PRELOADED = (
     *("numpy", "zenoh", "msgspec", "click.shell_completion", "rich.live", "rich.table", "yaml", "ssl"),
     *("zstate", "zstate.cli.main", "zstate.net.session", "zstate.net.presence", "zstate.cli.waiting"),
-    *("zstate.nodes.listener", "zstate.nodes.publisher", "zstate.nodes.clock", "zstate.driving"),
+    *("zstate.nodes.listener", "zstate.nodes.listener_diagnostics", "zstate.nodes.publisher"),
+    *("zstate.nodes.clock", "zstate.net.rendezvous", "zstate.buffer.snapshot", "zstate.driving"),
     *("zstate.model.pinocchio_solver", "zstate.sources", "zstate.cli.session", "zstate.cli.processes"),
     *("zstate.odometry", "zstate.scans", "zstate.odometry.cli.rover", "zstate.wire.registry"),
 )

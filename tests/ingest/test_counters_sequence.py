@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from zstate.ingest.counters import Counters, GapCounter, MissingSamples
+from zstate.ingest.counters import Counters, GapCounter, MissingSamples, SequenceNumbers
 
 
 def test_every_sample_of_a_new_session_is_missing():
@@ -73,3 +73,12 @@ def test_gaps_of_an_overflowed_batch_count_as_dropped_for_all_writers():
     for writer, seq in (("a", 7), ("b", 3), ("c", 2), ("c", 4), ("d", 7), ("d", 9)):
         gap_counter.add(writer, seq)
     assert counted(counters) == (4, 4)
+
+
+def test_numbers_that_are_skipped_are_missing_until_they_are_received():
+    numbers = SequenceNumbers()
+    assert numbers.skip_to(10) == 0  # the first; what is before it may be in a cache
+    assert [seq for seq in (8, 9, 10, 11) if numbers.is_missing(seq)] == [8, 9, 11]
+    assert numbers.skip_to(14) == 3
+    assert numbers.skip_to(12) == 0  # reordered
+    assert (numbers.next, numbers.is_missing(13)) == (15, True)

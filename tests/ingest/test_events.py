@@ -11,7 +11,8 @@ from helpers.processes import until
 from zstate._util.bounded import MAX_ENTRIES
 from zstate.errors import InsertRefused
 from zstate.ingest.deadline import FLOOR_S
-from zstate.ingest.events import EventLog, StaticEdgeOwners, WriterEvent
+from zstate.ingest.diagnostics import WriterEvent
+from zstate.ingest.events import EventLog, StaticEdgeOwners
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId

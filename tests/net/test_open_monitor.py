@@ -11,7 +11,7 @@ import pytest
 from helpers.access_routers import AccessRouters
 from helpers.processes import Child, find_free_port, until
 
-import zstate.net.open
+import zstate.net.connection_monitor
 from zstate.net.security.credentials import Credentials
 from zstate.net.session import connect
 
@@ -36,8 +36,8 @@ CASES: dict[str, tuple[Callable[[AccessRouters], str], Callable[[AccessRouters],
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """The monitor checks every tenth of a second."""
-    monkeypatch.setattr(zstate.net.open, "MONITOR_FIRST_PERIOD_S", 0.1)
-    monkeypatch.setattr(zstate.net.open, "MONITOR_PERIOD_S", 0.1)
+    monkeypatch.setattr(zstate.net.connection_monitor, "FIRST_PERIOD_S", 0.1)
+    monkeypatch.setattr(zstate.net.connection_monitor, "PERIOD_S", 0.1)
 
 
 def denials(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:

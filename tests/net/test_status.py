@@ -15,7 +15,8 @@ from msgspec.structs import replace
 from zstate.errors import Closed, InvalidInput
 from zstate.net.presence import discover
 from zstate.net.session import Session, connect
-from zstate.net.status import StatusPublisher, StatusSubscriber
+from zstate.net.status import StatusPublisher
+from zstate.net.status_monitor import StatusSubscriber
 from zstate.net.streams import KeyPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource

@@ -278,10 +278,10 @@ def test_gaps_in_a_batch_that_filled_the_ring_count_as_dropped(sessions, monkeyp
         states = [JointState(STAMP + seq, seq, 9, order_digest(RRBOT.joint_names), b"") for seq in seqs]
         key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
         samples = [SerializedSample(key, encode(state), encoding) for state in states]
-        listener._on_samples(listener._samples, samples)
+        listener._reader._on_samples(listener._reader.ingests.followed, samples)
 
     with TransformListener(sessions[0], "r1") as listener:
-        monkeypatch.setattr(listener._samples, "capacity", 3)
+        monkeypatch.setattr(listener._reader.ingests.followed, "capacity", 3)
         receive(0)
         receive(2, 5, 6)  # a full ring goes on losing its oldest while it is emptied
         receive(8)
@@ -302,10 +302,10 @@ def test_a_full_ring_counts_the_next_gap_of_writers_that_have_left_or_never_anno
             message = WriterTransforms(STAMP + seq, seq, session, order_digest(edges), pose, edges)
             key = f"zstate/r1/transforms/writer_{session}"
             arrived.append(SerializedSample(key, encode(message), ENCODINGS[WriterTransforms]))
-        listener._on_samples(streams, arrived)
+        listener._reader._on_samples(streams, arrived)
 
     with TransformListener(sessions[0], "r1") as listener:
-        streams = listener._sample_streams["transforms"]
+        streams = listener._reader.ingests.streams["transforms"]
         for session in (departed, announced):
             streams.announce("r1", session, f"writer_{session}")
         receive((stranger, 0), (departed, 0), (announced, 0), (other, 0))

@@ -10,7 +10,7 @@ import pytest
 from helpers.processes import Child, repeated, until
 from helpers.robots import RRBOT
 
-from zstate.ingest.events import WriterEvent
+from zstate.ingest.diagnostics import WriterEvent
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher

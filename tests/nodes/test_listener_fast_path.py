@@ -69,23 +69,28 @@ class Receiver:
         self.inserted_at_once = 0
 
     def receive(self, stream: str, arrivals: list[SerializedSample]) -> None:
-        samples = self.listener._sample_streams[stream]
+        samples = self.listener._reader.ingests.streams[stream]
         if self.is_fast:
             arrivals = [one for one in arrivals if not self._insert_next(samples, one)]
         if arrivals:
-            self.listener._on_samples(samples, arrivals)
+            self.listener._reader._on_samples(samples, arrivals)
 
     def _insert_next(self, samples, arrival: SerializedSample) -> bool:
         envelope = self.listener._wire.usual_envelope(samples.stream)
         attached = arrival.attachment or b""
         is_usual = (arrival.encoding, len(attached)) == envelope
         message = arrival.payload + attached if is_usual else None
-        inserted = self.listener._insert_next(samples, arrival.key, message)
+        inserted = self.listener._reader._insert_next(samples, arrival.key, message)
         self.inserted_at_once += inserted
         return inserted
 
+    def followed(self, session: int) -> StreamIngest:
+        """The ingest of the followed samples of "r1"."""
+        ingests = self.listener._reader.ingests
+        return ingests.find(ingests.followed, "r1", session)
+
     def ingests(self) -> Iterator[StreamIngest]:
-        for samples in self.listener._sample_streams.values():
+        for samples in self.listener._reader.ingests.streams.values():
             yield from samples.all()
 
     def state(self) -> dict[str, object]:
@@ -100,8 +105,8 @@ class Receiver:
             with ingest._lock:  # takes over what the fast path has advanced
                 late = None if ingest._last_late is None else ingest._last_late.seq
                 newest = getattr(ingest, "_newest_by_order", ingest._newest)
-                missing = list(ingest._missing._ranges)
-                ingests.append((ingest.robot, ingest.session, ingest._next_seq, newest, late, missing))
+                missing = list(ingest._numbers.missing._ranges)
+                ingests.append((ingest.robot, ingest.session, ingest._numbers.next, newest, late, missing))
         events = [(event.kind, event.robot, event.stream, event.text) for event in self.listener.events()]
         stats = astuple(self.listener.stats)
         return {
@@ -275,7 +280,7 @@ def interrupt(receiver: Receiver, action: int, writer: Writer, stream: str) -> N
             ingest.writer_left(session)
             ingest.name_writer(session, "the same writer, which is back")
         elif action == 5:
-            decoded = [receiver.listener._decode(stream, one, "r1") for one in writer.sent[-5:]]
+            decoded = [receiver.listener._reader._decode(stream, one, "r1") for one in writer.sent[-5:]]
             samples = [one for messages in decoded for one in messages if one.session == ingest.session]
             if samples:
                 ingest.insert_history(samples)
@@ -327,7 +332,7 @@ def assert_same_result(
         writer = make_writer(seed)
         with make_pair() as receivers:
             for receiver in receivers:
-                receiver.listener._ingest_for(receiver.listener._samples, "r1", 1).describe(description())
+                receiver.followed(1).describe(description())
             for _ in range(MESSAGES):
                 batch = [arrival for _ in range(choose.choice((1, 1, 1, 3))) for arrival in writer.arrivals()]
                 for receiver in receivers:
@@ -453,8 +458,7 @@ def test_removed_robot_is_refused_as_by_the_long_way(sessions):
     writer = Writer(0, "zstate/r1/joint_states", JointState, session=7)
     with pair(sessions[1], "r1", "joint_states") as receivers:
         for receiver in receivers:
-            ingest = receiver.listener._ingest_for(receiver.listener._samples, "r1", 7)
-            ingest.describe(description())
+            receiver.followed(7).describe(description())
         for number in range(6):
             message = writer.after(MILLISECOND)
             for receiver in receivers:
@@ -472,8 +476,7 @@ def test_clock_that_is_set_back_starts_a_new_epoch_as_by_the_long_way(sessions):
     writer = Writer(0, "zstate/r1/joint_states", JointState, session=7)
     with pair(sessions[1], "r1", "joint_states") as receivers:
         for receiver in receivers:
-            ingest = receiver.listener._ingest_for(receiver.listener._samples, "r1", 7)
-            ingest.describe(description())
+            receiver.followed(7).describe(description())
         stamps = list[int]()
         for period_ms in (1, 1, 1, -500, 1, 1):
             message = writer.after(period_ms * MILLISECOND)
@@ -497,7 +500,7 @@ def test_no_sample_is_lost_to_other_threads(sessions, round_number):
     with receiver.listener as listener:
         receiver.receive("transforms", live[:1])
         (ingest,) = receiver.ingests()
-        samples = [message for one in past for message in listener._decode("transforms", one, "r1")]
+        samples = [message for one in past for message in listener._reader._decode("transforms", one, "r1")]
         is_done = threading.Event()
 
         def disturb() -> None:

@@ -13,7 +13,7 @@ from helpers.tokens import current_tokens
 from msgspec.structs import replace
 
 from zstate.errors import InvalidInput, SecondWriter
-from zstate.ingest.events import WriterEvent
+from zstate.ingest.diagnostics import WriterEvent
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener

@@ -16,7 +16,7 @@ from zstate.clock import ManualClock
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
 from zstate.net.presence import announce, discover
 from zstate.net.session import connect
-from zstate.net.status import StatusSubscriber
+from zstate.net.status_monitor import StatusSubscriber
 from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -381,14 +381,14 @@ def test_samples_that_arrive_after_their_writer_left_join_its_history(sessions):
 def test_unannounced_writers_are_bounded_and_leave_no_edges(sessions):
     """A hostile writer makes up a session for each sample."""
     with TransformListener(sessions[0], "r1") as listener:
-        transforms = listener._sample_streams["transforms"]
+        transforms = listener._reader.ingests.streams["transforms"]
         stamp = time.time_ns()
         for session in range(300):
             edges = (("odom", f"frame{session}"),)
             sample = WriterTransforms(stamp, 0, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
             encoding = ENCODINGS[WriterTransforms]
             arrival = SerializedSample("zstate/r1/transforms/thief", encode(sample), encoding)
-            listener._on_samples(transforms, [arrival])
+            listener._reader._on_samples(transforms, [arrival])
         moving = [frame.name for frame in listener.buffer.frames() if frame.parent]
         assert listener.stats.refused == {"too many writers": 44}
     assert len(transforms.all()) == 256

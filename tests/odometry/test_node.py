@@ -20,7 +20,7 @@ from zstate.clock import ManualClock, SystemClock
 from zstate.errors import InvalidInput, Unreachable
 from zstate.model.kinematics import Kinematics
 from zstate.net.session import Session
-from zstate.net.status import StatusMonitor
+from zstate.net.status_monitor import StatusMonitor
 from zstate.net.subscription import Received, subscribe
 from zstate.odometry import (
     BaseEstimator,

@@ -396,7 +396,7 @@ def test_stamps_far_off_are_used_counted_and_logged_once_per_program(sessions, c
                 # The listener has the description, which has the clock, and the name of this writer.
                 until(lambda: any("driver@" in (one.writer or "") for one in listener.buffer.frames()))
                 session = publisher.description().session
-                until(lambda session=session: ("r1", session) in listener._names)
+                until(lambda session=session: ("r1", session) in listener._reader.ingests.writers)
                 wait_for_stream_readers(writer, "r1")
                 for number in range(5):
                     publisher.publish([0.5, 0.5], stamp=(time.time_ns() + number) // SECOND)

@@ -15,13 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate._util.other_names import missing_method
 from zstate.buffer.core import BufferCore
 from zstate.buffer.history import HistoryView
 from zstate.buffer.path import Plan, TransformPath, transforms_at_one_moment
 from zstate.buffer.robot_joints import RobotJoints
-from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader, TimeSpan
-from zstate.buffer.tracks import JointTrack, Track
+from zstate.buffer.tracks import JointTrack, TimeSpan, Track
 from zstate.buffer.waiting import MessageFilter, RequiredStamps, TransformWatch, Waiter, WakeCondition
 from zstate.checks import Points, check_names, check_points
 from zstate.clock import Clock, check_stamp, check_stamps, check_stamps_of_points, wait_interruptible
@@ -41,6 +39,9 @@ from zstate.errors import (
 )
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.transform import Transform, Twist
+
+if TYPE_CHECKING:
+    from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader
 
 S = TypeVar("S")
 
@@ -92,6 +93,8 @@ class TransformBuffer(BufferCore):
     if not TYPE_CHECKING:  # type checkers report such names themselves
 
         def __getattr__(self, name: str) -> NoReturn:
+            from zstate._util.other_names import missing_method  # noqa: PLC0415 - for mistakes alone
+
             raise missing_method(self, name)
 
     def __reduce__(self) -> NoReturn:
@@ -498,6 +501,8 @@ class TransformBuffer(BufferCore):
         key = frozenset(robots)
         reader = self._snapshot_readers.get(key)
         if reader is None or not reader.is_current(self._tree.version):
+            from zstate.buffer.snapshot import SnapshotReader  # noqa: PLC0415 - views use it, lookups do not
+
             if len(self._snapshot_readers) >= _MAX_CACHED_READERS:
                 self._snapshot_readers = {}
             reader = self._snapshot_readers[key] = SnapshotReader(self.tree_snapshot(), key)

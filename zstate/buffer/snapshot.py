@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +33,6 @@ JointReader: TypeAlias = Callable[[HistoryView, JointTrack, int], NDArray[np.flo
 """The joint positions of a track at a stamp, of a view of its history that covers it."""
 
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
-
-
-class TimeSpan(NamedTuple):
-    """From the oldest stamp [ns] that is known to the newest."""
-
-    oldest: int
-    newest: int
 
 
 @dataclass(frozen=True, eq=False)

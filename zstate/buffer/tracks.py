@@ -22,6 +22,13 @@ Interpolation = Literal["linear", "hermite"]
 ClockOffsets: TypeAlias = dict[str, Callable[[], ClockOffset | None]]
 
 
+class TimeSpan(NamedTuple):
+    """From the oldest stamp [ns] that is known to the newest."""
+
+    oldest: int
+    newest: int
+
+
 @dataclass(eq=False, slots=True)
 class TrackOwner:
     """Facts about a buffer that its tracks and their errors need."""

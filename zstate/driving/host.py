@@ -34,6 +34,7 @@ from zstate.driving.driver_state import (
 )
 from zstate.driving.limits import Limits
 from zstate.driving.motion_service import MotionService
+from zstate.driving.pace import DevicePace, Realtime, check_pace, control_loop_pace
 from zstate.driving.stops import StopLatch
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver, check_arguments
 from zstate.driving.transit import CommandAdmission, CommandAges
@@ -45,7 +46,7 @@ from zstate.net.queryable import check_timeout
 from zstate.net.session import Session
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
-from zstate.rate import DevicePace, Rate, Realtime, check_pace, control_loop_pace
+from zstate.rate import Rate
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import check_robot
 from zstate.wire.messages import DriverState, Mode

@@ -1,4 +1,4 @@
-"""Base of the ingest of one robot's samples: writers, sequence numbers, early samples, epochs."""
+"""Base of the ingest of one robot's samples: the order in which live, early and old ones are inserted."""
 
 from __future__ import annotations
 
@@ -7,26 +7,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
-from zstate._util.bounded import BoundedDict, BoundedQueue
 from zstate._util.fork_safe import fork_safe
 from zstate.buffer.tracks import JointTrack
 from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput, MessageError, format_duration
-from zstate.ingest.counters import MissingSamples
+from zstate.ingest.counters import SequenceNumbers
+from zstate.ingest.early_samples import EarlySamples
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.wire.messages import Edges, RobotDescription, Sample, message_size
-
-# Bounds on the samples that wait for the robot's description, which takes milliseconds.
-_EARLY = 1024
-EARLY_BYTES = 4 * 2**20
-_EARLY_HISTORY = 20_000
-_EARLY_HISTORY_BYTES = 16 * 2**20
-
-SILENT_NS = 2_000_000_000
-"""A writer without a token that has sent nothing for this long no longer replaces an announced one."""
-
-# Of the last sessions; each may have 16 MB.
-_MAX_DESCRIPTIONS = 4
+from zstate.ingest.writer_sessions import SessionDescriptions, WriterSessions
+from zstate.wire.messages import Edges, RobotDescription, Sample
 
 ClockSetBack: TypeAlias = Callable[[str, int, str], None]
 """Called with a robot, the session of its writer, and a description of what happened."""
@@ -71,25 +60,14 @@ class StreamIngest(ABC):
         self._buffer = ownership.buffer
         self._counters = ownership.counters.for_robot(robot)
         self._on_set_back = on_set_back
-        self._writers: BoundedDict[int, str] = BoundedDict()
-        self._session: int | None = None
-        self._ended_sessions: BoundedDict[int, None] = BoundedDict()
-        # The sample that was expected next, and when, since a replaced writer was first refused.
-        self._silence: tuple[int | None, int] = None, 0
-        self._next_seq: int | None = None
+        self._sessions = WriterSessions(ownership.clock)
+        self._descriptions = SessionDescriptions()
+        self._numbers = SequenceNumbers()
+        self._early = EarlySamples()
+        # Of the epoch: its newest stamp, and the last sample that was too late for it.
         self._newest: int | None = None
-        self._newest_recalled_seq = -1
         self._last_late: Sample | None = None
-        self._missing = MissingSamples()
-        self._early: BoundedQueue[Sample] = BoundedQueue(_EARLY, EARLY_BYTES)
-        self._early_history: list[Sample] = []
-        self._early_history_bytes = 0
-        # The clock domain of each session, by its description, and the last one described.
-        self._domains: BoundedDict[int, str] = BoundedDict()
-        self._domain: str | None = None
-        self._descriptions: dict[int, RobotDescription] = {}
         self._has_joined_domain = False
-        self._departed_session: int | None = None
         self._fast_order = b""
         self._fast_path = self._buffer.fast_path(self._counters.fast_counts, ownership)
         self._is_dropped = False
@@ -99,27 +77,24 @@ class StreamIngest(ABC):
     @property
     def session(self) -> int | None:
         """The session whose samples are inserted now."""
-        return self._session
+        return self._sessions.current
 
     @property
     def writer(self) -> str | None:
         """The writer whose samples are inserted now, if it is announced."""
-        return None if self._session is None else self._writers.get(self._session)
+        sessions = self._sessions
+        return None if sessions.current is None else sessions.names.get(sessions.current)
 
     def name_writer(self, session: int, writer: str) -> None:
         """Set the printed name of the writer of a session, as announced."""
         with self._lock:
-            self._writers[session] = writer
-            if session == self._departed_session:
-                self._departed_session = None
+            self._sessions.announce(session, writer)
             self._on_writer_changed()
 
     def writer_left(self, session: int) -> None:
         """Handle the end of a writer: a writer that it replaced may be accepted again."""
         with self._lock:
-            if session == self._session:
-                self._ended_sessions.clear()
-                self._departed_session = session
+            if self._sessions.leave(session):
                 self._has_joined_domain = False
                 self._buffer.domain.leave(self.robot)
 
@@ -158,29 +133,24 @@ class StreamIngest(ABC):
             if self._is_dropped:
                 self._count_dropped()
                 return
-            if sample.session != self._session and not self._accept_session(sample):
+            if sample.session != self._sessions.current and not self._accept_session(sample):
                 self._counters.count_refusal(
                     "second writer", f"{self.robot!r} has another, newer writer than {sample.session}"
                 )
                 return
-            is_in_order, seq, expected = True, sample.seq, self._next_seq
-            if seq == expected:
-                self._next_seq = seq + 1
+            is_in_order, seq, numbers = True, sample.seq, self._numbers
+            if seq == numbers.next:
+                numbers.next = seq + 1
             else:
-                # The network reorders only samples after a larger number. The samples of one ROS message
-                # have the same number.
-                is_in_order = seq >= (expected or 0) - 1
-                if expected is None:
-                    self._missing.stop_at(seq)
-                elif seq > expected:
-                    self._missing.add(expected, seq)
-                    self._counters.count("dropped" if overflowed else "missed", seq - expected)
-                self._next_seq = max(seq + 1, expected or 0)
+                # The network reorders only samples after a larger number.
+                is_in_order = seq >= (numbers.next or 0) - 1
+                if gap := numbers.skip_to(seq):
+                    self._counters.count("dropped" if overflowed else "missed", gap)
             inserted = self._insert_counted(sample, is_in_order=is_in_order)
             if inserted is None:
-                for _ in range(self._early.append(sample, message_size(sample))):
+                for _ in range(self._early.add(sample)):
                     self._refuse_undescribed()
-            elif inserted and message is not None and sample.seq + 1 == self._next_seq:
+            elif inserted and message is not None and seq + 1 == self._numbers.next:
                 self._expect_next(sample, message)
 
     def _expect_next(self, sample: Sample, message: bytes) -> None:
@@ -195,7 +165,7 @@ class StreamIngest(ABC):
         """Take over the state that the fast path has advanced."""
         advanced = self._fast_path.stop()
         if advanced is not None:
-            self._next_seq, stamp = advanced
+            self._numbers.next, stamp = advanced
             self._set_newest(self._fast_order, stamp)
 
     def insert_history(self, samples: Sequence[Sample]) -> bool:
@@ -211,17 +181,17 @@ class StreamIngest(ABC):
             with self._lock:  # for each, so that live samples need not wait for all
                 if self._is_dropped or not self._accept_session(sample):
                     return False
-                if self._is_missing(sample.seq) and not self._insert_old(sample):
+                if self._numbers.is_missing(sample.seq) and not self._insert_old(sample):
                     return False
-                self._missing.stop_at(sample.seq)
-        return bool(self._missing) or self._is_missing(samples[0].seq - 1)
+                self._numbers.missing.stop_at(sample.seq)
+        return bool(self._numbers.missing) or self._numbers.is_missing(samples[0].seq - 1)
 
     def _insert_past_counted(self, samples: Sequence[Sample]) -> int:
         """Insert the newest of ``samples`` together, as many as can be. Returns how many are handled."""
         with self._lock:
             if self._is_dropped or not self._accept_session(samples[-1]):
                 return 0
-            missing = [sample for sample in reversed(samples) if self._is_missing(sample.seq)]
+            missing = [sample for sample in reversed(samples) if self._numbers.is_missing(sample.seq)]
             if len(missing) < 2:
                 return 0
             try:
@@ -233,9 +203,9 @@ class StreamIngest(ABC):
             inserted = missing[:count]
             for sample in inserted:
                 self._advance(sample)
-            self._newest_recalled_seq = max(self._newest_recalled_seq, inserted[0].seq)
+            self._numbers.recall(inserted[0].seq)
             self._counters.count("recalled", count)
-            self._missing.stop_at(inserted[-1].seq)
+            self._numbers.missing.stop_at(inserted[-1].seq)
             return sum(sample.seq >= inserted[-1].seq for sample in samples)
 
     def _insert_past(self, samples: Sequence[Sample]) -> int:
@@ -245,10 +215,6 @@ class StreamIngest(ABC):
         """
         return 0
 
-    def _is_missing(self, seq: int) -> bool:
-        # After a network cut, history may arrive before the first live sample, which shows the gap.
-        return seq in self._missing or (self._next_seq is not None and seq >= self._next_seq)
-
     def _insert_old(self, sample: Sample) -> bool:
         """Insert a sample of the history; True if an older one would be inserted, too."""
         try:
@@ -257,34 +223,24 @@ class StreamIngest(ABC):
             self._count_refusal(error)
             return False
         if inserted is None:
-            self._early_history.append(sample)
-            self._early_history_bytes += message_size(sample)
-            is_full = self._early_history_bytes >= _EARLY_HISTORY_BYTES
-            return not is_full and len(self._early_history) < _EARLY_HISTORY
+            return self._early.add_old(sample)
         if inserted:
             self._advance(sample)
-            self._newest_recalled_seq = max(self._newest_recalled_seq, sample.seq)
+            self._numbers.recall(sample.seq)
         self._counters.count("recalled", int(inserted))
         return inserted
 
     def _insert_early(self) -> None:
         """Insert the samples that arrived before the robot's description."""
-        early, self._early = self._early, BoundedQueue(_EARLY, EARLY_BYTES)
         largest = 0
-        for sample in early:
+        for sample in self._early.take_live():
             if self._insert_counted(sample, is_in_order=sample.seq >= largest) is None:
                 self._refuse_undescribed()
             else:
                 largest = max(largest, sample.seq)
-        history = self._early_history
-        self._clear_early_history()
-        for sample in history:
+        for sample in self._early.take_history():
             if not self._insert_old(sample):
                 break
-
-    def _clear_early_history(self) -> None:
-        self._early_history = []
-        self._early_history_bytes = 0
 
     def _refuse_undescribed(self) -> None:
         self._counters.count_refusal(
@@ -310,12 +266,12 @@ class StreamIngest(ABC):
                 inserted = self._restart_epoch(sample) or inserted
         except (InvalidInput, MessageError) as error:
             self._count_refusal(error)
-            if isinstance(error, InsertRefused) and sample.session not in self._writers:
+            if isinstance(error, InsertRefused) and sample.session not in self._sessions.names:
                 # Its token may be on the way; then its history has this sample again.
-                self._missing.add(sample.seq, sample.seq + 1)
+                self._numbers.missing.add(sample.seq, sample.seq + 1)
             return False
         self._counters.count("received" if inserted else "late")
-        if not self._has_joined_domain and sample.session != self._departed_session:
+        if not self._has_joined_domain and sample.session != self._sessions.departed:
             self._has_joined_domain = True
             self._buffer.domain.join(self.robot)
         return inserted
@@ -327,18 +283,12 @@ class StreamIngest(ABC):
     def _set_domain(self, description: RobotDescription) -> None:
         """Set the clock domain that stamps the samples of the writer of ``description``."""
         with self._lock:
-            self._domain = description.clock
-            self._domains[description.session] = description.clock
-            self._descriptions.pop(description.session, None)
-            self._descriptions[description.session] = description
-            if len(self._descriptions) > _MAX_DESCRIPTIONS:
-                del self._descriptions[next(iter(self._descriptions))]
+            self._descriptions.add(description)
             self._update_domain()
 
     def _update_domain(self) -> bool:
         """Pass the clock domain of the current writer to the buffer; True if it replaces another one."""
-        # The description may come from another program than the samples.
-        domain = self._domain if self._session is None else self._domains.get(self._session, self._domain)
+        domain = self._descriptions.domain(self._sessions.current)
         before = self._buffer.domain.domain_of(self.robot)
         return domain is not None and self._buffer.set_domain(self.robot, domain) and bool(before)
 
@@ -356,7 +306,7 @@ class StreamIngest(ABC):
         A single old sample may have a wrong stamp or have been delayed; two consecutive ones show that the
         clock was set back.
         """
-        if sample.seq <= self._newest_recalled_seq:
+        if sample.seq <= self._numbers.newest_recalled:
             return False  # the history overtook this sample, which waited in a queue; the clock is right
         before, self._last_late = self._last_late, sample
         if before is None or sample.seq != before.seq + 1 or not before.stamp < sample.stamp:
@@ -366,8 +316,8 @@ class StreamIngest(ABC):
         newest = self._newest_of(sample)
         size = "" if newest is None else f" by {format_duration(newest - before.stamp)}"
         self._last_late = self._newest = None
-        self._missing.stop_at(0)  # samples missing so far belong to the old epoch
-        self._clear_early_history()
+        self._numbers.missing.stop_at(0)  # samples missing so far belong to the old epoch
+        self._early.clear_history()
         self._drop_history()
         text = f"the clock of {self.robot!r} went back{size}: its history restarts; other robots keep theirs"
         self._counters.warn_once(f"{self.robot} back", text)
@@ -387,38 +337,24 @@ class StreamIngest(ABC):
 
     def _accept_session(self, sample: Sample) -> bool:
         """Whether samples of this session are inserted: those of the newest writer to appear."""
-        session = sample.session
-        if session in self._ended_sessions:
-            if session not in self._writers or not self._is_unannounced_and_silent():
-                return False
-            del self._ended_sessions[session]
-        if session != self._session:
-            if self._session is not None:
-                self._ended_sessions[self._session] = None
-                self._early.clear()
-                self._replace_session(sample)
-            self._session = session
-            self._clear_early_history()
-            self._missing = MissingSamples()
-            self._next_seq = None
-            self._silence = None, 0
-            self._last_late = self._newest = None
-            self._newest_recalled_seq = -1
-            if self._update_domain():
-                self._drop_history()  # stamps of two clocks cannot be compared
-            self._on_writer_changed()
-            if session in self._descriptions:  # that of a writer which it replaced may be in use
-                self.describe(self._descriptions[session])
-        return True
-
-    def _is_unannounced_and_silent(self) -> bool:
-        """Whether the current writer has no token, and its samples have ended: called for those of others."""
-        now = self._ownership.clock.now()
-        if self._session in self._writers:
+        sessions, session = self._sessions, sample.session
+        if session == sessions.current:
+            return True
+        if not sessions.accept(session, self._numbers.next):
             return False
-        if self._silence[0] != self._next_seq:
-            self._silence = self._next_seq, now
-        return now - self._silence[1] >= SILENT_NS
+        if sessions.current is not None:
+            self._replace_session(sample)
+        sessions.replace(session)
+        self._early.clear()
+        self._numbers = SequenceNumbers()
+        self._last_late = self._newest = None
+        if self._update_domain():
+            self._drop_history()  # stamps of two clocks cannot be compared
+        self._on_writer_changed()
+        description = self._descriptions.of(session)
+        if description is not None:  # that of a writer which it replaced may be in use
+            self.describe(description)
+        return True
 
     def _replace_session(self, sample: Sample) -> None:
         """Handle the first sample of another writer, which begins a new epoch."""

@@ -127,6 +127,39 @@ class MissingSamples:
         self._ranges = [one for one in kept if one]
 
 
+class SequenceNumbers:
+    """The sequence numbers of one session: the ``next`` one, and those that are missing.
+
+    The samples of one ROS message have the same number.
+    """
+
+    def __init__(self) -> None:
+        self.next: int | None = None
+        self.newest_recalled = -1
+        """The largest number that came from the writer's cache."""
+        self.missing = MissingSamples()
+
+    def skip_to(self, seq: int) -> int:
+        """Go on after ``seq``, which is not the next one. Returns how many are missing before it."""
+        gap = 0
+        if self.next is None:
+            self.missing.stop_at(seq)
+        elif seq > self.next:
+            self.missing.add(self.next, seq)
+            gap = seq - self.next
+        self.next = max(seq + 1, self.next or 0)
+        return gap
+
+    def is_missing(self, seq: int) -> bool:
+        """Whether the sample ``seq`` was not received live, and is no older than the session."""
+        # After a network cut, history may arrive before the first live sample, which shows the gap.
+        return seq in self.missing or (self.next is not None and seq >= self.next)
+
+    def recall(self, seq: int) -> None:
+        """Note that the sample ``seq`` was inserted from the writer's cache."""
+        self.newest_recalled = max(self.newest_recalled, seq)
+
+
 class GapCounter:
     """Counts the samples missing from each writer: "dropped" by this process, or "missed" before it."""
 

@@ -7,7 +7,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
 from zstate._util.bounded import MAX_ENTRIES, BoundedDict
@@ -15,12 +14,11 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
+from zstate.ingest.diagnostics import Kind, WriterEvent
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.plugins import edge_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-
-Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]
 
 KEPT = 1024
 
@@ -30,34 +28,6 @@ _MAX_TICK_S = 0.5
 _CLOSES_WITHIN_S = 0.8
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class WriterEvent:
-    """An event of the ``writer`` of a stream of ``robot``, observed ``at`` [ns], system time.
-
-    - "joined": it publishes from now on; "restarted": as "joined", and the same program on the same host did
-      before;
-    - "left": it was closed, or its process ended, while the network is up;
-    - "cut off": the router that connected it is lost, or it was silent before it disappeared; it may still
-      publish. "back": the same writer is connected again;
-    - "stale": it is announced, but no sample came for ten of its periods (at least half a second): it is
-      frozen, or its source is. "resumed": samples come again;
-    - "set back": its clock was set back, so the robot's history begins with its next sample;
-    - "conflict": another writer publishes the same stream, or places the same frame.
-
-    ``writer`` is None if it is not announced; ``text`` describes the event in full.
-    """
-
-    kind: Kind
-    robot: str
-    stream: StreamName
-    writer: WriterId | None
-    at: int
-    text: str
-
-    def __str__(self) -> str:
-        return self.text
 
 
 StaticWriter = tuple[str, str]

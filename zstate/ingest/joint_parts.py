@@ -318,10 +318,10 @@ class PartialJointStateIngest(StreamIngest):
         return True  # other writers have tracks of their own
 
     def _drop_history(self) -> None:
-        self._parts.restart(self._session or 0)
+        self._parts.restart(self.session or 0)
 
     def _remove(self) -> None:
-        self._parts.drop(self._session or 0)
+        self._parts.drop(self.session or 0)
 
     def _on_writer_changed(self) -> None:
         pass  # ``RobotParts`` has the writers

@@ -87,7 +87,7 @@ class JointStateIngest(StreamIngest):
             self._buffer.restart(self._track)
 
     def _on_writer_changed(self) -> None:
-        self.parts.set_whole_writer(self._session)
+        self.parts.set_whole_writer(self.session)
         if self._track is not None:
             self._track.writer = self.writer
-            self._track.model_writer = self._writers.get(self._description_session or 0)
+            self._track.model_writer = self._sessions.names.get(self._description_session or 0)

@@ -8,15 +8,9 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import counts_from_start, format_duration, guess_unit
 from zstate.buffer.buffer import TransformBuffer
-from zstate.clock import SYSTEM, format_stamp
+from zstate.clock import FAR_NS, LATE_NS, SYSTEM, format_stamp
 from zstate.ingest.counters import Counters
 from zstate.wire.messages import Sample, TransformSample
-
-LATE_NS = 1_000_000_000
-"""Samples of a smaller age are not checked: a shorter wait is no backlog."""
-
-FAR_NS = 60_000_000_000
-"""No network delays a sample by this much; a larger difference is a clock that was never set."""
 
 _LAG_GROWTH_NS = 1_000_000_000
 

@@ -15,6 +15,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.ingest.base import StreamIngest
 from zstate.streams import StreamName
+from zstate.wire.messages import Sample
 
 MAX_STRANGERS = 256
 """Writers of one robot that were never announced. Of more, the oldest is dropped with its edges."""
@@ -89,6 +90,27 @@ class StreamIngests:
     def find(self, robot: str, session: int) -> StreamIngest | None:
         """The ingest of a session, if there is one."""
         return self._ingests.get((robot, session if self.is_shared else 0))
+
+    def start_batch(self, count: int) -> bool:
+        """Begin with ``count`` samples of the ring. Returns whether they filled it."""
+        is_full = count >= self.capacity
+        if is_full:
+            # It has lost samples of any of the writers, and loses more while it is drained.
+            self.overflowed = set(self.all())
+        return is_full
+
+    def insert(
+        self, ingest: StreamIngest, sample: Sample, key: str, *, is_full: bool, message: bytes | None
+    ) -> None:
+        """Insert a sample received on ``key``, in a batch that filled the ring if ``is_full``.
+
+        With its encoded ``message``, the ingest may expect the next one on that key.
+        """
+        overflowed = is_full or ingest in self.overflowed
+        ingest.insert_sample(sample, overflowed=overflowed, message=message)
+        self.overflowed.discard(ingest)
+        if message is not None and self.newest_by_key.get(key) is not ingest:
+            self.newest_by_key[key] = ingest
 
     def add(self, ingest: StreamIngest, session: int) -> StreamIngest:
         """Add the ingest of a session. Returns the one to use: another thread may have added one before."""

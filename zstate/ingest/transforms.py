@@ -158,7 +158,7 @@ class TransformIngest(StreamIngest):
             known = self._admitted.get(edges)
             if known is not None:
                 return known
-        source.name, source.session = self.writer or "an unannounced writer", self._session or 0
+        source.name, source.session = self.writer or "an unannounced writer", self.session or 0
         admitted = self._ownership.admit(source, edges)
         if self._version != self._ownership.version:
             self._admitted.clear()

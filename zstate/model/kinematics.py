@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from random import Random
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,8 +18,10 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import did_you_mean
 from zstate.errors import InvalidInput, LibraryMissing, ModelError
 from zstate.model.joint_transforms import Floats, JointTransforms
-from zstate.model.pinocchio_solver import PinocchioSolver, closed_forms
 from zstate.model.robot import RobotModel
+
+if TYPE_CHECKING:
+    from zstate.model.pinocchio_solver import PinocchioSolver
 
 _TOLERANCE = 1e-9
 """The largest difference of Pinocchio and closed forms [m], or of numbers of a unit quaternion."""
@@ -99,6 +101,8 @@ class Kinematics:
 
     @cached_property
     def _solver(self) -> PinocchioSolver:
+        from zstate.model.pinocchio_solver import PinocchioSolver  # noqa: PLC0415 - readers load no Pinocchio
+
         return PinocchioSolver(self.model, self._table.forms)
 
     def _row(self, link: str) -> int:
@@ -117,6 +121,8 @@ class MovingEdges:
     """
 
     def __init__(self, model: RobotModel) -> None:
+        from zstate.model.pinocchio_solver import PinocchioSolver, closed_forms  # noqa: PLC0415 - as above
+
         self._model, self._table = model, JointTransforms(model)
         self._rows = np.flatnonzero([form.kind != "fixed" for form in self._table.forms])
         self.forms = tuple(self._table.forms[row] for row in self._rows)

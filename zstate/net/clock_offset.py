@@ -21,13 +21,13 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.clock import Clock, ClockOffset, SystemClock
 from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.net.at_exit import join_at_exit
-from zstate.net.queryable import Queryable, Reply, check_timeout, query
+from zstate.net.queryable import check_timeout, query
 from zstate.net.sample_history import RoundRobinQueue
 from zstate.net.session import Session
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
 from zstate.wire.messages import ClockMessage
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.native import decode
 
 REFRESH_S = 30.0
 """A measurement older than this is repeated when it is read; sooner while there was no reply."""
@@ -62,17 +62,6 @@ class MeasuredOffset:
     offset_ns: int
     uncertainty_ns: int
     round_trip_ns: int
-
-
-class ClockService(Queryable):
-    """Replies with the time of ``clock``, which stamps what one writer of ``robot`` publishes."""
-
-    def __init__(self, session: Session, robot: str, writer: WriterId, clock: Clock) -> None:
-        def answer(_: object) -> Reply:
-            message = ClockMessage(clock.now(), self.answered, writer.session)
-            return Reply(encode(message), ENCODINGS[ClockMessage])
-
-        super().__init__(session, clock_key(robot, writer.identity), answer)
 
 
 def measure_offsets(

@@ -11,13 +11,15 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, get_args
 
 import zenoh
 
 from zstate._util.endpoint import parse_endpoint, parse_host_port
 from zstate.errors import ConfigError, InvalidInput, NetworkError, PortBusy
-from zstate.net.security.credentials import Credentials, password_in
+
+if TYPE_CHECKING:
+    from zstate.net.security.credentials import Credentials
 
 Mode = Literal["peer", "loopback", "lan", "client", "router"]
 ConfigSource: TypeAlias = "str | os.PathLike[str] | Mapping[str, object] | zenoh.Config"
@@ -158,19 +160,29 @@ def endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
 
 
 def credentials_in(config: zenoh.Config) -> Credentials | None:
-    """The credentials in ``config``; None if ``connect`` does not accept their kind."""
+    """The credentials in ``config``; None if it has none, or of a kind that ``connect`` does not accept."""
     tls: dict[str, Any] = json.loads(config.get_json("transport/link/tls"))
     user: dict[str, Any] = json.loads(config.get_json("transport/auth/usrpwd"))
+    found = {
+        "user": user["user"],
+        "password": user["password"],
+        "ca": tls["root_ca_certificate"],
+        "certificate": tls["connect_certificate"],
+        "key": tls["connect_private_key"],
+    }
+    if not any(found.values()):
+        return None
+    from zstate.net.security.credentials import Credentials  # noqa: PLC0415  # most sessions have none
+
     try:
-        return Credentials(
-            user=user["user"],
-            password=user["password"],
-            ca=tls["root_ca_certificate"],
-            certificate=tls["connect_certificate"],
-            key=tls["connect_private_key"],
-        )
+        return Credentials(**found)
     except ConfigError:
         return None
+
+
+def scouts_by_multicast(config: zenoh.Config) -> bool:
+    """Whether a session with ``config`` searches for others by multicast, in whatever mode."""
+    return json.loads(config.get_json("scouting/multicast/enabled")) is True
 
 
 def _load(source: ConfigSource) -> zenoh.Config:
@@ -319,6 +331,10 @@ def _credentials_in_environment() -> Credentials | None:
     if bool(certs) != bool(identity):
         has, lacks = (CERTS, IDENTITY) if certs else (IDENTITY, CERTS)
         raise ConfigError(f"{has} is set but {lacks} is not; set both or neither", path=has)
+    if not (certs or user):
+        return None
+    from zstate.net.security.credentials import Credentials, password_in  # noqa: PLC0415  # as above
+
     password = os.environ.get(PASSWORD) if user else None
     if user and (file := os.environ.get(PASSWORD_FILE)):
         password = password_in(file)
@@ -330,4 +346,4 @@ def _credentials_in_environment() -> Credentials | None:
         )
     if certs and identity:
         return Credentials.from_folder(certs, identity, user=user or None, password=password)
-    return Credentials(user=user, password=password) if user else None
+    return Credentials(user=user, password=password)

@@ -16,7 +16,7 @@ from zstate._util.closeable import Closeable
 from zstate.errors import NetworkError, Unreachable
 from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
-from zstate.net.status import StatusSubscriber
+from zstate.net.status_monitor import StatusSubscriber
 from zstate.plugins import edge_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import zenoh
 
@@ -30,12 +30,16 @@ from zstate.net.config import (
     endpoint_list,
     endpoints_in,
     listen_endpoints,
+    scouts_by_multicast,
     settings_from_environment,
     user_config,
 )
-from zstate.net.open import ConnectionMonitor, ProbeSession, connect_timeout, open_with_retry
-from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_addresses
-from zstate.net.security.credentials import Credentials, check_files
+from zstate.net.open import ProbeSession, connect_timeout, open_with_retry
+
+if TYPE_CHECKING:
+    from zstate.net.connection_monitor import ConnectionMonitor
+    from zstate.net.rendezvous import Rendezvous
+    from zstate.net.security.credentials import Credentials
 
 CLOSE_TIMEOUT_S = 0.8
 _UNDECLARE_TIMEOUT_S = 0.5
@@ -109,7 +113,7 @@ def connect(
         check_loopback_only((*endpoints, *listen))
     if credentials is not None:
         credentials.check_endpoints(endpoints, listen)
-        check_files(credentials)
+        credentials.check_files()
     source = config if config is not None else os.environ.get(CONFIG_VARIABLE) or None
     with session_opening():
         if source is None:
@@ -147,8 +151,19 @@ def _session(
     config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None, timeout_s: float
 ) -> Session:
     raw = open_with_retry(config, endpoints, credentials, timeout_s)
-    monitor = ConnectionMonitor(raw, config, endpoints, credentials)
+    monitor = _connection_monitor(raw, config, endpoints, credentials)
     return Session(raw, monitor, probe=ProbeSession.for_config(config, credentials))
+
+
+def _connection_monitor(
+    raw: zenoh.Session, config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None
+) -> ConnectionMonitor | None:
+    """The monitor of a session that others can deny; None if it only listens."""
+    if not endpoints and not scouts_by_multicast(config):
+        return None
+    from zstate.net.connection_monitor import ConnectionMonitor  # noqa: PLC0415  # not of most sessions
+
+    return ConnectionMonitor(raw, config, endpoints, credentials)
 
 
 def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Session:
@@ -158,6 +173,9 @@ def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Sessio
             "(--connect) or listen= (--listen)",
             path="credentials",
         )
+    # Sessions with endpoints do not meet there.
+    from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_addresses  # noqa: PLC0415
+
     addresses = rendezvous_addresses()
     if mode == "loopback":
         check_loopback_only([f"tcp/{host}:{port}" for host, port in addresses])

@@ -24,7 +24,6 @@ from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats
 from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.rate import RateReport
-from zstate.sources.joint_source import JointReading, JointSource
 from zstate.streams import StreamName
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import MODEL_WRITER, wire_name
@@ -38,6 +37,9 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.native import decode_joint_state, encode, joint_positions
+
+if TYPE_CHECKING:
+    from zstate.sources.joint_source import JointReading, JointSource
 
 if TYPE_CHECKING or kernel == "c":
     from zstate._kernel import JointStateEncoder, PublishPath

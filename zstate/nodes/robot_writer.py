@@ -15,7 +15,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.clock import SYSTEM, Clock
 from zstate.errors import Closed, InvalidInput, SecondWriter
-from zstate.net.clock_offset import ClockService
+from zstate.net.clock_service import ClockService
 from zstate.net.ownership import WriterClaim
 from zstate.net.presence import local_writer
 from zstate.net.sample_history import SampleCache, serve_history

@@ -14,7 +14,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.inbox import Inbox
 from zstate._util.refusals import Refusals
 from zstate.errors import InvalidInput, MessageError, ModelError
-from zstate.ingest.base import EARLY_BYTES
+from zstate.ingest.early_samples import EARLY_BYTES
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import announce_reader

@@ -12,8 +12,8 @@ import numpy as np
 
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.snapshot import FramePoses, FrameTable, TimeSpan
-from zstate.buffer.tracks import Track
+from zstate.buffer.snapshot import FramePoses, FrameTable
+from zstate.buffer.tracks import TimeSpan, Track
 from zstate.clock import Clock
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session

@@ -14,7 +14,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.snapshot import TimeSpan
+from zstate.buffer.tracks import TimeSpan
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.ingest.deadline import Deadline
 from zstate.net.presence import announce_reader

@@ -84,11 +84,12 @@ def test_no_robot_of_a_fleet_is_frozen_after_a_restart_of_the_router(
 ):
     router = start("router", listen=endpoint)
     with moving_fleet(endpoint, stream) as listener:
-        until(lambda: len(listener._names) == ROBOTS and not frozen(listener, 0), FLEET_DEADLINE_S)
+        writers = listener._reader.ingests.writers
+        until(lambda: len(writers) == ROBOTS and not frozen(listener, 0), FLEET_DEADLINE_S)
         router.kill()
-        until(lambda: not listener._names, FLEET_DEADLINE_S)
+        until(lambda: not writers, FLEET_DEADLINE_S)
         start("router", listen=endpoint)
-        until(lambda: len(listener._names) == ROBOTS, FLEET_DEADLINE_S)
+        until(lambda: len(writers) == ROBOTS, FLEET_DEADLINE_S)
         back_at = time.time_ns()
         try:
             until(lambda: not frozen(listener, back_at), DEADLINE_S)

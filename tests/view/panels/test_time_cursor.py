@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zstate.buffer.snapshot import TimeSpan
+from zstate.buffer.tracks import TimeSpan
 from zstate.errors import InvalidInput
 from zstate.view.panels.control_panels import TimeCursor
 

@@ -303,7 +303,7 @@ class RobotMonitor(Closeable):
     def __init__(
         self, session: Session, directory: RobotDirectory, robot: str, wire: str, clock: Clock | None
     ) -> None:
-        from zstate.net.status import StatusMonitor
+        from zstate.net.status_monitor import StatusMonitor
         from zstate.net.topic_statistics import TopicStatistics
         from zstate.wire.registry import get_wire
 

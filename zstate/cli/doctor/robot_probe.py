@@ -25,7 +25,7 @@ from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.clock_offset import MeasuredOffset, measure_offsets, unanswered
 from zstate.net.presence import RobotInfo, discover, discover_readers
 from zstate.net.session import Session
-from zstate.net.status import StatusSubscriber
+from zstate.net.status_monitor import StatusSubscriber
 from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, WriterKey
 from zstate.nodes.clock import SimulatedClock

@@ -147,6 +147,19 @@ class Credentials:
                     path=endpoint,
                 )
 
+    def check_files(self) -> None:
+        """Raise ConfigError for a file that is missing, open to all users of this machine, or malformed."""
+        for file in (self.ca, self.certificate, self.key, self.users):
+            if file is not None:
+                _check_readable(file)
+        for secret in (self.key, self.users):
+            if secret is not None:
+                check_private(secret)
+        if self.ca is not None:
+            client_context(self)
+        if self.users is not None:
+            _check_users(self.users)
+
     def settings(self) -> dict[str, object]:
         """The settings of Zenoh, by path in its configuration."""
         settings: dict[str, object] = {}
@@ -169,20 +182,6 @@ class Credentials:
 
 def _path(path: File | None) -> str | None:
     return None if path is None else str(Path(path).absolute())
-
-
-def check_files(credentials: Credentials) -> None:
-    """Raise ConfigError for a file that is missing, open to all users of this machine, or malformed."""
-    for file in (credentials.ca, credentials.certificate, credentials.key, credentials.users):
-        if file is not None:
-            _check_readable(file)
-    for secret in (credentials.key, credentials.users):
-        if secret is not None:
-            check_private(secret)
-    if credentials.ca is not None:
-        client_context(credentials)
-    if credentials.users is not None:
-        _check_users(credentials.users)
 
 
 def client_context(credentials: Credentials) -> ssl.SSLContext:

@@ -15,7 +15,7 @@ from viser import uplot
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
-from zstate.buffer.snapshot import TimeSpan
+from zstate.buffer.tracks import TimeSpan
 from zstate.clock import SYSTEM
 from zstate.driving.driver_state import DriverStateListener, ReceivedState
 from zstate.errors import InvalidInput, LookupFailed, format_duration

@@ -8,7 +8,8 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import viser
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.snapshot import FramePoses, TimeSpan
+from zstate.buffer.snapshot import FramePoses
+from zstate.buffer.tracks import TimeSpan
 
 T = TypeVar("T")
 

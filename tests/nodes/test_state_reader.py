@@ -1,0 +1,41 @@
+"""The reader inside a listener, alone: nothing that observes it is needed for the poses in its buffer."""
+
+from __future__ import annotations
+
+import pytest
+from helpers.processes import until
+from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.ingest.counters import Counters
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.state_reader import StateReader
+from zstate.wire.registry import get_wire
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize("follow", ["joint_states", "tf"])
+def test_reader_without_diagnostics_inserts_what_a_listener_inserts(sessions, follow):
+    writer, reader = sessions
+    buffer, counters = TransformBuffer(), Counters()
+    wire = get_wire("native")
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        TransformListener(reader, "r1", follow=follow, history_on_join=False) as listener,
+        StateReader(reader, ("r1",), wire, follow, buffer, counters=counters, history_on_join=False) as alone,
+    ):
+        wait_for_stream_readers(writer, "r1", follow)
+        until(lambda: listener.buffer.domain.domain_of("r1") == "system")
+        for step in range(20):
+            publisher.publish([0.01 * step, -0.02 * step], stamp=STAMP + step * MS)
+        for count in (counters.stats, lambda: listener.stats):
+            until(lambda count=count: count().received == 20)
+        assert alone.ingests.robots() == listener.robots() == ("r1",)
+    for step in range(20):
+        stamp = STAMP + step * MS
+        expected = listener.buffer.lookup("world", "tool", stamp)
+        assert buffer.lookup("world", "tool", stamp).pose7.tolist() == expected.pose7.tolist()
+    assert counters.stats().off_clock == 0  # which is counted by diagnostics
+    assert listener.stats.off_clock > 0
