@@ -43,7 +43,7 @@ FLOORS = (
     {"zstate"},
     {"metrics", "foxglove"},
     {"view", "cli"},
-    {f"{plugin}.cli" for plugin in _PLUGINS - {"metrics"}},
+    {f"{plugin}.cli" for plugin in _PLUGINS if any(PACKAGE.glob(f"{plugin}/cli*"))},
     {"__main__"},
 )
 NEIGHBOURS = {

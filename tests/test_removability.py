@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from helpers.processes import DEADLINE_S
@@ -47,7 +48,9 @@ with zstate.connect() as session, zstate.StatePublisher(session, model) as publi
     moving = threading.Thread(target=lambda: publisher.run(SineSource(model), 50.0))
     moving.start()
     codes = {}
-    for command in ("ls", "hz rrbot --once", "echo rrbot --once", "doctor rrbot", "monitor --robots --once"):
+    commands = ["ls", "hz rrbot --once", "echo rrbot --once", "doctor rrbot", "monitor --robots --once"]
+    commands += ["record run.mcap rrbot --seconds 1"] if "record" in own_commands() else []
+    for command in ("--help", *commands):
         codes[command] = run(command.split())
     publisher.close()
     moving.join()
@@ -59,12 +62,13 @@ print("\\n" + json.dumps([sorted(broken), list(own_commands()), codes]))
 @pytest.mark.long
 @pytest.mark.processes
 @pytest.mark.parametrize("folder", PLUGINS)
-def test_without_a_folder_the_rest_starts_and_shows_a_robot(folder: str):
+def test_without_a_folder_the_rest_starts_and_shows_a_robot(folder: str, tmp_path: Path):
     ended = subprocess.run(
         [sys.executable, "-c", PROGRAM, f"zstate.{folder}"],
         capture_output=True,
         text=True,
         timeout=8 * DEADLINE_S,
+        cwd=tmp_path,
         check=False,
     )
     assert ended.returncode == 0, ended.stderr

@@ -6,6 +6,7 @@ module of their folder, those of other packages where their entry point leads. `
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from importlib import import_module
@@ -132,7 +133,8 @@ class Stream:
             return _loaded(self.document)(message, robot)
         document = {name: getattr(message, name) for name in message.__struct_fields__ if name != "session"}
         if isinstance(frame := document.get("frame"), str):
-            document["frame"] = _loaded("zstate.wire.keys:full_name")(robot, frame)
+            with suppress(InvalidInput):  # no name of a frame: as it is
+                document["frame"] = _loaded("zstate.wire.keys:full_name")(robot, frame)
         return document
 
 

@@ -25,7 +25,7 @@ from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import STOP_STREAMS
 from zstate.wire.messages import HistoryPage, Message, MotionOutcome, order_digest
-from zstate.wire.native import ENCODINGS, MAX_MESSAGE_BYTES, NativeWire, decode, encode
+from zstate.wire.native import ENCODINGS, MAX_MESSAGE_BYTES, NativeWire, decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 Json = dict[str, Any]
@@ -33,7 +33,9 @@ Json = dict[str, Any]
 GOLDEN = Path(__file__).parent / "golden"
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
 
-KINDS: dict[str, type[Message]] = {kind.__name__: kind for kind in ENCODINGS}
+KINDS: dict[str, type[Message]] = {
+    kind.__name__: kind for kind in (*ENCODINGS, *(row.type for row in all_streams()))
+}
 FORMATS = {"f64[]": "d", "f32[]": "f", "i8[]": "b"}
 INTEGERS = ("stamp", "session", "uint", "ns")
 
@@ -198,7 +200,7 @@ def decoded(vector: Json) -> Message:
 
 def is_accepted(title: str, payload: bytes) -> bool:
     try:
-        decode(payload, ENCODINGS[KINDS[title]], KINDS[title])
+        decode(payload, encoding_of(KINDS[title]), KINDS[title])
     except MessageError as error:
         assert error.reason == "malformed", error
         return False
@@ -214,7 +216,7 @@ def test_the_tables_of_the_page_give_the_bytes_of_a_vector(vector: Json):
 def test_a_vector_is_decoded_to_its_fields_and_encoded_to_its_bytes(vector: Json):
     message = decoded(vector)
     assert type(message) is KINDS[vector["type"]]
-    assert vector["encoding"] == ENCODINGS[type(message)]
+    assert vector["encoding"] == encoding_of(type(message))
     assert shown_fields(message) == vector["fields"]
     assert (encode(message).hex() == vector["hex"]) is vector["canonical"]
 
@@ -234,7 +236,7 @@ def test_every_message_has_a_section_a_table_of_its_fields_and_a_vector():
     for title, kind in {**KINDS, "MotionOutcome": MotionOutcome}.items():
         assert tuple(TABLES[title]) == kind.__struct_fields__
     for title, kind in KINDS.items():
-        assert section(title).startswith(f"\nEncoding `{ENCODINGS[kind]}`. ")
+        assert section(title).startswith(f"\nEncoding `{encoding_of(kind)}`. ")
     assert {vector["type"] for vector in CANONICAL} == set(KINDS)
     assert len({vector["name"] for vector in (*MESSAGES, *REFUSALS)}) == len(MESSAGES) + len(REFUSALS)
 
@@ -253,7 +255,7 @@ def test_missing_fields_have_the_defaults_of_the_page_and_nil_is_accepted_where_
         accepted = [payload for payload in shorter if is_accepted(title, payload)]
         assert bool(accepted) is has_defaults, name
         for payload in accepted:
-            message = shown_fields(decode(payload, ENCODINGS[kind], kind))
+            message = shown_fields(decode(payload, encoding_of(kind), kind))
             for later, (form_of, default) in fields[number:]:
                 value = json.loads(default.replace("nil", "null"))
                 assert message[later] == (str(value) if form_of in INTEGERS else value), later

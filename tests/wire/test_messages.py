@@ -187,6 +187,10 @@ def odometry(**changed: Any) -> Odometry:
     ("make", "changed", "text"),
     [
         (imu, {"frame": ""}, "1 to 1024 characters, not 0"),
+        (imu, {"frame": "/"}, "'/' is no name of a frame"),
+        (imu, {"frame": "/imu"}, "slash at its end"),
+        (imu, {"frame": "r1/"}, "write 'frame' or 'robot/frame'"),
+        (imu, {"frame": "a\nb"}, "control characters"),
         (imu, {"gyro": to_block([1, 2])}, "angular velocities of 3 numbers take 24 bytes, not 16"),
         (imu, {"accel": to_block([0, np.nan, 0])}, "accelerations of finite numbers .* not 0.0, nan"),
         (imu, {"gyro_covariance": to_block(range(5))}, "of 6 numbers take 48 bytes, not 40"),

@@ -46,6 +46,7 @@ from zstate.wire.native import (
     decode,
     decode_joint_state,
     encode,
+    encoding_of,
     joint_positions,
 )
 from zstate.wire.protocol import SerializedSample, StreamEncoder, Wire, WriterNode
@@ -305,7 +306,7 @@ MESSAGES = [message for message, _ in GOLDEN.values()]
 @pytest.mark.parametrize(("message", "golden"), GOLDEN.values(), ids=GOLDEN.keys())
 def test_the_bytes_are_those_of_the_messagepack_specification(message: Message, golden: bytes):
     assert encode(message) == golden
-    assert decode(golden, ENCODINGS[type(message)], type(message)) == message
+    assert decode(golden, encoding_of(type(message)), type(message)) == message
 
 
 def test_the_encoding_names_type_and_version():
@@ -337,7 +338,7 @@ def reason(payload: bytes, encoding: str, kind: type[Message] = JointState) -> s
 def test_a_message_cut_off_anywhere_is_truncated(message: Message):
     whole = encode(message)
     kind = type(message)
-    reasons = {reason(whole[:length], ENCODINGS[kind], kind) for length in range(len(whole))}
+    reasons = {reason(whole[:length], encoding_of(kind), kind) for length in range(len(whole))}
     assert reasons == {"truncated"}
 
 
@@ -457,7 +458,7 @@ def test_the_wire_does_not_check_for_infinite_numbers():
 @given(st.binary(max_size=200), st.sampled_from(list(ENCODINGS)))
 def test_arbitrary_bytes_raise_only_message_error(payload: bytes, kind: type[Message]):
     try:
-        decode(payload, ENCODINGS[kind], kind)
+        decode(payload, encoding_of(kind), kind)
     except MessageError as error:
         assert error.reason in {"truncated", "malformed"}
 
@@ -467,7 +468,7 @@ def test_one_changed_byte_raises_only_message_error(message: Message, at: int, v
     payload = bytearray(encode(message))
     payload[at % len(payload)] = value
     try:
-        decode(bytes(payload), ENCODINGS[type(message)], type(message))
+        decode(bytes(payload), encoding_of(type(message)), type(message))
     except MessageError as error:
         assert error.reason in {"truncated", "malformed"}
 
@@ -481,7 +482,7 @@ def test_native_wire_implements_the_protocol_for_every_stream():
     by_type = {type(message): message for message in MESSAGES}
     for stream, kind in ((row.name, row.type) for row in all_streams()):
         message, encoder = by_type[kind], encoder_of(stream, "w")
-        assert encoder.encoding == ENCODINGS[kind]
+        assert encoder.encoding == encoding_of(kind)
         assert encoder.key.startswith(wire.expression("r1", stream).rstrip("*"))
         arrival = SerializedSample(encoder.key, encoder.encode(message), encoder.encoding, encoder.attachment)
         assert wire.decode(stream, arrival, "r1") == (message,)

@@ -213,8 +213,9 @@ class Commands(click.Group):
             rows = [
                 (name.ljust(width), one.summary) for name, one in commands.items() if one.section == section
             ]
-            with formatter.section(section):
-                formatter.write_dl(rows)
+            if rows:  # its plugins may be removed
+                with formatter.section(section):
+                    formatter.write_dl(rows)
 
 
 class _Completed(click.types.StringParamType):

@@ -48,6 +48,7 @@ from zstate.recording.decode import (
     RecordedWriter,
     check_has_robot,
     first_descriptions,
+    further_streams,
     recorded_model,
     robot_with_joint_states,
 )
@@ -56,7 +57,6 @@ from zstate.recording.joint_parts import MergedJointStateReader, RecordedJoints,
 from zstate.recording.joint_states import DELAYED_NS, JointStateReader
 from zstate.recording.reader import RecordingReader
 from zstate.streams import JOINT_STREAMS, StreamName
-from zstate.wire.json_form import carried_as_json, json_streams
 from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import (
     DriverState,
@@ -341,18 +341,16 @@ class Recording(Closeable):
         *,
         refuse: Callable[[str, str], None] | None = None,
     ) -> Iterator[DecodedMessage]:
-        """The messages of ``stream``, one of another package, of ``robot``, by default of all robots.
+        """The messages of ``stream``, one of a plugin, of ``robot``, by default of all robots.
 
-        Each has its writer and the time of its recording [ns]. They are in the order of recording and read
-        one after the other. Messages that cannot be decoded are left out: ``refuse(reason, text)`` is called
-        for each, by default the first of each reason is logged. Raises InvalidInput for a stream that no
-        installed package brings, for one that ROS carries, and for a robot that is not in the recording.
+        They are of its class (``Stream.type``), in the order of recording, read one after the other; each
+        has its writer and the time of its recording [ns]. Messages that cannot be decoded are left out:
+        ``refuse(reason, text)`` is called for each, by default the first of each reason is logged. Raises
+        InvalidInput for a stream that no plugin brings, and for a robot that is not in the recording.
         """
-        if not carried_as_json(stream_named(stream).name):
-            known = ", ".join(json_streams()) or "none is installed"
-            raise InvalidInput(
-                f"{stream!r} is no stream of measurements of another package; those are: {known}"
-            )
+        if stream_named(stream).name not in further_streams():
+            known = ", ".join(further_streams())
+            raise InvalidInput(f"{stream!r} is no stream of measurements, maps or odometry: {known}")
         return self._messages(robot, stream, refuse or Refusals(f"recorded {stream}").count)
 
     def _messages(

@@ -1,4 +1,4 @@
-"""Export of a stream of another package as a table, one row for each message, in the order of recording.
+"""Export of a stream of a plugin as a table, one row for each message, in the order of recording.
 
 ===========  =========================================================================================
 column       content
@@ -44,11 +44,17 @@ def export_stream(
     """Write the messages of ``stream``; the number of rows, and of messages left out, by reason.
 
     The file appears when it is complete. Raises RecordingError and LibraryMissing as ``new_table`` does, and
-    InvalidInput as ``Recording.measurements`` does, without a message, and for an integer beyond 64 bits.
+    InvalidInput as ``Recording.measurements`` does, for messages with blocks of numbers, without a message,
+    and for an integer beyond 64 bits.
     """
     refusals = Refusals(f"recorded {stream}")
     messages = recording.measurements(stream, refuse=refusals.count)
     hints = get_type_hints(stream_named(stream).type)
+    if blocks := [name for name, hint in hints.items() if hint in (bytes, bytes | None)]:
+        raise InvalidInput(
+            f"{stream!r} has no columns: {', '.join(blocks)} of its messages are blocks of numbers; read "
+            "them with zstate.Recording"
+        )
     rows = 0
     with new_table(path, kind, recording, overwrite=overwrite) as table:
         while batch := list(islice(messages, _ROWS)):

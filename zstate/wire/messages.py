@@ -737,6 +737,11 @@ def _check_frame(frame: str) -> None:
             f"the name of a frame has 1 to {MAX_FRAME_NAME_LENGTH} characters, not {len(frame)}; name the "
             "frame of the measurement or of the grid"
         )
+    if frame[0] == "/" or frame[-1] == "/" or not frame.isprintable():
+        raise InvalidInput(
+            f"{frame!r} is no name of a frame: it has a slash at its end, or control characters; write "
+            "'frame' or 'robot/frame'"
+        )
 
 
 def _check_finite(what: str, *numbers: float) -> None:

@@ -11,7 +11,7 @@ from zstate.cli.doctor.robot_probe import RobotProbe, StreamSamples, WriterSampl
 from zstate.cli.frame_checks import similar_frames, without_program_advice
 from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import publish_command_for
-from zstate.errors import LookupFailed, ModelError, format_duration
+from zstate.errors import InvalidInput, LookupFailed, ModelError, format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.model.robot import RobotModel, coordinate_names, representative_links
 from zstate.model.urdf import parse_urdf
@@ -271,13 +271,17 @@ def _sensor_frames_checks(
     frames = {frame.name for frame in probe.frames}
     for sensor, writer in names:
         for frame in writers[writer.session].names if writer.session in writers else ():
-            full = full_name(robot, frame)
+            then = f"zstate static TARGET FRAME --xyz X Y Z  # or start {writer} with another --frame"
+            try:
+                full = full_name(robot, frame)
+            except InvalidInput as error:
+                yield broken(stream, f"the {stream} of {sensor!r}: {error}", then)
+                continue
             if full.startswith(f"{robot}/") and full not in frames:
                 near = similar_frames(full, frames)
                 hint = f"; {near[0]!r} is similar" if near else ""
                 text = f"the {stream} of {sensor!r} is in {full!r}, which no writer places{hint}"
-                then = f"zstate static TARGET {full} --xyz X Y Z  # or start {writer} with another --frame"
-                yield broken(stream, text, then)
+                yield broken(stream, text, then.replace("FRAME", full))
 
 
 def _no_writer_check(probe: RobotProbe) -> Check:

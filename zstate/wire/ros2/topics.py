@@ -183,7 +183,7 @@ class FrameNames:
     def to_zstate(self, name: str) -> str:
         """The name that this robot has for the ROS frame ``name``."""
         name = name.removeprefix("/")
-        if not self._prefix:
+        if not (self._prefix and name):
             return name
         local = name.removeprefix(self._prefix)
         if local and local != name:

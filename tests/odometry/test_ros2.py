@@ -235,6 +235,11 @@ def _fields(message: Message) -> list[Any]:
     return [getattr(message, name) for name in message.__struct_fields__]
 
 
+def test_a_reading_without_a_frame_is_malformed_with_a_prefix_as_well():
+    with pytest.raises(MessageError, match="1 to 1024 characters"):
+        decoded("imu", rosbags_imu([0, 0, 0, 1], [NONE] * 3, ""), PREFIXED)
+
+
 def test_frames_have_the_prefix_of_their_robot():
     assert encoded(imu(), PREFIXED) == rosbags_imu([0, 0, 0, 1], [ABSENT, NONE, NONE], "r1/imu")
     payload = rosbags_odometry(symmetric(6), symmetric(6), "r1/odom")
