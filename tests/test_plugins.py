@@ -174,6 +174,38 @@ def test_a_check_that_fails_is_a_warning_and_costs_no_other_one_anything(
         assert found["plugins"] == ("warning", text)
 
 
+LEAK = """
+from zstate.plugins import Plugin
+from zstate.streams import StampedMessage, Stream
+
+class Leak(StampedMessage, frozen=True, array_like=True, gc=False):
+    frame: str
+
+PLUGIN = Plugin("leak", streams=(Stream("leak", Leak, named=True),))
+"""
+
+
+@pytest.mark.parametrize(
+    ("frame", "text", "echoed"),
+    [
+        ("/", "the leak of 'bilge': the frame name '/' of robot 'panda' is empty or has a slash", "/"),
+        ("deck", "the leak of 'bilge' is in 'panda/deck', which no writer places", "panda/deck"),
+    ],
+)
+def test_a_frame_that_the_robot_does_not_have_is_a_finding_and_is_echoed(
+    installed: Path, sessions: tuple[Session, Session], frame: str, text: str, echoed: str
+):
+    install(installed, "zstate-leak", LEAK)
+    with (
+        StreamPublisher(sessions[0], "panda", "leak", name="bilge") as publisher,
+        _Repeated(lambda: publisher.publish(frame=frame)),
+    ):
+        found = doctors_checks()["leak"]
+        assert (found[0], text in found[1]) == ("broken", True), found
+        shown = run_cli("echo", "panda", "--stream", "leak", "--once", "--field", "frame")
+        assert json.loads(shown.stdout) == echoed
+
+
 def test_metrics_count_its_messages_and_writers(sessions: tuple[Session, Session], battery_plugin: Stream):
     with StreamPublisher(sessions[0], "panda", battery_plugin, name="main") as publisher:
         published = PublisherMetrics([publisher])

@@ -9,9 +9,9 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+from zstate._util.lazy_names import loaded
 from zstate.errors import InvalidInput, printable
 
 if TYPE_CHECKING:
@@ -104,12 +104,12 @@ class Stream:
         """The class of its messages."""
         if not isinstance(self.message, str):
             return self.message
-        return _loaded(self.message)
+        return loaded(self.message)
 
     @cached_property
     def ros_form(self) -> Any:
         """How ROS 2 carries it."""
-        return _loaded(self.ros)
+        return loaded(self.ros)
 
     @property
     def is_measured(self) -> bool:
@@ -130,18 +130,12 @@ class Stream:
     def to_document(self, message: Message, robot: str) -> dict[str, Any]:
         """What `zstate echo` prints of ``message``."""
         if self.document:
-            return _loaded(self.document)(message, robot)
+            return loaded(self.document)(message, robot)
         document = {name: getattr(message, name) for name in message.__struct_fields__ if name != "session"}
         if isinstance(frame := document.get("frame"), str):
             with suppress(InvalidInput):  # no name of a frame: as it is
-                document["frame"] = _loaded("zstate.wire.keys:full_name")(robot, frame)
+                document["frame"] = loaded("zstate.wire.keys:full_name")(robot, frame)
         return document
-
-
-def _loaded(place: str) -> Any:
-    """What is at ``"module:name"``."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
 
 
 CORE = (
@@ -215,5 +209,5 @@ JOINT_STREAMS = frozenset(row.name for row in CORE if row.group == "joints")
 def __getattr__(name: str) -> Any:
     # The base class of messages, for those who add a stream; msgspec is loaded then.
     if name == "StampedMessage":
-        return _loaded("zstate.message:StampedMessage")
+        return loaded("zstate.message:StampedMessage")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,10 +1,11 @@
-"""Names of a package that are loaded at their first use."""
+"""Names of modules that are loaded at their first use."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from typing import Any
 
 
 def lazy_names(package: str, homes: Mapping[str, str]) -> Callable[[str], object]:
@@ -18,3 +19,9 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> Callable[[str], object
         return value
 
     return load
+
+
+def loaded(place: str) -> Any:
+    """What is at ``"module:name"``; its module is imported if it is not yet."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)

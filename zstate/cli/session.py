@@ -81,8 +81,8 @@ def open_session(
 ) -> Generator[Session]:
     """A session for commands on ``wires``; connecting to a router may take ``timeout_s``, or a few seconds.
 
-    With ``timeout_s`` a line says after a moment what is waited for. From now on, warnings of the library
-    go to standard error.
+    With ``timeout_s`` the command prints after 0.5 s where no router answers. From now on, warnings of the
+    library go to standard error.
     """
     from zstate.cli.processes import BackgroundCall
 
@@ -110,7 +110,7 @@ def open_session(
 
 
 def _result(call: BackgroundCall[Session], endpoints: Sequence[str], timeout_s: float | None) -> Session:
-    """What ``call`` returns. Unless that is soon, a command with ``timeout_s`` says that it waits."""
+    """The session of ``call``; with ``timeout_s``, a status line is printed if it takes over ``GRACE_S``."""
     if timeout_s is not None:
         try:
             return call.result(min(GRACE_S, timeout_s))

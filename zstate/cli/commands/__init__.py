@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from functools import cache
-from importlib import import_module
 
 import click
 
+from zstate._util.lazy_names import loaded
 from zstate.cli.output.console import fail
 from zstate.plugins import Command, built_in_plugins, found_plugins
 
@@ -52,7 +52,7 @@ def own_commands() -> dict[str, Command]:
 
 def load_command(name: str) -> click.Command:
     """``zstate NAME``, a command of zstate."""
-    command = _loaded(own_commands()[name].place)
+    command = loaded(own_commands()[name].place)
     assert isinstance(command, click.Command)
     return command
 
@@ -63,7 +63,7 @@ def load_other_command(name: str) -> click.Command | None:
         if name in one.plugin.commands:
             place = one.plugin.command(name).place
             try:
-                command = _loaded(place)
+                command = loaded(place)
             except Exception as error:  # whatever another package's module does when it is imported
                 problem = f"cannot be loaded: {type(error).__name__}: {error}"
                 fail(f"the command {name!r} of {one.distribution} ({place}) {problem}")
@@ -71,9 +71,3 @@ def load_other_command(name: str) -> click.Command | None:
                 fail(f"the command {name!r} of {one.distribution} ({place}) is no click.Command")
             return command
     return None
-
-
-def _loaded(place: str) -> object:
-    """What is at ``"module:attribute"``."""
-    module, _, attribute = place.partition(":")
-    return getattr(import_module(module), attribute)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from importlib import import_module
 from typing import Any, Protocol, TypeVar
 
 from zstate._util.closeable import Closeable
+from zstate._util.lazy_names import loaded
 from zstate.cli.doctor.check import Check, warning
 from zstate.errors import printable
 from zstate.net.presence import RobotInfo
@@ -109,8 +109,7 @@ def opened_checks(
     """The checks of all plugins, open."""
 
     def load(place: str) -> PluginChecks:
-        module, _, name = place.partition(":")
-        return getattr(import_module(module), name)(session, robots, wire, on_change)
+        return loaded(place)(session, robots, wire, on_change)
 
     with ExitStack() as opened:
         yield [

@@ -271,17 +271,17 @@ def _sensor_frames_checks(
     frames = {frame.name for frame in probe.frames}
     for sensor, writer in names:
         for frame in writers[writer.session].names if writer.session in writers else ():
-            then = f"zstate static TARGET FRAME --xyz X Y Z  # or start {writer} with another --frame"
+            restart = f"start {writer} with another --frame"
             try:
                 full = full_name(robot, frame)
             except InvalidInput as error:
-                yield broken(stream, f"the {stream} of {sensor!r}: {error}", then)
+                yield broken(stream, f"the {stream} of {sensor!r}: {error}", f"zstate ls  # {restart}")
                 continue
             if full.startswith(f"{robot}/") and full not in frames:
                 near = similar_frames(full, frames)
                 hint = f"; {near[0]!r} is similar" if near else ""
                 text = f"the {stream} of {sensor!r} is in {full!r}, which no writer places{hint}"
-                yield broken(stream, text, then.replace("FRAME", full))
+                yield broken(stream, text, f"zstate static TARGET {full} --xyz X Y Z  # or {restart}")
 
 
 def _no_writer_check(probe: RobotProbe) -> Check:
