@@ -90,6 +90,7 @@ HOMES = {
 EVERYWHERE = {"numpy"}
 GUESTS = {
     ("message.py", "msgspec"),  # the base classes of messages
+    *((f"{plugin}/messages.py", "msgspec") for plugin in _PLUGINS),  # their classes
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
     ("recording/cli/snapshot_file.py", "msgspec"),
     ("odometry/cli/settings_file.py", "msgspec"),

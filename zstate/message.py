@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias
+from typing import Annotated, ClassVar, TypeAlias
 
 from msgspec import Meta, Struct
 
@@ -15,6 +15,21 @@ Count: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 class Message(Struct, frozen=True, array_like=True, gc=False):
     """Base of the messages of the native wire format."""
+
+    type_name: ClassVar[str] = ""
+    """The name in its Zenoh encoding, which is part of the protocol; empty for that of the class."""
+    max_bytes: ClassVar[int] = 0
+    """Larger payloads are refused, on whatever key; 0 for the limit of latched values."""
+
+    @staticmethod
+    def pack(payload: bytes) -> bytes:
+        """The bytes on the wire for the MessagePack array ``payload``."""
+        return payload
+
+    @staticmethod
+    def unpack(payload: bytes) -> bytes:
+        """The MessagePack array in the bytes from the wire. Raises MessageError."""
+        return payload
 
 
 class StampedMessage(Message, frozen=True, array_like=True, gc=False):

@@ -69,6 +69,9 @@ class Stream:
     - ``start``: how to start a writer, for the tools that miss one; ``{robot}`` in it is the robot's name.
     - ``document``: ``"module:function"`` that makes a dict of a message and the name of its robot, as `zstate
       echo` prints it; by default of all fields, a ``frame`` with its full name.
+    - ``full_document``: the same for its options --json, --csv and --field, if that has more.
+    - ``recorded``: ``"module:name"`` of how recordings have it where ROS 2 does not carry it
+      (zstate.wire.ros2.streams.RecordedForm).
     - ``ros``: ``"module:name"`` of how ROS 2 carries it (zstate.wire.ros2.streams.RosStream); empty if it
       does not.
 
@@ -86,6 +89,8 @@ class Stream:
     version: int = 1
     start: str = ""
     document: str = ""
+    full_document: str = ""
+    recorded: str = ""
     ros: str = ""
 
     def __post_init__(self) -> None:
@@ -111,6 +116,11 @@ class Stream:
         """How ROS 2 carries it."""
         return loaded(self.ros)
 
+    @cached_property
+    def recorded_form(self) -> Any:
+        """How recordings have it."""
+        return loaded(self.recorded)
+
     @property
     def is_measured(self) -> bool:
         """Whether it has what sensors and programs measure, sample by sample."""
@@ -127,10 +137,10 @@ class Stream:
         is_of_joints = self.group == "joints" or self.name == "joint_setpoints"
         return is_of_joints or bool(self.document) or self.is_measured
 
-    def to_document(self, message: Message, robot: str) -> dict[str, Any]:
-        """What `zstate echo` prints of ``message``."""
-        if self.document:
-            return loaded(self.document)(message, robot)
+    def to_document(self, message: Message, robot: str, *, in_full: bool = False) -> dict[str, Any]:
+        """What `zstate echo` prints of ``message``; ``in_full`` for programs."""
+        if place := (in_full and self.full_document) or self.document:
+            return loaded(place)(message, robot)
         document = {name: getattr(message, name) for name in message.__struct_fields__ if name != "session"}
         if isinstance(frame := document.get("frame"), str):
             with suppress(InvalidInput):  # no name of a frame: as it is

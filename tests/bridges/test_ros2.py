@@ -25,9 +25,10 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import OdometryPublisher
+from zstate.odometry.messages import Odometry
 from zstate.sources import JointStateListener, SineSource
 from zstate.transform import Transform
-from zstate.wire.messages import Odometry, covariance_matrix, from_block
+from zstate.wire.messages import covariance_matrix, from_block
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 

@@ -27,6 +27,7 @@ from zstate.driving import Limits
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command
 from zstate.driving.control_loop import ControlLoop
 from zstate.driving.driver import Setpoint, StopMode
+from zstate.driving.messages import JointTrajectory, Mode, MotionCancel, Release
 from zstate.driving.motion_service import plan
 from zstate.driving.setpoint_limiter import Rate as JointRate
 from zstate.driving.stops import StopRegister
@@ -36,7 +37,7 @@ from zstate.driving.transit import CommandAdmission, CommandAges
 from zstate.errors import DriverFault, InvalidInput, MessageError
 from zstate.net.presence import local_writer
 from zstate.rate import Rate
-from zstate.wire.messages import JointTrajectory, Mode, MotionCancel, Release, to_block
+from zstate.wire.messages import to_block
 
 Floats = NDArray[np.float64]
 

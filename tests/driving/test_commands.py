@@ -13,13 +13,14 @@ from zstate._util.refusals import Refusals
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, CommandReceiver, Targets
 from zstate.driving.driver import Mode
 from zstate.driving.limits import Limits
+from zstate.driving.messages import JointCommand
 from zstate.driving.setpoint_limiter import Limited, Rate, SetpointLimiter
 from zstate.driving.transit import CommandAdmission, CommandAges
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.session import Session
 from zstate.wire.joint_order import order_digest
-from zstate.wire.messages import JointCommand, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.messages import to_block
+from zstate.wire.native import encode, encoding_of
 
 DT = 0.004
 TICK = 4_000_000
@@ -228,7 +229,7 @@ class Receiver:
 
     def receive(self, payload: bytes) -> Command | str:
         """A command as it is received, or the reason of its refusal."""
-        self._session.zenoh.put("zstate/arm/joint_commands", payload, encoding=ENCODINGS[JointCommand])
+        self._session.zenoh.put("zstate/arm/joint_commands", payload, encoding=encoding_of(JointCommand))
         found: list[Command] = []
         until(lambda: found.extend(self._receiver.drain()) or found or self._refusals.counts)
         return found[0] if found else next(iter(self._refusals.counts))

@@ -20,6 +20,7 @@ from zstate.driving import Limits, SimulatedDriver
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command
 from zstate.driving.control_loop import ControlLoop
 from zstate.driving.driver import Setpoint, StopMode
+from zstate.driving.messages import JointTrajectory, MotionCancel, Release
 from zstate.driving.motion_service import plan
 from zstate.driving.setpoint_limiter import Rate as JointRate
 from zstate.driving.stops import StopRegister
@@ -28,7 +29,7 @@ from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
 from zstate.errors import DriverFault, InvalidInput, MessageError
 from zstate.net.presence import local_writer
 from zstate.rate import Rate
-from zstate.wire.messages import JointTrajectory, MotionCancel, Release, to_block
+from zstate.wire.messages import to_block
 
 LIMITS = Limits(RRBOT.joint_names, [-1.0, -2.0], [1.0, 2.0], [2.0, 0.5], [50.0, np.inf])
 PERIOD_NS = 2_000_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from zstate.driving.driver_state import Durations, ReceivedState, Spread
-from zstate.wire.messages import DriverState
+from zstate.driving.messages import DriverState
 
 
 @pytest.mark.parametrize(("age_s", "is_live"), [(0.499, True), (0.5, False)])

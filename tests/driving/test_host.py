@@ -24,6 +24,7 @@ from helpers.robots import RRBOT, SampleCollector, wait_for_reader
 from zstate import JointReading, StatePublisher, load_model
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.driving.driver import Setpoint, StopMode
+from zstate.driving.messages import DriverState, JointCommand, Release
 from zstate.driving.stops import stops_file, wait_for_state
 from zstate.errors import DriverFault, InvalidInput, MotionRefused, SecondWriter, Unreachable
 from zstate.net.presence import announce, confirmed_tokens, local_writer
@@ -32,8 +33,8 @@ from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.sources import JointStateListener
 from zstate.wire.keys import release_key, writer_expression, writer_key
-from zstate.wire.messages import DriverState, JointCommand, Release, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.messages import order_digest, to_block
+from zstate.wire.native import encode, encoding_of
 
 LIMITS = Limits.of(RRBOT, velocity=2.0, acceleration=math.inf)
 ELBOW = order_digest(("elbow",))
@@ -261,7 +262,7 @@ def raw_commands(sessions: tuple[Session, Session]) -> Iterator:
     with ExitStack() as opened:
         for token in keys:
             opened.enter_context(announce(session, token))
-        publisher = opened.enter_context(KeyPublisher(session, key, ENCODINGS[JointCommand]))
+        publisher = opened.enter_context(KeyPublisher(session, key, encoding_of(JointCommand)))
         wait_for_reader(session, key)
         until(lambda: known.issuperset(keys))
         watched.undeclare()
@@ -386,7 +387,7 @@ def test_a_commander_that_has_closed_moves_nothing_by_what_arrives_later(session
     driver = RecordingDriver()
     with running(sessions[0], driver) as host:
         numbers = iter(range(10**6))
-        with KeyPublisher(sessions[1], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as publisher:
+        with KeyPublisher(sessions[1], "zstate/arm/joint_commands", encoding_of(JointCommand)) as publisher:
             with raw_commands(sessions) as put:
 
                 def is_moved() -> bool:
@@ -1202,7 +1203,7 @@ def test_a_command_from_before_the_release_that_arrives_after_it_is_refused(sess
     with (
         running(sessions[0], driver) as host,
         raw_commands(sessions) as put,
-        KeyPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
+        KeyPublisher(sessions[1], key, encoding_of(Release)) as releases,
     ):
         wait_for_reader(sessions[1], key)
         stopped = stop(sessions[1], "arm", timeout_s=DEADLINE_S)
@@ -1233,7 +1234,7 @@ def test_a_stop_that_is_released_before_the_next_tick_is_obeyed(sessions):
     with (
         running(sessions[0], driver, ttl_s=10.0) as host,
         Commander(sessions[1], "arm") as arm,
-        KeyPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
+        KeyPublisher(sessions[1], key, encoding_of(Release)) as releases,
     ):
         arm.wait_for_driver()
         wait_for_reader(sessions[1], key)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from zstate.driving.messages import DriverState, MotionOutcome, OutcomeName
 from zstate.driving.motion import Motion
-from zstate.wire.messages import DriverState, MotionOutcome, OutcomeName
 
 HOST, IDENTITY = 5, (7, 3)
 

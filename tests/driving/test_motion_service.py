@@ -16,6 +16,7 @@ from helpers.raw_ros_nodes import COMMANDS, TRAJECTORY, RosPublisher, announced_
 from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.driving import Commander, DriverHost, Limits, Motion, SimulatedDriver, stop
+from zstate.driving.messages import JointCommand, JointTrajectory, MotionCancel, MotionReply
 from zstate.driving.stops import wait_for_state
 from zstate.driving.trajectory import Trajectory
 from zstate.errors import InvalidInput, MotionRefused, MotionTimeout
@@ -25,15 +26,8 @@ from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
 from zstate.net.writer import WireWriter
-from zstate.wire.messages import (
-    JointCommand,
-    JointTrajectory,
-    MotionCancel,
-    MotionReply,
-    order_digest,
-    to_block,
-)
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.messages import order_digest, to_block
+from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.registry import get_wire
 
 RATE_HZ = 200.0
@@ -422,7 +416,7 @@ def test_a_repeated_request_is_the_same_motion_and_an_older_one_is_refused(sessi
     with (
         hosted(sessions[0], driver),
         announced(sessions[1]),
-        KeyPublisher(sessions[1], key, ENCODINGS[JointCommand]) as commands,
+        KeyPublisher(sessions[1], key, encoding_of(JointCommand)) as commands,
     ):
         wait_for_reader(sessions[1], key)
 
@@ -470,10 +464,10 @@ def test_a_motion_request_that_has_waited_for_a_second_is_refused_while_its_comm
 
 
 def replies_to(session: Session, selector: str, message: JointTrajectory | MotionCancel) -> list[MotionReply]:
-    payload, encoding = encode(message), ENCODINGS[type(message)]
+    payload, encoding = encode(message), encoding_of(type(message))
     found = query(session.zenoh, selector, DEADLINE_S, payload=payload, encoding=encoding)
     answers = [reply.ok for reply in found if reply.ok is not None]
-    kind = ENCODINGS[MotionReply]
+    kind = encoding_of(MotionReply)
     return [decode(one.payload.to_bytes(), kind, MotionReply) for one in answers if str(one.encoding) == kind]
 
 

@@ -22,6 +22,7 @@ from zstate._util.refusals import Refusals
 from zstate.driving import Commander, DriverHost, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
 from zstate.driving.driver_state import DriverStatePublisher
+from zstate.driving.messages import DriverState, Release, Stop, stop_text
 from zstate.driving.stops import StopLatch, StopRegister
 from zstate.driving.stops_file import ActiveStop, stops_file, write_stops
 from zstate.errors import AccessDenied, ConfigError, SecondWriter, Unreachable
@@ -39,8 +40,7 @@ from zstate.wire.keys import (
     stop_expressions,
     stop_key,
 )
-from zstate.wire.messages import DriverState, Release, Stop, stop_text
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 HOST = local_writer(7)
@@ -146,7 +146,7 @@ def test_a_late_release_of_a_hosts_first_stop_does_not_end_its_second(sessions):
     key = release_key("arm", commander.identity)
     with (
         StopLatch(sessions[0], "arm", HOST, Refusals()) as latch,
-        KeyPublisher(sessions[1], key, ENCODINGS[Release]) as releases,
+        KeyPublisher(sessions[1], key, encoding_of(Release)) as releases,
     ):
         wait_for_reader(sessions[1], key)
         latch.latch("first")
@@ -279,7 +279,7 @@ def test_a_release_returns_once_the_driver_is_no_longer_stopped(sessions):
     present = [stopped]
     states: list[str] = []
     with (
-        LatchedPublisher(sessions[0], driver_key("arm"), ENCODINGS[DriverState]) as values,
+        LatchedPublisher(sessions[0], driver_key("arm"), encoding_of(DriverState)) as values,
         repeated(lambda: values.set(encode(present[-1]))),
         Commander(sessions[1], "arm") as arm,
     ):
@@ -302,7 +302,7 @@ def test_a_release_returns_once_the_driver_is_no_longer_stopped(sessions):
 @contextmanager
 def forger(session: Session, key: str) -> Iterator[Callable[[Stop | bytes], None]]:
     """Sends stops on the key of another program."""
-    with LatchedPublisher(session, key, ENCODINGS[Stop]) as values:
+    with LatchedPublisher(session, key, encoding_of(Stop)) as values:
         yield lambda one: values.set(one if isinstance(one, bytes) else encode(one))
 
 
@@ -346,7 +346,9 @@ def test_a_forged_stop_and_its_release_do_not_end_the_stop_of_the_program_that_i
         assert "hand inside" in state.reason
         assert "a test" in state.reason
         release = Release(0, 0, local_writer(8).session, ((session, seq + 1),))
-        releases = KeyPublisher(sessions[1], release_key("arm", local_writer(8).identity), ENCODINGS[Release])
+        releases = KeyPublisher(
+            sessions[1], release_key("arm", local_writer(8).identity), encoding_of(Release)
+        )
         with releases, repeated(lambda: releases.put(encode(release))):
             until(lambda: arm.wait_for_driver().stops == ((session, seq),))
         assert arm.wait_for_driver().state == "stopped"
@@ -591,7 +593,7 @@ def put_stop(session: Session, number: int, seq: int) -> None:
     """A stop of the session with that number, which is not cached for late joiners."""
     payload = encode(Stop(0, seq, number, "hold", f"flood {seq}"))
     key = stop_key("arm", WriterId("flood", "desk", 1, 1, number).identity)
-    session.zenoh.put(key, payload, encoding=ENCODINGS[Stop], congestion_control=CongestionControl.BLOCK)
+    session.zenoh.put(key, payload, encoding=encoding_of(Stop), congestion_control=CongestionControl.BLOCK)
 
 
 @pytest.mark.parametrize("kind", ["rising", "distinct"])
@@ -682,7 +684,7 @@ def test_every_name_may_hold_a_driver_and_reads_that_it_has_stopped_and_only_com
                 stop(users[name], "arm", name, how="relax", timeout_s=0.5)
             payload = encode(Stop(0, 0, 9, "relax", name))
             users[name].zenoh.put(
-                relax_key("arm", local_writer(9).identity), payload, encoding=ENCODINGS[Stop]
+                relax_key("arm", local_writer(9).identity), payload, encoding=encoding_of(Stop)
             )
         assert set(driver.hows) == {"hold"}
         assert not arm.release(DEADLINE_S).stops
@@ -708,7 +710,7 @@ def test_a_driver_without_torque_stays_so_until_that_stop_is_released(sessions):
         held = {(one["session"], one["seq"]) for one in stops_in_file() if one["how"] == "hold"}
         until(lambda: held <= set(arm.wait_for_driver().stops))
         key = release_key("arm", local_writer(8).identity)
-        with KeyPublisher(sessions[1], key, ENCODINGS[Release]) as releases:
+        with KeyPublisher(sessions[1], key, encoding_of(Release)) as releases:
             message = encode(Release(0, 0, local_writer(8).session, tuple(held)))
             with repeated(lambda: releases.put(message)):
                 until(lambda: not held & set(arm.wait_for_driver().stops))
@@ -763,7 +765,7 @@ def test_a_commander_that_was_stopped_may_move_again_by_a_release_after_that_of_
             state = stop(sessions[1], "arm")
             releaser = local_writer(8)
             key = release_key("arm", releaser.identity)
-            with KeyPublisher(sessions[1], key, ENCODINGS[Release]) as releases:
+            with KeyPublisher(sessions[1], key, encoding_of(Release)) as releases:
                 message = encode(Release(0, 0, releaser.session, state.stops))
                 with repeated(lambda: releases.put(message)):
                     until(lambda: host.report().refused.get("not released"))
@@ -775,7 +777,7 @@ def test_a_release_in_the_name_of_another_program_is_refused(sessions):
     with hosted(sessions[0]) as host, Commander(sessions[1], "arm"):
         stopped = stop(sessions[1], "arm")
         key = release_key("arm", local_writer(8).identity)
-        releases = KeyPublisher(sessions[1], key, ENCODINGS[Release])
+        releases = KeyPublisher(sessions[1], key, encoding_of(Release))
         with releases, repeated(lambda: releases.put(encode(Release(0, 0, 9, stopped.stops)))):
             until(lambda: host.report().refused.get("foreign"))
         assert host.state == "stopped"

@@ -7,9 +7,9 @@ from collections import deque
 import numpy as np
 import pytest
 
+from zstate.driving.messages import DriverState
 from zstate.driving.transit import CommandAdmission, CommandAges, CommandWindow, DriverClock
 from zstate.errors import MessageError
-from zstate.wire.messages import DriverState
 
 MS = 1_000_000
 S = 1000 * MS

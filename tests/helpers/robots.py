@@ -14,7 +14,7 @@ from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.se3 import to_matrix
 from zstate.transform import Transform
 from zstate.wire.messages import JointState
-from zstate.wire.native import ENCODINGS, decode
+from zstate.wire.native import decode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 RRBOT = load_model("rrbot")
@@ -51,7 +51,7 @@ class SampleCollector:
 
     def joint_states(self, count: int) -> list[JointState]:
         """The first ``count`` payloads, as joint states."""
-        return [decode(payload, ENCODINGS[JointState], JointState) for payload in self.payloads(count)]
+        return [decode(payload, encoding_of(JointState), JointState) for payload in self.payloads(count)]
 
     def close(self) -> None:
         self._subscriber.close()

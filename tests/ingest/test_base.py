@@ -19,15 +19,8 @@ from zstate.ingest.transforms import TransformIngest
 from zstate.model.kinematics import Kinematics
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
-from zstate.wire.messages import (
-    JointState,
-    RobotDescription,
-    Sample,
-    TransformSample,
-    order_digest,
-    to_block,
-)
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.messages import JointState, RobotDescription, Sample, TransformSample, order_digest, to_block
+from zstate.wire.native import decode, encode, encoding_of
 
 LONGER = load_model(RRBOT.urdf.replace('xyz="0 0 0.6"', 'xyz="0 0 0.9"'))
 SWAPPED = load_model(RRBOT.urdf.replace('name="shoulder"', 'name="aa"'))
@@ -347,9 +340,9 @@ def test_changed_model_replaces_the_robot_and_its_history():
 
 def test_repeated_description_leaves_the_history(case: IngestCase):
     payload = encode(description())
-    case.ingest.describe(decode(payload, ENCODINGS[RobotDescription], RobotDescription))
+    case.ingest.describe(decode(payload, encoding_of(RobotDescription), RobotDescription))
     case.receive(case.sample(0, [0.1, 0.2]), case.sample(1, [0.3, 0.4]))
-    case.ingest.describe(decode(payload, ENCODINGS[RobotDescription], RobotDescription))
+    case.ingest.describe(decode(payload, encoding_of(RobotDescription), RobotDescription))
     assert case.elbow_is([0.1, 0.2], at=0)
     assert case.elbow_is([0.3, 0.4], at=1)
 

@@ -16,13 +16,7 @@ from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.transforms import TransformIngest
 from zstate.transform import COVARIANCE_NUMBERS
-from zstate.wire.messages import (
-    JointState,
-    RobotDescription,
-    WriterTransforms,
-    order_digest,
-    to_block,
-)
+from zstate.wire.messages import JointState, RobotDescription, WriterTransforms, order_digest, to_block
 
 PERIOD = 10_000_000
 ORDER = order_digest(RRBOT.joint_names)

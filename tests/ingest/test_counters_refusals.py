@@ -21,7 +21,7 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 JOINT_STATE = encode(JointState(1, 0, 9, order_digest(RRBOT.joint_names), to_block([0.0, 0.0])))
 SAMPLE = encode(TransformSample(1, 0, 9, b"8 bytes.", to_block([0.0] * 14)))
@@ -48,12 +48,12 @@ def test_garbage_on_every_key_is_counted_by_reason_and_logged_once(sessions, cap
         wait_for_stream_readers(writer, "r1", follow)
         for key in keys:
             kind, good = KINDS[key]
-            ours = ENCODINGS[kind]
+            ours = encoding_of(kind)
             for _ in range(2):
                 for payload, encoding in (
                     (good[: len(good) // 2], ours),
                     (good, "application/json"),
-                    (good, ENCODINGS[RobotDescription if kind is JointState else JointState]),
+                    (good, encoding_of(RobotDescription if kind is JointState else JointState)),
                     (good, ours.replace("v=1", "v=2")),
                     (b"\xc1" + random.bytes(40), ours),
                     (random.bytes(40), "zenoh/bytes"),
@@ -77,7 +77,7 @@ def test_message_with_invalid_positions_is_counted_and_the_next_is_inserted(sess
     order = order_digest(RRBOT.joint_names)
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
-        KeyPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as driver,
+        KeyPublisher(writer, "zstate/r1/joint_states", encoding_of(JointState)) as driver,
         TransformListener(reader, "r1") as listener,
     ):
         until(lambda: driver.has_readers)
@@ -92,7 +92,7 @@ def test_unusable_description_is_counted_and_a_good_one_is_used(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener:
         bad = encode(RobotDescription(9, "<robot name='x'/>", "digest", (), ()))
-        key, encoding = "zstate/r1/robot_description", ENCODINGS[RobotDescription]
+        key, encoding = "zstate/r1/robot_description", encoding_of(RobotDescription)
         with LatchedPublisher(writer, key, encoding) as latched:
             latched.set(bad)
             until(lambda: listener.stats.refused == {"robot description": 1})

@@ -19,13 +19,7 @@ from zstate.model.kinematics import Kinematics
 from zstate.model.load import load_model
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER
-from zstate.wire.messages import (
-    RobotDescription,
-    StaticTransforms,
-    TransformSample,
-    order_digest,
-    to_block,
-)
+from zstate.wire.messages import RobotDescription, StaticTransforms, TransformSample, order_digest, to_block
 
 Edge = tuple[str, str]
 Step = Callable[["Network"], object]

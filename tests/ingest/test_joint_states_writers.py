@@ -15,12 +15,8 @@ from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
-from zstate.wire.messages import (
-    JointState,
-    order_digest,
-    to_block,
-)
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.messages import JointState, order_digest, to_block
+from zstate.wire.native import encode, encoding_of
 
 LONGER = load_model(RRBOT.urdf.replace('xyz="0 0 0.6"', 'xyz="0 0 0.9"'))
 
@@ -89,7 +85,7 @@ def test_writer_without_a_model_is_mapped_by_its_joint_names(sessions):
     state = JointState(STAMP, 0, 9, order_digest(names), to_block([2.0, 7.0, 1.0]), None, None, names)
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
-        KeyPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as driver,
+        KeyPublisher(writer, "zstate/r1/joint_states", encoding_of(JointState)) as driver,
         TransformListener(reader, "r1") as listener,
     ):
         until(lambda: driver.has_readers)
@@ -103,7 +99,7 @@ def test_lost_samples_count_as_missed(sessions):
     order = order_digest(RRBOT.joint_names)
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
-        KeyPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as driver,
+        KeyPublisher(writer, "zstate/r1/joint_states", encoding_of(JointState)) as driver,
         TransformListener(reader, "r1") as listener,
     ):
         until(lambda: driver.has_readers)

@@ -16,9 +16,9 @@ from zstate.ingest.joint_parts import PartialJointStateIngest, RobotParts
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.stream_ingests import MAX_DEPARTED, MAX_STRANGERS, StreamIngests
 from zstate.ingest.transforms import TransformIngest
+from zstate.odometry.messages import Odometry
 from zstate.wire.messages import (
     JointState,
-    Odometry,
     RobotDescription,
     Sample,
     WriterTransforms,

@@ -33,7 +33,7 @@ from zstate.nodes.metered_buffer import InstrumentedBuffer
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import SineSource
 from zstate.wire.messages import JointState
-from zstate.wire.native import ENCODINGS
+from zstate.wire.native import encoding_of
 
 JOINTS = {"robot": "r1", "wire": "native", "stream": "joint_states"}
 TF = {**JOINTS, "stream": "tf"}
@@ -90,7 +90,7 @@ def test_listener_stats_age_latency_and_lookups_are_reported(sessions):
     with (
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "r1", InstrumentedBuffer(), history_on_join=False) as listener,
-        KeyPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as noise,
+        KeyPublisher(writer, "zstate/r1/joint_states", encoding_of(JointState)) as noise,
     ):
         wait_for_stream_readers(writer, "r1")
         noise.put(b"noise")
@@ -261,7 +261,7 @@ def test_a_driver_has_its_state_refused_commands_and_the_age_of_the_newest(sessi
         commander.wait_for_driver(DEADLINE_S)
         with repeated(lambda: commander.send({"elbow": 0.1})):
             until(lambda: host.state == "active")
-        publisher = KeyPublisher(sessions[1], "zstate/arm/joint_commands", ENCODINGS[JointState])
+        publisher = KeyPublisher(sessions[1], "zstate/arm/joint_commands", encoding_of(JointState))
         until(lambda: publisher.put(b"") or host.report().refused.get("foreign"))
         until(lambda: "foreign" in drivers.states()["arm"].state.refused)
         rows = collected(DriverMetrics(drivers))

@@ -19,7 +19,7 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
 from zstate.wire.messages import ClockMessage
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -97,7 +97,7 @@ def test_reply_needs_the_key_and_the_session_of_its_writer(sessions, session):
     ours = WriterId("driver", "nuc", 3, 1, 5)
     key = clock_key("r1", ours.identity)
     payload = encode(ClockMessage(time.time_ns(), 0, session))
-    answer = lambda query: query.reply(key, payload, encoding=ENCODINGS[ClockMessage])  # noqa: E731
+    answer = lambda query: query.reply(key, payload, encoding=encoding_of(ClockMessage))  # noqa: E731
     queryable = sessions[0].zenoh.declare_queryable(key, answer)
     found = measure_offsets(sessions[1], "r1", timeout_s=0.5)
     assert [one.writer for one in found] == ([ours] if session == 5 else [])
@@ -224,7 +224,7 @@ def test_reply_of_another_writer_does_not_count(sessions):
     key = clock_key("r1", asked.identity)
 
     def answer(session: int) -> Reply:
-        return Reply(encode(ClockMessage(STAMP, 0, session)), ENCODINGS[ClockMessage])
+        return Reply(encode(ClockMessage(STAMP, 0, session)), encoding_of(ClockMessage))
 
     with Queryable(writer, key, lambda _: answer(other.session)):
         assert measure_offsets(reader, "r1", timeout_s=0.3) == ()

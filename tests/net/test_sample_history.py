@@ -23,7 +23,7 @@ from zstate.net.sample_history import (
 )
 from zstate.net.session import Session
 from zstate.wire.messages import HistoryPage, JointState
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 KEY = "zstate/r1/joint_states"
@@ -160,7 +160,7 @@ def test_reader_receives_every_sample_as_sent_newest_page_first(sessions: tuple[
         until(lambda: len(received.pages) == 2)
     assert received.seqs() == [list(range(3, 256 + 3)), [0, 1, 2]]
     assert received.pages[1] == [
-        SerializedSample(KEY, encode(state(seq)), ENCODINGS[JointState]) for seq in range(3)
+        SerializedSample(KEY, encode(state(seq)), encoding_of(JointState)) for seq in range(3)
     ]
 
 
@@ -194,11 +194,11 @@ def test_writer_without_samples_replies_once_with_an_empty_page(sessions):
 
 def test_reply_on_another_key_is_ignored(sessions: tuple[Session, Session]):
     writer, reader = sessions
-    reader_ = encode(HistoryPage(ENCODINGS[JointState], (encode(state(0)),), None))
+    reader_ = encode(HistoryPage(encoding_of(JointState), (encode(state(0)),), None))
     asked = threading.Semaphore(0)
 
     def answer(query: zenoh.Query) -> None:
-        query.reply("zstate/*/joint_states", reader_, encoding=ENCODINGS[HistoryPage])
+        query.reply("zstate/*/joint_states", reader_, encoding=encoding_of(HistoryPage))
         query.drop()
         asked.release()
 
@@ -244,8 +244,8 @@ def test_more_writers_than_the_in_flight_limit_are_all_requested(sessions: tuple
 @pytest.mark.parametrize(
     ("answer", "reason"),
     [
-        (Reply(b"\x93", ENCODINGS[HistoryPage]), "truncated"),
-        (Reply(encode(state(0)), ENCODINGS[JointState]), "foreign"),
+        (Reply(b"\x93", encoding_of(HistoryPage)), "truncated"),
+        (Reply(encode(state(0)), encoding_of(JointState)), "foreign"),
     ],
 )
 def test_invalid_page_is_reported_and_ends_the_requests(sessions, answer: Reply, reason: str):
@@ -260,12 +260,12 @@ def test_invalid_page_is_reported_and_ends_the_requests(sessions, answer: Reply,
 
 def test_writer_that_repeats_a_page_is_not_requested_for_ever(sessions):
     writer, reader = sessions
-    page = encode(HistoryPage(ENCODINGS[JointState], (encode(state(5)),), 5))
+    page = encode(HistoryPage(encoding_of(JointState), (encode(state(5)),), 5))
     asked: list[str] = []
 
     def answer(parameters):
         asked.append(parameters.get("before", ""))
-        return Reply(page, ENCODINGS[HistoryPage])
+        return Reply(page, encoding_of(HistoryPage))
 
     received = Pages(reader)
     with Queryable(writer, KEY, answer), received.reader:
@@ -291,7 +291,7 @@ def test_late_reply_is_received(sessions: tuple[Session, Session]):
             return (
                 None
                 if first
-                else Reply(encode(HistoryPage(ENCODINGS[JointState], (b"x",))), ENCODINGS[HistoryPage])
+                else Reply(encode(HistoryPage(encoding_of(JointState), (b"x",))), encoding_of(HistoryPage))
             )
 
         with Queryable(writer, KEY, answer):
@@ -345,13 +345,15 @@ def test_silent_writer_is_requested_three_times(sessions):
 
 def test_first_of_many_replies_on_the_key_is_the_page(sessions):
     writer, reader = sessions
-    right, wrong = (encode(HistoryPage(ENCODINGS[JointState], (sample,))) for sample in (b"right", b"wrong"))
+    right, wrong = (
+        encode(HistoryPage(encoding_of(JointState), (sample,))) for sample in (b"right", b"wrong")
+    )
 
     def answer(query: zenoh.Query) -> None:
         with query:
-            query.reply("zstate/*/joint_states", wrong, encoding=ENCODINGS[HistoryPage])
+            query.reply("zstate/*/joint_states", wrong, encoding=encoding_of(HistoryPage))
             for payload in (right, wrong, wrong):
-                query.reply(KEY, payload, encoding=ENCODINGS[HistoryPage])
+                query.reply(KEY, payload, encoding=encoding_of(HistoryPage))
 
     queryable = writer.zenoh.declare_queryable(KEY, answer)
     received = Pages(reader)
@@ -365,11 +367,11 @@ def test_first_of_many_replies_on_the_key_is_the_page(sessions):
 @pytest.mark.parametrize(("size", "reason"), [(524_288, ""), (524_289, "too large")])
 def test_page_of_more_than_524288_bytes_is_refused(sessions, size: int, reason: str):
     writer, reader = sessions
-    others = len(encode(HistoryPage(ENCODINGS[JointState], (bytes(2**16),)))) - 2**16
-    page = encode(HistoryPage(ENCODINGS[JointState], (bytes(size - others),)))
+    others = len(encode(HistoryPage(encoding_of(JointState), (bytes(2**16),)))) - 2**16
+    page = encode(HistoryPage(encoding_of(JointState), (bytes(size - others),)))
     assert len(page) == size
     received = Pages(reader)
-    with Queryable(writer, KEY, lambda _: Reply(page, ENCODINGS[HistoryPage])), received.reader:
+    with Queryable(writer, KEY, lambda _: Reply(page, encoding_of(HistoryPage))), received.reader:
         wait_for_queryable(reader)
         received.reader.request(KEY, 7)
         until(lambda: received.errors or received.pages)

@@ -23,7 +23,7 @@ from zstate.sources import JointReading, SineSource
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import status_key
 from zstate.wire.messages import Status
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 OK = Status(1, 2, "ok", "driver", "nuc", 3, 100.0, 4, 0)
 ME = WriterId("driver", "nuc", 3, 1, OK.session).identity
@@ -193,7 +193,7 @@ def test_invalid_status_is_counted_and_ignored(sessions):
     with ExitStack() as opened:
         publishers = {
             encoding: opened.enter_context(KeyPublisher(sessions[0], key, encoding))
-            for encoding in ("", ENCODINGS[Status])
+            for encoding in ("", encoding_of(Status))
         }
         wait_for_reader(sessions[0], key)
         for stream in publishers.values():
@@ -211,7 +211,7 @@ def test_a_status_counts_only_on_the_key_of_its_own_writer(sessions):
     wrong += [("r1", "me", OK), ("r1", ME, replace(OK, text="a" * 70_000))]
     for robot, identity, status in wrong:
         key = f"zstate/{robot}/status/{identity}"
-        sessions[0].zenoh.put(key, encode(status), encoding=ENCODINGS[Status])
+        sessions[0].zenoh.put(key, encode(status), encoding=encoding_of(Status))
     until(lambda: sum(received.watch.refused.values()) == len(wrong))
     assert received.watch.refused == {"foreign": 3, "malformed": 1, "too large": 1}
     assert not received.statuses

@@ -9,7 +9,7 @@ from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import KeyPublisher
 from zstate.net.subscription import Received, subscribe
 from zstate.wire.messages import JointState, StaticTransforms, order_digest, to_block
-from zstate.wire.native import ENCODINGS, NativeWire, encode
+from zstate.wire.native import NativeWire, encode, encoding_of
 
 STATE = JointState(5, 0, 1, order_digest(("a",)), to_block([0.5]))
 STATICS = StaticTransforms(1, (("base", "camera"),), to_block([0.0, 0, 0, 0, 0, 0, 1]))
@@ -19,7 +19,7 @@ STATICS = StaticTransforms(1, (("base", "camera"),), to_block([0.0, 0, 0, 0, 0, 
 def test_messages_of_a_stream_arrive_with_their_robot_and_broken_ones_are_reported(sessions, robot: str):
     received: list[Received] = []
     errors: list[tuple[str, str]] = []
-    key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
+    key, encoding = "zstate/r1/joint_states", encoding_of(JointState)
     with (
         KeyPublisher(sessions[0], key, encoding) as publisher,
         subscribe(
@@ -45,7 +45,7 @@ def test_a_key_without_a_robot_is_reported_as_foreign(sessions):
     received: list[Received] = []
     with (
         KeyPublisher(sessions[0], "zstate/@x/joint_states", "") as foreign,
-        KeyPublisher(sessions[0], "zstate/R 1/joint_states", ENCODINGS[JointState]) as publisher,
+        KeyPublisher(sessions[0], "zstate/R 1/joint_states", encoding_of(JointState)) as publisher,
         subscribe(
             sessions[1],
             NativeWire(),
@@ -67,7 +67,7 @@ def test_withdrawn_value_is_reported_by_its_key_without_an_error(sessions):
     received: list[Received] = []
     withdrawn: list[str] = []
     errors: list[object] = []
-    key, encoding = "zstate/r1/tf_static/mount", ENCODINGS[StaticTransforms]
+    key, encoding = "zstate/r1/tf_static/mount", encoding_of(StaticTransforms)
     with (
         LatchedPublisher(sessions[0], key, encoding) as publisher,
         subscribe(

@@ -25,10 +25,10 @@ from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import edge_key, writer_key
 from zstate.wire.messages import WriterTransforms, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 KEY = "zstate/r1/transforms/thief"
-ENCODING = ENCODINGS[WriterTransforms]
+ENCODING = encoding_of(WriterTransforms)
 REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 EDGE = (("odom", "base_link"),)
 CUP = (("odom", "cup"),)

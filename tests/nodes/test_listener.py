@@ -21,10 +21,11 @@ from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
+from zstate.odometry.messages import Odometry
 from zstate.sources import SineSource
 from zstate.transform import Transform
-from zstate.wire.messages import JointState, Odometry, WriterTransforms, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.messages import JointState, WriterTransforms, order_digest, to_block
+from zstate.wire.native import encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 PERIOD = 10_000_000
@@ -276,7 +277,7 @@ def test_listener_imports_neither_pinocchio_nor_the_view(sessions, spawn, follow
 def test_gaps_in_a_batch_that_filled_the_ring_count_as_dropped(sessions, monkeypatch: pytest.MonkeyPatch):
     def receive(*seqs: int) -> None:
         states = [JointState(STAMP + seq, seq, 9, order_digest(RRBOT.joint_names), b"") for seq in seqs]
-        key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
+        key, encoding = "zstate/r1/joint_states", encoding_of(JointState)
         samples = [SerializedSample(key, encode(state), encoding) for state in states]
         listener._reader._on_samples(listener._reader.ingests.followed, samples)
 
@@ -301,7 +302,7 @@ def test_a_full_ring_counts_the_next_gap_of_writers_that_have_left_or_never_anno
             pose = to_block([0.0, 0.0, 0.0, *UPRIGHT])
             message = WriterTransforms(STAMP + seq, seq, session, order_digest(edges), pose, edges)
             key = f"zstate/r1/transforms/writer_{session}"
-            arrived.append(SerializedSample(key, encode(message), ENCODINGS[WriterTransforms]))
+            arrived.append(SerializedSample(key, encode(message), encoding_of(WriterTransforms)))
         listener._reader._on_samples(streams, arrived)
 
     with TransformListener(sessions[0], "r1") as listener:
@@ -329,7 +330,7 @@ def test_key_without_a_robot_is_foreign_and_loses_no_sample(sessions):
         for number in range(50):
             for key in strange:
                 state = JointState(STAMP + number, number, 99, order_digest(RRBOT.joint_names), bytes(16))
-                writer.zenoh.put(key, encode(state), encoding=ENCODINGS[JointState])
+                writer.zenoh.put(key, encode(state), encoding=encoding_of(JointState))
             publisher.publish([0.0, 0.0])
         writer.zenoh.put("zstate/*/robot_description", b"noise")
         writer.zenoh.put("zstate/*/tf_static/mount", b"noise")
@@ -407,7 +408,7 @@ def test_writer_whose_token_has_no_name_is_announced(sessions, monkeypatch: pyte
         return [frame.writer for frame in listener.buffer.frames() if frame.parent] == ["p@h pid 1"]
 
     seqs = count()
-    encoding = ENCODINGS[WriterTransforms if stream == "transforms" else Odometry]
+    encoding = encoding_of(WriterTransforms if stream == "transforms" else Odometry)
     with (
         announce(writer, f"zstate/r1/@writer/{stream}/p,h,1,1,5"),
         TransformListener(reader, "r1") as listener,

@@ -37,7 +37,7 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.encoder import JointStateEncoder
@@ -188,7 +188,7 @@ class Writer:
         return arrival
 
     def serialized(self, sample: Sample) -> SerializedSample:
-        return SerializedSample(self.key, encode(sample), ENCODINGS[self.kind])
+        return SerializedSample(self.key, encode(sample), encoding_of(self.kind))
 
     def not_finite(self, payload: bytes) -> bytes:
         numbers = to_block([self.random.choice((np.nan, np.inf)), 1.0])

@@ -27,7 +27,7 @@ from zstate.sources import SineSource
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.messages import JointState, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 MS = 1_000_000
@@ -340,7 +340,7 @@ def test_history_equals_the_published_samples_byte_for_byte(sessions: tuple[Sess
             past.request(JOINTS, publisher.cache.writer)
             until(lambda: pages)
     assert [one.payload for one in pages[0]] == expected
-    assert {one.encoding for one in pages[0]} == {ENCODINGS[JointState]}
+    assert {one.encoding for one in pages[0]} == {encoding_of(JointState)}
     tap.close()
 
 

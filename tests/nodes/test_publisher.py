@@ -22,7 +22,7 @@ from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.nodes.publisher_status import StreamStats
 from zstate.wire.messages import TransformSample, from_block, poses_from_block
-from zstate.wire.native import ENCODINGS, decode
+from zstate.wire.native import decode, encoding_of
 
 NAN, INF = float("nan"), float("inf")
 JOINTS, TF = "zstate/r1/joint_states", "zstate/r1/tf"
@@ -115,7 +115,7 @@ def test_both_streams_carry_the_same_instant_and_agree_with_kinematics(sessions)
         publisher.publish([0.03, 0.4], stamp=STAMP)
         named = publisher.description().moving_edges
     state = joints.joint_states(1)[0]
-    sample = decode(transforms.payloads(1)[0], ENCODINGS[TransformSample], TransformSample)
+    sample = decode(transforms.payloads(1)[0], encoding_of(TransformSample), TransformSample)
     assert (sample.stamp, sample.seq, sample.session) == (state.stamp, state.seq, state.session)
     kinematics = Kinematics(model)
     edges = dict(zip(kinematics.edges, kinematics.edge_poses([0.03, 0.4]), strict=True))
@@ -151,7 +151,7 @@ def test_transforms_are_computed_and_sent_only_while_they_have_a_reader(sessions
         transforms = SampleCollector(reader, TF)
         # A second observer learns of readers a moment later than the first.
         until(lambda: publisher.publish([0.0, 0.0], stamp=2) or transforms.arrivals)
-        first = decode(transforms.payloads(1)[0], ENCODINGS[TransformSample], TransformSample)
+        first = decode(transforms.payloads(1)[0], encoding_of(TransformSample), TransformSample)
         assert (first.stamp, first.seq) == (2, transform_stats().suppressed)
         transforms.close()
         until(lambda: publisher.publish([0.0, 0.0], stamp=3) or transform_stats().suppressed > first.seq)
@@ -331,7 +331,7 @@ def test_without_pinocchio_closed_forms_serve_and_one_warning_names_what_mends_i
     (record,) = [one for one in caplog.records if "closed forms" in one.message]
     assert "`pip install pin`" in record.message
     moves = [joint.type != "fixed" for joint in RRBOT.joints]
-    sample = decode(transforms.payloads(1)[0], ENCODINGS[TransformSample], TransformSample)
+    sample = decode(transforms.payloads(1)[0], encoding_of(TransformSample), TransformSample)
     expected = Kinematics(RRBOT).edge_poses([0.25, -0.5])[moves]
     assert poses_from_block(sample.poses).tolist() == expected.tolist()
     publisher_module._warn_of_closed_forms.cache_clear()

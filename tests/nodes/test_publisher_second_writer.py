@@ -25,7 +25,7 @@ from zstate.transform import Transform
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import stream_key, writer_expression, writer_key
 from zstate.wire.messages import JointState, RobotDescription, order_digest
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 WRITER = """
     import sys
@@ -163,7 +163,7 @@ def test_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_pu
 
 
 def put(session: Session, key: str, message: JointState | RobotDescription) -> None:
-    session.zenoh.put(key, encode(message), encoding=ENCODINGS[type(message)])
+    session.zenoh.put(key, encode(message), encoding=encoding_of(type(message)))
 
 
 def test_streams_of_a_robot_may_have_separate_writers(sessions):

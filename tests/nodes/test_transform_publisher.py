@@ -26,7 +26,7 @@ from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import writer_key
 from zstate.wire.messages import Status, WriterTransforms, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 MS = 1_000_000
@@ -205,7 +205,7 @@ def test_token_of_an_earlier_writer_ends_none_that_publishes_an_edge(sessions):
     stranger = Announcement("r1", "transforms", WriterId("stranger", "laptop", 9, 1, 99), "stranger")
     with (
         TransformPublisher(ours, "r1", "wheels") as wheels,
-        KeyPublisher(theirs, "zstate/r1/transforms/stranger", ENCODINGS[WriterTransforms]) as stream,
+        KeyPublisher(theirs, "zstate/r1/transforms/stranger", encoding_of(WriterTransforms)) as stream,
     ):
         wheels.publish([pose("odom", "base_link")])
         with announce(theirs, writer_key("r1", "transforms", stranger.identity)):
@@ -371,7 +371,7 @@ def test_samples_that_arrive_after_their_writer_left_join_its_history(sessions):
             session = odometry._out.session_id
         until(lambda: [event.kind for event in listener.events()] == ["joined", "left"])
         late = WriterTransforms(stamp + 2, 2, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
-        with KeyPublisher(writer, key, ENCODINGS[WriterTransforms]) as stream:
+        with KeyPublisher(writer, key, encoding_of(WriterTransforms)) as stream:
             wait_for_reader(writer, key)
             stream.put(encode(late))
             until(lambda: counts() == [3])
@@ -386,7 +386,7 @@ def test_unannounced_writers_are_bounded_and_leave_no_edges(sessions):
         for session in range(300):
             edges = (("odom", f"frame{session}"),)
             sample = WriterTransforms(stamp, 0, session, order_digest(edges), to_block(np.eye(7)[6]), edges)
-            encoding = ENCODINGS[WriterTransforms]
+            encoding = encoding_of(WriterTransforms)
             arrival = SerializedSample("zstate/r1/transforms/thief", encode(sample), encoding)
             listener._reader._on_samples(transforms, [arrival])
         moving = [frame.name for frame in listener.buffer.frames() if frame.parent]

@@ -34,13 +34,14 @@ from zstate.odometry import (
     VelocityNoise,
     VelocityPublisher,
 )
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
 from zstate.odometry.node import pose_covariance, velocity_covariance
 from zstate.odometry.requests import request_odometry
 from zstate.odometry.simulated_rover import SimulatedRover
 from zstate.rate import Rate
 from zstate.sources.square_drive import WheelPair
 from zstate.transform import Transform
-from zstate.wire.messages import Imu, Odometry, Pose, Velocity, to_block
+from zstate.wire.messages import to_block
 from zstate.wire.registry import get_wire
 
 MODEL = load_model("diffbot")

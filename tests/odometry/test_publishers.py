@@ -20,18 +20,10 @@ from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
 from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.messages import (
-    Imu,
-    Message,
-    Odometry,
-    Pose,
-    Velocity,
-    covariance_matrix,
-    covariances_of,
-    from_block,
-)
+from zstate.wire.messages import Message, covariance_matrix, covariances_of, from_block
 from zstate.wire.registry import get_wire
 
 MS = 1_000_000

@@ -12,9 +12,10 @@ from zstate import Transform, load_model
 from zstate.model.kinematics import Kinematics
 from zstate.odometry.cli.settings_file import LegSettings, OdometrySettings
 from zstate.odometry.invariant_filter import Floats
+from zstate.odometry.messages import Imu
 from zstate.odometry.node import add_imu, add_joints
 from zstate.sources import JointReading
-from zstate.wire.messages import Imu, to_block
+from zstate.wire.messages import to_block
 
 pytestmark = pytest.mark.robots
 

@@ -13,19 +13,9 @@ from mcap_ros2._dynamic import generate_dynamic
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
+from zstate.odometry.messages import MAX_RATE, MAX_SPEED, Imu, Odometry, Pose, Velocity
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import (
-    MAX_RATE,
-    MAX_SPEED,
-    Imu,
-    Message,
-    Odometry,
-    Pose,
-    Velocity,
-    from_block,
-    order_digest,
-    to_block,
-)
+from zstate.wire.messages import Message, from_block, order_digest, to_block
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options

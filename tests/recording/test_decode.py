@@ -24,13 +24,12 @@ from rosbags.rosbag2 import StoragePlugin
 from zstate.recording.decode import STREAMS, DecodedMessage, DecodedRecording
 from zstate.recording.mcap.recover import recover
 from zstate.recording.reader import RecordingReader
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
     JointState,
-    LaserScan,
-    OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     TransformSample,

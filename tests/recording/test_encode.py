@@ -28,12 +28,11 @@ from zstate.recording.encode import (
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import Record
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
     ClockMessage,
     JointState,
-    LaserScan,
-    OccupancyGrid,
     RobotDescription,
     StaticTransforms,
     TransformSample,
@@ -214,7 +213,7 @@ def test_messages_that_cdr_cannot_represent_are_counted_by_reason(case: EncoderC
     case.encoder.write_message("cart", short, NOW)
     case.encoder.write_message("cart", statics(("arm", "to\0ol")), NOW, "mount")
     case.encoder.write_message("a b", statics(("arm", "tool")), NOW, "mount")
-    assert case.refused == {"no stamp": 2, "stamp outside 1901 to 2038": 4, "not sayable": 3}
+    assert case.refused == {"no stamp": 2, "stamp outside 1901 to 2038": 4, "not representable": 3}
     assert [message.header.stamp.sec for message in case.read("/joint_states")] == [2**31 - 1, -(2**31)]
     published = [record.publish_time for record in case.records() if record.topic == "/tf"]
     assert published == [2**31 * S - 1, 0]

@@ -10,7 +10,8 @@ from helpers.recording_files import START, S, joint_states, write_run
 
 from zstate.errors import RecordingError
 from zstate.recording.info import read_info, recorded_robots
-from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
+from zstate.scans.messages import LaserScan, OccupancyGrid
+from zstate.wire.messages import to_block, to_float32_block
 
 
 def test_info_has_the_facts_of_the_writer(tmp_path: Path):

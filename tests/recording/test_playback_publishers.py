@@ -25,25 +25,24 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+from zstate.odometry.messages import Odometry
 from zstate.recording.decode import DecodedRecording
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
 from zstate.scans import ScanPublisher
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
 from zstate.wire.keys import writer_expression
 from zstate.wire.messages import (
     JointState,
-    LaserScan,
-    OccupancyGrid,
-    Odometry,
     TransformSample,
     order_digest,
     poses_from_block,
     to_block,
     to_float32_block,
 )
-from zstate.wire.native import ENCODINGS, decode
+from zstate.wire.native import decode, encoding_of
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
@@ -150,7 +149,7 @@ def test_transforms_are_played_by_writers_of_the_same_names(sessions, tracked: P
         assert replay(sessions[1], tracked) == 2 * COUNT
         for collector, edge, column in ((odometry, ("odom", "base"), 1), (camera, ("odom", "ball"), 0)):
             payloads = collector.payloads(COUNT)
-            samples = [decode(one, ENCODINGS[TransformSample], TransformSample) for one in payloads]
+            samples = [decode(one, encoding_of(TransformSample), TransformSample) for one in payloads]
             assert [sample.edges for sample in samples] == [(edge,)] * COUNT
             assert [sample.seq for sample in samples] == list(range(COUNT))
             assert [sample.stamp for sample in samples] == [START + n * 10 * MS for n in range(COUNT)]
@@ -294,7 +293,7 @@ def test_drivers_are_played_on_the_keys_of_their_names(sessions, drivers: Path):
         wait_for_stream_readers(sessions[1], "arm", *names)
         replay(sessions[1], drivers)
         # The restarted driver continues as its predecessor.
-        samples = [decode(one, ENCODINGS[JointState], JointState) for one in lower.payloads(2 * COUNT)]
+        samples = [decode(one, encoding_of(JointState), JointState) for one in lower.payloads(2 * COUNT)]
         assert {sample.names for sample in samples} == {(SHOULDER,)}
         assert [sample.seq for sample in samples] == list(range(2 * COUNT))
         assert [sample.velocities for sample in samples] == [

@@ -35,17 +35,17 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.recording.player import CLOCK_HZ, Player, PlayerReport
 from zstate.recording.recorder import Recorder
+from zstate.scans.messages import OccupancyGrid
 from zstate.transform import Transform
 from zstate.wire.messages import (
     ClockMessage,
     JointState,
-    OccupancyGrid,
     StaticTransforms,
     TransformSample,
     from_block,
     to_block,
 )
-from zstate.wire.native import ENCODINGS, decode
+from zstate.wire.native import decode, encoding_of
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.options import Ros2Options
@@ -238,7 +238,7 @@ def test_each_pass_of_a_loop_starts_a_new_epoch(sessions, arm: Path):
         assert states[0].stamp == START
     until(
         lambda: (
-            len({decode(p, ENCODINGS[ClockMessage], ClockMessage).session for p in clocks.payloads(1)}) >= 3
+            len({decode(p, encoding_of(ClockMessage), ClockMessage).session for p in clocks.payloads(1)}) >= 3
         )
     )
 
@@ -252,7 +252,9 @@ def test_recording_time_is_published_on_the_clock(sessions, arm: Path):
         first, last = replayer.span
         # 100 times a second at five times the speed: every 50 ms of the recording.
         expected = list(range(first, last + 1, 50 * MS))
-        stamps = [decode(p, ENCODINGS[ClockMessage], ClockMessage).stamp for p in tap.payloads(len(expected))]
+        stamps = [
+            decode(p, encoding_of(ClockMessage), ClockMessage).stamp for p in tap.payloads(len(expected))
+        ]
     assert stamps == expected
 
 
@@ -266,7 +268,7 @@ def test_recorded_clock_is_published_unchanged(sessions, tmp_path: Path):
     wait_for_reader(writer, "zstate/clock")
     with Player(writer, tmp_path / "r.mcap", rate=math.inf) as replayer:
         replayer.run()
-    assert [decode(p, ENCODINGS[ClockMessage], ClockMessage).stamp for p in tap.payloads(5)] == [
+    assert [decode(p, encoding_of(ClockMessage), ClockMessage).stamp for p in tap.payloads(5)] == [
         n * MS for n in range(5)
     ]
 
@@ -337,7 +339,7 @@ def test_robot_without_a_model_is_published_unchanged(sessions, tmp_path: Path):
         found = listener.buffer.wait("map", "base", START + 55 * MS, timeout_s=5.0)
         expected = recorded_buffer(path).lookup("map", "base", START + 55 * MS)
     assert np.array_equal(found.pose7, expected.pose7)
-    samples = [decode(p, ENCODINGS[TransformSample], TransformSample) for p in tap.payloads(20)]
+    samples = [decode(p, encoding_of(TransformSample), TransformSample) for p in tap.payloads(20)]
     assert [(sample.stamp, sample.seq) for sample in samples] == [(START + n * 10 * MS, n) for n in range(20)]
 
 
@@ -419,7 +421,7 @@ def test_unpublishable_messages_are_counted(sessions, tmp_path: Path):
         bag.joints(START + 4 * MS, {"shoulder": 0.5})
     with Player(sessions[0], tmp_path / "bag", rate=math.inf) as replayer:
         report = replayer.run()
-    assert (report.samples, report.refused) == (2, {"not sayable": 1, "missing joints": 1})
+    assert (report.samples, report.refused) == (2, {"not representable": 1, "missing joints": 1})
 
 
 def test_truncated_recording_is_played_as_far_as_possible(sessions, tmp_path: Path):

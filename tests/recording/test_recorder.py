@@ -21,6 +21,7 @@ from rosbags.highlevel import AnyReader
 
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
+from zstate.driving.messages import JointCommand, Stop
 from zstate.errors import InvalidInput, RecordingError
 from zstate.model.kinematics import MovingEdges
 from zstate.model.load import load_model
@@ -46,15 +47,13 @@ from zstate.transform import Transform
 from zstate.wire.keys import writer_key
 from zstate.wire.messages import (
     ClockMessage,
-    JointCommand,
     JointState,
-    Stop,
     covariance_matrix,
     from_block,
     order_digest,
     to_block,
 )
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
 
@@ -317,7 +316,7 @@ def test_missed_undecodable_and_unwritable_messages_are_counted(sessions, tmp_pa
     key = "zstate/r1/joint_states"
     with (
         Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder,
-        KeyPublisher(writer, key, ENCODINGS[JointState]) as ours,
+        KeyPublisher(writer, key, encoding_of(JointState)) as ours,
         KeyPublisher(writer, key, "text/plain") as foreign,
     ):
         until(lambda: ours.has_readers and foreign.has_readers)
@@ -341,7 +340,7 @@ def test_simulated_time_is_recorded_with_the_robots(sessions, tmp_path: Path):
     writer, reader = sessions
     with (
         Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder,
-        KeyPublisher(writer, "zstate/clock", ENCODINGS[ClockMessage]) as clock,
+        KeyPublisher(writer, "zstate/clock", encoding_of(ClockMessage)) as clock,
     ):
         until(lambda: clock.has_readers)
         clock.put(encode(ClockMessage(3_000_000_007, 0, 9)))
@@ -494,7 +493,7 @@ def test_received_samples_are_written_even_if_the_recording_ends_at_once(session
     writer, reader = sessions
     with (
         Recorder(reader, tmp_path / "run.mcap") as recorder,
-        KeyPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as publisher,
+        KeyPublisher(writer, "zstate/r1/joint_states", encoding_of(JointState)) as publisher,
     ):
         until(lambda: publisher.has_readers)
         with closing(SampleCollector(reader, "zstate/r1/joint_states")) as tap:
@@ -765,7 +764,7 @@ def test_commands_are_recorded_as_joint_states_and_not_replayed(sessions, tmp_pa
         StatePublisher(sessions[0], RRBOT, "arm") as publisher,
         Recorder(sessions[1], path, ["arm"]) as recorder,
         announce(sessions[0], writer_key("arm", "joint_commands", teleop.identity)),
-        KeyPublisher(sessions[0], "zstate/arm/joint_commands", ENCODINGS[JointCommand]) as commands,
+        KeyPublisher(sessions[0], "zstate/arm/joint_commands", encoding_of(JointCommand)) as commands,
     ):
         wait_for_stream_readers(sessions[0], "arm", "joint_states", "joint_commands")
         until(lambda: teleop.session in recorder._programs)
@@ -802,7 +801,7 @@ def test_stops_with_and_without_torque_are_recorded_and_their_numbers_have_no_ga
         hows: tuple[tuple[str, StopMode], ...] = (("stop", "hold"), ("relax", "relax"))
         for stream, how in hows:
             key = f"zstate/arm/{stream}/{writer.identity}"
-            latched = opened.enter_context(LatchedPublisher(sessions[0], key, ENCODINGS[Stop]))
+            latched = opened.enter_context(LatchedPublisher(sessions[0], key, encoding_of(Stop)))
             wait_for_reader(sessions[0], key)
             for seq in (5, 2**40):
                 latched.set(encode(Stop(STAMP, seq, writer.session, how, "")))

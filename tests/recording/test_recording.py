@@ -24,9 +24,11 @@ from rosbags.rosbag2 import StoragePlugin
 
 from zstate import Recording, UnknownFrame
 from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
+from zstate.odometry.messages import Imu, Pose
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import Imu, LaserScan, OccupancyGrid, Pose, to_block, to_float32_block
+from zstate.wire.messages import to_block, to_float32_block
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames

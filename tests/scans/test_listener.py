@@ -16,8 +16,8 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.scans import PlacedScan, Scan, ScanListener, ScanPublisher
+from zstate.scans.messages import SCAN_RAYS
 from zstate.transform import Transform
-from zstate.wire.messages import SCAN_RAYS
 from zstate.wire.registry import get_wire
 
 MS = 1_000_000

@@ -15,8 +15,8 @@ from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net.subscription import Received, subscribe
 from zstate.scans import Grid, MapPublisher, Scan, ScanPublisher
 from zstate.scans.grid import grid_from_message
+from zstate.scans.messages import SCAN_RAYS, LaserScan, OccupancyGrid
 from zstate.scans.scan import scan_from_message
-from zstate.wire.messages import SCAN_RAYS, LaserScan, OccupancyGrid
 from zstate.wire.registry import get_wire
 
 GEOMETRY = {"angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.1, "range_max": 10.0}

@@ -15,14 +15,9 @@ from mcap_ros2._dynamic import generate_dynamic
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.plugins import stream_named
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import (
-    LaserScan,
-    Message,
-    OccupancyGrid,
-    to_block,
-    to_float32_block,
-)
+from zstate.wire.messages import Message, to_block, to_float32_block
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options

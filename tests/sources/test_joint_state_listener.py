@@ -13,7 +13,7 @@ from zstate.net.streams import KeyPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointStateListener
 from zstate.wire.messages import JointState, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 KEY = "zstate/r1/joint_states"
 NAN = float("nan")
@@ -23,7 +23,7 @@ FLOATING = load_model(
 )
 
 
-def put(session: Session, payload: bytes, encoding: str = ENCODINGS[JointState]) -> None:
+def put(session: Session, payload: bytes, encoding: str = encoding_of(JointState)) -> None:
     wait_for_reader(session, KEY)
     with KeyPublisher(session, KEY, encoding) as stream:
         stream.put(payload)
@@ -121,16 +121,16 @@ def test_tasks_read_samples_and_end_with_the_listener(sessions):
 @pytest.mark.parametrize(
     ("payload", "encoding", "reason"),
     [
-        (b"\x98", ENCODINGS[JointState], "truncated"),
-        (joint_state([1, 2])[:-3], ENCODINGS[JointState], "truncated"),
-        (b"\x00\xff\xfe", ENCODINGS[JointState], "malformed"),
+        (b"\x98", encoding_of(JointState), "truncated"),
+        (joint_state([1, 2])[:-3], encoding_of(JointState), "truncated"),
+        (b"\x00\xff\xfe", encoding_of(JointState), "malformed"),
         (joint_state([1, 2]), "zstate/JointState;v=2", "newer version"),
         (joint_state([1, 2]), "text/plain", "foreign"),
-        (joint_state([1, 2, 3]), ENCODINGS[JointState], "bad numbers"),
-        (joint_state([1, NAN]), ENCODINGS[JointState], "bad numbers"),
-        (joint_state([1, 2], [1, NAN]), ENCODINGS[JointState], "bad numbers"),
-        (joint_state([1, 2], [1]), ENCODINGS[JointState], "bad numbers"),
-        (joint_state([1, 2], [1, 2], [float("inf"), 2]), ENCODINGS[JointState], "bad numbers"),
+        (joint_state([1, 2, 3]), encoding_of(JointState), "bad numbers"),
+        (joint_state([1, NAN]), encoding_of(JointState), "bad numbers"),
+        (joint_state([1, 2], [1, NAN]), encoding_of(JointState), "bad numbers"),
+        (joint_state([1, 2], [1]), encoding_of(JointState), "bad numbers"),
+        (joint_state([1, 2], [1, 2], [float("inf"), 2]), encoding_of(JointState), "bad numbers"),
     ],
     ids=lambda value: value if isinstance(value, str) else value[:9].hex(),
 )
@@ -158,7 +158,7 @@ def test_samples_that_wait_for_the_model_are_bounded_in_bytes(sessions):
             writer.zenoh.put(
                 KEY,
                 payload,
-                encoding=ENCODINGS[JointState],
+                encoding=encoding_of(JointState),
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
 
@@ -177,7 +177,7 @@ def test_the_newest_1024_readings_wait_for_their_reader(sessions):
     block, order = to_block([1.0, 2.0]), order_digest(RRBOT.joint_names)
     with JointStateListener(reader, "r1", RRBOT) as source:
         wait_for_reader(writer, KEY)
-        with KeyPublisher(writer, KEY, ENCODINGS[JointState]) as stream:
+        with KeyPublisher(writer, KEY, encoding_of(JointState)) as stream:
             for batch in range(11):  # each ends with a message whose refusal shows that it was received
                 for seq in range(100 * batch, 100 * batch + 100):
                     stream.put(encode(JointState(seq, seq, 1, order, block)))

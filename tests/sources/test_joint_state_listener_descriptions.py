@@ -12,10 +12,10 @@ from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources.joint_state_listener import DescriptionSubscriber
 from zstate.wire.messages import RobotDescription
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 KEY = "zstate/r1/robot_description"
-ENCODING = ENCODINGS[RobotDescription]
+ENCODING = encoding_of(RobotDescription)
 GRIPPER = load_model("gripper")
 EACH = "ros2:namespace=*"
 

@@ -27,7 +27,7 @@ from zstate.nodes.static_publisher import StaticPublisher
 from zstate.recording.player import Player
 from zstate.transform import Transform
 from zstate.wire.messages import JointState, RobotDescription, TransformSample, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -440,7 +440,7 @@ def test_stamps_of_transforms_are_checked_without_a_description(sessions):
     edges = (("base", "hand"),)
     pose = to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     with (
-        KeyPublisher(writer, "zstate/r1/tf", ENCODINGS[TransformSample]) as publisher,
+        KeyPublisher(writer, "zstate/r1/tf", encoding_of(TransformSample)) as publisher,
         TransformListener(reader, "r1", follow="tf") as listener,
     ):
         until(lambda: publisher.has_readers)

@@ -8,10 +8,11 @@ import pytest
 from helpers.recording_builder import MS, START, RecordingBuilder, S, pose
 
 from zstate.scans import Scan
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.view.data_source import ViewSource
 from zstate.view.recorded_world import LogTimes, RecordedMap, RecordedScans
 from zstate.view.world_source import WriterName
-from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
+from zstate.wire.messages import to_block, to_float32_block
 
 FRONT, FLOOR = WriterName("cart", "front"), WriterName("hall", "floor")
 RAY_NS = 1000

@@ -18,11 +18,12 @@ pytest.importorskip("viser")
 from zstate import StatePublisher, StaticPublisher, Transform, load_model
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FramePoses
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.view.camera import Camera, Visibility, fit_camera
 from zstate.view.data_source import ViewSource
 from zstate.view.server import ViewServer
 from zstate.view.view import View
-from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
+from zstate.wire.messages import to_block, to_float32_block
 
 CART = load_model("diffbot")
 STILL = [0.0, 0.0, 0.0, 1.0]

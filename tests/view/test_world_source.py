@@ -7,9 +7,10 @@ import pytest
 from zstate.buffer.buffer import TransformBuffer
 from zstate.net.subscription import Received
 from zstate.scans import Scan
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
 from zstate.view.world_source import SensorScans, WorldSource, WriterName
-from zstate.wire.messages import LaserScan, OccupancyGrid, to_block, to_float32_block
+from zstate.wire.messages import to_block, to_float32_block
 
 MS = 1_000_000
 

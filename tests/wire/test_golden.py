@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.matrix_kinematics import MatrixKinematics, matrices
+from helpers.message_types import MESSAGE_TYPES
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.driving.messages import MotionOutcome
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.urdf import parse_urdf
 from zstate.net.sample_history import MAX_PAGE_BYTES
@@ -24,8 +26,8 @@ from zstate.streams import StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import STOP_STREAMS
-from zstate.wire.messages import HistoryPage, Message, MotionOutcome, order_digest
-from zstate.wire.native import ENCODINGS, MAX_MESSAGE_BYTES, NativeWire, decode, encode, encoding_of
+from zstate.wire.messages import HistoryPage, Message, order_digest
+from zstate.wire.native import NativeWire, decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 Json = dict[str, Any]
@@ -34,7 +36,7 @@ GOLDEN = Path(__file__).parent / "golden"
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
 
 KINDS: dict[str, type[Message]] = {
-    kind.__name__: kind for kind in (*ENCODINGS, *(row.type for row in all_streams()))
+    kind.__name__: kind for kind in (*MESSAGE_TYPES, *(row.type for row in all_streams()))
 }
 FORMATS = {"f64[]": "d", "f32[]": "f", "i8[]": "b"}
 INTEGERS = ("stamp", "session", "uint", "ns")
@@ -324,7 +326,7 @@ def test_the_size_limits_of_the_page_are_those_of_the_code():
     limits: dict[str, int] = {}
     for names, limit in rows_of(section("Size limits"))[2:]:
         limits |= {name.strip("`"): int(limit) for name in names.split(", ")}
-    single = {kind.__name__: size for kind, size in MAX_MESSAGE_BYTES.items()}
+    single = {kind.__name__: kind.max_bytes for kind in MESSAGE_TYPES if kind.max_bytes}
     for stream, kind in ((row.name, row.type) for row in all_streams()):
         assert single.pop(kind.__name__, limits[stream]) == limits[stream]
     assert single[HistoryPage.__name__] > MAX_PAGE_BYTES  # the page is checked before it is decoded

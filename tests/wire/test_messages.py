@@ -5,23 +5,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from zstate.driving.messages import DriverState, JointTrajectory, with_short_texts
 from zstate.errors import InvalidInput, MessageError
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity, with_full_names
 from zstate.plugins import stream_named
+from zstate.scans.messages import LaserScan, OccupancyGrid, cells_of
 from zstate.wire.messages import (
-    DriverState,
-    Imu,
     JointState,
-    JointTrajectory,
-    LaserScan,
     Message,
-    OccupancyGrid,
-    Odometry,
-    Pose,
     StaticTransforms,
     TransformSample,
-    Velocity,
     WriterTransforms,
-    cells_of,
     covariance_matrix,
     edge_of,
     from_block,
@@ -30,10 +24,8 @@ from zstate.wire.messages import (
     poses_from_block,
     to_block,
     to_float32_block,
-    with_full_names,
-    with_short_texts,
 )
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.native import decode, encode, encoding_of
 
 EDGES = (("base", "arm"), ("arm", "hand"))
 
@@ -356,7 +348,7 @@ def test_numbers_of_a_driver_state_outside_of_their_ranges_are_malformed(
 ):
     def received(number: float) -> DriverState:
         state = DriverState(0, 5, "host", "ready", "", ("elbow",), 1, **{field: number})
-        return decode(encode(state), ENCODINGS[DriverState], DriverState)
+        return decode(encode(state), encoding_of(DriverState), DriverState)
 
     assert [getattr(received(number), field) for number in (least, most)] == [least, most]
     for number in (np.nextafter(least, -1.0), np.nextafter(most, np.inf)):

@@ -5,43 +5,41 @@ import zlib
 import msgspec
 import numpy as np
 import pytest
+from helpers.message_types import MESSAGE_TYPES
 from hypothesis import given
 from hypothesis import strategies as st
 
+from zstate.driving.messages import (
+    DriverState,
+    JointCommand,
+    JointTrajectory,
+    MotionCancel,
+    MotionOutcome,
+    MotionReply,
+    Release,
+    Stop,
+)
 from zstate.errors import MessageError
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
 from zstate.plugins import all_streams
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.streams import LATCHED_BYTES, StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.messages import (
     ClockMessage,
-    DriverState,
     HistoryPage,
-    Imu,
-    JointCommand,
     JointState,
-    JointTrajectory,
-    LaserScan,
     Message,
-    MotionCancel,
-    MotionOutcome,
-    MotionReply,
-    OccupancyGrid,
-    Odometry,
-    Pose,
-    Release,
     RobotDescription,
     StaticTransforms,
     Status,
-    Stop,
     TransformSample,
-    Velocity,
     WriterTransforms,
     order_digest,
     to_block,
     to_float32_block,
 )
 from zstate.wire.native import (
-    ENCODINGS,
     NativeWire,
     decode,
     decode_joint_state,
@@ -310,8 +308,8 @@ def test_the_bytes_are_those_of_the_messagepack_specification(message: Message, 
 
 
 def test_the_encoding_names_type_and_version():
-    assert ENCODINGS[JointState] == "zstate/JointState;v=1"
-    assert ENCODINGS[RobotDescription] == "zstate/RobotDescription;v=1"
+    assert encoding_of(JointState) == "zstate/JointState;v=1"
+    assert encoding_of(RobotDescription) == "zstate/RobotDescription;v=1"
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 29, 31, 32, 200])
@@ -360,7 +358,9 @@ def test_newer_version_has_its_own_reason():
 
 def test_appended_fields_of_a_later_version_are_ignored():
     fields = msgspec.msgpack.decode(encode(MESSAGES[0]))
-    assert decode(msgspec.msgpack.encode([*fields, "more"]), ENCODINGS[JointState], JointState) == MESSAGES[0]
+    assert (
+        decode(msgspec.msgpack.encode([*fields, "more"]), encoding_of(JointState), JointState) == MESSAGES[0]
+    )
 
 
 GOOD = [0, 0, 1, ORDER, b"12345678"]
@@ -385,27 +385,27 @@ GOOD = [0, 0, 1, ORDER, b"12345678"]
     ],
 )
 def test_wrong_types_ranges_and_lengths_are_malformed(fields: object):
-    assert reason(msgspec.msgpack.encode(fields), ENCODINGS[JointState]) == "malformed"
+    assert reason(msgspec.msgpack.encode(fields), encoding_of(JointState)) == "malformed"
 
 
 def test_bytes_after_the_message_are_malformed():
-    assert reason(encode(MESSAGES[0]) + b"\x00", ENCODINGS[JointState]) == "malformed"
+    assert reason(encode(MESSAGES[0]) + b"\x00", encoding_of(JointState)) == "malformed"
 
 
 def test_text_that_is_not_utf8_is_malformed():
     description = encode(MESSAGES[5]).replace(b"<robot/>", b"\xff\xfe12345.")
-    assert reason(description, ENCODINGS[RobotDescription], RobotDescription) == "malformed"
+    assert reason(description, encoding_of(RobotDescription), RobotDescription) == "malformed"
 
 
 def test_arrays_nested_without_end_are_malformed():
     bomb = b"\x99" + encode(MESSAGES[0])[1:] + b"\x91" * 1_000_000 + b"\xc0"
-    assert reason(bomb, ENCODINGS[JointState]) == "malformed"
+    assert reason(bomb, encoding_of(JointState)) == "malformed"
 
 
 def test_a_further_element_of_100_nested_arrays_is_ignored():
     message = MESSAGES[0]
     nested = b"\x99" + encode(message)[1:] + b"\x91" * 100 + b"\xc0"
-    assert decode(nested, ENCODINGS[JointState], JointState) == message
+    assert decode(nested, encoding_of(JointState), JointState) == message
 
 
 def large_grid(side: int) -> OccupancyGrid:
@@ -419,7 +419,7 @@ def test_a_grid_is_deflated_above_64_kb_and_read_again(side: int):
     payload = encode(grid)
     plain = msgspec.msgpack.encode(grid)
     assert payload == plain if side == 250 else zlib.decompress(payload) == plain
-    arrival = SerializedSample("zstate/hall/map/map", payload, ENCODINGS[OccupancyGrid])
+    arrival = SerializedSample("zstate/hall/map/map", payload, encoding_of(OccupancyGrid))
     assert NativeWire().decode("map", arrival, "hall") == (grid,)
 
 
@@ -429,7 +429,7 @@ def test_a_deflated_grid_cut_off_anywhere_is_truncated():
     )
     assert len(payload) < 1000
     lengths = range(1, len(payload))
-    assert {reason(payload[:n], ENCODINGS[OccupancyGrid], OccupancyGrid) for n in lengths} == {"truncated"}
+    assert {reason(payload[:n], encoding_of(OccupancyGrid), OccupancyGrid) for n in lengths} == {"truncated"}
 
 
 @pytest.mark.long
@@ -438,7 +438,7 @@ def test_a_grid_that_inflates_beyond_the_limit_is_refused_without_inflating_it()
     assert len(bomb) < 300_000
     tracemalloc.start()
     try:
-        assert reason(bomb, ENCODINGS[OccupancyGrid], OccupancyGrid) == "too large"
+        assert reason(bomb, encoding_of(OccupancyGrid), OccupancyGrid) == "too large"
         assert tracemalloc.get_traced_memory()[1] < 3 * LATCHED_BYTES
     finally:
         tracemalloc.stop()
@@ -447,15 +447,15 @@ def test_a_grid_that_inflates_beyond_the_limit_is_refused_without_inflating_it()
 def test_bytes_after_a_deflated_grid_and_wrong_checksums_are_malformed():
     payload = encode(large_grid(300))
     for wrong in (payload + b"\0", payload[:-1] + bytes([payload[-1] ^ 1]), b"\x78" + bytes(9)):
-        assert reason(wrong, ENCODINGS[OccupancyGrid], OccupancyGrid) == "malformed"
+        assert reason(wrong, encoding_of(OccupancyGrid), OccupancyGrid) == "malformed"
 
 
 def test_the_wire_does_not_check_for_infinite_numbers():
     state = JointState(0, 0, 1, ORDER, to_block([np.nan, np.inf]))
-    assert decode(encode(state), ENCODINGS[JointState], JointState) == state
+    assert decode(encode(state), encoding_of(JointState), JointState) == state
 
 
-@given(st.binary(max_size=200), st.sampled_from(list(ENCODINGS)))
+@given(st.binary(max_size=200), st.sampled_from(MESSAGE_TYPES))
 def test_arbitrary_bytes_raise_only_message_error(payload: bytes, kind: type[Message]):
     try:
         decode(payload, encoding_of(kind), kind)

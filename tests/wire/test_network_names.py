@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import zenoh
+from helpers.message_types import MESSAGE_TYPES
 from helpers.processes import repeated, until
 from helpers.robots import wait_for_reader
 
@@ -30,7 +31,7 @@ from zstate import (
 )
 from zstate.net.session import Session
 from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
-from zstate.wire.native import ENCODINGS
+from zstate.wire.native import encoding_of
 
 NETWORK = json.loads(Path(__file__).with_name("golden").joinpath("network.json").read_text())
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -38,7 +39,7 @@ EVERYTHING = ("joint_states", "tf", "tf_static", "robot_description")
 
 
 def test_encodings_of_all_message_classes():
-    assert sorted(ENCODINGS.values()) == NETWORK["native_encodings"]
+    assert sorted(map(encoding_of, MESSAGE_TYPES)) == NETWORK["native_encodings"]
 
 
 class Sniffer:

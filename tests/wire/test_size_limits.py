@@ -19,7 +19,7 @@ from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.plugins import stream_named
 from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
-from zstate.wire.native import ENCODINGS, NativeWire, decode, encode
+from zstate.wire.native import NativeWire, decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 
@@ -46,7 +46,9 @@ def test_each_stream_has_a_largest_payload(wire, stream):
 
 def test_more_than_ten_thousand_static_edges_are_too_many():
     def arrival(count: int) -> SerializedSample:
-        return SerializedSample("zstate/r1/tf_static/w", encode(statics(count)), ENCODINGS[StaticTransforms])
+        return SerializedSample(
+            "zstate/r1/tf_static/w", encode(statics(count)), encoding_of(StaticTransforms)
+        )
 
     assert NativeWire().decode("tf_static", arrival(10_000), "r1")
     with pytest.raises(MessageError, match="10001 static edges"):
@@ -55,7 +57,7 @@ def test_more_than_ten_thousand_static_edges_are_too_many():
 
 def test_messages_without_a_stream_have_a_limit_too():
     with pytest.raises(MessageError) as caught:
-        decode(bytes(64_001), ENCODINGS[Status], Status)
+        decode(bytes(64_001), encoding_of(Status), Status)
     assert caught.value.reason == "too large"
 
 
@@ -72,8 +74,8 @@ def test_of_samples_that_wait_for_a_description_the_newest_1024_or_4_mib_are_kep
 def test_too_large_messages_are_counted_and_later_ones_are_inserted(sessions):
     writer, reader = sessions
     with (
-        KeyPublisher(writer, "zstate/r2/joint_states", ENCODINGS[JointState]) as stranger,
-        LatchedPublisher(writer, "zstate/r1/tf_static/mount", ENCODINGS[StaticTransforms]) as mount,
+        KeyPublisher(writer, "zstate/r2/joint_states", encoding_of(JointState)) as stranger,
+        LatchedPublisher(writer, "zstate/r1/tf_static/mount", encoding_of(StaticTransforms)) as mount,
         TransformListener(reader) as listener,
         StatePublisher(writer, RRBOT, "r1") as publisher,
     ):

@@ -32,19 +32,13 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import OdometryPublisher
+from zstate.odometry.messages import Odometry
 from zstate.sources.joint_state_listener import DescriptionSubscriber, JointStateListener
 from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, MODEL_WRITER, check_robot
-from zstate.wire.messages import (
-    Edges,
-    Odometry,
-    StaticTransforms,
-    TransformSample,
-    poses_from_block,
-    to_block,
-)
+from zstate.wire.messages import Edges, StaticTransforms, TransformSample, poses_from_block, to_block
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.wire import Ros2Wire

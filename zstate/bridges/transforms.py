@@ -13,17 +13,11 @@ from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter, ZSt
 from zstate.model.robot import RobotModel
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import OdometryPublisher
+from zstate.odometry.messages import Odometry
 from zstate.transform import Transform
 from zstate.wire.joint_order import Floats
 from zstate.wire.keys import full_name
-from zstate.wire.messages import (
-    Edges,
-    Odometry,
-    covariance_matrix,
-    covariances_of,
-    from_block,
-    poses_from_block,
-)
+from zstate.wire.messages import Edges, covariance_matrix, covariances_of, from_block, poses_from_block
 
 P = TypeVar("P", TransformPublisher, OdometryPublisher)
 

@@ -16,7 +16,7 @@ from zstate.net.streams import CAPACITY
 from zstate.net.subscription import Received, subscribe
 from zstate.streams import StreamName
 from zstate.wire.keys import check_robot
-from zstate.wire.messages import OccupancyGrid, StampedMessage
+from zstate.wire.messages import Message
 from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class TimedSample(NamedTuple):
     """A sample, or a map, and its ``arrival`` [ns] by the monotonic clock."""
 
     arrival: int
-    sample: StampedMessage | OccupancyGrid
+    sample: Message
 
 
 class StreamReader(Closeable):
@@ -58,7 +58,6 @@ class StreamReader(Closeable):
     def _on_messages(self, received: list[Received]) -> None:
         now = time.monotonic_ns()
         for _, _, sample in received:
-            assert isinstance(sample, StampedMessage | OccupancyGrid)
             # If the queue is not read, as on a stopped terminal, the newest samples are dropped.
             if self._samples.qsize() < CAPACITY:
                 self._samples.put(TimedSample(now, sample))

@@ -18,6 +18,20 @@ from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.checks import real_numbers
 from zstate.driving.commands import check_named
 from zstate.driving.driver_state import SILENT_S, cached_state
+from zstate.driving.messages import (
+    GOAL_TIME_S,
+    GOAL_TOLERANCE,
+    PATH_TOLERANCE,
+    DriverState,
+    JointCommand,
+    JointTrajectory,
+    Mode,
+    MotionCancel,
+    MotionReply,
+    Release,
+    state_text,
+    with_echo,
+)
 from zstate.driving.motion import Motion, Points, rows_block
 from zstate.driving.transit import REQUEST_TTL_NS, CommandWindow, DriverClock
 from zstate.errors import (
@@ -38,23 +52,8 @@ from zstate.net.streams import KeyPublisher
 from zstate.net.writer import WireWriter
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import check_robot, driver_key, motion_key, release_key
-from zstate.wire.messages import (
-    GOAL_TIME_S,
-    GOAL_TOLERANCE,
-    PATH_TOLERANCE,
-    DriverState,
-    JointCommand,
-    JointTrajectory,
-    Mode,
-    MotionCancel,
-    MotionReply,
-    Release,
-    order_digest,
-    state_text,
-    to_block,
-    with_echo,
-)
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.messages import order_digest, to_block
+from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 
@@ -127,7 +126,7 @@ class Commander(Closeable):
             self._writer = writer.open_stream("joint_commands")
             self._claim.confirm()
             key = release_key(self.robot, identity.identity)
-            self._releases = opening.enter_context(KeyPublisher(session, key, ENCODINGS[Release]))
+            self._releases = opening.enter_context(KeyPublisher(session, key, encoding_of(Release)))
             opening.enter_context(LatchedSubscriber(session, driver_key(self.robot), self._on_state))
             self._opened = opening.pop_all()
 
@@ -419,7 +418,7 @@ class Commander(Closeable):
     def _replies(
         self, key: str, message: JointTrajectory | MotionCancel, timeout_s: float
     ) -> list[MotionReply]:
-        payload, encoding = encode(message), ENCODINGS[type(message)]
+        payload, encoding = encode(message), encoding_of(type(message))
         answers: list[MotionReply] = []
         for reply in query(self._session.zenoh, key, timeout_s, payload=payload, encoding=encoding):
             if reply.ok is not None:

@@ -17,6 +17,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.driving.driver import Mode
+from zstate.driving.messages import JointCommand
 from zstate.driving.setpoint_limiter import Rate, Rates
 from zstate.driving.transit import CommandAdmission
 from zstate.errors import InvalidInput, MessageError, format_duration, printable
@@ -24,12 +25,12 @@ from zstate.net.presence import announce
 from zstate.net.session import Session
 from zstate.net.streams import StreamInbox
 from zstate.wire.keys import shortened, stream_key
-from zstate.wire.messages import JointCommand, from_block
+from zstate.wire.messages import from_block
 from zstate.wire.native import decode
 from zstate.wire.protocol import SerializedSample
 
 if TYPE_CHECKING:
-    from zstate.wire.ros2.wire import Ros2Controller
+    from zstate.driving.ros2 import Ros2Controller
 
 Floats = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.checks import real_numbers
+from zstate.driving.messages import Mode
 from zstate.errors import InvalidInput
 from zstate.sources import JointReading
-from zstate.wire.messages import Mode
 
 StopMode: TypeAlias = Literal["hold", "relax"]
 """How a driver stops: it holds its joints where they are, or switches their torque off."""

@@ -17,6 +17,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.driving.driver import Setpoint
+from zstate.driving.messages import DriverState, state_text, with_encodable_fields, with_short_texts
 from zstate.errors import Closed, InvalidInput, MessageError, SecondWriter, format_duration, printable
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber, cached_values
 from zstate.net.ownership import wait_for_discovery
@@ -25,15 +26,8 @@ from zstate.net.writer import WireWriter
 from zstate.rate import RateReport
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import driver_expression, driver_key, robot_from_key
-from zstate.wire.messages import (
-    DriverState,
-    JointState,
-    order_digest,
-    state_text,
-    to_block,
-    with_short_texts,
-)
-from zstate.wire.native import ENCODINGS, decode, encode, with_encodable_fields
+from zstate.wire.messages import JointState, order_digest, to_block
+from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 
@@ -104,7 +98,7 @@ class DriverStatePublisher(Closeable):
 
     def __init__(self, session: Session, robot: str, build: Callable[[], DriverState]) -> None:
         self._build = build
-        self._latched = LatchedPublisher(session, driver_key(robot), ENCODINGS[DriverState])
+        self._latched = LatchedPublisher(session, driver_key(robot), encoding_of(DriverState))
         self._has_changed = fork_safe(threading.Event())
         self._closed = False
         self._has_failed = False

@@ -33,6 +33,7 @@ from zstate.driving.driver_state import (
     check_only_host,
 )
 from zstate.driving.limits import Limits
+from zstate.driving.messages import DriverState, Mode
 from zstate.driving.motion_service import MotionService
 from zstate.driving.pace import DevicePace, Realtime, check_pace, control_loop_pace
 from zstate.driving.stops import StopLatch
@@ -49,11 +50,10 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.rate import Rate
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import check_robot
-from zstate.wire.messages import DriverState, Mode
-from zstate.wire.registry import as_wire_names, get_controller, get_wire
+from zstate.wire.registry import as_wire_names, get_wire
 
 if TYPE_CHECKING:
-    from zstate.wire.ros2.wire import Ros2Controller
+    from zstate.driving.ros2 import Ros2Controller
 
 _RECENT_NS = 1_000_000_000
 """For so long the excess of the newest command is reported."""
@@ -153,7 +153,11 @@ class DriverHost(Closeable):
             self._stops = opening.enter_context(StopLatch(session, self.robot, self._writer, self._refusals))
             setpoints = SetpointPublisher(session, self.robot, names, self._writer)
             opening.enter_context(setpoints)
-            controller = get_controller(self._wires, self.robot, ros2_controller) if ros2_controller else None
+            controller = None
+            if ros2_controller:
+                from zstate.driving.ros2 import get_controller  # noqa: PLC0415 - loads the ROS wire
+
+                controller = get_controller(self._wires, self.robot, ros2_controller)
             ages = CommandAges(self._writer.session, self._ttl_ns)
             self._admission = CommandAdmission(ages)
             commands = CommandReceiver(

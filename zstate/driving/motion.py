@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 
 from zstate._util.fork_safe import fork_safe
 from zstate.checks import real_numbers
+from zstate.driving.messages import DriverState, OutcomeName
 from zstate.errors import InvalidInput, MotionTimeout
 from zstate.net.queryable import check_timeout
-from zstate.wire.messages import DriverState, OutcomeName, to_block
+from zstate.wire.messages import to_block
 
 Points = Mapping[str, Sequence[float] | ArrayLike]
 """Numbers by joint, one for each time."""

@@ -36,14 +36,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
 from zstate.driving.limits import Limits
-from zstate.driving.trajectory import Trajectory
-from zstate.driving.transit import REQUEST_TTL_NS, CommandAges, check_waited
-from zstate.errors import InvalidInput, MessageError, format_duration
-from zstate.net.queryable import Reply, RequestAnswer, RequestQueryable
-from zstate.net.session import Session
-from zstate.net.streams import StreamSubscriber
-from zstate.wire.keys import motion_key
-from zstate.wire.messages import (
+from zstate.driving.messages import (
     MOTION_POINTS,
     JointTrajectory,
     Mode,
@@ -51,14 +44,21 @@ from zstate.wire.messages import (
     MotionOutcome,
     MotionReply,
     OutcomeName,
-    from_block,
     without_past,
 )
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.driving.trajectory import Trajectory
+from zstate.driving.transit import REQUEST_TTL_NS, CommandAges, check_waited
+from zstate.errors import InvalidInput, MessageError, format_duration
+from zstate.net.queryable import Reply, RequestAnswer, RequestQueryable
+from zstate.net.session import Session
+from zstate.net.streams import StreamSubscriber
+from zstate.wire.keys import motion_key
+from zstate.wire.messages import from_block
+from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 if TYPE_CHECKING:
-    from zstate.wire.ros2.wire import Ros2Controller
+    from zstate.driving.ros2 import Ros2Controller
 
 Floats = NDArray[np.float64]
 
@@ -447,7 +447,7 @@ class MotionService(Closeable):
 
     def _answer(self, payload: bytes, encoding: str) -> RequestAnswer:
         """The reply to a request; a cancellation does not wait for the plan of another one."""
-        if encoding == ENCODINGS[MotionCancel]:
+        if encoding == encoding_of(MotionCancel):
             return self._reply(self._counted(lambda: self._cancel(payload)) or ())
         if not self._places.acquire(blocking=False):
             self._refusals.count("overrun", f"{_MOST_PLANS} motions wait to be planned")
@@ -464,7 +464,7 @@ class MotionService(Closeable):
     def _reply(self, findings: _Findings) -> Reply:
         texts = tuple(text[:_MAX_FINDING_LENGTH] for text in findings[:_MOST_FINDINGS])
         reply = MotionReply(self._host_session, self._executor.ttl_ns, texts)
-        return Reply(encode(reply), ENCODINGS[MotionReply])
+        return Reply(encode(reply), encoding_of(MotionReply))
 
     def _on_ros_samples(self, controller: Ros2Controller, samples: list[SerializedSample]) -> None:
         for sample in samples:
@@ -483,7 +483,7 @@ class MotionService(Closeable):
         return findings
 
     def _cancel(self, payload: bytes) -> _Findings:
-        cancel = decode(payload, ENCODINGS[MotionCancel], MotionCancel)
+        cancel = decode(payload, encoding_of(MotionCancel), MotionCancel)
         self._executor.call(lambda _: self._executor.cancel(cancel))
         return ()
 

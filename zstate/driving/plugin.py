@@ -3,7 +3,7 @@
 from zstate.plugins import Command, Plugin
 from zstate.streams import SAMPLE_BYTES, Stream
 
-_MESSAGES = "zstate.wire.messages"
+_MESSAGES = "zstate.driving.messages"
 
 JOINT_COMMANDS = Stream(
     "joint_commands",
@@ -11,10 +11,11 @@ JOINT_COMMANDS = Stream(
     summary="setpoints and motions for a driver",
     group="driver",
     max_bytes=SAMPLE_BYTES,
+    recorded="zstate.driving.recorded:COMMANDS",
 )
 JOINT_SETPOINTS = Stream(
     "joint_setpoints",
-    f"{_MESSAGES}:JointState",
+    "zstate.wire.messages:JointState",
     summary="what a driver writes to the hardware",
     group="driver",
     max_bytes=SAMPLE_BYTES,
@@ -25,6 +26,7 @@ DRIVER = Stream(
     summary="whether a driver follows commands, and why not",
     group="driver",
     max_bytes=SAMPLE_BYTES,
+    recorded="zstate.driving.recorded:STATES",
 )
 STOP = Stream(
     "stop",
@@ -33,6 +35,7 @@ STOP = Stream(
     group="driver",
     named=True,
     max_bytes=SAMPLE_BYTES,
+    recorded="zstate.driving.recorded:STOPS",
 )
 RELAX = Stream(
     "relax",
@@ -41,6 +44,7 @@ RELAX = Stream(
     group="driver",
     named=True,
     max_bytes=SAMPLE_BYTES,
+    recorded="zstate.driving.recorded:STOPS",
 )
 
 PLUGIN = Plugin(

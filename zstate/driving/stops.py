@@ -21,6 +21,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.driving.driver import StopMode
+from zstate.driving.messages import DriverState, Release, Stop, stop_text
 from zstate.driving.stops_file import (
     ActiveStop,
     HostLock,
@@ -48,8 +49,7 @@ from zstate.wire.keys import (
     stop_expressions,
     stop_key,
 )
-from zstate.wire.messages import DriverState, Release, Stop, stop_text
-from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
 _LOG = logging.getLogger("zstate")
@@ -153,7 +153,7 @@ class _Stopper:
     def _publisher(self, session: Session, how: StopMode) -> LatchedPublisher:
         if how not in self._publishers:
             key = (stop_key if how == "hold" else relax_key)(self._robot, self._writer.identity)
-            self._publishers[how] = LatchedPublisher(session, key, ENCODINGS[Stop], urgent=True)
+            self._publishers[how] = LatchedPublisher(session, key, encoding_of(Stop), urgent=True)
         return self._publishers[how]
 
     def _is_obeyed(self, state: DriverState, first: int, how: StopMode) -> bool:

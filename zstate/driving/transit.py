@@ -24,8 +24,8 @@ from typing import NamedTuple
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
+from zstate.driving.messages import DriverState
 from zstate.errors import MessageError, format_duration
-from zstate.wire.messages import DriverState
 
 _MOST_DRIFT = 1e-3
 """Of a clock against another: above what NTP slews by, 500 ppm, and an oscillator is off by."""

@@ -299,7 +299,7 @@ class FoxgloveBridge(Closeable):
                 topic, kind, _ = encoder.topic(robot, of_topic, name)
                 topics.append((topic, kind, (robot, of_messages)))
         except InvalidInput as error:
-            self._counters.count_refusal("not sayable", f"{robot!r}: {error}")
+            self._counters.count_refusal("not representable", f"{robot!r}: {error}")
         return topics
 
     def _update_parameter(self, encoder: RecordingEncoder, robot: str) -> None:

@@ -19,7 +19,6 @@ from zstate.wire.keys import MODEL_WRITER, EdgeNames, full_name
 from zstate.wire.messages import (
     POSE_BYTES,
     Edges,
-    Odometry,
     RobotDescription,
     Sample,
     StaticTransforms,
@@ -209,8 +208,8 @@ class TransformIngest(StreamIngest):
             return None
         if isinstance(sample, WriterTransforms) and sample.covariances is not None:
             return None
-        if isinstance(sample, Odometry):
-            return None  # its twist changes as well
+        if type(sample) not in (TransformSample, WriterTransforms):
+            return None  # a plugin's has further numbers, which change as well
         return self._all_admitted.get(sample.order)
 
     def _drop_history(self) -> None:

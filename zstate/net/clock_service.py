@@ -11,7 +11,7 @@ from zstate.net.session import Session
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import clock_key
 from zstate.wire.messages import ClockMessage
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 
 class ClockService(Queryable):
@@ -20,6 +20,6 @@ class ClockService(Queryable):
     def __init__(self, session: Session, robot: str, writer: WriterId, clock: Clock) -> None:
         def answer(_: object) -> Reply:
             message = ClockMessage(clock.now(), self.answered, writer.session)
-            return Reply(encode(message), ENCODINGS[ClockMessage])
+            return Reply(encode(message), encoding_of(ClockMessage))
 
         super().__init__(session, clock_key(robot, writer.identity), answer)

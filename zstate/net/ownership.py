@@ -46,7 +46,7 @@ from zstate.wire.keys import (
     stream_expression,
     stream_key,
 )
-from zstate.wire.messages import Edges, OccupancyGrid, RobotDescription, StampedMessage, StaticTransforms
+from zstate.wire.messages import Edges, RobotDescription, StaticTransforms, session_of
 from zstate.wire.native import NativeWire
 
 CAPACITY = 1024
@@ -232,10 +232,7 @@ class WriterClaim(Closeable):
         for sample in islice(iter(self._received[stream].handler.try_recv, None), CAPACITY):
             with suppress(MessageError):  # withdrawn, or not of zstate
                 for message in _WIRE.decode(rival.stream, to_serialized(sample), rival.robot):
-                    if isinstance(
-                        message, StampedMessage | StaticTransforms | RobotDescription | OccupancyGrid
-                    ):
-                        self._publishing.add(message.session)
+                    self._publishing.add(session_of(message))
         self._publishing &= {one.writer.session for one in self._rivals}
         return rival.writer.session in self._publishing
 

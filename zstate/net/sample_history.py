@@ -41,7 +41,7 @@ from zstate.net.streams import JOIN_WITHIN_S, to_serialized
 from zstate.streams import StreamName
 from zstate.wire.keys import stream_key
 from zstate.wire.messages import HistoryPage
-from zstate.wire.native import ENCODINGS, decode, encode, stream_encoding
+from zstate.wire.native import decode, encode, encoding_of, stream_encoding
 from zstate.wire.protocol import SerializedSample
 
 T = TypeVar("T")
@@ -224,7 +224,7 @@ def serve_history(
         is_all = not more and len(samples) == len(cached)
         next_before = None if is_all else cached[-len(samples)].seq
         page = HistoryPage(encoding, tuple(reversed(samples)), next_before)
-        return Reply(encode(page), ENCODINGS[HistoryPage])
+        return Reply(encode(page), encoding_of(HistoryPage))
 
     return Queryable(session, stream_key(robot, stream, writer), answer)
 

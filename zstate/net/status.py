@@ -20,7 +20,7 @@ from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
 from zstate.wire.keys import status_key
 from zstate.wire.messages import Status
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 PERIOD_S = 1.0
 JOIN_WITHIN_S = 0.5
@@ -40,7 +40,7 @@ class StatusPublisher(Closeable):
     def __init__(self, session: Session, robot: str, identity: str, status: Callable[[], Status]) -> None:
         self._session = session
         self._status = status
-        self._publisher = KeyPublisher(session, status_key(robot, identity), ENCODINGS[Status])
+        self._publisher = KeyPublisher(session, status_key(robot, identity), encoding_of(Status))
         with _LOCK:
             self._timer = _TIMERS.setdefault(session, _StatusTimer())
         self._timer.add(self)

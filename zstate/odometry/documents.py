@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
 from zstate.wire.keys import full_name
-from zstate.wire.messages import Imu, Odometry, Pose, Velocity, covariance_matrix, from_block
+from zstate.wire.messages import covariance_matrix, from_block
 
 
 def imu_document(message: Imu, robot: str) -> dict[str, Any]:

@@ -58,11 +58,11 @@ from zstate.odometry.measurements import (
     pose,
     yaw_curvature,
 )
+from zstate.odometry.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_RATE, MAX_SPEED
 from zstate.odometry.placement import Placement, is_finite, last_pose, placed
 from zstate.odometry.stamp_order import Held, StampOrder
 from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions, displacement
 from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
-from zstate.wire.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_RATE, MAX_SPEED
 
 IMU, WHEELS, FEET, CONTACTS = "imu", "wheels", "feet", "contacts"
 """The names of these sources in ``BaseEstimator.health``."""

@@ -30,6 +30,7 @@ from zstate.net.subscription import Received, subscribe
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
 from zstate.odometry.invariant_filter import Floats
+from zstate.odometry.messages import Imu, Pose, Velocity, with_full_names
 from zstate.odometry.publishers import OdometryPublisher
 from zstate.odometry.requests import apply_request
 from zstate.odometry.source_noise import PoseNoise, VelocityNoise
@@ -37,7 +38,7 @@ from zstate.sources import JointReading, JointStateListener
 from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.keys import check_robot, odometry_request_key, shortened
-from zstate.wire.messages import Imu, Pose, Velocity, covariance_matrix, from_block, with_full_names
+from zstate.wire.messages import covariance_matrix, from_block
 from zstate.wire.registry import get_wire
 
 _SILENT_NS = 100_000_000

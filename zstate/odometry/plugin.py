@@ -3,7 +3,7 @@
 from zstate.plugins import Command, Plugin
 from zstate.streams import Stream
 
-_MESSAGES = "zstate.wire.messages"
+_MESSAGES = "zstate.odometry.messages"
 
 IMU = Stream(
     "imu",

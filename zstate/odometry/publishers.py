@@ -12,9 +12,10 @@ from zstate.errors import InvalidInput
 from zstate.net.session import Session
 from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
 from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
 from zstate.wire.keys import full_name
-from zstate.wire.messages import Imu, Odometry, Pose, Velocity, to_block
+from zstate.wire.messages import to_block
 
 
 class ImuPublisher(MeasurementPublisher):

@@ -10,16 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.messages import (
-    Imu,
-    Odometry,
-    Pose,
-    Velocity,
-    covariance_matrix,
-    from_block,
-    order_digest,
-    to_block,
-)
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+from zstate.wire.messages import covariance_matrix, from_block, order_digest, to_block
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.streams import RosStream
@@ -180,11 +172,25 @@ def _triangle(block: bytes, size: int) -> bytes | None:
     return to_block(matrix[np.triu_indices(size)])
 
 
-_OF_SENSOR = {"is_named": True, "is_of_sensor": True}
 _QOS = Qos(depth=10)
-IMU_STREAM = RosStream(IMU, _QOS, encode=encode_imu, decode=decode_imu, **_OF_SENSOR)
+IMU_STREAM = RosStream(IMU, _QOS, encode=encode_imu, decode=decode_imu, is_named=True, is_of_sensor=True)
 VELOCITY_STREAM = RosStream(
-    TWIST_WITH_COVARIANCE, _QOS, encode=encode_velocity, decode=decode_velocity, **_OF_SENSOR
+    TWIST_WITH_COVARIANCE,
+    _QOS,
+    encode=encode_velocity,
+    decode=decode_velocity,
+    is_named=True,
+    is_of_sensor=True,
 )
-POSE_STREAM = RosStream(POSE_WITH_COVARIANCE, _QOS, encode=encode_pose, decode=decode_pose, **_OF_SENSOR)
-ODOMETRY_STREAM = RosStream(ODOMETRY, _QOS, encode=encode_odometry, decode=decode_odometry, **_OF_SENSOR)
+POSE_STREAM = RosStream(
+    POSE_WITH_COVARIANCE,
+    _QOS,
+    encode=encode_pose,
+    decode=decode_pose,
+    uncarried="child",
+    is_named=True,
+    is_of_sensor=True,
+)
+ODOMETRY_STREAM = RosStream(
+    ODOMETRY, _QOS, encode=encode_odometry, decode=decode_odometry, is_named=True, is_of_sensor=True
+)

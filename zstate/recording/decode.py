@@ -14,9 +14,8 @@ from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import stream_named, streams_where
+from zstate.plugins import is_latched, stream_named, streams_where
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance, is_covariance_topic
-from zstate.recording.driver_messages import DRIVER_TYPES, decode_command, decode_status, driver_stream
 from zstate.recording.encode import POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, JSON, ROBOT, STREAM, VERSION, Channel, Record
@@ -25,16 +24,14 @@ from zstate.wire.json_form import JsonDecoder, carried_as_json
 from zstate.wire.messages import (
     JointState,
     Message,
-    OccupancyGrid,
-    Pose,
     RobotDescription,
     StaticTransforms,
     TransformSample,
-    with_child,
+    with_field,
 )
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.streams import has_named_topics, has_sensor_topics, ros_streams
+from zstate.wire.ros2.streams import has_named_topics, has_sensor_topics, recorded_forms, ros_streams
 from zstate.wire.ros2.topics import SHARED, FrameNames, robot_from_topic
 
 _TOPICS: tuple[StreamName, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
@@ -103,10 +100,10 @@ class RecordedWriter:
                 if is_named and channel.type_name == carried.type.name:
                     break
             else:
-                of_driver = None if foreign else driver_stream(channel.topic, channel.type_name)
-                if of_driver is None:
+                found = None if foreign else _stream_of_form(name, channel.type_name)
+                if found is None:
                     return None
-                stream = of_driver
+                stream = found
         if EDGE_WRITER in facts:
             stream = _NAMED.get(stream, stream)
         digest = blake2b(channel.topic.encode(), digest_size=4).digest()
@@ -123,6 +120,12 @@ class RecordedWriter:
             program=facts.get("zstate.program"),
             foreign=foreign,
         )
+
+
+def _stream_of_form(topic: str, type_name: str) -> StreamName | None:
+    """The stream that only recordings have, by the last name and the type of its topic, if any."""
+    forms = recorded_forms().items()
+    return next((name for name, form in forms if (form.topic, form.type.name) == (topic, type_name)), None)
 
 
 def _sensor_from_topic(topic: str, robots: Collection[str]) -> tuple[str, str]:
@@ -254,10 +257,8 @@ class DecodedRecording:
         writer = channel.writer
         messages: Sequence[Message]
         try:
-            if writer.stream == "joint_commands":
-                messages = (decode_command(record.payload, writer.session, seq),)
-            elif writer.stream in DRIVER_TYPES:
-                messages = (decode_status(writer.stream, record.payload),)
+            if (form := recorded_forms().get(writer.stream)) is not None:
+                messages = (form.decode(record.payload, writer.session, seq),)
             elif channel.json is not None:
                 messages = (channel.json.decode(record.payload),)
             else:
@@ -267,7 +268,8 @@ class DecodedRecording:
             self._refuse(error.reason, f"{record.topic}: {error}")
             return
         for message in messages:
-            content = with_child(message, channel.posed) if isinstance(message, Pose) else message
+            field = channel.uncarried
+            content = with_field(message, field, channel.posed) if field else message
             yield DecodedMessage(writer, content, record.log_time)
 
     def records(
@@ -333,6 +335,12 @@ class ChannelDecoder(NamedTuple):
     posed: str
     json: JsonDecoder | None
 
+    @property
+    def uncarried(self) -> str:
+        """The field with the frame ``posed``; empty if its messages have none."""
+        carried = ros_streams().get(self.writer.stream)
+        return "" if carried is None else carried.uncarried
+
 
 class LatchedState:
     """The robot descriptions, static edges and maps in effect at one point of a recording."""
@@ -366,7 +374,7 @@ class LatchedState:
             key = static_key(writer)
             before = self._statics.get(key)
             self._statics[key] = decoded
-        elif isinstance(message, OccupancyGrid):
+        elif is_latched(writer.stream):
             before = self.maps.get(key := (writer.robot, writer.edge_writer or ""))
             self.maps[key] = decoded
         else:
@@ -379,11 +387,9 @@ def _latched_value(message: Message) -> object:
     """What a latched message states, whatever session repeats it."""
     if isinstance(message, RobotDescription):
         return message.urdf
-    if isinstance(message, OccupancyGrid):
-        grid = message.stamp, message.frame, message.resolution, message.width, message.origin
-        return *grid, message.cells
-    assert isinstance(message, StaticTransforms)
-    return message.edges, message.poses
+    if isinstance(message, StaticTransforms):
+        return message.edges, message.poses
+    return tuple(getattr(message, name) for name in message.__struct_fields__ if name != "session")
 
 
 def static_key(writer: RecordedWriter) -> tuple[str, str]:

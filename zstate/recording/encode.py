@@ -18,7 +18,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.robot import coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import own_streams, stream_named
+from zstate.plugins import is_latched, own_streams, stream_named
 from zstate.recording.covariances import (
     CHILD_FRAME,
     EdgeCovariance,
@@ -27,13 +27,6 @@ from zstate.recording.covariances import (
     known_covariances,
     ros_name,
 )
-from zstate.recording.driver_messages import (
-    DRIVER_TYPES,
-    driver_topic,
-    encode_command,
-    encode_status,
-    program_of,
-)
 from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.storage import EDGE_WRITER, ROBOT, STREAM, VERSION, ChannelType
 from zstate.streams import StreamName
@@ -41,26 +34,21 @@ from zstate.wire.joint_order import SampleLayout
 from zstate.wire.json_form import carried_as_json, encode_json, json_type
 from zstate.wire.messages import (
     POSE_BYTES,
-    DriverState,
-    JointCommand,
     JointState,
     Message,
-    OccupancyGrid,
-    Pose,
     RobotDescription,
     Sample,
     StampedMessage,
     StaticTransforms,
-    Stop,
     TransformSample,
     order_digest,
-    to_block,
+    session_of,
 )
 from zstate.wire.ros2.cdr import to_time
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import Qos
-from zstate.wire.ros2.streams import ros_stream
+from zstate.wire.ros2.streams import RecordedForm, recorded_forms, ros_stream
 from zstate.wire.ros2.topics import SHARED, FrameNames, RmwKeys
 from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 
@@ -86,9 +74,6 @@ TOPICS: dict[StreamName, StreamName] = {"transforms": "tf", "partial_joint_state
 
 POSED_FRAME = "zstate.posed_frame"
 """Channel metadata key of the frame whose measured poses a channel has, as it is named in /tf."""
-
-NO_MAP = OccupancyGrid(0, 1, "map", 1.0, 0, 0, to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), b"")
-"""Recorded when a map is withdrawn."""
 
 _NAMED = SampleLayout()
 
@@ -152,9 +137,9 @@ class RecordingEncoder:
     The robot ``alone`` and what belongs to no robot are in the root of ROS's names, with unchanged frame
     names, where every ROS tool finds them; any other robot has a namespace and a frame prefix of its own.
     ``refuse(reason, text)`` is called for each message that cannot be written: CDR cannot represent it ("no
-    stamp", "stamp outside 1901 to 2038", "not sayable"), its model is unusable ("unusable model"), or its
-    robot has opened too many channels ("too many writers", see ``OpenChannels``). It is also called for each
-    map that is in one file only, since 128 MiB of maps are repeated in the files that follow ("map not
+    stamp", "stamp outside 1901 to 2038", "not representable"), its model is unusable ("unusable model"), or
+    its robot has opened too many channels ("too many writers", see ``OpenChannels``). It is also called for
+    each map that is in one file only, since 128 MiB of maps are repeated in the files that follow ("map not
     repeated"). ``programs`` maps sessions to program names, as far as known when the first message of a
     session is written.
     """
@@ -225,11 +210,11 @@ class RecordingEncoder:
                 self._latch(robot, message, log_time, edge_writer)
             elif isinstance(message, RobotDescription):
                 self._write_description(robot, message, log_time)
-            elif isinstance(message, OccupancyGrid):
+            elif is_latched(_stream_of(type(message))):
                 self._latch(robot, message, log_time, edge_writer or "")
-            elif isinstance(message, (JointCommand, DriverState, Stop)):
+            elif (form := recorded_forms().get(_stream_of(type(message)))) is not None:
                 with self._lock:
-                    self._write_of_driver(robot, message, log_time, edge_writer or "")
+                    self._write_form(form, robot, message, log_time, edge_writer or "")
             elif isinstance(message, StampedMessage):
                 with self._lock:
                     self._write_sample(robot, message, log_time, edge_writer or "")
@@ -237,9 +222,9 @@ class RecordingEncoder:
             self._refuse("too many writers", f"{robot!r}: {error}")
             return False
         except InvalidInput as error:
-            reason, stamp = "not sayable", 1
-            if isinstance(message, (StampedMessage, DriverState)) and not carried_as_json(stream):
-                stamp = message.stamp
+            reason, stamp = "not representable", 1
+            if not carried_as_json(stream):
+                stamp = getattr(message, "stamp", 1)
             try:
                 to_time(stamp)
             except InvalidInput:
@@ -257,7 +242,7 @@ class RecordingEncoder:
             channel = self._latched.get(robot, {}).pop(key, None)
             self._map_bytes.pop(key, None)
             if channel is not None:
-                empty = NO_MAP if stream == "map" else StaticTransforms(0, (), b"")
+                empty = ros_stream(stream).withdrawn or StaticTransforms(0, (), b"")
                 self._writer.latch(channel.number, key, channel.encode(empty), log_time, log_time)
                 self._writer.unlatch(channel.number, key)
                 self._counts[robot, stream] += 1
@@ -273,7 +258,7 @@ class RecordingEncoder:
             edges = sample_names.moving_edges if message.edges is None else message.edges
             for one in known_covariances(message, edges):
                 self._write_covariance(robot, message, one, log_time, edge_writer)
-        child = message.child if isinstance(message, Pose) else ""
+        child = getattr(message, ros_stream(TOPICS.get(stream, stream)).uncarried, "")
         channel = self._channel(robot, stream, message.session, log_time, edge_writer, child=child)
         if not self._writer.is_read(channel.number):
             return
@@ -294,20 +279,17 @@ class RecordingEncoder:
             self._writer.write(channel.number, payload, log_time, publish_time, sequence=message.seq)
             self._counts[robot, stream] += 1
 
-    def _write_of_driver(
-        self, robot: str, message: JointCommand | DriverState | Stop, log_time: int, edge_writer: str
+    def _write_form(
+        self, form: RecordedForm, robot: str, message: Message, log_time: int, edge_writer: str
     ) -> None:
-        if isinstance(message, JointCommand):
-            if message.motion is not None:
-                return  # keeps a motion valid, and has no numbers
-            program, payload, seq = "", encode_command(message), message.seq
-        else:
-            program = program_of(message, edge_writer)
-            payload = encode_status(message, robot, program)
-            seq = message.seq if isinstance(message, Stop) else 0
+        program = "" if form.program_of is None else form.program_of(message, edge_writer)
+        payload = form.encode(message, robot, program)
+        if payload is None:
+            return
         stream = _stream_of(type(message))
-        channel = self._channel(robot, stream, message.session, log_time, program=program)
-        self._writer.write(channel.number, payload, log_time, max(message.stamp, 0), sequence=seq)
+        channel = self._channel(robot, stream, session_of(message), log_time, program=program)
+        seq, stamp = getattr(message, "seq", 0), max(getattr(message, "stamp", 0), 0)
+        self._writer.write(channel.number, payload, log_time, stamp, sequence=seq)
         self._counts[robot, stream] += 1
 
     def _write_covariance(
@@ -340,7 +322,7 @@ class RecordingEncoder:
     def _latch(
         self,
         robot: str,
-        message: StaticTransforms | RobotDescription | OccupancyGrid,
+        message: Message,
         log_time: int,
         edge_writer: str = "",
     ) -> None:
@@ -352,7 +334,7 @@ class RecordingEncoder:
                 raise _TooManyWriters(
                     f"it has {MAX_LATCHED} latched messages; that of {edge_writer!r} is one more"
                 )
-            channel = self._channel(robot, stream, message.session, log_time, edge_writer)
+            channel = self._channel(robot, stream, session_of(message), log_time, edge_writer)
         payload = channel.encode(message)
         with self._lock:
             # The maps of a fleet, with 16 MB each, would be most of a recording if they were repeated.
@@ -421,7 +403,7 @@ class RecordingEncoder:
         topic, kind, qos = self.topic(robot, stream, edge_writer)
         if carried_as_json(stream):
             metadata |= {STREAM: stream, VERSION: str(stream_named(stream).version)}
-        if child and stream == "pose":
+        if child and ros_stream(TOPICS.get(stream, stream)).uncarried:
             metadata[POSED_FRAME] = names.to_ros(child)
         elif child:
             metadata[CHILD_FRAME] = in_ros = names.to_ros(child)
@@ -439,8 +421,8 @@ class RecordingEncoder:
         a child, have further topics. Raises InvalidInput for an invalid name.
         """
         options = self._options(robot)
-        if stream in DRIVER_TYPES:
-            return driver_topic(options.namespace, stream), DRIVER_TYPES[stream], Qos()
+        if (form := recorded_forms().get(stream)) is not None:
+            return form.topic_in(options.namespace), form.type, Qos()
         if carried_as_json(stream):
             tokens = filter(None, (options.namespace, stream, writer_name and ros_name(writer_name)))
             return f"/{'/'.join(tokens)}", json_type(stream_named(stream)), Qos()

@@ -17,7 +17,7 @@ from zstate.recording.decode import RecordedWriter, recorded_writers
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import ROBOT, Channel
 from zstate.streams import StreamName
-from zstate.wire.messages import LaserScan, from_float32_block
+from zstate.wire.messages import from_float32_block
 from zstate.wire.ros2.cdr import decode_string
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
@@ -153,6 +153,8 @@ def recorded_robots(info: RecordingInfo) -> list[RecordedRobot]:
 
 def _ray_count(reader: RecordingReader, topic: str) -> int | None:
     """The rays of the first scan on a topic; None if it cannot be decoded."""
+    from zstate.scans.messages import LaserScan  # noqa: PLC0415 - scans are a plugin
+
     names = FrameNames(Ros2Options(), SHARED)
     for record in reader.records({topic}):
         with suppress(MessageError):

@@ -24,7 +24,7 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
-from zstate.plugins import edge_streams, is_measured, is_named, measured_streams
+from zstate.plugins import edge_streams, is_latched, is_measured, is_named, measured_streams
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
@@ -34,22 +34,20 @@ from zstate.wire.messages import (
     Edges,
     JointState,
     Message,
-    OccupancyGrid,
     RobotDescription,
     StampedMessage,
     StaticTransforms,
     TransformSample,
     renumbered,
     select_edges,
+    with_field,
 )
 from zstate.wire.protocol import carrier
 from zstate.wire.registry import get_wire
+from zstate.wire.ros2.streams import ros_stream
 
 EdgeWriter: TypeAlias = tuple[str, str]
 """The robot and the name of a writer of transforms."""
-
-LatchedMessage: TypeAlias = RobotDescription | StaticTransforms | OccupancyGrid
-"""Messages in effect until the next of their writer."""
 
 _Named: TypeAlias = tuple[str, StreamName, str]
 """The robot, the stream and the name of a writer."""
@@ -176,33 +174,33 @@ class PlaybackPublishers(Closeable):
 
     def publish(self, decoded: DecodedMessage) -> bool:
         """Publish it; False for a repetition and for what cannot be published."""
-        if isinstance(decoded.message, LatchedMessage):
+        if is_latched(decoded.writer.stream):
             changed = self._latched.update(decoded)
             return changed is not None and self._publish_counted(changed)
         return self._publish_counted(decoded)
 
     def _publish_counted(self, decoded: DecodedMessage) -> bool:
         try:
-            if isinstance(decoded.message, LatchedMessage):
+            if is_latched(decoded.writer.stream):
                 return self._publish_latched(decoded.writer, decoded.message)
             return self._publish_sample(decoded.writer, decoded.message)
         except MessageError as error:
             self._refusals.count(error.reason, f"{decoded.writer.robot!r}: {error}")
         except InvalidInput as error:
-            self._refusals.count("not sayable", f"{decoded.writer.robot!r}: {error}")
+            self._refusals.count("not representable", f"{decoded.writer.robot!r}: {error}")
         except ModelError as error:
             self._refusals.count("robot description", f"{decoded.writer.robot!r}: {error}")
         return False
 
-    def _publish_latched(self, writer: RecordedWriter, message: LatchedMessage) -> bool:
+    def _publish_latched(self, writer: RecordedWriter, message: Message) -> bool:
         robot = self._robots.get(writer.robot)
         if isinstance(message, StaticTransforms):
             if writer.edge_writer == MODEL_WRITER and robot is not None:
                 return False
             edges = self._modelled.filter_statics(writer.robot, message)
             self._others[writer.robot].set_statics(edges, static_key(writer)[1])
-        elif isinstance(message, OccupancyGrid):
-            self._others[writer.robot].set_map(message, writer.edge_writer or "")
+        elif not isinstance(message, RobotDescription):
+            self._others[writer.robot].set_value(writer.stream, message, writer.edge_writer or "")
         elif robot is None:
             self._others[writer.robot].describe(message)
         elif robot.publisher.model.urdf != message.urdf:
@@ -432,7 +430,8 @@ class PassthroughPublisher(Closeable):
         self._seqs: Counter[StreamName] = Counter()
         self._latched: dict[tuple[StreamName, str], list[LatchedWriter]] = {}
         self._placed: dict[str, set[Edge]] = {}
-        self._maps: set[str] = set()
+        self._values: set[tuple[StreamName, str]] = set()
+        """Streams, with the names of writers, that have a latched value of a sensor."""
         self._writer = writer = local_writer(self._session_id)
         sessions.add(self._session_id)
         with ExitStack() as opening:
@@ -505,20 +504,19 @@ class PassthroughPublisher(Closeable):
             write_all(writers, StaticTransforms(self._session_id, statics.edges, statics.poses))
         self._placed[writer] = edges
 
-    def set_map(self, grid: OccupancyGrid, writer: str) -> None:
-        """Publish the map of ``writer``; one without cells withdraws the previous one."""
-        if not grid.cells:
-            self._withdraw_map(writer)
+    def set_value(self, stream: StreamName, message: Message, writer: str) -> None:
+        """Publish the latched value of ``writer``; one that was withdrawn withdraws the previous one."""
+        is_withdrawn = ros_stream(stream).is_withdrawn
+        if is_withdrawn is not None and is_withdrawn(message):
+            self._withdraw(stream, writer)
             return
-        size = grid.resolution, grid.width, grid.height
-        message = OccupancyGrid(self._session_id, grid.stamp, grid.frame, *size, grid.origin, grid.cells)
-        write_all(self._latch("map", writer), message)
-        self._maps.add(writer)
+        write_all(self._latch(stream, writer), with_field(message, "session", self._session_id))
+        self._values.add((stream, writer))
 
-    def _withdraw_map(self, writer: str) -> None:
-        if writer in self._maps:
-            self._maps.discard(writer)
-            for latched in self._latched["map", writer]:
+    def _withdraw(self, stream: StreamName, writer: str) -> None:
+        if (stream, writer) in self._values:
+            self._values.discard((stream, writer))
+            for latched in self._latched[stream, writer]:
                 latched.withdraw()
 
     def _latch(self, stream: StreamName, writer: str) -> list[LatchedWriter]:
@@ -543,8 +541,8 @@ class PassthroughPublisher(Closeable):
 
     def close(self) -> None:
         """Stop, and withdraw maps; readers keep the other latched values. A second call does nothing."""
-        for name in tuple(self._maps):
-            self._withdraw_map(name)
+        for stream, name in tuple(self._values):
+            self._withdraw(stream, name)
         self._opened.close()
 
 

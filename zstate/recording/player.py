@@ -30,7 +30,6 @@ from zstate.recording.decode import (
     recorded_model,
     robot_with_joint_states,
 )
-from zstate.recording.driver_messages import DRIVER_TYPES
 from zstate.recording.joint_parts import has_parts
 from zstate.recording.playback_publishers import PlaybackPublishers
 from zstate.recording.player_clock import Lateness, PlayerClock
@@ -39,6 +38,7 @@ from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.wire.joint_order import JointNumbers
 from zstate.wire.messages import ClockMessage, JointState, StampedMessage
 from zstate.wire.registry import as_wire_names
+from zstate.wire.ros2.streams import recorded_forms
 
 CLOCK_HZ = 100.0
 """Rate at which the player publishes the clock if the recording has no clock messages."""
@@ -119,7 +119,7 @@ class Player(Closeable):
             selected = tuple(check_has_robot(self._recording, robot) for robot in robots)
             self.robots = selected or self._recording.names
             streams = {writer.stream for writer in self._recording.writers_of(self.robots)}
-            self.has_samples = not streams <= {*latched_streams(), *DRIVER_TYPES, "clock"}
+            self.has_samples = not streams <= {*latched_streams(), *recorded_forms(), "clock"}
             self._begin, self._end = self._bounds(path, start_s, duration_s)
             self._models: dict[str, RobotModel] = {}
             self._in_parts: set[str] = set()

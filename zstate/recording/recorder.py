@@ -28,15 +28,15 @@ from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.plugins import edge_streams, is_latched, is_named, latched_streams, measured_streams
 from zstate.rate import Rate
-from zstate.recording.driver_messages import DRIVER_TYPES
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, check_robot
-from zstate.wire.messages import Message, Odometry, StampedMessage, Stop, edge_of
+from zstate.wire.messages import Message, StampedMessage, WriterTransforms, edge_of
 from zstate.wire.protocol import SerializedSample, Wire
 from zstate.wire.registry import get_wire
+from zstate.wire.ros2.streams import recorded_forms
 from zstate.wire.ros2.topics import SHARED
 
 FLUSH_NS = 500_000_000
@@ -176,11 +176,13 @@ class SampleWriter:
             self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
         for message in messages:
             is_known = encoder.write_message(robot, message, stamp, edge_writer, stream=stream)
-            if isinstance(message, Odometry) and stream in self._wire.edges:
+            is_edge = stream in self._wire.edges and stream != self._wire.transforms
+            if is_edge and isinstance(message, WriterTransforms):
                 # On /tf, where ROS tools and readers of recordings find edges; ROS nodes publish it there.
                 encoder.write_message(robot, edge_of(message), stamp, edge_writer)
             # The numbers of stops rise by any steps.
-            if is_known and isinstance(message, StampedMessage) and not isinstance(message, Stop):
+            is_of_stops = is_named(stream) and stream in recorded_forms()
+            if is_known and isinstance(message, StampedMessage) and not is_of_stops:
                 self._gaps.add((robot, stream, message.session), message.seq)
         return messages
 
@@ -190,7 +192,7 @@ def recorded_streams(wire: Wire) -> tuple[StreamName, ...]:
     # On a ROS wire all moving edges are on tf, and all joints on joint_states.
     named = wire.partial_joint_states, wire.transforms
     latched = latched_streams()
-    driving = tuple(DRIVER_TYPES) if wire.name == "native" else ()
+    driving = tuple(recorded_forms()) if wire.name == "native" else ()
     samples = ("joint_states", "tf", *named, *measured_streams(), *edge_streams(), *driving)
     return tuple(dict.fromkeys(stream for stream in (*latched, *samples) if wire.carries(stream)))
 

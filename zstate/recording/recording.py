@@ -22,7 +22,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,28 +59,21 @@ from zstate.recording.reader import RecordingReader
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import (
-    DriverState,
     Edges,
-    Imu,
-    JointCommand,
     JointState,
-    LaserScan,
-    OccupancyGrid,
-    Odometry,
-    Pose,
     RobotDescription,
     Sample,
     StaticTransforms,
-    Stop,
     TransformSample,
-    Velocity,
     covariances_of,
     poses_from_block,
-    with_full_names,
 )
 
 if TYPE_CHECKING:
+    from zstate.driving.messages import DriverState, JointCommand, Stop
+    from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
     from zstate.scans.grid import Grid
+    from zstate.scans.messages import LaserScan, OccupancyGrid
     from zstate.scans.scan import Scan
 
 # A buffer that keeps a whole recording: 28 years, on any clock.
@@ -88,8 +81,6 @@ HISTORY_S = 9e8
 # The buffer drops unneeded samples after every so many messages, at least.
 _BATCH = 4096
 _UNNAMED = "a ROS node"
-
-_Measurement = TypeVar("_Measurement", Imu, Velocity, Pose)
 
 
 class Recording(Closeable):
@@ -235,9 +226,9 @@ class Recording(Closeable):
 
         refusals = Refusals("recorded scans")
         for writer, message, _ in self._messages(robot, "scan", refusals.count):
-            if isinstance(message, LaserScan) and sensor in (None, writer.edge_writer):
+            if sensor in (None, writer.edge_writer):
                 try:
-                    yield scan_from_message(message, writer.robot)
+                    yield scan_from_message(cast("LaserScan", message), writer.robot)
                 except InvalidInput as error:
                     refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
 
@@ -248,15 +239,15 @@ class Recording(Closeable):
         Messages that cannot be used are left out; the first of each reason is logged. Raises InvalidInput
         for a robot that is not in the recording.
         """
-        return self._measurements(Imu, robot, "imu", sensor)
+        return self._measurements("imu", robot, sensor)
 
     def velocities(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Velocity]:
         """The measured velocities of ``robot``, likewise."""
-        return self._measurements(Velocity, robot, "velocity", sensor)
+        return self._measurements("velocity", robot, sensor)
 
     def poses(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Pose]:
         """The measured poses of ``robot``, likewise. The child is empty for its base, as in ROS."""
-        return self._measurements(Pose, robot, "pose", sensor)
+        return self._measurements("pose", robot, sensor)
 
     def odometry(self, robot: str | None = None, writer: str | None = None) -> Iterator[Odometry]:
         """The odometry of ``robot``, by default of all robots, or of one ``writer``, likewise.
@@ -265,17 +256,17 @@ class Recording(Closeable):
         """
         refusals = Refusals("recorded odometry")
         for recorded, message, _ in self._messages(robot, "odometry", refusals.count):
-            if isinstance(message, Odometry) and writer in (None, recorded.edge_writer):
-                yield message
+            if writer in (None, recorded.edge_writer):
+                yield cast("Odometry", message)
 
-    def _measurements(
-        self, kind: type[_Measurement], robot: str | None, stream: StreamName, sensor: str | None
-    ) -> Iterator[_Measurement]:
+    def _measurements(self, stream: StreamName, robot: str | None, sensor: str | None) -> Iterator[Any]:
+        from zstate.odometry.messages import with_full_names  # noqa: PLC0415 - odometry is a plugin
+
         refusals = Refusals(f"recorded {stream}")
         for writer, message, _ in self._messages(robot, stream, refusals.count):
-            if isinstance(message, kind) and sensor in (None, writer.edge_writer):
+            if sensor in (None, writer.edge_writer):
                 try:
-                    yield with_full_names(message, writer.robot)
+                    yield with_full_names(cast("Imu | Velocity | Pose", message), writer.robot)
                 except InvalidInput as error:
                     refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
 
@@ -293,9 +284,10 @@ class Recording(Closeable):
         for decoded in self._messages(robot, "map", refusals.count):
             writer, message, _ = decoded
             # Repeated for readers that start in the middle; without cells when it was withdrawn.
-            if latched.update(decoded) and isinstance(message, OccupancyGrid) and message.cells:
+            grid = cast("OccupancyGrid", message)
+            if latched.update(decoded) and grid.cells:
                 try:
-                    yield grid_from_message(message, writer.robot)
+                    yield grid_from_message(grid, writer.robot)
                 except InvalidInput as error:
                     refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
 
@@ -309,8 +301,7 @@ class Recording(Closeable):
         for _, message, _ in self._messages(
             robot, "joint_commands", Refusals("recorded joint_commands").count
         ):
-            assert isinstance(message, JointCommand)
-            yield message
+            yield cast("JointCommand", message)
 
     def driver_states(self, robot: str | None = None) -> Iterator[DriverState]:
         """The states of the driver of ``robot``, by default of all robots, one by one.
@@ -320,8 +311,7 @@ class Recording(Closeable):
         it has refused. Raises InvalidInput for a robot that is not in the recording.
         """
         for _, message, _ in self._messages(robot, "driver", Refusals("recorded states of drivers").count):
-            assert isinstance(message, DriverState)
-            yield message
+            yield cast("DriverState", message)
 
     def stops(self, robot: str | None = None) -> Iterator[tuple[str, Stop]]:
         """The stops sent to the driver of ``robot``, by default of all robots, each after its program.
@@ -331,8 +321,7 @@ class Recording(Closeable):
         recording.
         """
         for writer, message, _ in self._messages(robot, "stop", Refusals("recorded stops").count):
-            assert isinstance(message, Stop)
-            yield writer.program or "", message
+            yield writer.program or "", cast("Stop", message)
 
     def measurements(
         self,

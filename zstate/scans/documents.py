@@ -8,19 +8,15 @@ import numpy as np
 
 from zstate.scans.grid import grid_from_message
 from zstate.scans.map_files import SAVED_FREE, SAVED_OCCUPIED
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.scans.scan import scan_from_message
-from zstate.wire.messages import LaserScan, OccupancyGrid
 
 
-def scan_document(message: LaserScan, robot: str, *, has_ranges: bool = False) -> dict[str, Any]:
-    """A scan of ``robot`` as a document: stamp [ns], angles [rad], limits [m], and what it measured.
-
-    ``has_ranges`` adds the range of each ray [m], NaN if it is no measurement.
-    """
+def scan_document(message: LaserScan, robot: str) -> dict[str, Any]:
+    """A scan of ``robot`` as a document: stamp [ns], angles [rad], limits [m], and what it measured."""
     scan = scan_from_message(message, robot)
-    ranges = np.where(scan.valid, scan.ranges.astype(float), np.nan)
-    measured = ranges[scan.valid]
-    document: dict[str, Any] = {
+    measured = scan.ranges[scan.valid].astype(float)
+    return {
         "stamp": scan.stamp,
         "seq": message.seq,
         "frame": scan.frame,
@@ -29,12 +25,18 @@ def scan_document(message: LaserScan, robot: str, *, has_ranges: bool = False) -
         "ray_ns": scan.ray_ns,
         "range_min": scan.range_min,
         "range_max": scan.range_max,
-        "rays": len(ranges),
+        "rays": len(scan.ranges),
         "valid": len(measured),
         "nearest": measured.min().item() if measured.size else np.nan,
         "farthest": measured.max().item() if measured.size else np.nan,
     }
-    return {**document, "ranges": ranges.tolist()} if has_ranges else document
+
+
+def full_scan_document(message: LaserScan, robot: str) -> dict[str, Any]:
+    """The same with the range of each ray [m], NaN if it is no measurement."""
+    scan = scan_from_message(message, robot)
+    ranges = np.where(scan.valid, scan.ranges.astype(float), np.nan)
+    return {**scan_document(message, robot), "ranges": ranges.tolist()}
 
 
 def map_document(message: OccupancyGrid, robot: str) -> dict[str, Any]:

@@ -19,9 +19,10 @@ from zstate.clock import check_stamp
 from zstate.errors import InvalidInput
 from zstate.scans.map_files import read_cells, scale_image, write_map
 from zstate.scans.map_metadata import Mode, read_metadata
+from zstate.scans.messages import OccupancyGrid, cells_of
 from zstate.transform import Transform
 from zstate.wire.keys import full_name
-from zstate.wire.messages import OccupancyGrid, cells_of, from_block, to_block
+from zstate.wire.messages import from_block, to_block
 
 UNKNOWN = -1
 OCCUPIED = 100

@@ -25,9 +25,9 @@ from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
+from zstate.scans.messages import LaserScan
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.wire.keys import ANY, check_robot, check_writer, full_name, shortened
-from zstate.wire.messages import LaserScan
 from zstate.wire.registry import get_wire
 
 _CAPACITY = 256

@@ -3,7 +3,7 @@
 from zstate.plugins import Command, Plugin
 from zstate.streams import LATCHED_BYTES, Stream
 
-_MESSAGES = "zstate.wire.messages"
+_MESSAGES = "zstate.scans.messages"
 _SCAN_BYTES = 810_000
 """A scan of the most rays, with intensities, takes less on each wire."""
 
@@ -16,6 +16,7 @@ SCAN = Stream(
     start="start one: `zstate scan {robot} --frame FRAME --dummy`",
     ros="zstate.scans.ros2:SCAN_STREAM",
     document="zstate.scans.documents:scan_document",
+    full_document="zstate.scans.documents:full_scan_document",
 )
 MAP = Stream(
     "map",

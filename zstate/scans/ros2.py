@@ -6,14 +6,15 @@ import struct
 from math import isfinite
 
 from zstate.errors import InvalidInput
-from zstate.wire.messages import LaserScan, OccupancyGrid
+from zstate.scans.messages import LaserScan, OccupancyGrid
+from zstate.wire.messages import FLOAT32_BYTES, to_block
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
-from zstate.wire.ros2.decoder import CELL_BYTES, FLOAT_BYTES
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.streams import RosStream
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
 
+_CELL_BYTES = 1
 _SCAN_FLOATS = 7
 _POSE_NUMBERS = 7
 
@@ -26,16 +27,16 @@ def encode_scan(scan: LaserScan, names: FrameNames) -> bytes:
     the last ray. Raises InvalidInput for a number that float32 cannot represent, and for a stamp outside 1901
     to 2038.
     """
-    last_ray = max(0, len(scan.ranges) // FLOAT_BYTES - 1)
+    last_ray = max(0, len(scan.ranges) // FLOAT32_BYTES - 1)
     angle_max = scan.angle_min + last_ray * scan.angle_increment
     angles = scan.angle_min, angle_max, scan.angle_increment
     times_s = scan.ray_ns * 1e-9, scan.scan_ns * 1e-9
     writer = CdrWriter()
     writer.stamp(scan.stamp)
     writer.text(names.to_ros(scan.frame))
-    writer.numbers(_float32(*angles, *times_s, scan.range_min, scan.range_max), FLOAT_BYTES)
-    writer.sequence(scan.ranges, FLOAT_BYTES)
-    writer.sequence(scan.intensities or b"", FLOAT_BYTES)
+    writer.numbers(_float32(*angles, *times_s, scan.range_min, scan.range_max), FLOAT32_BYTES)
+    writer.sequence(scan.ranges, FLOAT32_BYTES)
+    writer.sequence(scan.intensities or b"", FLOAT32_BYTES)
     return writer.payload()
 
 
@@ -48,11 +49,11 @@ def encode_grid(grid: OccupancyGrid, names: FrameNames) -> bytes:
     writer.stamp(grid.stamp)
     writer.text(names.to_ros(grid.frame))
     writer.stamp(grid.stamp)
-    writer.numbers(_float32(grid.resolution), FLOAT_BYTES)
+    writer.numbers(_float32(grid.resolution), FLOAT32_BYTES)
     writer.count(grid.width)
     writer.count(grid.height)
     writer.numbers(grid.origin)
-    writer.sequence(grid.cells, CELL_BYTES)
+    writer.sequence(grid.cells, _CELL_BYTES)
     return writer.payload()
 
 
@@ -73,7 +74,7 @@ def decode_scan(payload: bytes, session: int, seq: int, names: FrameNames) -> La
     reader = CdrReader(payload, LASER_SCAN.name)
     stamp, frame = reader.stamp(), names.to_zstate(reader.text())
     angle_min, _, angle_increment, ray_s, scan_s, range_min, range_max = _floats(reader, _SCAN_FLOATS)
-    ranges, intensities = reader.sequence(FLOAT_BYTES), reader.sequence(FLOAT_BYTES)
+    ranges, intensities = reader.sequence(FLOAT32_BYTES), reader.sequence(FLOAT32_BYTES)
     if not (isfinite(ray_s) and isfinite(scan_s)):
         raise reader.malformed(f"its time_increment is {ray_s}, and its scan_time {scan_s} [s]")
     times = round(ray_s * 1e9), round(scan_s * 1e9)
@@ -94,7 +95,7 @@ def decode_grid(payload: bytes, session: int, seq: int, names: FrameNames) -> Oc
     reader.stamp()
     (resolution,) = _floats(reader, 1)
     width, height, origin = reader.count(), reader.count(), reader.numbers(_POSE_NUMBERS)
-    cells = reader.sequence(CELL_BYTES)
+    cells = reader.sequence(_CELL_BYTES)
     try:
         return OccupancyGrid(session, stamp, frame, resolution, width, height, origin, cells)
     except InvalidInput as error:
@@ -102,9 +103,14 @@ def decode_grid(payload: bytes, session: int, seq: int, names: FrameNames) -> Oc
 
 
 def _floats(reader: CdrReader, count: int) -> tuple[float, ...]:
-    return struct.unpack(f"<{count}f", reader.numbers(count, FLOAT_BYTES))
+    return struct.unpack(f"<{count}f", reader.numbers(count, FLOAT32_BYTES))
 
 
+def _is_withdrawn(grid: OccupancyGrid) -> bool:
+    return not grid.cells
+
+
+_WITHDRAWN = OccupancyGrid(0, 1, "map", 1.0, 0, 0, to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), b"")
 SCAN_STREAM = RosStream(
     LASER_SCAN, Qos("best_effort", depth=5), is_named=True, encode=encode_scan, decode=decode_scan
 )
@@ -114,4 +120,6 @@ MAP_STREAM = RosStream(
     is_named=True,
     encode=encode_grid,
     decode=decode_grid,
+    withdrawn=_WITHDRAWN,
+    is_withdrawn=_is_withdrawn,
 )

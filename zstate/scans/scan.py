@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.checks import check_names, real_numbers, reduced_to_fields
 from zstate.clock import check_stamp, format_stamp
 from zstate.errors import InvalidInput
+from zstate.scans.messages import LaserScan
 from zstate.wire.keys import full_name
-from zstate.wire.messages import LaserScan, from_float32_block, to_float32_block
+from zstate.wire.messages import from_float32_block, to_float32_block
 
 Floats = NDArray[np.float32]
 

@@ -23,11 +23,12 @@ from zstate.ingest.deadline import PERIODS, is_stale
 from zstate.recording.decode import DecodedMessage, DecodedRecording, LatchedState
 from zstate.recording.reader import RecordingReader
 from zstate.scans.grid import Grid, grid_from_message
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.scans.plugin import MAP, SCAN
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.streams import StreamName
 from zstate.view.world_source import TIME_JUMP_NS, WriterName
-from zstate.wire.messages import LaserScan, Message, OccupancyGrid
+from zstate.wire.messages import Message
 
 _READ_AHEAD = 30
 """Scans that are read together: a second of most sensors."""

@@ -21,10 +21,10 @@ from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.scans.grid import Grid, grid_from_message
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.scans.plugin import MAP, SCAN
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.wire.keys import ANY, shortened
-from zstate.wire.messages import LaserScan, OccupancyGrid
 from zstate.wire.registry import get_wire
 
 _TIMEOUT_S = 1.0

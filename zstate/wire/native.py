@@ -1,54 +1,27 @@
 """Native wire format: plain keys, MessagePack arrays, type and version in the Zenoh encoding.
 
 docs/wire.md is its specification.
-
-The payload of an OccupancyGrid above 64 kB is deflated (zlib, RFC 1950). Its first byte is then 0x78, with
-which no array of MessagePack begins.
 """
 
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.plugins import all_streams, edge_streams, find_stream, is_named, is_own, stream_named
-from zstate.streams import LATCHED_BYTES, SAMPLE_BYTES, Stream, StreamName
+from zstate.streams import LATCHED_BYTES, Stream, StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.messages import (
-    ClockMessage,
-    Count,
-    DriverState,
-    HistoryPage,
-    Imu,
-    JointCommand,
     JointState,
-    JointTrajectory,
-    LaserScan,
     Message,
-    MotionCancel,
-    MotionReply,
-    OccupancyGrid,
-    Odometry,
-    Pose,
-    Release,
-    RobotDescription,
-    SessionId,
-    Stamp,
     StampedMessage,
-    StaticTransforms,
-    Status,
-    Stop,
-    TransformSample,
-    Velocity,
-    WriterTransforms,
     check_edges,
     check_size,
 )
@@ -58,49 +31,8 @@ VERSION = 1
 
 M = TypeVar("M", bound=Message)
 
-# Literals, because they are part of the protocol and the class names are not.
-ENCODINGS: dict[type[Message], str] = {
-    JointState: "zstate/JointState;v=1",
-    TransformSample: "zstate/TransformSample;v=1",
-    WriterTransforms: "zstate/WriterTransforms;v=1",
-    JointCommand: "zstate/JointCommand;v=1",
-    JointTrajectory: "zstate/JointTrajectory;v=1",
-    MotionCancel: "zstate/MotionCancel;v=1",
-    MotionReply: "zstate/MotionReply;v=1",
-    DriverState: "zstate/DriverState;v=1",
-    Stop: "zstate/Stop;v=1",
-    Release: "zstate/Release;v=1",
-    StaticTransforms: "zstate/StaticTransforms;v=1",
-    RobotDescription: "zstate/RobotDescription;v=1",
-    LaserScan: "zstate/LaserScan;v=1",
-    OccupancyGrid: "zstate/OccupancyGrid;v=1",
-    Imu: "zstate/Imu;v=1",
-    Velocity: "zstate/Velocity;v=1",
-    Pose: "zstate/Pose;v=1",
-    Odometry: "zstate/Odometry;v=1",
-    ClockMessage: "zstate/Clock;v=1",
-    Status: "zstate/Status;v=1",
-    HistoryPage: "zstate/Past;v=1",
-}
 # The smallest limit: most payloads pass with one comparison.
 _MIN_LIMIT_BYTES = 1_000
-
-MAX_MESSAGE_BYTES: dict[type[Message], int] = {
-    ClockMessage: 1_000,
-    Status: 64_000,
-    DriverState: 256_000,
-    Stop: SAMPLE_BYTES,
-    Release: 64_000,
-    JointTrajectory: 4_000_000,
-    MotionCancel: 1_000,
-    MotionReply: 256_000,
-    HistoryPage: 4 * SAMPLE_BYTES,
-}
-"""The limits of messages that are not, or not only, received on a stream."""
-
-_DEFLATED_BYTES = 64_000
-_DEFLATED = b"\x78"
-_FASTEST = 1
 
 _ENCODER = msgspec.msgpack.Encoder()
 
@@ -125,18 +57,23 @@ def stream_encoding(stream: StreamName) -> str:
 @lru_cache(256)
 def encoding_of(kind: type[Message]) -> str:
     """The Zenoh encoding of the messages of type ``kind``, which may be that of another package's stream."""
-    if kind in ENCODINGS:
-        return ENCODINGS[kind]
-    version = next((row.version for row in all_streams() if row.type is kind), VERSION)
-    return f"zstate/{kind.__name__};v={version}"
+    version = VERSION
+    if not _is_own(kind):
+        version = next((row.version for row in all_streams() if row.type is kind), VERSION)
+    return f"zstate/{_type_name(kind)};v={version}"
+
+
+def _is_own(kind: type[Message]) -> bool:
+    return kind.__module__.startswith("zstate.")
+
+
+def _type_name(kind: type[Message]) -> str:
+    return kind.type_name or kind.__name__
 
 
 def encode(message: Message) -> bytes:
-    """The payload of ``message``; its Zenoh encoding is ``ENCODINGS[type(message)]``."""
-    payload = _ENCODER.encode(message)
-    if isinstance(message, OccupancyGrid) and len(payload) > _DEFLATED_BYTES:
-        return zlib.compress(payload, _FASTEST)
-    return payload
+    """The payload of ``message``; its Zenoh encoding is ``encoding_of(type(message))``."""
+    return message.pack(_ENCODER.encode(message))
 
 
 def new_message(row: Stream, stamp: int, fields: Mapping[str, Any]) -> StampedMessage:
@@ -154,18 +91,6 @@ def new_message(row: Stream, stamp: int, fields: Mapping[str, Any]) -> StampedMe
         raise InvalidInput(f"no message of {row.name}, whose fields are {own}: {error}") from None
 
 
-def with_encodable_fields(state: DriverState) -> DriverState:
-    """``state`` with empty values in place of those that cannot be encoded."""
-    empty = DriverState(0, 0, "", state.state, "", (), 0)
-    fields = {name: getattr(state, name) for name in state.__struct_fields__}
-    for name, value in fields.items():
-        try:
-            _ENCODER.encode(value)
-        except Exception:  # it has several, one for each type
-            fields[name] = getattr(empty, name)
-    return DriverState(**fields)
-
-
 def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     """The message of type ``kind`` in ``payload``, whose Zenoh encoding is ``encoding``.
 
@@ -174,14 +99,10 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     """
     if encoding != encoding_of(kind):
         raise _foreign_error(encoding, kind)
-    if len(payload) > _MIN_LIMIT_BYTES and len(payload) > MAX_MESSAGE_BYTES.get(kind, LATCHED_BYTES):
+    if len(payload) > _MIN_LIMIT_BYTES and len(payload) > (kind.max_bytes or LATCHED_BYTES):
         raise MessageError(f"a {_type_name(kind)} of {len(payload)} bytes", reason="too large")
-    if kind is OccupancyGrid and payload.startswith(_DEFLATED):
-        payload = _inflated(payload)
     try:
-        if kind is Stop:
-            return _decoded_stop(payload)  # type: ignore[return-value]  # of this kind
-        return _DECODERS[kind].decode(payload)  # type: ignore[return-value]  # one decoder per type
+        return _DECODERS[kind].decode(kind.unpack(payload))  # type: ignore[return-value]  # one decoder per type
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         # msgspec raises one exception for both; only the texts differ
         if type(error) is msgspec.DecodeError and "truncated" in str(error):
@@ -190,55 +111,9 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
         raise MessageError(f"a malformed {_type_name(kind)}: {error}", reason="malformed") from None
 
 
-class _StopHead(msgspec.Struct, array_like=True, gc=False):
-    """The fields of a Stop, its reason as it is encoded."""
-
-    stamp: Stamp
-    seq: Count
-    session: SessionId
-    how: Literal["hold", "relax"]
-    reason: msgspec.Raw = msgspec.Raw(b"\xa0")
-
-
-_STOP_DECODER = msgspec.msgpack.Decoder(_StopHead)
-_TEXT_DECODER = msgspec.msgpack.Decoder(str)
-_TEXT_HEADERS = {0xD9: 2, 0xDA: 3, 0xDB: 5}
-"""The size of the header of a str by its first byte; one byte for all others [MessagePack]."""
-
-
-def _decoded_stop(payload: bytes) -> Stop:
-    """The Stop in ``payload``, also if its reason is not UTF-8: a stop never fails because of its text."""
-    head = _STOP_DECODER.decode(payload)
-    encoded = bytes(head.reason)
-    try:
-        reason = _TEXT_DECODER.decode(encoded)
-    except UnicodeDecodeError:
-        reason = encoded[_TEXT_HEADERS.get(encoded[0], 1) :].decode("utf-8", "replace")
-    return Stop(head.stamp, head.seq, head.session, head.how, reason)
-
-
-def _inflated(payload: bytes) -> bytes:
-    """The deflated grid in ``payload``; at most one byte more than is allowed is inflated."""
-    inflater = zlib.decompressobj()
-    try:
-        data = inflater.decompress(payload, LATCHED_BYTES + 1)
-    except zlib.error as error:
-        raise MessageError(f"a malformed OccupancyGrid: {error}", reason="malformed") from None
-    if len(data) > LATCHED_BYTES:
-        text = f"an OccupancyGrid of more than {LATCHED_BYTES} bytes, deflated to {len(payload)}"
-        raise MessageError(text, reason="too large")
-    if not inflater.eof:
-        text = f"a deflated OccupancyGrid cut off after {len(payload)} bytes"
-        raise MessageError(text, reason="truncated")
-    if inflater.unused_data:
-        text = f"a malformed OccupancyGrid: {len(inflater.unused_data)} bytes after its deflated ones"
-        raise MessageError(text, reason="malformed")
-    return data
-
-
 def decode_joint_state(payload: bytes) -> JointState:
     """The joint state in ``payload``, which this process encoded."""
-    return decode(payload, ENCODINGS[JointState], JointState)
+    return decode(payload, encoding_of(JointState), JointState)
 
 
 class _JointPositions(msgspec.Struct, array_like=True, gc=False):
@@ -348,10 +223,6 @@ class NativeWire:
             return ()
 
 
-def _type_name(kind: type[Message]) -> str:
-    return encoding_of(kind).removeprefix("zstate/").partition(";")[0]
-
-
 def _version(kind: type[Message]) -> int:
     return int(encoding_of(kind).rpartition("=")[2])
 
@@ -359,7 +230,7 @@ def _version(kind: type[Message]) -> int:
 def _foreign_error(encoding: str, kind: type[Message]) -> MessageError:
     match, name = _ENCODING.fullmatch(encoding), _type_name(kind)
     if match and match[1] == name and int(match[2]) > _version(kind):
-        update = "zstate" if kind in ENCODINGS else kind.__module__.partition(".")[0]
+        update = kind.__module__.partition(".")[0]
         text = f"{name} of version {match[2]}, but this {update} reads version {_version(kind)}"
         return MessageError(f"{text}: `pip install -U {update}`", reason="newer version")
     return MessageError(

@@ -14,7 +14,6 @@ from zstate.wire.protocol import Wire
 
 if TYPE_CHECKING:
     from zstate.wire.ros2.options import Ros2Options
-    from zstate.wire.ros2.wire import Ros2Controller
 
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
 
@@ -57,19 +56,3 @@ def ros_options(text: str) -> Ros2Options:
         return replace(options, domain=int(domain) if domain.isascii() and domain.isdecimal() else domain)
     except InvalidInput as error:
         raise InvalidInput(f"{error} (the domain is that of {DOMAIN_VARIABLE})") from None
-
-
-def get_controller(wires: Sequence[str], robot: str, name: str) -> Ros2Controller:
-    """The topics of the controller ``name`` of ``robot``, on the one wire "ros2" among ``wires``.
-
-    Raises InvalidInput if there is none, or more than one, and for names that ROS does not allow.
-    """
-    from zstate.wire.ros2.wire import Ros2Controller  # noqa: PLC0415 - as above
-
-    texts = [wire.partition(":")[2] for wire in wires if wire.partition(":")[0] == "ros2"]
-    if len(texts) != 1:
-        raise InvalidInput(
-            f"the commands of ROS nodes to {name!r} arrive on one wire 'ros2', not on {tuple(wires)}: pass "
-            "wires=('native', 'ros2'), or with its options, such as 'ros2:domain=5,namespace=r1'"
-        )
-    return Ros2Controller(ros_options(texts[0]), robot, name)

@@ -13,7 +13,7 @@ from zstate.cli.edge_statistics import EdgeMeasure, EdgeRow, EdgeStatistics, ove
 from zstate.clock import ClockOffset, ManualClock
 from zstate.net.streams import KeyPublisher
 from zstate.wire.messages import JointState, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 DRIVER = "driver@jetson pid 412"
 
@@ -134,7 +134,7 @@ def test_missing_numbers_and_latency_are_measured():
         EdgeStatistics(reader, "r1", "native", "joint_states", CLOCK) as statistics,
     ):
         key, order = "zstate/r1/joint_states", order_digest(("swing",))
-        with KeyPublisher(writer, key, ENCODINGS[JointState]) as stream:
+        with KeyPublisher(writer, key, encoding_of(JointState)) as stream:
             until(lambda: stream.has_readers)
             for seq in (0, 1, 5):
                 stream.put(encode(JointState(CLOCK.now() - 10_000_000, seq, 7, order, to_block([0.5]))))

@@ -32,7 +32,7 @@ from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import reader_key, writer_key
 from zstate.wire.messages import JointState, order_digest
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 SECOND = 1_000_000_000
 LINKS = ["zstate", "network", "robots", "writers", "model", "joint_states", "clocks", "stamps"]
@@ -304,7 +304,9 @@ def test_a_fifth_of_lost_samples_is_a_warning():
             number = next(seq)
             if number % 4:
                 state = JointState(time.time_ns(), number, 7, order, bytes(16))
-                session.zenoh.put("zstate/rrbot/joint_states", encode(state), encoding=ENCODINGS[JointState])
+                session.zenoh.put(
+                    "zstate/rrbot/joint_states", encode(state), encoding=encoding_of(JointState)
+                )
 
         with repeated(publish):
             found = warnings("rrbot")
@@ -325,7 +327,7 @@ def test_a_writer_whose_samples_arrive_is_not_frozen_though_it_does_not_reply():
             probe = RobotProbe(collector, info, [info])
             until(lambda: probe.silent_writers() == {writer})
             state = JointState(time.time_ns(), 0, 7, order_digest(()), b"")
-            session.zenoh.put("zstate/cart/joint_states", encode(state), encoding=ENCODINGS[JointState])
+            session.zenoh.put("zstate/cart/joint_states", encode(state), encoding=encoding_of(JointState))
             until(lambda: not probe.silent_writers())
 
 

@@ -19,7 +19,7 @@ from zstate.net.streams import KeyPublisher
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import reader_key, status_key, stream_key, writer_key
 from zstate.wire.messages import StaticTransforms, Status, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.native import encode, encoding_of
 
 FAKE = "\x1b]0;owned\x07\x1b[2J\x9b31m\nok       robots        all is well\u202e"
 
@@ -43,12 +43,12 @@ def stranger() -> Iterator[None]:
         ):
             opened.enter_context(announce(session, token))
         mount = LatchedPublisher(
-            session, stream_key("rrbot", "tf_static", "mount"), ENCODINGS[StaticTransforms]
+            session, stream_key("rrbot", "tf_static", "mount"), encoding_of(StaticTransforms)
         )
         opened.enter_context(mount)
         for frame in ("gauge", f"cam{FAKE}"):
             mount.set(encode(StaticTransforms(77, (("tool", frame),), pose)))
-        status_publisher = KeyPublisher(session, status_key("rrbot", EVIL.identity), ENCODINGS[Status])
+        status_publisher = KeyPublisher(session, status_key("rrbot", EVIL.identity), encoding_of(Status))
         opened.enter_context(status_publisher)
         opened.enter_context(repeated(lambda: status_publisher.put(encode(status))))
         yield

@@ -21,7 +21,7 @@ from zstate.cli.commands import joints
 from zstate.cli.output.logs import text_in
 from zstate.net.streams import KeyPublisher
 from zstate.wire.messages import JointState
-from zstate.wire.native import ENCODINGS
+from zstate.wire.native import encoding_of
 
 
 def entries(stderr: str) -> list[dict[str, object]]:
@@ -90,7 +90,7 @@ def test_standard_output_of_a_service_is_json_too(free_port: int, service: tuple
 
 def test_library_warning_has_its_event_and_reason():
     def disturb(command: Command) -> None:
-        key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]
+        key, encoding = "zstate/rrbot/joint_states", encoding_of(JointState)
         with published_robot(), connect() as session, KeyPublisher(session, key, encoding) as noise:
             command.line()
             until(lambda: noise.has_readers)

@@ -21,10 +21,10 @@ from helpers.programs import driver
 
 from zstate import JointReading, TransformListener, connect
 from zstate.driving import Commander, stop
+from zstate.driving.messages import DriverState, state_text
 from zstate.net.latched import LatchedSubscriber
 from zstate.sources import JointStateListener
 from zstate.wire.keys import driver_key
-from zstate.wire.messages import DriverState, state_text
 from zstate.wire.native import decode
 from zstate.wire.protocol import SerializedSample
 

@@ -31,9 +31,10 @@ from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.wire import keys
-from zstate.wire.messages import LaserScan, OccupancyGrid, TransformSample, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.messages import TransformSample, order_digest, to_block
+from zstate.wire.native import encode, encoding_of
 
 FLEET = AclRoles(
     ("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",), commanders=("teleop",)
@@ -159,7 +160,7 @@ def test_robots_read_the_map_of_a_place_but_not_the_scans_of_another_robot(site:
     keys_of = {"map": "zstate/r2/map/hall", "scan": "zstate/r2/scan/front", "own": "zstate/r1/scan/front"}
     with ExitStack() as opened:
         place, robot = site.join("r2"), site.join("r1")
-        published = opened.enter_context(LatchedPublisher(place, keys_of["map"], ENCODINGS[OccupancyGrid]))
+        published = opened.enter_context(LatchedPublisher(place, keys_of["map"], encoding_of(OccupancyGrid)))
         published.set(encode(hall))
         opened.enter_context(
             LatchedSubscriber(robot, "zstate/*/map/*", lambda one: received.append(one.payload))
@@ -169,8 +170,8 @@ def test_robots_read_the_map_of_a_place_but_not_the_scans_of_another_robot(site:
         opened.enter_context(
             StreamSubscriber(robot, "zstate/*/scan/*", lambda batch: scans.extend(one.key for one in batch))
         )
-        foreign = opened.enter_context(KeyPublisher(place, keys_of["scan"], ENCODINGS[LaserScan]))
-        own = opened.enter_context(KeyPublisher(robot, keys_of["own"], ENCODINGS[LaserScan]))
+        foreign = opened.enter_context(KeyPublisher(place, keys_of["scan"], encoding_of(LaserScan)))
+        own = opened.enter_context(KeyPublisher(robot, keys_of["own"], encoding_of(LaserScan)))
 
         def publish() -> None:
             foreign.put(encode(front))
@@ -296,7 +297,7 @@ def test_robot_announced_as_another_takes_over_no_edges(site: Site):
     with (
         StatePublisher(robot, RRBOT, "r1") as publisher,
         TransformListener(site.join("desk"), "*", follow="tf") as listener,
-        KeyPublisher(thief, "zstate/r2/tf", ENCODINGS[TransformSample]) as stream,
+        KeyPublisher(thief, "zstate/r2/tf", encoding_of(TransformSample)) as stream,
     ):
         until(lambda: publish_and_check(publisher, listener))
         (info,) = discover(site.join("desk"))

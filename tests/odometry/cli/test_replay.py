@@ -35,9 +35,10 @@ from zstate.odometry.cli.replay import (
     sigma_factor,
 )
 from zstate.odometry.cli.settings_file import OdometrySettings
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
 from zstate.odometry.simulated_rover import ImuReading
 from zstate.sources.square_drive import WheelPair
-from zstate.wire.messages import Imu, Odometry, Pose, Velocity, order_digest, to_block
+from zstate.wire.messages import order_digest, to_block
 
 MODEL = load_model("diffbot")
 NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)

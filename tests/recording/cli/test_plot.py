@@ -12,7 +12,8 @@ from helpers.recording_builder import START, RecordingBuilder
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
 from zstate.errors import InvalidInput
 from zstate.recording.cli.plot import joint_series, path_series
-from zstate.wire.messages import OccupancyGrid, to_block
+from zstate.scans.messages import OccupancyGrid
+from zstate.wire.messages import to_block
 
 SECOND = 1_000_000_000
 DOCUMENTS = [

@@ -8,7 +8,8 @@ from helpers.processes import until
 from helpers.recording_builder import LATENCY, MS, START, Bag, RecordingBuilder, S, swing_positions
 
 from zstate import TransformListener, connect, discover
-from zstate.wire.messages import OccupancyGrid, to_block
+from zstate.scans.messages import OccupancyGrid
+from zstate.wire.messages import to_block
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from helpers.cli_runner import Spawn, failure, interrupted, run_cli, run_until, 
 
 from zstate import StreamListener, connect, discover
 from zstate.scans import Grid, MapPublisher, load_map
-from zstate.wire.messages import OccupancyGrid
+from zstate.scans.messages import OccupancyGrid
 
 # Two rows of three cells: two occupied, three free, one unknown.
 CELLS = [[100, 0, 0], [-1, 0, 100]]

@@ -26,8 +26,8 @@ from helpers.programs import scanner
 
 from zstate import StaticPublisher, StreamListener, Transform, TransformPublisher, connect
 from zstate.scans import Grid, ScanListener
+from zstate.scans.messages import LaserScan
 from zstate.scans.scan import scan_from_message
-from zstate.wire.messages import LaserScan
 
 WALL_M = 3.0
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import pytest
 import zenoh
+from helpers.message_types import MESSAGE_TYPES
 from helpers.processes import until
 from helpers.robots import RRBOT, wait_for_reader
 
@@ -19,12 +20,12 @@ from zstate.net.session import Session, connect
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.streams import StreamName
-from zstate.wire.native import ENCODINGS
+from zstate.wire.native import encoding_of
 from zstate.wire.registry import get_wire
 
 BATCH = 150  # the batches of all four targets fit into every ring, so that none overflows
 FOLLOWS: tuple[Follow, ...] = ("joint_states", "tf")
-ENCODED = (*ENCODINGS.values(), "", "text/plain", "zenoh/bytes", "application/cdr")
+ENCODED = (*map(encoding_of, MESSAGE_TYPES), "", "text/plain", "zenoh/bytes", "application/cdr")
 NAMES = ("r1", "r2", "\u0440\u043e\u0431\u043e\u0442", "a" * 200, "%", "r 3", "-", "1")
 UNREAD = (
     "zstate/r1/joint_commands",

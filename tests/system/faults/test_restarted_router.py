@@ -16,11 +16,12 @@ from zstate import TransformListener, connect
 from zstate.net.presence import LivelinessToken, announce
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
+from zstate.odometry.messages import Odometry
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import stream_key, writer_key
-from zstate.wire.messages import Odometry, WriterTransforms, order_digest, to_block
-from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.messages import WriterTransforms, order_digest, to_block
+from zstate.wire.native import encode, encoding_of
 
 pytestmark = pytest.mark.processes
 
@@ -46,7 +47,7 @@ class Fleet:
             identity = Announcement(robot, stream, writer, NAME).identity
             self._tokens.append(announce(session, writer_key(robot, stream, identity)))
             key = stream_key(robot, stream, NAME)
-            publisher = KeyPublisher(session, key, ENCODINGS[self._message])
+            publisher = KeyPublisher(session, key, encoding_of(self._message))
             self._writers.append((writer.session, publisher))
 
     def publish(self) -> None:

@@ -7,10 +7,10 @@ from helpers.browser_client import browser
 from helpers.processes import until
 
 from zstate.driving.driver_state import DriverStateListener, ReceivedState
+from zstate.driving.messages import DriverState
 from zstate.view.panels import html
 from zstate.view.panels.control_panels import _DriverPanel, plotted_rows
 from zstate.view.sliders import SliderCommander
-from zstate.wire.messages import DriverState
 
 S = 1_000_000_000
 

@@ -11,11 +11,12 @@ from helpers.manual_cdr import (
     rosbags_trajectory,
 )
 
+from zstate.driving.messages import JointTrajectory
+from zstate.driving.ros2 import decode_numbers, decode_trajectory
 from zstate.errors import MessageError
 from zstate.wire.messages import (
     ClockMessage,
     JointState,
-    JointTrajectory,
     RobotDescription,
     StaticTransforms,
     TransformSample,
@@ -23,7 +24,7 @@ from zstate.wire.messages import (
     poses_from_block,
     to_block,
 )
-from zstate.wire.ros2.decoder import RosDecoder, decode_numbers, decode_trajectory
+from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
 

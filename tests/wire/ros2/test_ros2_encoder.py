@@ -15,12 +15,12 @@ from helpers.manual_cdr import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from zstate.driving.messages import JointCommand
 from zstate.errors import InvalidInput
 from zstate.extension import kernel
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import (
     ClockMessage,
-    JointCommand,
     JointState,
     RobotDescription,
     StaticTransforms,

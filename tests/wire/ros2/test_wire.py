@@ -20,13 +20,14 @@ from helpers.raw_ros_nodes import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from zstate.driving.ros2 import Ros2Controller
 from zstate.errors import InvalidInput, MessageError
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.protocol import SerializedSample, StreamEncoder, WriterNode
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
-from zstate.wire.ros2.wire import Ros2Controller, Ros2DdsWire, Ros2Wire
+from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
 
 STAMP = 1_700_000_000_123_456_789
 GOOD = rosbags_joint_state(STAMP, "", ("a",), [1.0], [], [])

@@ -98,7 +98,7 @@ def echo_command(
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
     from zstate.plugins import stream_named
-    from zstate.wire.messages import JointState, LaserScan
+    from zstate.wire.messages import JointState
     from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire
 
@@ -127,12 +127,8 @@ def echo_command(
         row = stream_named(stream)
         if row.type is JointState:
             document = opened.enter_context(DescribedJointStates(session, selected, wire)).document
-        elif row.type is LaserScan and (form or field) is not None:
-            from zstate.scans.documents import scan_document
-
-            document = partial(scan_document, robot=selected, has_ranges=True)
         else:
-            document = partial(row.to_document, robot=selected)
+            document = partial(row.to_document, robot=selected, in_full=(form or field) is not None)
         carrying = carrier(get_wire(wire), stream)
         reader = opened.enter_context(StreamReader(session, selected, carrying, wire))
         received = reader.first(timeout if once else None)

@@ -8,12 +8,12 @@ from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.plugin_checks import PluginChecks, ProbedRobot
 from zstate.cli.output.console import count_text
 from zstate.driving.driver_state import DriverStateListener, ReceivedState
+from zstate.driving.messages import DriverState
 from zstate.errors import format_duration
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import ANY
-from zstate.wire.messages import DriverState
 
 _MAX_SKIPPED = 0.01
 """The greatest ratio of the skipped to the due ticks of a driver's loop."""

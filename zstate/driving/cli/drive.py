@@ -30,9 +30,9 @@ from zstate.errors import DriverFault, InvalidInput, MessageError, ZStateError, 
 if TYPE_CHECKING:
     from zstate.driving import Driver, DriverHost, DriverReport, Limits
     from zstate.driving.driver_state import Spread
+    from zstate.driving.messages import Mode
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
-    from zstate.wire.messages import Mode
     from zstate.wire.protocol import SerializedSample
 
 _SIMULATED = "sim"
@@ -271,7 +271,7 @@ def drive_command(
 
 def _controller_text(wires: tuple[str, ...], robot: str, name: str) -> str:
     """The topics of the ROS 2 controller ``name``. Raises UsageError if it has no wire."""
-    from zstate.wire.registry import get_controller
+    from zstate.driving.ros2 import get_controller
 
     try:
         return " and ".join(get_controller(wires, robot, name).topics)
@@ -348,7 +348,7 @@ class _StateLines(Closeable):
 
     def _on_state(self, sample: SerializedSample) -> None:
         from zstate.driving.control_loop import NO_READING
-        from zstate.wire.messages import DriverState, state_text
+        from zstate.driving.messages import DriverState, state_text
         from zstate.wire.native import decode
 
         with suppress(MessageError):

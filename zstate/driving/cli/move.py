@@ -30,10 +30,10 @@ from zstate.errors import (
 if TYPE_CHECKING:
     from zstate.driving import Commander
     from zstate.driving.driver import StopMode
+    from zstate.driving.messages import DriverState
     from zstate.driving.motion import Motion, Outcome
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
-    from zstate.wire.messages import DriverState
 
 _SECONDS = 1.0
 _SEND_PERIOD_S = 0.05
@@ -386,7 +386,7 @@ def stop_command(
     if release and (relax or reason):
         raise click.UsageError("--release ends stops; leave out --relax and --reason")
     from zstate.cli.processes import BackgroundCall  # loads numpy, which --help does not need
-    from zstate.wire.messages import state_text
+    from zstate.driving.messages import state_text
 
     act = partial(_release, timeout_s=timeout)
     if not release:

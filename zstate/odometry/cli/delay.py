@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from zstate.buffer.buffer import TransformBuffer
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.odometry import Wheels
-from zstate.wire.messages import Imu, Pose, StampedMessage, Velocity, from_block
+from zstate.odometry.messages import Imu, Pose, Velocity
+from zstate.wire.messages import StampedMessage, from_block
 
 Floats = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from zstate.odometry import DiffDrive, OdometryNode, PoseNoise, VelocityNoise
     from zstate.odometry.cli.reference import ReferenceName
     from zstate.odometry.cli.settings_file import LegSettings, OdometrySettings, PlanarPose
-    from zstate.wire.messages import Imu, Pose, Velocity
+    from zstate.odometry.messages import Imu, Pose, Velocity
 
     SensorMessage = Imu | Velocity | Pose
 
@@ -310,10 +310,10 @@ def _wait_for_sensors(
     from zstate.cli.waiting import ConditionWaiter
     from zstate.odometry import SensorListener
     from zstate.odometry.cli.settings_file import others_text
+    from zstate.odometry.messages import Imu
     from zstate.odometry.node import pose_covariance, velocity_covariance
     from zstate.sources.joint_state_listener import DescriptionSubscriber
     from zstate.wire.keys import full_name
-    from zstate.wire.messages import Imu
 
     waiter = ConditionWaiter()
     models: dict[str, RobotModel] = {}

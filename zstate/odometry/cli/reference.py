@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from zstate._util.format import did_you_mean
 from zstate.errors import InvalidInput
+from zstate.odometry.messages import Odometry, Pose
 from zstate.odometry.source_noise import PoseNoise
 from zstate.wire.keys import check_writer
-from zstate.wire.messages import Odometry, Pose, covariance_matrix, from_block
+from zstate.wire.messages import covariance_matrix, from_block
 
 Floats = NDArray[np.float64]
 

@@ -27,6 +27,7 @@ from zstate.odometry.cli.settings_file import OdometrySettings, others_text
 from zstate.odometry.estimator import WHEELS
 from zstate.odometry.fusion import STANDSTILL
 from zstate.odometry.health import WINDOW
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
 from zstate.odometry.node import (
     add_imu,
     add_pose,
@@ -38,13 +39,7 @@ from zstate.recording.cli.plot import new_figure
 from zstate.recording.info import recorded_robots
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.wire.keys import full_name
-from zstate.wire.messages import (
-    Imu,
-    Odometry,
-    Pose,
-    RobotDescription,
-    Velocity,
-)
+from zstate.wire.messages import RobotDescription
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,9 @@ from zstate.cli.doctor.plugin_checks import PluginChecks, ProbedRobot
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
+from zstate.scans.messages import OccupancyGrid
 from zstate.scans.plugin import MAP
 from zstate.wire.keys import ANY, full_name
-from zstate.wire.messages import OccupancyGrid
 from zstate.wire.registry import get_wire
 
 

@@ -18,6 +18,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.tracks import TimeSpan
 from zstate.clock import SYSTEM
 from zstate.driving.driver_state import DriverStateListener, ReceivedState
+from zstate.driving.messages import DriverState
 from zstate.errors import InvalidInput, LookupFailed, format_duration
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.session import Session
@@ -28,7 +29,6 @@ from zstate.view.panels.panel import BoundWidget, PanelContext
 from zstate.view.server import ViewServer
 from zstate.view.sliders import SliderCommander, SliderMapping, SliderPublisher, SliderSpec, velocity_specs
 from zstate.wire.keys import ANY
-from zstate.wire.messages import DriverState
 
 _UNITS: tuple[str, ...] = ("rad", "deg")
 _NO_ROBOT: tuple[str, ...] = ("(none)",)

@@ -10,19 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.errors import InvalidInput, MessageError
+from zstate.errors import MessageError
 from zstate.streams import StreamName
 from zstate.wire.messages import (
     ClockMessage,
     Edges,
     JointState,
-    JointTrajectory,
     Message,
     RobotDescription,
     StampedMessage,
     StaticTransforms,
     TransformSample,
-    from_block,
     order_digest,
     poses_from_block,
     to_block,
@@ -39,16 +37,9 @@ from zstate.wire.ros2.cdr import (
 from zstate.wire.ros2.streams import ros_stream
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
-    FLOAT64_MULTI_ARRAY,
     JOINT_STATE,
-    JOINT_TRAJECTORY,
     TF_MESSAGE,
 )
-
-FLOAT_BYTES = 4
-"""Of a float32, in which ROS has ranges."""
-CELL_BYTES = 1
-"""Of a cell of a grid."""
 
 _SCAN_FLOATS = 7
 _POSE_NUMBERS = 7
@@ -292,46 +283,3 @@ def read_tf_message(reader: CdrReader) -> RosTransforms:
         poses.append(reader.numbers(_POSE_NUMBERS))
     shared = stamps[0] if len(set(stamps)) == 1 else None
     return RosTransforms(shared, tuple(stamps), tuple(edges), b"".join(poses))
-
-
-def decode_numbers(payload: bytes) -> NDArray[np.float64]:
-    """The data of a Float64MultiArray: (n,), read-only. Its layout is ignored, as by ros2_control.
-
-    Raises MessageError with the reason "truncated" or "malformed".
-    """
-    reader = CdrReader(payload, FLOAT64_MULTI_ARRAY.name)
-    for _ in range(reader.count()):
-        reader.text()  # label
-        reader.count()  # size
-        reader.count()  # stride
-    reader.count()  # data_offset
-    return from_block(reader.sequence())
-
-
-def decode_trajectory(payload: bytes, session: int, seq: int) -> JointTrajectory | None:
-    """The motion in a JointTrajectory of ROS; None for one without points, which ends a motion.
-
-    It starts at its stamp, or at its arrival if that is zero. Does not check that numbers are finite, and
-    times ascend. Raises MessageError with the reason "truncated", "malformed", or "mode" for efforts.
-    """
-    reader = CdrReader(payload, JOINT_TRAJECTORY.name)
-    stamp, _ = reader.stamp(), reader.text()
-    names = tuple(reader.text() for _ in range(reader.count()))
-    blocks: tuple[list[bytes], ...] = [], [], [], []
-    times: list[int] = []
-    for _ in range(reader.count()):
-        for block in blocks:
-            block.append(reader.sequence())
-        times.append(reader.stamp())
-    points, velocities, accelerations, efforts = (b"".join(block) for block in blocks)
-    if efforts:
-        raise MessageError("a trajectory with efforts, which are not supported", reason="mode")
-    if not times:
-        return None
-    if any(len(block) not in (0, 8 * len(names)) for each in blocks for block in each):
-        raise reader.malformed(f"a point has not one number for each of {len(names)} joints")
-    numbers = to_block(np.array(times) / SECOND_NS), points, velocities or None, accelerations or None
-    try:
-        return JointTrajectory(stamp, seq, session, names, *numbers, start=stamp or None)
-    except InvalidInput as error:
-        raise reader.malformed(str(error)) from None

@@ -23,8 +23,10 @@ class RosStream(NamedTuple):
     Topics with ``is_named`` have the name of the sensor, or of the writer, and are found by their type.
     ``encode(message, names)`` makes the payload of a message, ``decode(payload, session, seq, names)`` the
     message in one, with the frames as ``names`` has them (FrameNames); those of the streams of the core are
-    in ``RosStreamEncoder`` and ``RosDecoder``. With
-    ``is_of_sensor`` their namespace may be that of the sensor: /r1/imu/data is a topic of the robot r1.
+    in ``RosStreamEncoder`` and ``RosDecoder``. With ``is_of_sensor`` their namespace may be that of the
+    sensor: /r1/imu/data is a topic of the robot r1. ``uncarried`` is the field with a frame that ROS does not
+    carry: a recording has a channel for each. ``withdrawn`` is recorded when a latched value is withdrawn,
+    which ROS cannot express; ``is_withdrawn`` whether a message is such a one.
     """
 
     type: RosType
@@ -33,6 +35,36 @@ class RosStream(NamedTuple):
     encode: Callable[..., bytes] | None = None
     decode: Callable[..., Message] | None = None
     is_of_sensor: bool = False
+    uncarried: str = ""
+    withdrawn: Message | None = None
+    is_withdrawn: Callable[..., bool] | None = None
+
+
+class RecordedForm(NamedTuple):
+    """How recordings have a stream that ROS 2 does not carry: as messages that ROS tools display.
+
+    ``topic`` is the last name of its topics, of type ``type``; with ``is_shared`` there is one for all
+    robots. ``encode(message, robot, program)`` makes the payload of a message, None of one that is not
+    recorded; ``decode(payload, session, seq)`` the message in one. ``program_of(message, writer)`` is the
+    program that has sent it. They are never published again: a replay must not move hardware.
+    """
+
+    type: RosType
+    topic: str
+    encode: Callable[..., bytes | None]
+    decode: Callable[..., Message]
+    program_of: Callable[..., str] | None = None
+    is_shared: bool = False
+
+    def topic_in(self, namespace: str) -> str:
+        """The topic for a robot in ``namespace`` ("" is the root)."""
+        return f"/{namespace}/{self.topic}" if namespace and not self.is_shared else f"/{self.topic}"
+
+
+@cache
+def recorded_forms() -> dict[StreamName, RecordedForm]:
+    """The streams that only recordings have."""
+    return {row.name: row.recorded_form for row in own_streams() if row.recorded}
 
 
 # The QoS of robot_state_publisher, tf2 and map_server, and of the broadcasters of ros2_control: readers of

@@ -7,18 +7,15 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import lru_cache, partial
-from typing import Literal, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Literal
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY
-from zstate.wire.messages import JointTrajectory, Message, check_edges, check_size
+from zstate.wire.messages import Message, check_edges, check_size
 from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
-from zstate.wire.ros2.decoder import RosDecoder, decode_numbers, decode_trajectory
+from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.graph import (
     ATTACHMENT_BYTES,
@@ -33,18 +30,15 @@ from zstate.wire.ros2.graph import (
     session_from_gid,
     unpack_attachment,
 )
-from zstate.wire.ros2.options import Ros2Options, check_token
-from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.streams import has_named_topics, ros_stream, ros_streams, ros_type, topic_stream
 from zstate.wire.ros2.topics import (
-    HUMBLE_HASH,
     SHARED,
     DdsKeys,
     FrameNames,
     RmwKeys,
     robot_from_topic,
 )
-from zstate.wire.ros2.types import FLOAT64_MULTI_ARRAY, JOINT_TRAJECTORY, RosType
 
 
 class Ros2Wire:
@@ -206,89 +200,3 @@ class Ros2DdsWire(Ros2Wire):
             return ()
         writer = WriterId(f"ros2dds bridge {parsed.zid[:8]}", host="", pid=0, since=0, session=0)
         return self._announcement(f"/{parsed.topic}", parsed.dds_type, robot, writer)
-
-
-class RosCommand(NamedTuple):
-    """``positions`` (n,) that a ROS node with the writer number ``session`` has sent as message ``seq``.
-
-    ``stamp`` [ns] is the time of sending, by the clock of the node.
-    """
-
-    session: int
-    seq: int
-    stamp: int
-    positions: NDArray[np.float64]
-
-
-class RosMotion(NamedTuple):
-    """The motion that a ROS node with the writer number ``session`` requests; None ends its motion.
-
-    ``stamp`` is when it was sent [ns].
-    """
-
-    session: int
-    stamp: int
-    request: JointTrajectory | None
-
-
-class Ros2Controller:
-    """The topics of a controller of ros2_control, on which ROS nodes command a robot, in rmw_zenoh_cpp.
-
-    They are in the namespace of ``robot``. ``<name>/commands`` is a Float64MultiArray: a position for each
-    joint, in an order that both sides know. ``<name>/joint_trajectory`` is a JointTrajectory. Raises
-    InvalidInput for a name that ROS does not allow.
-    """
-
-    def __init__(self, options: Ros2Options, robot: str, name: str) -> None:
-        check_token("controller", name, ", which becomes a part of ROS topics")
-        self._options = options
-        self._name = name
-        self._namespace = f"/{options.robot_namespace(robot)}"
-        root = f"{self._namespace.rstrip('/')}/{name}"
-        self.topics = {f"{root}/commands": FLOAT64_MULTI_ARRAY, f"{root}/joint_trajectory": JOINT_TRAJECTORY}
-        """The names of both topics, and their types."""
-        self.commands, self.trajectories = (
-            f"{options.domain}{topic}/{kind.dds}/*" for topic, kind in self.topics.items()
-        )
-        """The key expressions of both topics."""
-
-    def decode_command(self, arrival: SerializedSample) -> RosCommand:
-        """The command in a sample received under ``commands``. Raises MessageError."""
-        session, seq, stamp = self._origin(arrival)
-        return RosCommand(session, seq, stamp, decode_numbers(arrival.payload))
-
-    def decode_trajectory(self, arrival: SerializedSample) -> RosMotion:
-        """The motion in a sample received under ``trajectories``. Raises MessageError."""
-        session, seq, stamp = self._origin(arrival)
-        return RosMotion(session, stamp, decode_trajectory(arrival.payload, session, seq))
-
-    def _origin(self, arrival: SerializedSample) -> tuple[int, int, int]:
-        """The writer's session, the sequence number, and the time of sending. Raises MessageError."""
-        check_size("joint_commands", arrival.size or len(arrival.payload))
-        attachment = unpack_attachment(arrival.attachment)
-        return session_from_gid(attachment.gid), attachment.seq, attachment.source_time
-
-    def reader_tokens(self, zid: str, number: Callable[[], int]) -> tuple[str, ...]:
-        """The liveliness tokens of the controller as a node with its subscriptions, in the session ``zid``.
-
-        ``number()`` returns the next unused number of the session.
-        """
-        node = NodeToken(self._options.domain, zid, number(), "/", self._namespace, self._name)
-        endpoints = [
-            EndpointToken(node, number(), "MS", topic, kind.dds, self._hash_of(kind), Qos()).key
-            for topic, kind in self.topics.items()
-        ]
-        return node.key, *endpoints
-
-    def _hash_of(self, kind: RosType) -> str:
-        return kind.hash if self._options.hash == "iron" else HUMBLE_HASH
-
-    def writers_expression(self, robot: str) -> str:
-        return graph_expression(self._options.domain)
-
-    def parse_token(self, token: str, robot: str) -> tuple[Announcement, ...]:
-        parsed = parse_token(token)
-        if not isinstance(parsed, EndpointToken) or parsed.kind != "MP" or parsed.topic not in self.topics:
-            return ()
-        writer = WriterId(parsed.full_name, host="", pid=0, since=0, session=session_from_gid(gid(token)))
-        return (Announcement(robot, "joint_commands", writer),)

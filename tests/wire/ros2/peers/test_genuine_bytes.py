@@ -26,9 +26,10 @@ from ros_messages import (
     transform_stamped,
 )
 
+from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.streams import StreamName
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import LaserScan, Message, OccupancyGrid, to_block, to_float32_block
+from zstate.wire.messages import Message, to_block, to_float32_block
 from zstate.wire.ros2 import types
 from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string
 from zstate.wire.ros2.decoder import JointStateDecoder, RosDecoder, TfMessageDecoder

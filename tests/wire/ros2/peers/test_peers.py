@@ -29,8 +29,8 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.scans import Grid, MapPublisher, Scan, ScanListener, ScanPublisher
 from zstate.scans.grid import grid_from_message
+from zstate.scans.messages import OccupancyGrid
 from zstate.transform import Transform
-from zstate.wire.messages import OccupancyGrid
 from zstate.wire.registry import get_wire
 
 WIRE = f"ros2:domain={DOMAIN}"

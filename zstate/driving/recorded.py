@@ -17,41 +17,18 @@ panels show; as in ROS it is one for all robots.
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import Any, TypeVar
 
+from zstate.driving.messages import DriverState, JointCommand, Stop, state_text
 from zstate.errors import InvalidInput
-from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
-from zstate.wire.messages import (
-    DriverState,
-    JointCommand,
-    Stop,
-    message_fields,
-    message_from_fields,
-    order_digest,
-    state_text,
-)
+from zstate.wire.messages import message_fields, message_from_fields, order_digest
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
-from zstate.wire.ros2.types import DIAGNOSTIC_ARRAY, JOINT_STATE, RosType
+from zstate.wire.ros2.streams import RecordedForm
+from zstate.wire.ros2.types import DIAGNOSTIC_ARRAY, JOINT_STATE
 
-DRIVER_TYPES: dict[StreamName, RosType] = {
-    "joint_commands": JOINT_STATE,
-    "driver": DIAGNOSTIC_ARRAY,
-    "stop": DIAGNOSTIC_ARRAY,
-    "relax": DIAGNOSTIC_ARRAY,
-}
-"""The streams of drivers and their types, in recordings by zstate. They are never published again, since a
-replay must not move hardware."""
+_Status = TypeVar("_Status", DriverState, Stop)
 
-_LAST_NAMES: dict[StreamName, str] = {
-    "joint_commands": "joint_commands",
-    "driver": "diagnostics",
-    "stop": "stops",
-    "relax": "stops",
-}
-"""The last names of their topics."""
-
-_KINDS: dict[StreamName, type[DriverState] | type[Stop]] = {"driver": DriverState, "stop": Stop}
 _TEXTS = frozenset({"program", "state", "reason", "commander", "last_refusal", "how"})
 """The fields that are texts."""
 
@@ -61,23 +38,13 @@ _LEVELS = {"stopped": _WARN, "fault": _ERROR}
 """Those of the states of a driver that are not OK."""
 
 
-def driver_topic(namespace: str, stream: StreamName) -> str:
-    """The topic of a stream of drivers, for a robot in ``namespace`` ("" is the root)."""
-    topic = f"/{_LAST_NAMES[stream]}"
-    return f"/{namespace}{topic}" if namespace and stream != "driver" else topic
+def encode_command(command: JointCommand, robot: str, program: str) -> bytes | None:
+    """The JointState with the numbers of ``command``; None for one that keeps a motion valid and has none.
 
-
-def driver_stream(topic: str, type_name: str) -> StreamName | None:
-    """The stream of drivers that has this topic; None if it is another topic."""
-    last_name = topic.rpartition("/")[2]
-    for stream, kind in DRIVER_TYPES.items():
-        if (last_name, type_name) == (_LAST_NAMES[stream], kind.name):
-            return stream
-    return None
-
-
-def encode_command(command: JointCommand) -> bytes:
-    """The JointState with the numbers of ``command``. Raises InvalidInput for one without joint names."""
+    Raises InvalidInput for one without joint names.
+    """
+    if command.motion is not None:
+        return None
     if not command.names:
         raise InvalidInput("a command without the names of its joints, which drivers refuse")
     writer = CdrWriter()
@@ -105,13 +72,11 @@ def decode_command(payload: bytes, session: int, seq: int) -> JointCommand:
         raise reader.malformed(str(error)) from None
 
 
-def program_of(message: DriverState | Stop, identity: str) -> str:
-    """The program that sent ``message``: of a Stop by the ``identity`` in its key.
+def program_of_stop(message: Stop, identity: str) -> str:
+    """The program that sent ``message``, by the ``identity`` in its key.
 
     Raises InvalidInput if that is of another program.
     """
-    if isinstance(message, DriverState):
-        return message.program
     writer = WriterId.parse(identity)
     if writer.session != message.session:
         raise InvalidInput(f"a stop of another program on the key of {str(writer)!r}")
@@ -141,8 +106,17 @@ def encode_status(message: DriverState | Stop, robot: str, program: str) -> byte
     return writer.payload()
 
 
-def decode_status(stream: StreamName, payload: bytes) -> DriverState | Stop:
-    """The message of ``stream`` in ``payload``. Raises MessageError."""
+def decode_state(payload: bytes, session: int, seq: int) -> DriverState:
+    """The state of a driver in ``payload``, which has its own session. Raises MessageError."""
+    return _decode_status(DriverState, payload)
+
+
+def decode_stop(payload: bytes, session: int, seq: int) -> Stop:
+    """The stop in ``payload``, which has its own session and seq. Raises MessageError."""
+    return _decode_status(Stop, payload)
+
+
+def _decode_status(kind: type[_Status], payload: bytes) -> _Status:
     reader = CdrReader(payload, DIAGNOSTIC_ARRAY.name)
     fields: dict[str, Any] = {"stamp": reader.stamp()}
     reader.text()
@@ -155,6 +129,17 @@ def decode_status(stream: StreamName, payload: bytes) -> DriverState | Stop:
         for _ in range(reader.count()):
             name, value = reader.text(), reader.text()
             fields[name] = value if name in _TEXTS else json.loads(value)
-        return message_from_fields(_KINDS[stream], fields)
+        return message_from_fields(kind, fields)
     except (ValueError, RecursionError) as error:
         raise reader.malformed(str(error)) from None
+
+
+def _program_of_state(message: DriverState, identity: str) -> str:
+    return message.program
+
+
+COMMANDS = RecordedForm(JOINT_STATE, "joint_commands", encode_command, decode_command)
+STATES = RecordedForm(
+    DIAGNOSTIC_ARRAY, "diagnostics", encode_status, decode_state, _program_of_state, is_shared=True
+)
+STOPS = RecordedForm(DIAGNOSTIC_ARRAY, "stops", encode_status, decode_stop, program_of_stop)
