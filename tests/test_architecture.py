@@ -62,7 +62,7 @@ HOMES = {
     "xacrodoc": "model",
     "msgspec": "wire",
     "zenoh": "net",
-    "cryptography": "net",
+    "cryptography": "fleet",
     "xxhash": "wire",
     "mcap": "recording",
     "pyarrow": "recording",  # `zstate export`
@@ -354,7 +354,7 @@ def test_a_session_without_credentials_loads_no_security():
 
 
 def test_modules_outside_of_the_core_exist_and_are_seen():
-    names = {"net.security", "net.security.acl", "scans.listener", *OBSERVERS}
+    names = {"net.security", "fleet.acl", "scans.listener", *OBSERVERS}
     assert {f"zstate.{name}" for name in names} <= modules().keys()
     assert outside_of_the_core({"json", "zstate.net.open", *(f"zstate.{name}" for name in names)}) == names
 

@@ -32,7 +32,7 @@ def _connect(job: Job, role: str) -> Session:
 
 
 def _services(job: Job) -> Sequence[Service]:
-    from zstate.net.security.certificates import issue_identities  # noqa: PLC0415 - as above
+    from zstate.fleet.certificates import issue_identities  # noqa: PLC0415 - as above
 
     issue_identities(job.folder, ("router", "writer", "reader"))
     return (router(job, "--certs", job.folder, "--identity", "router", protocol="tls"),)

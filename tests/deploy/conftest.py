@@ -12,7 +12,7 @@ from helpers.deployment import Deployment
 def certs(tmp_path) -> Path:
     """Test identities of a router, the robots r1 and r2, and the viewer desk."""
     pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
-    from zstate.net.security.certificates import issue_identities
+    from zstate.fleet.certificates import issue_identities
 
     issue_identities(tmp_path / "certs", ("router", "r1", "r2", "desk"), hosts=("router",))
     return tmp_path / "certs"

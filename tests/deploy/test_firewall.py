@@ -83,7 +83,7 @@ def test_nft_accepts_the_rules():
 @pytest.mark.timeout(240)
 def test_a_flood_from_one_address_keeps_no_robot_out(tmp_path: Path):
     pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
-    from zstate.net.security.certificates import issue_identities
+    from zstate.fleet.certificates import issue_identities
 
     certs = tmp_path / "certs"
     with NamespaceHosts("fleet", "robot", "attacker") as hosts, ExitStack() as opened:

@@ -20,9 +20,9 @@ from zstate.driving.messages import JointCommand, JointTrajectory, MotionCancel,
 from zstate.driving.stops import wait_for_state
 from zstate.driving.trajectory import Trajectory
 from zstate.errors import InvalidInput, MotionRefused, MotionTimeout
+from zstate.fleet.acl import AclRoles
 from zstate.net.presence import local_writer
 from zstate.net.queryable import query
-from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
 from zstate.net.writer import WireWriter

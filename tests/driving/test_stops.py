@@ -26,9 +26,9 @@ from zstate.driving.messages import DriverState, Release, Stop, stop_text
 from zstate.driving.stops import StopLatch, StopRegister
 from zstate.driving.stops_file import ActiveStop, stops_file, write_stops
 from zstate.errors import AccessDenied, ConfigError, SecondWriter, Unreachable
+from zstate.fleet.acl import AclRoles
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.presence import local_writer
-from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session, connect
 from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.wire.identity import WriterId

@@ -19,10 +19,10 @@ from helpers.processes import until
 from helpers.robots import RRBOT, STAMP, UPRIGHT, wait_for_reader, wait_for_stream_readers
 from mcap.reader import make_reader
 
+from zstate.fleet.acl import AclRoles
 from zstate.foxglove.bridge import FoxgloveBridge
 from zstate.foxglove.server import SUBPROTOCOLS, FoxgloveServer
 from zstate.net.presence import discover_readers
-from zstate.net.security.acl import AclRoles
 from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.listener import TransformListener

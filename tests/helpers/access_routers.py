@@ -11,7 +11,7 @@ import zenoh
 from helpers.processes import find_free_port, until
 from helpers.robots import SampleCollector
 
-from zstate.net.security.acl import AclRoles, access_control
+from zstate.fleet.acl import AclRoles, access_control
 from zstate.net.security.credentials import Credentials
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener

@@ -78,7 +78,7 @@ class Site:
     """A router with TLS and access control: the robots r1 and r2, and the viewer desk."""
 
     def __init__(self, folder: Path, start: Start) -> None:
-        certificates = pytest.importorskip("zstate.net.security.certificates")
+        certificates = pytest.importorskip("zstate.fleet.certificates")
         certificates.issue_identities(folder, ["router", "r1", "r2", "desk", "stranger"])
         self.folder = folder
         self.endpoint = f"tls/127.0.0.1:{find_free_port()}"

@@ -28,9 +28,9 @@ from zstate import (
     load_model,
 )
 from zstate.clock import SystemClock
-from zstate.net.security.acl import AclRoles, access_control
+from zstate.fleet.acl import AclRoles, access_control
+from zstate.fleet.router_config import RouterConfig
 from zstate.net.security.credentials import Credentials
-from zstate.net.security.router_config import RouterConfig
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.recording.recorder import Recorder

@@ -11,9 +11,9 @@ from typing import Any
 from zstate import Transform, TransformPublisher, connect, load_model
 from zstate.clock import SystemClock
 from zstate.driving import DriverHost, Limits, SimulatedDriver
-from zstate.net.security.acl import read_access_control
+from zstate.fleet.acl import read_access_control
+from zstate.fleet.router_config import RouterConfig
 from zstate.net.security.credentials import Credentials
-from zstate.net.security.router_config import RouterConfig
 from zstate.rate import Rate
 from zstate.scans import ScanPublisher
 from zstate.scans.simulated_laser import (

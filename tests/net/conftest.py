@@ -9,7 +9,7 @@ import pytest
 from helpers.access_routers import ROUTERS_PROGRAM, AccessRouters
 from helpers.processes import Child, find_free_port
 
-from zstate.net.security.certificates import issue_identities
+from zstate.fleet.certificates import issue_identities
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ import pytest
 from helpers.processes import Child, find_free_port, until
 
 from zstate.errors import ConfigError, InvalidInput
+from zstate.fleet.certificates import issue_identities
 from zstate.net.config import default_config
-from zstate.net.security.certificates import issue_identities
 from zstate.net.session import connect
 
 LAN_PEER = """

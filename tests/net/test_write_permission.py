@@ -10,7 +10,7 @@ from helpers.robots import RRBOT
 
 from zstate import StatePublisher, StaticPublisher, connect, discover
 from zstate.errors import AccessDenied
-from zstate.net.security.acl import AclRoles
+from zstate.fleet.acl import AclRoles
 
 USERS = ("r1", "r2", "desk", "stranger")
 

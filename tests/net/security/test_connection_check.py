@@ -188,7 +188,7 @@ def test_idle_connections_do_not_block_a_client_of_a_router_with_users(
     endpoint = f"tcp/127.0.0.1:{free_port}"
     code = """
         import sys
-        from zstate.net.security.router_config import RouterConfig
+        from zstate.fleet.router_config import RouterConfig
         from zstate.net.security.credentials import Credentials
         from zstate.net.session import connect
         with connect(RouterConfig((sys.argv[1],), credentials=Credentials(users=sys.argv[2])).settings()):

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from zstate.errors import ConfigError
-from zstate.net.security.certificates import issue_identities
+from zstate.fleet.certificates import issue_identities
 from zstate.net.security.credentials import Credentials
 from zstate.net.session import connect
 

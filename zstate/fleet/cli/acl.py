@@ -60,8 +60,8 @@ def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, .
     zstate acl --robot r1 --robot r2 --viewer rviz --wire 'ros2:namespace=*,tf=namespace' >acl.json5
     zstate router --listen tls/0.0.0.0:7447 --certs certs --identity router --acl acl.json5
     """
-    from zstate.net.security.acl import AclRoles
-    from zstate.net.security.router_config import access_text
+    from zstate.fleet.acl import AclRoles
+    from zstate.fleet.router_config import access_text
 
     if not any(roles.values()):
         *others, last = (f"--{role} NAME" for role in _ROLES)

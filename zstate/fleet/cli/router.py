@@ -82,9 +82,9 @@ def router_command(
     zstate router --ros2                               # for ROS 2 nodes of this host
     zstate router --ros2 --listen "tcp/[::]:7447"      # for all hosts, as rmw_zenohd
     """
+    from zstate.fleet.acl import read_access_control
+    from zstate.fleet.router_config import Downsampling, RouterConfig
     from zstate.net.config import check_credentials, listen_endpoints
-    from zstate.net.security.acl import read_access_control
-    from zstate.net.security.router_config import Downsampling, RouterConfig
 
     file = config or (None if ros2 else os.environ.get("ZENOH_CONFIG"))
     if file:

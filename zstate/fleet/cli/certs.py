@@ -42,7 +42,7 @@ def certs_command(
     zstate ls --connect tls/192.168.1.10:7447 --certs fleet --identity viewer
     zstate certs fleet --server peer1 --server peer2   # for direct links, without a router
     """
-    from zstate.net.security.certificates import issue_identities
+    from zstate.fleet.certificates import issue_identities
     from zstate.net.security.credentials import AUTHORITY, CertificateFiles
 
     authority = CertificateFiles.for_name(folder, AUTHORITY)

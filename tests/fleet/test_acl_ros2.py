@@ -16,8 +16,8 @@ from helpers.tokens import current_tokens
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, discover
 from zstate.errors import AccessDenied, InvalidInput
-from zstate.net.security.acl import AclRoles, access_control
-from zstate.net.security.router_config import access_text
+from zstate.fleet.acl import AclRoles, access_control
+from zstate.fleet.router_config import access_text
 from zstate.net.session import Session
 
 WIRE = "ros2:domain=7,namespace=*"

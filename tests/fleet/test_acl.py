@@ -22,10 +22,10 @@ from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import AccessDenied, InvalidInput, SecondWriter
+from zstate.fleet.acl import AclRoles, access_control
+from zstate.fleet.router_config import access_text
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.presence import announce, discover_readers
-from zstate.net.security.acl import AclRoles, access_control
-from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.nodes.partial_publisher import PartialStatePublisher

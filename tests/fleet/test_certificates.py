@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from zstate.errors import ConfigError, InvalidInput
-from zstate.net.security.certificates import issue_identities
+from zstate.fleet.certificates import issue_identities
 
 x509 = pytest.importorskip("cryptography.x509", reason="needs cryptography: pip install 'zstate[certs]'")
 
@@ -138,7 +138,7 @@ def test_missing_library_error_has_the_install_command():
     code = (
         "import sys; sys.modules['cryptography'] = None\n"
         "from zstate.errors import LibraryMissing\n"
-        "try: import zstate.net.security.certificates\n"
+        "try: import zstate.fleet.certificates\n"
         "except LibraryMissing as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

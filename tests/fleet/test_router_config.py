@@ -12,10 +12,10 @@ from helpers.robots import RRBOT, SampleCollector, wait_for_reader
 
 from zstate import StatePublisher, connect
 from zstate.errors import ConfigError, InvalidInput
+from zstate.fleet.acl import AclRoles, access_control, read_access_control
+from zstate.fleet.router_config import Downsampling, RouterConfig, access_text
 from zstate.net.config import default_config
-from zstate.net.security.acl import AclRoles, access_control, read_access_control
 from zstate.net.security.credentials import Credentials
-from zstate.net.security.router_config import Downsampling, RouterConfig, access_text
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from zstate.errors import ConfigError, InvalidInput
+from zstate.fleet.acl import AclRoles, access_control, check_namespace
 from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
-from zstate.net.security.acl import AclRoles, access_control, check_namespace
 from zstate.net.security.credentials import Credentials
 from zstate.plugins import edge_streams
 from zstate.streams import StreamName

@@ -1,0 +1,1 @@
+"""Routers of a fleet: their configuration, access control, and certificates."""

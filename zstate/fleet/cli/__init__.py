@@ -1,0 +1,1 @@
+"""Commands for routers, their access control, and certificates."""
