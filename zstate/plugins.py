@@ -283,6 +283,12 @@ def is_measured(name: StreamName) -> bool:
     return found is not None and found.is_measured
 
 
+def is_value(name: StreamName) -> bool:
+    """Whether the stream has one current value of what was measured."""
+    found = find_stream(name)
+    return found is not None and found.is_value
+
+
 def in_canonical_order(names: Iterable[StreamName]) -> tuple[StreamName, ...]:
     """``names``, each once, in the order of tokens, without those that no plugin brings."""
     given = set(names)

@@ -127,6 +127,11 @@ class Stream:
         return self.group == "measurement" and not self.latched
 
     @property
+    def is_value(self) -> bool:
+        """Whether it has one current value of what was measured, as a map is."""
+        return self.group == "measurement" and self.latched
+
+    @property
     def is_sampled(self) -> bool:
         """Whether its messages are samples, which come at a rate."""
         return not self.latched and (self.group not in ("driver", "time") or self.name == "joint_setpoints")

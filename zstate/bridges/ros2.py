@@ -33,6 +33,7 @@ from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import OdometryPublisher
 from zstate.odometry.messages import Odometry
+from zstate.odometry.plugin import ODOMETRY
 from zstate.sources.joint_state_listener import DescriptionSubscriber, JointStateListener
 from zstate.streams import StreamName
 from zstate.transform import Transform
@@ -151,7 +152,7 @@ class TransformBridge(Closeable):
         self._source = source
         self._wire = get_wire(source.wire)
         self._counters = counters
-        self._streams: tuple[StreamName, ...] = tuple(dict.fromkeys((*self._wire.edges, "odometry")))
+        self._streams: tuple[StreamName, ...] = tuple(dict.fromkeys((*self._wire.edges, ODOMETRY.name)))
         self._writers: dict[int, str] = {}
         self._placed: defaultdict[str, set[Edges]] = defaultdict(set)
         """Single edges on /tf, by writer: those that its odometry may have."""
@@ -188,7 +189,7 @@ class TransformBridge(Closeable):
             return
         self._writers.pop(session, None)
         with self._lock:
-            if announced.stream == "odometry":  # its edge may go on
+            if announced.stream == ODOMETRY.name:  # its edge may go on
                 self._as_odometry = {edge: one for edge, one in self._as_odometry.items() if one != name}
         if name not in self._writers.values():  # a ROS node may have several publishers
             self._placed.pop(name, None)

@@ -14,7 +14,7 @@ from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import is_latched, stream_named, streams_where
+from zstate.plugins import edge_streams, is_value, stream_named, streams_where
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance, is_covariance_topic
 from zstate.recording.encode import POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
@@ -46,9 +46,12 @@ def further_streams() -> tuple[StreamName, ...]:
 
     The edges of odometry are recorded on tf as well, and read from there.
     """
-    return streams_where(
-        lambda row: row.group == "measurement" or (row.group == "edges" and row.name not in TOPICS)
-    )
+    return streams_where(lambda row: row.group == "measurement" or row.name in edges_with_more())
+
+
+def edges_with_more() -> tuple[StreamName, ...]:
+    """The streams of edges with more than poses, as velocities; recorded by themselves, and their edges on tf."""
+    return tuple(name for name in edge_streams() if name not in TOPICS)
 
 
 _NAMED: dict[StreamName, StreamName] = {topic: named for named, topic in TOPICS.items()}
@@ -199,7 +202,7 @@ class DecodedRecording:
 
         Without the places that have maps only.
         """
-        return tuple(sorted({writer.robot for writer in self.writers if writer.stream != "map"} - {""}))
+        return tuple(sorted({writer.robot for writer in self.writers if not is_value(writer.stream)} - {""}))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -374,7 +377,7 @@ class LatchedState:
             key = static_key(writer)
             before = self._statics.get(key)
             self._statics[key] = decoded
-        elif is_latched(writer.stream):
+        elif is_value(writer.stream):
             before = self.maps.get(key := (writer.robot, writer.edge_writer or ""))
             self.maps[key] = decoded
         else:

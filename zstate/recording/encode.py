@@ -18,7 +18,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.robot import coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import is_latched, own_streams, stream_named
+from zstate.plugins import is_latched, is_value, own_streams, stream_named
 from zstate.recording.covariances import (
     CHILD_FRAME,
     EdgeCovariance,
@@ -338,7 +338,7 @@ class RecordingEncoder:
         payload = channel.encode(message)
         with self._lock:
             # The maps of a fleet, with 16 MB each, would be most of a recording if they were repeated.
-            once = stream == "map"
+            once = is_value(stream)
             number = channel.number
             before = latched.get(key, channel)
             if once and not self._may_repeat(key, len(payload)):

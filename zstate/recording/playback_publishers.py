@@ -25,7 +25,7 @@ from zstate.net.session import Session
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
 from zstate.plugins import edge_streams, is_latched, is_measured, is_named, measured_streams
-from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
+from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, edges_with_more, static_key
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder
@@ -145,7 +145,7 @@ class PlaybackPublishers(Closeable):
                     found[_named(writer)] = wires
             elif _edge_of_odometry(writer) in self._copied:
                 found[_named(writer)] = self._wires
-            elif ros and (writer.stream == "odometry" or writer in self._copied):
+            elif ros and (writer.stream in edges_with_more() or writer in self._copied):
                 found.setdefault(_named(writer), ros)
         return found
 
@@ -212,7 +212,7 @@ class PlaybackPublishers(Closeable):
     def _publish_sample(self, writer: RecordedWriter, message: Message) -> bool:
         robot = self._robots.get(writer.robot)
         # By the stream first: messages of other packages are of any type.
-        if writer.stream in (*measured_streams(), "odometry") or writer in self._copied:
+        if writer.stream in (*measured_streams(), *edges_with_more()) or writer in self._copied:
             publisher = self._named.get(_named(writer))
             if publisher is None:
                 return False
@@ -252,7 +252,7 @@ def _named(writer: RecordedWriter) -> _Named:
 
 def _edge_of_odometry(writer: RecordedWriter) -> RecordedWriter | None:
     """The writer under which the edge of ``writer`` is recorded, if that writes odometry."""
-    return replace(writer, stream="transforms") if writer.stream == "odometry" else None
+    return replace(writer, stream="transforms") if writer.stream in edges_with_more() else None
 
 
 class _RobotPublisher(NamedTuple):
@@ -424,7 +424,7 @@ class PassthroughPublisher(Closeable):
         self._session_id = secrets.randbits(32)
         self._robot = robot
         self.edge_writer = edge_writer
-        self._moving: StreamName = "odometry" if "odometry" in streams else "transforms"
+        self._moving: StreamName = next((one for one in streams if one in edges_with_more()), "transforms")
         self._sessions = sessions
         self._is_alone = "native" in wires and not takeover
         self._seqs: Counter[StreamName] = Counter()
