@@ -50,7 +50,7 @@ def further_streams() -> tuple[StreamName, ...]:
 
 
 def edges_with_more() -> tuple[StreamName, ...]:
-    """The streams of edges with more than poses, as velocities; recorded by themselves, and their edges on tf."""
+    """The streams of edges with more than poses, as velocities: recorded, and their edges on tf as well."""
     return tuple(name for name in edge_streams() if name not in TOPICS)
 
 
