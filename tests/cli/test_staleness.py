@@ -16,7 +16,7 @@ from zstate.cli.output.drawing import ALARM, draw
 from zstate.clock import SystemClock
 from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale
 from zstate.net.presence import RobotInfo
-from zstate.net.topic_statistics import Received, TopicStatistics
+from zstate.net.topic_statistics import Arrival, TopicStatistics
 from zstate.nodes.metered_buffer import MeteredBuffer
 from zstate.wire.identity import WriterId
 from zstate.wire.messages import JointState, order_digest
@@ -51,7 +51,7 @@ def staleness(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
                 topic.add("r1", "joint_states", sample, at, stamp)
             events.on_sample(("r1", SESSION), at * 1e-9)
             answered.on_sample(at * 1e-9)
-            metered.statistics_of("r1").add(Received(at, stamp, seq, 0))
+            metered.statistics_of("r1").add(Arrival(at, stamp, seq, 0))
             buffer.insert(Transform("r1/base", "r1/tool", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp))
         (tool,) = [frame for frame in buffer.frames() if frame.name == "r1/tool"]
         found["events"] = bool(events.expired(now_s)[0])

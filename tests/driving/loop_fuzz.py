@@ -29,7 +29,7 @@ from zstate.driving.control_loop import ControlLoop
 from zstate.driving.driver import Setpoint, StopMode
 from zstate.driving.messages import JointTrajectory, Mode, MotionCancel, Release
 from zstate.driving.motion_service import plan
-from zstate.driving.setpoint_limiter import Rate as JointRate
+from zstate.driving.setpoint_limiter import JointRate
 from zstate.driving.stops import StopRegister
 from zstate.driving.stops_file import ActiveStop
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver

@@ -14,7 +14,7 @@ from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, CommandRe
 from zstate.driving.driver import Mode
 from zstate.driving.limits import Limits
 from zstate.driving.messages import JointCommand
-from zstate.driving.setpoint_limiter import Limited, Rate, SetpointLimiter
+from zstate.driving.setpoint_limiter import JointRate, Limited, SetpointLimiter
 from zstate.driving.transit import CommandAdmission, CommandAges
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.session import Session
@@ -64,7 +64,7 @@ class Core:
         self.last = self.limiter.start(self.robot.positions)
         return self.last
 
-    def send(self, rates: dict[int, Rate], ttl: int = TTL) -> None:
+    def send(self, rates: dict[int, JointRate], ttl: int = TTL) -> None:
         columns = [column for column, rate in rates.items() if rate.mode == "position"]
         positions = np.array([rates[column].value for column in columns])
         others = {column: rate for column, rate in rates.items() if rate.mode != "position"}
@@ -103,7 +103,7 @@ def random_limits(generator: np.random.Generator) -> Limits:
 
 def random_command(
     generator: np.random.Generator, limits: Limits, modes: tuple[Mode, ...]
-) -> dict[int, Rate]:
+) -> dict[int, JointRate]:
     columns = generator.choice(COUNT, generator.integers(1, COUNT), replace=False).tolist()
     low, high = np.maximum(limits.lower, -3.0), np.minimum(limits.upper, 3.0)
     values: dict[Mode, np.ndarray] = {
@@ -112,7 +112,7 @@ def random_command(
         "effort": generator.uniform(-1.5, 1.5, COUNT) * limits.effort,
     }
     picked = {column: modes[generator.integers(len(modes))] for column in columns}
-    return {column: Rate(mode, float(values[mode][column])) for column, mode in picked.items()}
+    return {column: JointRate(mode, float(values[mode][column])) for column, mode in picked.items()}
 
 
 @pytest.mark.parametrize("modes", [MODES, MODES[:2], MODES[1:], MODES[1:2]], ids="-".join)
@@ -181,7 +181,7 @@ def _send(targets: Targets, session: int, arrived: int, ttl_ns: int = TTL) -> No
 
 
 def test_a_velocity_whose_command_has_expired_ends_while_another_joint_is_commanded():
-    targets, turning = Targets(2), Rate("velocity", 0.5)
+    targets, turning = Targets(2), JointRate("velocity", 0.5)
     targets.accept(Command(1, 0, NO_COLUMNS, NO_POSITIONS, 0, TTL, rates={1: turning}))
     targets.accept(Command(1, 1, np.array([0]), np.zeros(1), 0, 2 * TTL))
     targets.current(TTL - 1, lambda: np.zeros(2))

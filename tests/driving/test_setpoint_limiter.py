@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from zstate.driving.driver import Mode
 from zstate.driving.limits import Limits
-from zstate.driving.setpoint_limiter import Rate, SetpointLimiter
+from zstate.driving.setpoint_limiter import JointRate, SetpointLimiter
 from zstate.driving.trajectory import Trajectory
 from zstate.errors import InvalidInput
 
@@ -267,7 +267,7 @@ def test_a_velocity_towards_a_limit_ends_there_at_rest_also_if_the_joint_follows
     path: list[float] = []
     for tick in range(3_000):
         limiter.observe(np.array([position]), None, tick * 2_000_000)
-        setpoint = limiter.step([0.0], DT, rates={0: Rate("velocity", 5.0 * side)}).velocities[0]
+        setpoint = limiter.step([0.0], DT, rates={0: JointRate("velocity", 5.0 * side)}).velocities[0]
         assert 0.0 <= side * setpoint <= 2.0
         assert abs(setpoint - velocity) <= acceleration * DT * (1 + EXACT) or lag_s
         velocity = setpoint + (velocity - setpoint) * math.exp(-DT / lag_s) if lag_s else setpoint
@@ -283,9 +283,9 @@ def test_near_a_limit_the_velocity_is_that_which_takes_0_2625_s_and_a_step_for_t
     limiter, _ = in_modes(acceleration=math.inf, velocity=2.0)
     room = 0.05
     limiter.observe(np.array([side * (2.0 - room)]), None, 0)
-    limiter.step([0.0], DT, rates={0: Rate("velocity", side)})  # enters the mode
+    limiter.step([0.0], DT, rates={0: JointRate("velocity", side)})  # enters the mode
     limiter.observe(np.array([side * (2.0 - room)]), None, 1)
-    found = limiter.step([0.0], DT, rates={0: Rate("velocity", 2.0 * side)})
+    found = limiter.step([0.0], DT, rates={0: JointRate("velocity", 2.0 * side)})
     # T = 0.2 s of the approach, and s = 0.05 s (1 + 0.05 s / T) of a lag.
     assert found.velocities[0] == pytest.approx(side * room / (DT + 0.0625 + 0.2))
 
@@ -294,15 +294,15 @@ def test_near_a_limit_the_velocity_is_that_which_takes_0_2625_s_and_a_step_for_t
 def test_a_joint_outside_its_limits_turns_inwards_only(side: float):
     limiter, _ = in_modes(position=side * 2.1, acceleration=math.inf)
     limiter.observe(np.array([side * 2.1]), None, 0)
-    outwards = limiter.step([0.0], DT, rates={0: Rate("velocity", side)})
+    outwards = limiter.step([0.0], DT, rates={0: JointRate("velocity", side)})
     assert (outwards.velocities[0], outwards.limited) == (0.0, ("elbow",))
-    assert limiter.step([0.0], DT, rates={0: Rate("velocity", -side)}).velocities[0] == -side
+    assert limiter.step([0.0], DT, rates={0: JointRate("velocity", -side)}).velocities[0] == -side
 
 
 def test_after_a_velocity_the_joint_brakes_in_that_mode_and_then_holds_its_position():
     limiter, _ = in_modes()
     for _ in range(500):
-        turning = limiter.step([0.0], DT, rates={0: Rate("velocity", 1.0)})
+        turning = limiter.step([0.0], DT, rates={0: JointRate("velocity", 1.0)})
     assert turning.velocities[0] == 1.0
     braking = [limiter.brake(DT) for _ in range(350)]
     # 1 rad/s / 4 rad/s^2 are 125 steps; 0.2 s at rest are 100.
@@ -313,7 +313,7 @@ def test_after_a_velocity_the_joint_brakes_in_that_mode_and_then_holds_its_posit
 
 def test_a_joint_in_mode_velocity_has_moved_on_while_a_setpoint_could_not_be_written():
     limiter, _ = in_modes(acceleration=math.inf)
-    turning = {0: Rate("velocity", 0.5)}
+    turning = {0: JointRate("velocity", 0.5)}
     last = limiter.step([0.0], DT, rates=turning)
     limiter.step([0.0], DT, rates=turning)
     limiter.resume(last, 0.1)
@@ -323,7 +323,7 @@ def test_a_joint_in_mode_velocity_has_moved_on_while_a_setpoint_could_not_be_wri
 
 def test_setpoints_that_could_not_be_written_are_no_time_at_rest():
     limiter = SetpointLimiter(limits_of_elbow(), ("position", "velocity"))
-    last, at_rest = limiter.start([0.0]), {0: Rate("velocity", 0.0)}
+    last, at_rest = limiter.start([0.0]), {0: JointRate("velocity", 0.0)}
     for _ in range(200):  # 0.4 s; after 0.2 s at rest a position is held
         limiter.step([0.0], DT, rates=at_rest)
         limiter.resume(last, DT)
@@ -335,7 +335,7 @@ def test_setpoints_that_could_not_be_written_are_no_time_at_rest():
 def test_a_wheel_has_zero_velocity_after_its_commands(modes: tuple[Mode, ...]):
     limiter, _ = in_modes(modes, lower=-math.inf, upper=math.inf)
     for _ in range(500):
-        limiter.step([0.0], DT, rates={0: Rate("velocity", 1.0)})
+        limiter.step([0.0], DT, rates={0: JointRate("velocity", 1.0)})
     at_rest = [limiter.step([0.0], DT, rates={0: None}) for _ in range(200)][-1]
     assert (at_rest.modes, at_rest.velocities[0]) == (("velocity",), 0.0)
 
@@ -350,7 +350,7 @@ def test_after_an_effort_the_joint_brakes_from_the_measured_velocity_by_what_the
     limiter, limits = in_modes(modes)
     for tick in range(200):  # measured at 0.5 rad/s
         limiter.observe(np.array([0.5 * tick * DT]), None, tick * 2_000_000)
-        pushed = limiter.step([0.0], DT, rates={0: Rate("effort", 9.0)})
+        pushed = limiter.step([0.0], DT, rates={0: JointRate("effort", 9.0)})
     assert pushed.efforts is not None
     assert (pushed.modes, pushed.efforts.tolist(), pushed.limited) == (("effort",), [5.0], ("elbow",))
     assert pushed.velocities[0] == pytest.approx(0.5, abs=1e-3)  # after ten time constants of the filter
@@ -367,7 +367,7 @@ def test_after_an_effort_the_joint_brakes_from_the_measured_velocity_by_what_the
 
 def test_without_new_readings_a_pushed_joint_is_held_where_it_is_expected():
     limiter, limits = in_modes()
-    pushing = {0: Rate("effort", 1.0)}
+    pushing = {0: JointRate("effort", 1.0)}
     limiter.step([0.0], DT, rates=pushing)
     limiter.observe(np.array([0.1]), np.array([0.8]), 0)
     for _ in range(100):  # such as of a device that is slower than the loop
@@ -390,7 +390,7 @@ def test_a_joint_that_leaves_its_range_or_is_too_fast_in_mode_effort_is_held_unt
     at: float, speed: float, reason: str
 ):
     limiter, _ = in_modes()
-    pushing = {0: Rate("effort", 1.0)}
+    pushing = {0: JointRate("effort", 1.0)}
     assert limiter.step([0.0], DT, rates=pushing).modes == ("effort",)
     limiter.observe(np.array([at]), np.array([speed]), 0)
     (text,) = (held := limiter.step([0.0], DT, rates=pushing)).braked
@@ -410,7 +410,7 @@ def test_a_driver_with_efforts_only_gets_them_inwards_and_against_the_motion():
 
     def effort(at: float, speed: float, asked: float) -> float:
         limiter.observe(np.array([at]), np.array([speed]), 0)
-        limited = limiter.step([0.0], DT, rates={0: Rate("effort", asked)})
+        limited = limiter.step([0.0], DT, rates={0: JointRate("effort", asked)})
         assert limited.efforts is not None
         return limited.efforts[0]
 
@@ -424,5 +424,5 @@ def test_a_driver_with_efforts_only_gets_them_inwards_and_against_the_motion():
 def test_efforts_of_joints_without_an_effort_limit_are_refused(effort: float):
     limiter = SetpointLimiter(replace(limits_of_elbow(), effort=np.array([effort])), ALL_MODES)
     with pytest.raises(InvalidInput, match=rf"have not: 'elbow' \({effort:g}\); start the driver with"):
-        limiter.check_rates({0: Rate("effort", 1.0)})
-    limiter.check_rates({0: Rate("velocity", 1.0)})
+        limiter.check_rates({0: JointRate("effort", 1.0)})
+    limiter.check_rates({0: JointRate("velocity", 1.0)})

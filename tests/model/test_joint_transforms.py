@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput
 from zstate.model.joint_transforms import JointTransforms, edge_forms
-from zstate.model.robot import Joint, JointType, Limits, Mimic, RobotModel
+from zstate.model.robot import DeclaredLimits, Joint, JointType, Mimic, RobotModel
 
 Pose = tuple[float, float, float, float, float, float, float]
 QUARTER = sin(pi / 4)
@@ -24,7 +24,7 @@ def joint(
     axis: tuple[float, float, float] = (1.0, 0.0, 0.0),
     mimic: Mimic | None = None,
 ) -> Joint:
-    return Joint(name, kind, parent, f"{name}_link", origin, axis, Limits(), mimic)
+    return Joint(name, kind, parent, f"{name}_link", origin, axis, DeclaredLimits(), mimic)
 
 
 def robot(*joints: Joint) -> RobotModel:

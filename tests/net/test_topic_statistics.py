@@ -4,8 +4,8 @@ import pytest
 
 from zstate import connect
 from zstate.net.topic_statistics import (
+    Arrival,
     IntervalStatistics,
-    Received,
     SequenceGaps,
     TopicStatistics,
     WriterKey,
@@ -20,7 +20,7 @@ def added(*received: tuple[int, int, int, int]) -> IntervalStatistics:
     """Samples as (arrival, stamp, number, delay), times in milliseconds."""
     statistics = IntervalStatistics()
     for at, stamp, seq, delay in received:
-        statistics.add(Received(at * MS, stamp * MS, seq, delay * MS))
+        statistics.add(Arrival(at * MS, stamp * MS, seq, delay * MS))
     return statistics
 
 

@@ -22,12 +22,12 @@ from hypothesis import strategies as st
 
 from zstate import load_model
 from zstate.errors import InvalidInput
-from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.joint_history import JointHistory
 from zstate.recording.recording import Recording
 from zstate.wire.messages import JointState, order_digest, to_block
 
 
-def joint_states(path: Path, robot: str | None = None) -> JointTrajectory:
+def joint_states(path: Path, robot: str | None = None) -> JointHistory:
     with Recording(path) as recording:
         return recording.joint_states(robot)
 

@@ -37,7 +37,7 @@ from zstate.errors import (
     UnknownFrame,
     as_timeout,
 )
-from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.joint_history import JointHistory
 from zstate.transform import Transform, Twist
 
 if TYPE_CHECKING:
@@ -444,7 +444,7 @@ class TransformBuffer(BufferCore):
         instants = check_stamps(stamps)
         return self._robot_joints(self._robot_track(robot)).positions_many(instants)
 
-    def joint_states(self, robot: str, start: int | None = None, end: int | None = None) -> JointTrajectory:
+    def joint_states(self, robot: str, start: int | None = None, end: int | None = None) -> JointHistory:
         """The samples of a robot that are kept, with stamps in [start, end): copies; efforts are not kept.
 
         Of a robot with several drivers: an instant for each sample of any of them that all of them cover,

@@ -291,29 +291,29 @@ Step: TypeAlias = StaticStep | JointStep | PoseStep
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class MovingPose:
     """A pose and the velocities of its child, in the parent's axes."""
 
     pose: Pose
     linear: Vector
     angular: Vector
 
-    def then(self, other: Motion) -> Motion:
+    def then(self, other: MovingPose) -> MovingPose:
         """The motion of the child of ``other``, whose parent is the child of this one."""
         q = self.pose[3:]
         arm = se3.rotate(q, other.pose[:3])
         linear = _sum(self.linear, se3.cross(self.angular, arm), se3.rotate(q, other.linear))
         angular = _sum(self.angular, se3.rotate(q, other.angular))
-        return Motion(se3.compose(self.pose, other.pose), linear, angular)
+        return MovingPose(se3.compose(self.pose, other.pose), linear, angular)
 
-    def inverse(self) -> Motion:
+    def inverse(self) -> MovingPose:
         """The motion of the parent, seen from the child."""
         q = se3.conjugate(self.pose[3:])
         x, y, z = se3.cross(self.angular, self.pose[:3])
         vx, vy, vz = self.linear
         wx, wy, wz = self.angular
         linear = se3.rotate(q, (x - vx, y - vy, z - vz))
-        return Motion(se3.invert(self.pose), linear, se3.rotate(q, (-wx, -wy, -wz)))
+        return MovingPose(se3.invert(self.pose), linear, se3.rotate(q, (-wx, -wy, -wz)))
 
 
 def _sum(*vectors: Vector) -> Vector:
@@ -330,9 +330,9 @@ def chain_pose(steps: Sequence[Step], values: Values, f: Backend) -> Pose:
     return pose
 
 
-def chain_motion(steps: Sequence[Step], values: Values, rates: Values, f: Backend) -> Motion:
+def chain_motion(steps: Sequence[Step], values: Values, rates: Values, f: Backend) -> MovingPose:
     """The same with velocities."""
-    motion = Motion(se3.IDENTITY, *_AT_REST)
+    motion = MovingPose(se3.IDENTITY, *_AT_REST)
     for step in steps:
-        motion = motion.then(Motion(step.pose(values, f), *step.rate(values, rates)))
+        motion = motion.then(MovingPose(step.pose(values, f), *step.rate(values, rates)))
     return motion

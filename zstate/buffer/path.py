@@ -24,7 +24,7 @@ from zstate.buffer.interpolation import (
     Interpolator,
     JointStep,
     LinearInterpolator,
-    Motion,
+    MovingPose,
     PoseInterpolator,
     PoseStep,
     StaticStep,
@@ -160,7 +160,7 @@ class TransformPath:
                 values.append(predicted)
         return values, at, kind, predicted_ns
 
-    def motion(self, stamp: int | None) -> tuple[Motion, int | None]:
+    def motion(self, stamp: int | None) -> tuple[MovingPose, int | None]:
         """Pose and velocity of the source in the target. Raises as ``transform``; NoData without rates."""
         views = self.views()
         at = stamp if stamp is not None or not self.uses else self._latest(views)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zstate.buffer.path import TrackUse, TransformPath, ViewReader, Views, joint_interpolators
 from zstate.buffer.tracks import JointTrack
-from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.joint_history import JointHistory
 from zstate.model.robot import POSITION_COUNTS, coordinate_names, velocity_columns_by_position
 
 Floats = NDArray[np.float64]
@@ -66,7 +66,7 @@ class RobotJoints:
         positions[unusable] = np.nan
         return positions, valid & ~unusable
 
-    def samples(self, start: int | None, end: int | None) -> JointTrajectory:
+    def samples(self, start: int | None, end: int | None) -> JointHistory:
         """Copies of the samples in [start, end) [ns].
 
         With several tracks, an instant for each of their samples that all of them cover: positions are
@@ -81,7 +81,7 @@ class RobotJoints:
         model = self._robot.model
         coordinates, slots = coordinate_names(model), velocity_columns_by_position(model)
         slot_names = tuple(coordinates[slot] for slot in slots)
-        whole = JointTrajectory(model.joint_names, coordinates, slot_names, stamps, positions)
+        whole = JointHistory(model.joint_names, coordinates, slot_names, stamps, positions)
         if any(part.velocities is not None for part in parts):
             velocities = np.full((len(stamps), len(slots)), np.nan)
             for part, columns in zip(parts, self._columns, strict=True):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.history import History, HistoryView
 from zstate.clock import ClockOffset
-from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.joint_history import JointHistory
 from zstate.model.joint_transforms import JointTransform, shared_transforms
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
@@ -141,7 +141,7 @@ class JointTrack:
             velocities = np.full(self.model.velocity_count, np.nan)
         return np.concatenate((positions, velocities))
 
-    def samples(self, view: HistoryView, start: int | None, end: int | None) -> JointTrajectory:
+    def samples(self, view: HistoryView, start: int | None, end: int | None) -> JointHistory:
         """Copies of the samples in ``view`` with stamps in [start, end) [ns]; None is no limit."""
         coordinates = coordinate_names(self.model)
         stamps = view.kept_stamps()
@@ -149,7 +149,7 @@ class JointTrack:
         last = len(stamps) if end is None else int(stamps.searchsorted(end))
         rows = view.kept_rows()[first:last].copy()
         positions, velocities = rows[:, : self.position_count], rows[:, self.position_count :]
-        return JointTrajectory(
+        return JointHistory(
             self.model.joint_names,
             coordinates,
             tuple(coordinates[column] for column in velocity_columns_by_position(self.model)),

@@ -18,7 +18,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.driving.driver import Mode
 from zstate.driving.messages import JointCommand
-from zstate.driving.setpoint_limiter import Rate, Rates
+from zstate.driving.setpoint_limiter import JointRate, Rates
 from zstate.driving.transit import CommandAdmission
 from zstate.errors import InvalidInput, MessageError, format_duration, printable
 from zstate.net.presence import announce
@@ -44,7 +44,7 @@ _OVERTAKEN_NS = 200_000_000
 """A command may arrive so much later than the end of the token of its commander."""
 
 NO_DEADLINE = -1
-NO_RATES: Mapping[int, Rate] = {}
+NO_RATES: Mapping[int, JointRate] = {}
 NO_COLUMNS = np.array([], dtype=np.intp)
 NO_POSITIONS = np.array([], dtype=np.float64)
 
@@ -67,7 +67,7 @@ class Command:
     arrived: int
     deadline: int
     motion: int | None = None
-    rates: Mapping[int, Rate] = field(default_factory=lambda: NO_RATES)
+    rates: Mapping[int, JointRate] = field(default_factory=lambda: NO_RATES)
 
     @property
     def joints(self) -> NDArray[np.intp]:
@@ -195,10 +195,10 @@ class CommandReceiver(Closeable):
         _check_finite(names, numbers, mode)
         if mode == "position":
             return Command(session, seq, np.arange(len(names)), numbers, now, deadline)
-        rates = {column: Rate(mode, value) for column, value in enumerate(numbers.tolist())}
+        rates = {column: JointRate(mode, value) for column, value in enumerate(numbers.tolist())}
         return Command(session, seq, NO_COLUMNS, NO_POSITIONS, now, deadline, rates=rates)
 
-    def _check_modes(self, columns: NDArray[np.intp], rates: Mapping[int, Rate]) -> None:
+    def _check_modes(self, columns: NDArray[np.intp], rates: Mapping[int, JointRate]) -> None:
         """Raise MessageError for a mode that the driver does not take."""
         used: set[Mode] = {rate.mode for rate in rates.values()}
         if columns.size:
@@ -220,9 +220,9 @@ class CommandReceiver(Closeable):
         return np.array([self._columns[name] for name in names], dtype=np.intp)
 
 
-def _rates_of(message: JointCommand, names: Sequence[str]) -> list[Rate]:
+def _rates_of(message: JointCommand, names: Sequence[str]) -> list[JointRate]:
     """Mode and number of each joint. Raises MessageError unless each has one, which is finite."""
-    commanded: list[Rate | None] = [None] * len(names)
+    commanded: list[JointRate | None] = [None] * len(names)
     blocks: tuple[tuple[Mode, bytes | None], ...] = (
         ("position", message.positions),
         ("velocity", message.velocities),
@@ -237,7 +237,7 @@ def _rates_of(message: JointCommand, names: Sequence[str]) -> list[Rate]:
             if (first := commanded[row]) is not None:
                 text = f"{names[row]!r} has a {first.mode} and a {mode}; a joint is commanded by one of them"
                 raise MessageError(text, reason="mode")
-            commanded[row] = Rate(mode, value)
+            commanded[row] = JointRate(mode, value)
     found = [rate for rate in commanded if rate is not None]
     if len(found) < len(names):
         bad = next(name for name, rate in zip(names, commanded, strict=True) if rate is None)
@@ -265,7 +265,7 @@ class Targets:
         self._deadlines = np.full(count, NO_DEADLINE, dtype=np.int64)
         self._first_deadline = self._last_deadline = NO_DEADLINE
         self._last_seqs: BoundedDict[int, int] = BoundedDict()
-        self._rates: dict[int, Rate | None] = {}
+        self._rates: dict[int, JointRate | None] = {}
         self._gone: BoundedDict[int, int] = BoundedDict()
         """When the tokens of commanders have gone [ns, monotonic]."""
         self.session = 0

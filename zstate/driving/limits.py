@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from zstate._util.format import suggestion_text
 from zstate.checks import real_numbers, reduced_to_fields
 from zstate.errors import InvalidInput
-from zstate.model.robot import POSITION_COUNTS, Joint, Mimic, RobotModel, near_joint
-from zstate.model.robot import Limits as JointLimits
+from zstate.model.robot import POSITION_COUNTS, DeclaredLimits, Joint, Mimic, RobotModel, near_joint
 from zstate.wire.keys import shortened
 
 Floats = NDArray[np.float64]
@@ -262,7 +261,7 @@ def unused_ranges(model: RobotModel, joint_names: Sequence[str]) -> tuple[str, .
     return tuple(text for joint in chosen for text in _stated_limits(model, joint)[1])
 
 
-def _stated_limits(model: RobotModel, joint: Joint) -> tuple[JointLimits, list[str]]:
+def _stated_limits(model: RobotModel, joint: Joint) -> tuple[DeclaredLimits, list[str]]:
     """The limits of ``joint``, of its commands, and of the joints that mimic it, as limits of its own.
 
     A range of which less than two positions are left is not used, and has a text: followers often have that
@@ -287,7 +286,7 @@ def _stated_limits(model: RobotModel, joint: Joint) -> tuple[JointLimits, list[s
     return found, texts
 
 
-def _through(mimic: Mimic, limits: JointLimits) -> JointLimits:
+def _through(mimic: Mimic, limits: DeclaredLimits) -> DeclaredLimits:
     """The ``limits`` of a joint as those of the joint that it follows by ``mimic``.
 
     A range or a rate of zero is none, as exporters write for an unknown one. The effort of the leading joint
@@ -295,12 +294,12 @@ def _through(mimic: Mimic, limits: JointLimits) -> JointLimits:
     """
     ratio = mimic.multiplier
     if ratio == 0.0:
-        return JointLimits()
+        return DeclaredLimits()
     ends = sorted((end - mimic.offset) / ratio for end in (limits.lower, limits.upper))
     lower, upper = ends if limits.lower < limits.upper else (-math.inf, math.inf)
     velocity = limits.velocity / abs(ratio) if limits.velocity > 0.0 else math.inf
     effort = limits.effort * abs(ratio) if limits.effort > 0.0 else math.inf
-    return JointLimits(lower, upper, velocity, effort, limits.acceleration / abs(ratio))
+    return DeclaredLimits(lower, upper, velocity, effort, limits.acceleration / abs(ratio))
 
 
 def _not_single_text(model: RobotModel, name: str, single: Sequence[str]) -> str:

@@ -88,7 +88,7 @@ class Present(NamedTuple):
     stops: object
 
 
-class Plan(NamedTuple):
+class PlannedMotion(NamedTuple):
     """A motion that may be driven if it has no ``findings``.
 
     ``time_s`` of it have passed at ``planned_at`` [ns, monotonic]; negative until its start.
@@ -103,7 +103,7 @@ class Plan(NamedTuple):
     findings: tuple[str, ...]
 
 
-def plan(request: JointTrajectory, limits: Limits, present: Present, stamp: int) -> Plan:
+def plan(request: JointTrajectory, limits: Limits, present: Present, stamp: int) -> PlannedMotion:
     """The motion of ``request`` from the ``present`` joints, at the stamp ``stamp`` [ns].
 
     One that starts later rests until then. Raises InvalidInput for a request that is no motion at all.
@@ -141,7 +141,7 @@ def plan(request: JointTrajectory, limits: Limits, present: Present, stamp: int)
     if request.stretch:
         trajectory = trajectory.stretched(allowed)
     time_s, findings = -max(wait_s, 0.0), trajectory.findings(allowed)
-    return Plan(request, columns, trajectory, present, time_s, planned_at, findings)
+    return PlannedMotion(request, columns, trajectory, present, time_s, planned_at, findings)
 
 
 def _after(first: Floats, block: bytes) -> Floats:
@@ -339,7 +339,7 @@ class MotionExecutor:
         self.outcomes = (*self.outcomes, outcome)[-_MOST_OUTCOMES:]
         self._on_change()
 
-    def start(self, planned: Plan, now: int) -> None:
+    def start(self, planned: PlannedMotion, now: int) -> None:
         """Make the motion ``planned`` in place of the last one. Raises MessageError if it must not start."""
         request = planned.request
         if self.is_known(request):

@@ -49,17 +49,17 @@ _LONGEST_GAP_S = 0.1
 """After a longer time between two readings, no velocity is derived from them."""
 
 
-class Rate(NamedTuple):
+class JointRate(NamedTuple):
     """The command of a joint in mode "velocity", per s, or "effort" [Nm] or [N]."""
 
     mode: Mode
     value: float
 
 
-Rates: TypeAlias = Mapping[int, Rate | None]
+Rates: TypeAlias = Mapping[int, JointRate | None]
 """Commands by the column of the joint; None where one has expired, and the joint is to rest."""
 
-_TO_TARGET = Rate("position", 0.0)
+_TO_TARGET = JointRate("position", 0.0)
 _NO_RATES: Rates = {}
 
 
@@ -374,7 +374,7 @@ class SetpointLimiter:
         braked = tuple(text for column, text in self._braked.items() if column not in known)
         return self._limited(positions, slowed)._replace(braked=braked)
 
-    def _enter_mode(self, column: int, here: float, rate: Rate | None) -> Rate | None:
+    def _enter_mode(self, column: int, here: float, rate: JointRate | None) -> JointRate | None:
         """Sets the mode of a joint for its next setpoint; returns its command, None if it is to rest."""
         joint, before = self._joints[column], self._modes[column]
         if rate is None or rate.mode != "effort":

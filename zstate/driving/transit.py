@@ -111,7 +111,7 @@ def check_waited(waited: int, ttl: int, *, has_echo: bool) -> None:
     )
 
 
-class Received(NamedTuple):
+class ReceivedCommand(NamedTuple):
     """A command, by ``session`` and ``seq``, that took ``excess`` [ns] longer than the fastest.
 
     It has arrived at ``arrived`` [ns, monotonic].
@@ -140,7 +140,7 @@ class CommandAdmission:
         """When sessions have lost their tokens [ns, monotonic]."""
         self._unannounced: tuple[int, int] | None = None
         """When sessions that had no token began to send commands, and sent the last one [ns, monotonic]."""
-        self.newest: Received | None = None
+        self.newest: ReceivedCommand | None = None
         """The newest command of an announced session, also if it was refused; may be read from any thread."""
 
     def set_announced(self, session: int, alive: bool, now: int) -> None:
@@ -166,7 +166,7 @@ class CommandAdmission:
             text = f"a command of session {session:x}, which is not announced as a commander"
             raise MessageError(text, reason="no claim")
         excess = self._ages.excess(session, stamp, arrived, echo)
-        self.newest = Received(session, seq, excess, arrived)
+        self.newest = ReceivedCommand(session, seq, excess, arrived)
         check_waited(excess, ttl, has_echo=echo is not None)
         return arrived - excess + ttl
 

@@ -19,7 +19,7 @@ from zstate.net.session import Session
 from zstate.plugins import is_latched
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import ChannelId
-from zstate.recording.recorder import MessageQueue, SampleWriter, recorded_streams
+from zstate.recording.recorder import MessageQueue, SampleRecorder, recorded_streams
 from zstate.recording.storage import ROBOT, ChannelType
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
@@ -171,7 +171,7 @@ class FoxgloveBridge(Closeable):
         self._streams = recorded_streams(self._wire)
         self._topics = ServedTopics(server)
         self._counters = Counters()
-        self._samples = SampleWriter(self._wire, self._counters)
+        self._samples = SampleRecorder(self._wire, self._counters)
         self._encoder: RecordingEncoder | None = None
         self._starts_at: int | None = None
         self._changes: deque[tuple[Announcement, bool]] = deque()

@@ -11,7 +11,7 @@ import math
 from collections import defaultdict
 
 from zstate.model.findings import Findings, quoted
-from zstate.model.robot import Limits
+from zstate.model.robot import DeclaredLimits
 from zstate.model.xml import Element, NumberError, read_number
 
 NOT_LIMITING = "which does not limit its commands"
@@ -20,9 +20,9 @@ NOT_LIMITING = "which does not limit its commands"
 _RATES = ("velocity", "effort", "acceleration")
 
 
-def read_command_limits(robot: Element, findings: Findings) -> dict[str, Limits]:
+def read_command_limits(robot: Element, findings: Findings) -> dict[str, DeclaredLimits]:
     """Limits by the name of the joint; what cannot be read is a warning of ``findings``."""
-    found: defaultdict[str, Limits] = defaultdict(Limits)
+    found: defaultdict[str, DeclaredLimits] = defaultdict(DeclaredLimits)
     reader = _Reader(findings)
     for joint in robot.all("joint"):
         name = joint.attributes.get("name", "")
@@ -45,33 +45,35 @@ class _Reader:
     def __init__(self, findings: Findings) -> None:
         self._findings = findings
 
-    def soft_limits(self, joint: str, element: Element) -> Limits:
+    def soft_limits(self, joint: str, element: Element) -> DeclaredLimits:
         lower, upper = (
             self._number(joint, element, name, element.attributes.get(name))
             for name in ("soft_lower_limit", "soft_upper_limit")
         )
         return self._range(joint, element, lower, upper)
 
-    def interface_limits(self, joint: str, element: Element) -> Limits:
+    def interface_limits(self, joint: str, element: Element) -> DeclaredLimits:
         kind = element.attributes.get("name", "")
         texts = {param.attributes.get("name", ""): param.text for param in element.all("param")}
         least, most = (self._number(joint, element, name, texts.get(name)) for name in ("min", "max"))
         if kind == "position":
             return self._range(joint, element, least, most)
         if kind not in _RATES or (least is None and most is None):
-            return Limits()
+            return DeclaredLimits()
         at_most = min(abs(number) for number in (least, most) if number is not None)
         if at_most == 0.0 or (least or 0.0) > 0.0 or (most or 0.0) < 0.0:
             self._warn(joint, element, f"a {kind} from {_text(least)} to {_text(most)}")
-            return Limits()
-        return Limits(**{kind: at_most})
+            return DeclaredLimits()
+        return DeclaredLimits(**{kind: at_most})
 
-    def _range(self, joint: str, element: Element, lower: float | None, upper: float | None) -> Limits:
-        range_ = Limits(-math.inf if lower is None else lower, math.inf if upper is None else upper)
+    def _range(
+        self, joint: str, element: Element, lower: float | None, upper: float | None
+    ) -> DeclaredLimits:
+        range_ = DeclaredLimits(-math.inf if lower is None else lower, math.inf if upper is None else upper)
         if range_.lower < range_.upper:
             return range_
         self._warn(joint, element, f"positions from {_text(lower)} to {_text(upper)}")
-        return Limits()
+        return DeclaredLimits()
 
     def _number(self, joint: str, element: Element, name: str, text: str | None) -> float | None:
         """The number ``text`` of the parameter ``name``; None without one."""

@@ -66,7 +66,7 @@ _COORDINATES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class DeclaredLimits:
     """Limits of a joint: [rad] or [m], per s, [Nm] or [N], and per s^2. Infinite unless stated."""
 
     lower: float = -np.inf
@@ -76,9 +76,9 @@ class Limits:
     acceleration: float = np.inf
     """Of commands alone: a joint of a URDF has none."""
 
-    def narrowed(self, other: Limits) -> Limits:
+    def narrowed(self, other: DeclaredLimits) -> DeclaredLimits:
         """The narrower of these limits and ``other``, each."""
-        return Limits(
+        return DeclaredLimits(
             max(self.lower, other.lower),
             min(self.upper, other.upper),
             min(self.velocity, other.velocity),
@@ -111,10 +111,10 @@ class Joint:
     child: str
     origin: Pose7
     axis: Vector3
-    limits: Limits
+    limits: DeclaredLimits
     mimic: Mimic | None = None
     line: int | None = None
-    command_limits: Limits = Limits()
+    command_limits: DeclaredLimits = DeclaredLimits()
 
     @property
     def driven(self) -> bool:

@@ -1,7 +1,7 @@
 """Parser of URDF text: returns a RobotModel or reports all faults with their lines.
 
 It reads no files and does not use Pinocchio, whose own reader accepts detached cycles and zero axes and
-has one message for all faults. Limits: 16 MiB, 2000 links, 500 joints in a chain, 100 levels of XML,
+has one message for all faults. DeclaredLimits: 16 MiB, 2000 links, 500 joints in a chain, 100 levels of XML,
 100 mimics in a chain, 200 velocities (mimics counted: Pinocchio's memory grows with their cube).
 """
 
@@ -14,7 +14,7 @@ from dataclasses import replace
 from zstate._util.format import suggestion_text
 from zstate.model.command_limits import read_command_limits
 from zstate.model.findings import Findings, quoted, shortened
-from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, Joint, Limits, RobotModel
+from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, DeclaredLimits, Joint, RobotModel
 from zstate.model.urdf_joint import read_joint
 from zstate.model.xml import Document, Element, NumberError, read_document, read_number
 
@@ -52,7 +52,7 @@ def parse_document(document: Document, source: str) -> RobotModel:
     links = _read_links(findings, robot)
     commands = read_command_limits(robot, findings)
     joints = [read_joint(element, links, findings) for element in robot.all("joint")]
-    joints = [replace(joint, command_limits=commands.get(joint.name, Limits())) for joint in joints]
+    joints = [replace(joint, command_limits=commands.get(joint.name, DeclaredLimits())) for joint in joints]
     root = _check_tree(findings, links, joints)
     _check_mimics(findings, joints)
     findings.raise_errors()

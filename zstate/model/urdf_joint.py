@@ -9,7 +9,7 @@ from typing import Final
 
 from zstate._util.format import suggestion_text
 from zstate.model.findings import Findings, quoted, shortened
-from zstate.model.robot import POSITION_COUNTS, Joint, JointType, Limits, Mimic, Pose7, Vector3
+from zstate.model.robot import POSITION_COUNTS, DeclaredLimits, Joint, JointType, Mimic, Pose7, Vector3
 from zstate.model.xml import Element, NumberError, read_number, read_numbers
 from zstate.se3 import quaternion_from_rpy
 
@@ -129,18 +129,18 @@ class _JointReader:
             )
         return axis
 
-    def _limits(self, kind: JointType) -> Limits:
+    def _limits(self, kind: JointType) -> DeclaredLimits:
         limit = self._first("limit")
         if limit is None:
             if kind in {"revolute", "prismatic"}:
                 problem = f' is {kind} and has no <limit lower="..." upper="..."/>'
                 self._error(self._element, problem, _SOME_LIMITS[kind])
-            return Limits()
+            return DeclaredLimits()
         lower, upper, velocity, effort = (
             (self._numbers(limit, name, 1) or (None,))[0] for name in ("lower", "upper", "velocity", "effort")
         )
         if kind == "fixed":
-            return Limits()
+            return DeclaredLimits()
         if kind == "continuous" and (lower, upper) != (None, None):
             problem = " is continuous, so its lower and upper limits are not used"
             self._warning(limit, problem, 'delete lower and upper, or type="revolute"')
@@ -152,7 +152,7 @@ class _JointReader:
         else:
             lower, upper = -math.inf, math.inf
         velocity = math.inf if velocity is None else velocity
-        return Limits(lower, upper, velocity, math.inf if effort is None else effort)
+        return DeclaredLimits(lower, upper, velocity, math.inf if effort is None else effort)
 
     def _mimic(self, kind: JointType) -> Mimic | None:
         mimic = self._first("mimic")

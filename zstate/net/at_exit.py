@@ -63,7 +63,7 @@ def forked_text(fact: str) -> str:
     )
 
 
-class Session(Protocol):
+class ClosedAtExit(Protocol):
     """A session that is closed when the process ends."""
 
     def close_blocking(self) -> None:
@@ -78,7 +78,7 @@ class _Process:
 
     def __init__(self, zenoh_started_in: int | None = None) -> None:
         self.zenoh_started_in = zenoh_started_in
-        self.sessions: weakref.WeakSet[Session] = weakref.WeakSet()
+        self.sessions: weakref.WeakSet[ClosedAtExit] = weakref.WeakSet()
         self.threads: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
         self.lock = fork_safe_lock()
         self.opening = 0
@@ -158,7 +158,7 @@ def _join_users(deadline: float) -> None:
 _process = _Process()
 
 
-def close_at_exit(session: Session) -> None:
+def close_at_exit(session: ClosedAtExit) -> None:
     """Close ``session`` when the process ends, if it still exists."""
     _process.sessions.add(session)
 

@@ -44,7 +44,7 @@ def mean_rate_hz(count: int, span: int) -> float | None:
     return (count - 1) * 1e9 / span if count > 1 and span > 0 else None
 
 
-class Received(NamedTuple):
+class Arrival(NamedTuple):
     """When a sample arrived, its stamp, its sequence number, and how long it took from stamp to arrival."""
 
     at: int
@@ -56,7 +56,7 @@ class Received(NamedTuple):
 class Window:
     """Statistics of successive samples of one source, at least one; None where they are too few."""
 
-    def __init__(self, received: Sequence[Received]) -> None:
+    def __init__(self, received: Sequence[Arrival]) -> None:
         self.received = received
 
     @property
@@ -101,9 +101,9 @@ class IntervalStatistics:
         self.session = 0
         """The writer of the newest sample."""
         self.deadline = Deadline()
-        self._received: deque[Received] = deque(maxlen=window)
+        self._received: deque[Arrival] = deque(maxlen=window)
 
-    def add(self, received: Received, session: int = 0) -> None:
+    def add(self, received: Arrival, session: int = 0) -> None:
         """Count a sample."""
         self.session = session
         self.deadline.on_sample(received.at * 1e-9)
@@ -115,7 +115,7 @@ class IntervalStatistics:
         self._received.clear()
 
     @property
-    def newest(self) -> Received | None:
+    def newest(self) -> Arrival | None:
         """The newest sample."""
         received = self._received
         return received[-1] if received else None
@@ -230,7 +230,7 @@ class TopicStatistics(Closeable):
     def add(self, robot: str, stream: StreamName, sample: StampedMessage, at: int, now: int) -> None:
         """Count a sample that arrived ``at``, when it was ``now`` by the clock of the stamps."""
         self.gaps.add(sample.session, sample.seq)
-        received = Received(at, sample.stamp, sample.seq, now - sample.stamp)
+        received = Arrival(at, sample.stamp, sample.seq, now - sample.stamp)
         for source in self._sources(robot, stream, sample):
             statistics = self._statistics.get(source)
             if statistics is None:

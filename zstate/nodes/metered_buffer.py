@@ -18,7 +18,7 @@ from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.buffer.tracks import JointTrack
 from zstate.clock import Clock
 from zstate.errors import LookupFailed, WaitTimeout
-from zstate.net.topic_statistics import IntervalStatistics, Received
+from zstate.net.topic_statistics import Arrival, IntervalStatistics
 from zstate.transform import Transform
 
 LATENCY_BOUNDS_S = (
@@ -169,7 +169,7 @@ class MeteredBuffer(InstrumentedBuffer):
             self.latency_of(robot).add(delay * 1e-9)
         statistics = self.statistics_of(robot, kind)
         with self._counting:  # each stream has a thread
-            statistics.add(Received(time.monotonic_ns(), stamp, statistics.count, delay))
+            statistics.add(Arrival(time.monotonic_ns(), stamp, statistics.count, delay))
 
     def measure(self, robot: str, within_ns: int = _WINDOW_NS) -> RobotMeasure:
         """How the samples of ``robot`` arrived."""

@@ -23,7 +23,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput
 from zstate.odometry.invariant_filter import ImuNoise
 from zstate.sources import JointReading
-from zstate.sources.square_drive import BaseState, WheelPair
+from zstate.sources.square_drive import SquareDriveState, WheelPair
 from zstate.transform import Transform
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -317,7 +317,7 @@ class SimulatedWheels:
         self.enable(False)
 
 
-def tracking_twist(goal: BaseState, pose: PlanarPose) -> tuple[float, float]:
+def tracking_twist(goal: SquareDriveState, pose: PlanarPose) -> tuple[float, float]:
     """The speed [m/s] and the yaw rate [rad/s] with which a base at ``pose`` approaches the moving ``goal``.
 
     The controller of Kanayama et al. ("A stable tracking control method for an autonomous mobile robot",

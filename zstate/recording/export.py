@@ -35,7 +35,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InvalidInput, LibraryMissing, LookupFailed, RecordingError
-from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.joint_history import JointHistory
 from zstate.recording.joint_states import DELAYED_NS, JointStatePart
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.wire.keys import frame_owner
@@ -139,7 +139,7 @@ class Exporter:
         with new_table(path, kind, self._recording, overwrite=overwrite) as table:
             return self._write(table)
 
-    def _write(self, table: Table) -> ExportReport:
+    def _write(self, table: ColumnFile) -> ExportReport:
         if self._is_as_recorded and not self._poses:
             return self._write_samples(table)
         survey = self._survey()
@@ -187,14 +187,14 @@ class Exporter:
         grid = first + np.round(np.arange(count) * (1e9 / self._rate_hz)).astype(np.int64)
         return Survey(grid[grid <= last])
 
-    def _write_samples(self, table: Table) -> ExportReport:
+    def _write_samples(self, table: ColumnFile) -> ExportReport:
         """Write all samples; from the start again if velocities or efforts first appear later."""
         kinds: dict[int, set[str]] = {}
         while (report := self._try_samples(table, kinds)) is None:
             table.restart()
         return report
 
-    def _try_samples(self, table: Table, kinds: dict[int, set[str]]) -> ExportReport | None:
+    def _try_samples(self, table: ColumnFile, kinds: dict[int, set[str]]) -> ExportReport | None:
         """Write all samples with the columns of ``kinds``, by the number of the history.
 
         None if a part has more; ``kinds`` then has them.
@@ -214,7 +214,7 @@ class Exporter:
         return report
 
     def _write_lookups(
-        self, table: Table, survey: Survey, source: StreamedBuffer | ReloadedBuffer
+        self, table: ColumnFile, survey: Survey, source: StreamedBuffer | ReloadedBuffer
     ) -> ExportReport:
         """Write the rows of ``survey`` with lookups in the buffers of ``source``."""
         report = self._report()
@@ -232,7 +232,7 @@ class Exporter:
         report.refused += self._refusals.counts
         return report
 
-    def _recorded(self, survey: Survey) -> Iterator[JointTrajectory]:
+    def _recorded(self, survey: Survey) -> Iterator[JointHistory]:
         """The samples of ``survey``."""
         histories = 0
         for trajectory, restarts in self._samples():
@@ -244,7 +244,11 @@ class Exporter:
         return ExportReport(self.robot, unknown_poses=dict.fromkeys(self._poses, 0))
 
     def _write_rows(
-        self, table: Table, trajectory: JointTrajectory, buffer: TransformBuffer | None, report: ExportReport
+        self,
+        table: ColumnFile,
+        trajectory: JointHistory,
+        buffer: TransformBuffer | None,
+        report: ExportReport,
     ) -> None:
         columns = joint_columns(trajectory)
         for target, source in self._poses:
@@ -388,7 +392,7 @@ class ReloadedBuffer:
         """Nothing: each buffer is of the whole recording."""
 
 
-def joint_columns(trajectory: JointTrajectory) -> dict[str, NDArray[Any]]:
+def joint_columns(trajectory: JointHistory) -> dict[str, NDArray[Any]]:
     """``stamp`` [ns], then ``position.NAME``, ``velocity.NAME`` and ``effort.NAME`` for each coordinate."""
     columns: dict[str, NDArray[Any]] = {"stamp": trajectory.stamps}
     blocks = (
@@ -402,7 +406,7 @@ def joint_columns(trajectory: JointTrajectory) -> dict[str, NDArray[Any]]:
     return columns
 
 
-class Table(Closeable):
+class ColumnFile(Closeable):
     """A file of columns, which are the same for each ``write``."""
 
     @abstractmethod
@@ -417,7 +421,7 @@ class Table(Closeable):
 @contextmanager
 def new_table(
     path: Path, kind: TableFormat, recording: Recording, *, overwrite: bool
-) -> Generator[Table, None, None]:
+) -> Generator[ColumnFile, None, None]:
     """A table of data of ``recording``, which is at ``path`` when the context ends without an exception.
 
     Raises RecordingError if the file exists (unless ``overwrite``) or cannot be written, and LibraryMissing
@@ -441,7 +445,7 @@ def new_table(
         incomplete.unlink(missing_ok=True)
 
 
-class CsvTable(Table):
+class CsvTable(ColumnFile):
     """Comma-separated values, with a line of names first. Missing numbers are ``nan``."""
 
     def __init__(self, path: Path) -> None:
@@ -461,7 +465,7 @@ class CsvTable(Table):
         self._file.close()
 
 
-class ParquetTable(Table):
+class ParquetTable(ColumnFile):
     """Parquet, compressed with Zstandard. Raises LibraryMissing without pyarrow."""
 
     def __init__(self, path: Path) -> None:

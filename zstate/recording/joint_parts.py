@@ -22,7 +22,7 @@ from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_parts import JointNames, PartialJointStateIngest, RobotParts
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.transforms import ModelEdgeFilter
-from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import DecodedRecording, RecordedWriter
 from zstate.recording.joint_states import DELAYED_NS, JointStatePart
@@ -214,7 +214,7 @@ class MergedJointStateReader:
         writers = self._recording.writers.items()
         return sum(count for one, count in writers if one.robot == self.robot and one.stream in JOINT_STREAMS)
 
-    def all(self) -> JointTrajectory:
+    def all(self) -> JointHistory:
         """All rows."""
         return self._read_buffer().joint_states(self.robot)
 

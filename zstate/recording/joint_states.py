@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zstate.clock import SET_BACK_NS
 from zstate.errors import MessageError, ModelError
 from zstate.ingest.joint_parts import joint_order
-from zstate.model.joint_trajectory import JointTrajectory, concatenate
+from zstate.model.joint_history import JointHistory, concatenate
 from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
@@ -42,19 +42,19 @@ Refuse = Callable[[str, str], None]
 class JointStatePart(NamedTuple):
     """Consecutive samples. With ``restarts`` they begin a new history, and earlier parts do not count."""
 
-    trajectory: JointTrajectory
+    trajectory: JointHistory
     restarts: bool
 
 
 class _GrowingTrajectory:
     """Consecutive trajectories as one, in arrays that grow in place: no sample is in memory twice."""
 
-    def __init__(self, first: JointTrajectory) -> None:
+    def __init__(self, first: JointHistory) -> None:
         self._arrays: dict[str, NDArray[Any]] = {}
         self._count = 0
         self.append(first)
 
-    def append(self, part: JointTrajectory) -> None:
+    def append(self, part: JointHistory) -> None:
         """Append a trajectory of the same joints."""
         first, self._count = self._count, self._count + len(part)
         self._newest = part
@@ -69,7 +69,7 @@ class _GrowingTrajectory:
                     _resize(array, self._count + self._count // 8)
                 array[first : self._count] = np.nan if block is None else block
 
-    def trajectory(self) -> JointTrajectory:
+    def trajectory(self) -> JointHistory:
         """All of them. No ``append`` may follow."""
         for array in self._arrays.values():
             _resize(array, self._count)
@@ -88,7 +88,7 @@ class _Batch(NamedTuple):
     seqs: NDArray[np.int64]
 
 
-class JointStateReader:
+class RecordedJointReader:
     """Reads the joint states of ``robot`` once, in the order of its model, or else of its first message.
 
     Samples that a buffer would refuse are left out, and ``refuse(reason, text)`` is called for each.
@@ -121,7 +121,7 @@ class JointStateReader:
             return decoded.message.names or ()
         return ()
 
-    def all(self) -> JointTrajectory:
+    def all(self) -> JointHistory:
         """All samples."""
         whole: _GrowingTrajectory | None = None
         for trajectory, restarts in self.parts():
@@ -136,7 +136,7 @@ class JointStateReader:
 
         A sample is passed on once another is 10 s newer. Of two samples with one stamp the later one counts.
         """
-        pending: JointTrajectory | None = None
+        pending: JointHistory | None = None
         restarts = False
         for trajectory, is_new in self._as_recorded():
             pending = concatenate((trajectory,) if pending is None or is_new else (pending, trajectory))
@@ -250,14 +250,14 @@ class JointLayout:
         slots, transforms = velocity_columns_by_position(model), JointTransforms(model)
         return cls(model.joint_names, coordinate_names(model), slots, joint_order(model), transforms)
 
-    def empty(self) -> JointTrajectory:
+    def empty(self) -> JointHistory:
         """A trajectory without samples."""
         no_stamps, no_positions = np.empty(0, np.int64), np.empty((0, len(self._coordinates)))
         return self._trajectory(no_stamps, no_positions, None, None)
 
     def read(
         self, states: RosJointStates, robot: str, refuse: Refuse
-    ) -> tuple[JointTrajectory, NDArray[np.intp]]:
+    ) -> tuple[JointHistory, NDArray[np.intp]]:
         """The trajectory of the usable ``states``, and their rows. ``refuse`` is called for the others."""
         try:
             columns, rate_columns = self._order.columns_by_name(states.names)
@@ -287,9 +287,9 @@ class JointLayout:
         positions: NDArray[np.float64],
         velocities: NDArray[np.float64] | None,
         efforts: NDArray[np.float64] | None,
-    ) -> JointTrajectory:
+    ) -> JointHistory:
         names = self._names, self._coordinates, self._velocity_coordinates
-        return JointTrajectory(*names, stamps, positions, velocities, efforts)
+        return JointHistory(*names, stamps, positions, velocities, efforts)
 
 
 def _known(block: NDArray[np.float64]) -> NDArray[np.float64] | None:

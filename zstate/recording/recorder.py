@@ -137,7 +137,7 @@ class MessageQueue(Closeable):
             self.unsubscribe(stream)
 
 
-class SampleWriter:
+class SampleRecorder:
     """Decodes received samples of ``wire``, and writes their messages with a RecordingEncoder."""
 
     def __init__(self, wire: Wire, counters: Counters) -> None:
@@ -252,7 +252,7 @@ class Recorder(Closeable):
         self._wire = get_wire(wire)
         self._streams = recorded_streams(self._wire)
         self._counters = Counters()
-        self._samples = SampleWriter(self._wire, self._counters)
+        self._samples = SampleRecorder(self._wire, self._counters)
         self._programs: BoundedDict[int, str] = BoundedDict()
         self._discovered: set[str] = set()
         self._pending: list[Batch] = []

@@ -37,7 +37,7 @@ from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest, TransformIngest
-from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
 from zstate.plugins import stream_named
 from zstate.recording.decode import (
@@ -54,7 +54,7 @@ from zstate.recording.decode import (
 )
 from zstate.recording.info import RecordingInfo, read_info
 from zstate.recording.joint_parts import MergedJointStateReader, RecordedJoints, has_parts
-from zstate.recording.joint_states import DELAYED_NS, JointStateReader
+from zstate.recording.joint_states import DELAYED_NS, RecordedJointReader
 from zstate.recording.reader import RecordingReader
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import MODEL_WRITER, full_name
@@ -111,7 +111,7 @@ class Recording(Closeable):
     def __reduce__(self) -> tuple[Any, ...]:
         return Recording, (self.info.path, self.robot)
 
-    def joint_states(self, robot: str | None = None) -> JointTrajectory:
+    def joint_states(self, robot: str | None = None) -> JointHistory:
         """All joint states of ``robot``, by default of the only one: those of its last history.
 
         Of samples with one stamp the later one counts. Samples without a finite position of every joint
@@ -123,7 +123,7 @@ class Recording(Closeable):
 
     def joint_state_reader(
         self, robot: str | None = None, refuse: Callable[[str, str], None] | None = None
-    ) -> JointStateReader | MergedJointStateReader:
+    ) -> RecordedJointReader | MergedJointStateReader:
         """Reader of ``joint_states(robot)`` in parts, for a recording that does not fit into memory.
 
         ``refuse(reason, text)`` is called for each sample left out; by default the first of each reason is
@@ -132,7 +132,7 @@ class Recording(Closeable):
         refuse = refuse or Refusals("recorded joint_states").count
         decoded = DecodedRecording(self._reader, refuse)
         robot = robot_with_joint_states(decoded, robot or self.robot, JOINT_STREAMS)
-        reader = JointStateReader(decoded, robot, refuse)
+        reader = RecordedJointReader(decoded, robot, refuse)
         if reader.model is None or not has_parts(decoded, robot, reader.model):
             return reader
         return MergedJointStateReader(

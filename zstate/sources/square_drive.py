@@ -24,7 +24,7 @@ from zstate.transform import Transform
 _HEADINGS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
-class BaseState(NamedTuple):
+class SquareDriveState(NamedTuple):
     """Pose of a base in its odometry frame, and its twist in its own axes, x forward, z up.
 
     ``x`` and ``y`` [m]; ``yaw`` [rad], from 0 to 2 pi; ``speed`` along x [m/s], ``yaw_rate`` [rad/s]. The
@@ -84,7 +84,7 @@ class SquareDrive:
         # Exact, because the laps since 1970 are more than a float keeps apart from small rotations.
         self._turns_per_lap = [Fraction(turn) for turn in turns]
 
-    def state(self, stamp: int) -> BaseState:
+    def state(self, stamp: int) -> SquareDriveState:
         """Pose and twist at ``stamp`` [ns]."""
         quarter, along = divmod(4.0 * self._phase(stamp), 1.0)
         distance = 0.25 * along * self._lap
@@ -95,7 +95,7 @@ class SquareDrive:
         middle = 0.5 * self._straight, 0.5 * self._straight + self._radius
         cosine, sine = _HEADINGS[int(quarter)]
         ahead, left = ahead - middle[0], left - middle[1]
-        return BaseState(
+        return SquareDriveState(
             middle[0] + cosine * ahead - sine * left,
             middle[1] + sine * ahead + cosine * left,
             0.5 * math.pi * quarter + angle,

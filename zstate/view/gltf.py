@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.model.geometry import Color
-from zstate.view.mesh_geometry import Material, Mesh
+from zstate.view.mesh_geometry import Mesh, MeshMaterial
 
 GREY: Color = (0.74, 0.75, 0.77, 1.0)
 """The colour of a mesh without a material."""
@@ -32,7 +32,7 @@ class Glb:
     """Meshes packed once, for files in several colours; meshes with the same material are joined."""
 
     def __init__(self, meshes: Sequence[Mesh]) -> None:
-        self._materials: list[tuple[Material | None, bool]] = []
+        self._materials: list[tuple[MeshMaterial | None, bool]] = []
         self._primitives: list[dict[str, Any]] = []
         self._accessors: list[dict[str, Any]] = []
         self._views: list[dict[str, Any]] = []
@@ -53,13 +53,13 @@ class Glb:
         images = {material.image for material, _ in self._materials if material and material.image}
         return len(self._binary) + sum(map(len, images))
 
-    def to_bytes(self, missing: Material, over: Color | None) -> bytes:
+    def to_bytes(self, missing: MeshMaterial, over: Color | None) -> bytes:
         """The glTF file; meshes without a material have ``missing``, or all have the colour ``over``."""
-        materials: list[Material] = []
+        materials: list[MeshMaterial] = []
         for own, has_uv in self._materials:
             material = missing if own is None else own
             if over is not None or not has_uv:
-                material = Material(over or material.color)
+                material = MeshMaterial(over or material.color)
             materials.append(material)
         images = list(dict.fromkeys(material.image for material in materials if material.image is not None))
         binary, views = bytearray(self._binary), list(self._views)
@@ -131,7 +131,7 @@ def _joined(meshes: Iterable[Mesh]) -> list[Mesh]:
 
     If one has texture coordinates or colours, all get them: viser draws instances of no others.
     """
-    by_material: dict[Material | None, list[Mesh]] = {}
+    by_material: dict[MeshMaterial | None, list[Mesh]] = {}
     for mesh in meshes:
         if len(mesh.triangles):
             by_material.setdefault(mesh.material, []).append(mesh)
@@ -158,7 +158,7 @@ def _joined(meshes: Iterable[Mesh]) -> list[Mesh]:
     return joined
 
 
-def _material(material: Material, images: list[bytes]) -> dict[str, Any]:
+def _material(material: MeshMaterial, images: list[bytes]) -> dict[str, Any]:
     red, green, blue, opacity = material.color
     shading: dict[str, Any] = {
         "baseColorFactor": [*_linear(np.array([red, green, blue])).tolist(), opacity],

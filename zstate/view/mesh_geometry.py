@@ -24,7 +24,7 @@ Corners = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Material:
+class MeshMaterial:
     """The colour of a mesh (sRGB and opacity, 0..1), or its texture.
 
     ``image`` is the content of a JPEG or PNG file; the colour is multiplied with it.
@@ -45,7 +45,7 @@ class Mesh:
 
     points: NDArray[np.float32]
     triangles: NDArray[np.uint32]
-    material: Material | None = None
+    material: MeshMaterial | None = None
     uv: NDArray[np.float32] | None = None
     colors: NDArray[np.uint8] | None = None
 
@@ -68,7 +68,7 @@ def directions(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 def smooth_normals(
     points: NDArray[np.float64],
     triangles: NDArray[np.intp],
-    material: Material | None = None,
+    material: MeshMaterial | None = None,
     *,
     normals: NDArray[np.float64] | None = None,
     uv: NDArray[np.float64] | None = None,

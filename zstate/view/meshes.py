@@ -26,7 +26,7 @@ from trimesh.units import unit_conversion
 from zstate.model.geometry import Box, Color, Cylinder, MeshFile, Shape, Sphere
 from zstate.model.mesh_paths import MeshPaths, MissingFile
 from zstate.view.gltf import GREY, Glb
-from zstate.view.mesh_geometry import Material, Mesh, primitive, smooth_normals
+from zstate.view.mesh_geometry import Mesh, MeshMaterial, primitive, smooth_normals
 
 _T = TypeVar("_T")
 _Source = Path | tuple[Box | Cylinder | Sphere, bool]
@@ -89,7 +89,7 @@ class Meshes:
         self._packed: OrderedDict[_Source, Glb] = OrderedDict()
         self.kept_byte_count = 0
         """Size of the geometry in memory [bytes]."""
-        self._copies: WeakValueDictionary[tuple[_Source, Material, Color | None], Copy] = (
+        self._copies: WeakValueDictionary[tuple[_Source, MeshMaterial, Color | None], Copy] = (
             WeakValueDictionary()
         )
         self._firsts: WeakValueDictionary[_Source, Copy] = WeakValueDictionary()
@@ -126,9 +126,9 @@ class Meshes:
     ) -> MeshAsset:
         image = self._texture(shape, base) if over is None else None
         if isinstance(image, bytes):
-            missing = Material(shape.color or (1.0, 1.0, 1.0, 1.0), image)
+            missing = MeshMaterial(shape.color or (1.0, 1.0, 1.0, 1.0), image)
         else:
-            missing = Material(GREY if shape.color is None or over is not None else shape.color)
+            missing = MeshMaterial(GREY if shape.color is None or over is not None else shape.color)
         done = self._copies.get((source, missing, over))
         if done is not None:
             return MeshAsset(done)
@@ -297,10 +297,10 @@ def _loaded(path: Path, data: Path | io.BytesIO) -> tuple[Mesh, ...]:
     return tuple(meshes)
 
 
-def _visual(visual: Any) -> tuple[Material | None, NDArray[np.float64] | None, NDArray[np.uint8] | None]:
+def _visual(visual: Any) -> tuple[MeshMaterial | None, NDArray[np.float64] | None, NDArray[np.uint8] | None]:
     """Material, texture coordinates and point colours."""
     if visual.kind in {"vertex", "face"}:
-        return Material((1.0, 1.0, 1.0, 1.0)), None, np.asarray(visual.vertex_colors, dtype=np.uint8)
+        return MeshMaterial((1.0, 1.0, 1.0, 1.0)), None, np.asarray(visual.vertex_colors, dtype=np.uint8)
     if getattr(visual, "material", None) is None:
         return None, None, None
     material = _material(visual.material)
@@ -309,7 +309,7 @@ def _visual(visual: Any) -> tuple[Material | None, NDArray[np.float64] | None, N
     return material, np.asarray(visual.uv, dtype=np.float64) if is_covered else None, None
 
 
-def _material(material: Any) -> Material | None:
+def _material(material: Any) -> MeshMaterial | None:
     if hasattr(material, "baseColorFactor"):
         factor, image = material.baseColorFactor, material.baseColorTexture
     elif getattr(material, "_name", None) is None:
@@ -319,7 +319,7 @@ def _material(material: Any) -> Material | None:
     own = (1.0,) * 4 if factor is None else (np.asarray(factor, dtype=np.float64) / 255.0).tolist()
     red, green, blue, opacity = own
     color = (red, green, blue, opacity if opacity > _INVISIBLE else 1.0)
-    return Material(color, None if image is None else _encoded(image))
+    return MeshMaterial(color, None if image is None else _encoded(image))
 
 
 def _encoded(image: Any) -> bytes:

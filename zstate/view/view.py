@@ -37,7 +37,7 @@ from zstate.view.panels.display_panels import (
 )
 from zstate.view.panels.panel import Panel, PanelContext
 from zstate.view.scene.scene import Scene
-from zstate.view.scene.world import Place
+from zstate.view.scene.world import DrawnFrames
 from zstate.view.server import ViewServer
 from zstate.view.sliders import SliderPublisher
 
@@ -160,7 +160,7 @@ class View(Closeable):
             try:
                 if fixed:
                     poses = self.scene.show(snapshot, fixed) if snapshot.tree.names else _NO_POSES
-                    place = Place(snapshot.tree, poses, fixed)
+                    place = DrawnFrames(snapshot.tree, poses, fixed)
                     self.scene.world.show(self._source.world, self._source.buffer, place, at)
                     self.scene.odometry.show(self._source.buffer, place, at)
                     self._fit_camera(snapshot, fixed, poses)
@@ -194,7 +194,7 @@ class View(Closeable):
         has_more = unknown < self._fitted_unknown or (self._fitted_busy and not self.scene.busy)
         if subject == self._fitted_to and not has_more:
             return
-        maps = self.scene.world.corners(Place(snapshot.tree, poses, fixed))
+        maps = self.scene.world.corners(DrawnFrames(snapshot.tree, poses, fixed))
         corners = self.scene.corners(snapshot.tree, poses)
         pose = fit_camera(snapshot, poses, self._aspect, corners, maps)
         if pose is None:

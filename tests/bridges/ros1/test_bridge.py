@@ -376,8 +376,8 @@ def test_rospy_does_not_change_other_loggers(namespace: str, spawn: Spawn):
         sys.path.append({DEBIAN_PACKAGES!r})
         logging.basicConfig(level=logging.ERROR)
         before = logging.root.handlers[:], logging.root.level, logging.getLoggerClass()
-        from zstate.bridges.ros1.node import Node
-        with Node():
+        from zstate.bridges.ros1.node import Ros1Node
+        with Ros1Node():
             print(before == (logging.root.handlers, logging.root.level, logging.getLoggerClass()))
         """
     )

@@ -15,9 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from zstate import load_model
 from zstate.bridges.ros1.messages import (
-    JointStateReader,
     JointStateWriter,
     Ros1FrameNames,
+    Ros1JointReader,
     get_stamp,
     partial_joint_state,
     read_transforms,
@@ -87,7 +87,7 @@ def test_link_with_a_slash_in_its_name_belongs_to_the_robot():
 
 
 def test_joints_are_found_by_name_in_any_order():
-    reader = JointStateReader(MODEL)
+    reader = Ros1JointReader(MODEL)
     message = joint_state(("wheel", "elbow", "shoulder"), (9.0, 0.2, 0.1), (), (0.0, 4.0, 3.0))
     numbers = reader.read(message)
     assert numbers is not None
@@ -109,13 +109,13 @@ def test_joints_are_found_by_name_in_any_order():
 )
 def test_a_joint_state_that_cannot_be_read_is_refused(message: Any, reason: str):
     with pytest.raises(MessageError) as caught:
-        JointStateReader(MODEL).read(message)
+        Ros1JointReader(MODEL).read(message)
     assert caught.value.reason == reason
 
 
 def test_part_of_a_robot_is_read_as_a_state_of_the_joints_it_names():
     message = joint_state(("wheel", "elbow"), (9.0, 0.2), (), (0.0, 4.0))
-    assert JointStateReader(MODEL).read(message) is None
+    assert Ros1JointReader(MODEL).read(message) is None
     state = partial_joint_state(message, 5, "/gripper")
     assert (state.stamp, state.names, state.velocities) == (5, ("wheel", "elbow"), None)
     assert state.efforts is not None
@@ -140,7 +140,7 @@ def test_each_number_of_a_floating_joint_has_a_name_in_ros():
     positions, velocities = np.array([1, 2, 3, 0, 0, 0, 1, 9.0]), np.arange(7.0)
     message = JointStateWriter(ROS, model).message(1, JointNumbers(positions, velocities, None))
     assert message.name == [*(f"flight.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")), "spin"]
-    read = JointStateReader(model).read(message)
+    read = Ros1JointReader(model).read(message)
     assert read is not None
     assert np.array_equal(read.positions, positions)
     assert read.velocities is not None

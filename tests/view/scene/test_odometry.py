@@ -12,7 +12,7 @@ from helpers.scene_drawing import at, handles, is_visible, pose_in_fixed, tree  
 from zstate.buffer.buffer import TransformBuffer  # noqa: E402
 from zstate.transform import Transform  # noqa: E402
 from zstate.view.scene.odometry import OdometryPaths  # noqa: E402
-from zstate.view.scene.world import Place  # noqa: E402
+from zstate.view.scene.world import DrawnFrames  # noqa: E402
 
 S = 1_000_000_000
 COVARIANCE = np.diag([0.04, 0.01, 1.0, 1.0, 1.0, 1.0])
@@ -33,7 +33,7 @@ class Shown:
 
     def show(self, stamp: int | None = None, fixed: str = "r1/odom") -> None:
         snapshot = self.buffer.snapshot(stamp)
-        self.odometry.show(self.buffer, Place(snapshot.tree, snapshot.poses_in(fixed), fixed), stamp)
+        self.odometry.show(self.buffer, DrawnFrames(snapshot.tree, snapshot.poses_in(fixed), fixed), stamp)
 
     def points(self, name: str) -> np.ndarray:
         """The visible line of that name in the fixed frame: (N, 3)."""
@@ -118,5 +118,5 @@ def test_withdrawn_edge_is_removed(shown: Shown):
 
 def test_odometry_without_a_place_is_hidden(shown: Shown):
     frames = tree({"map": None})
-    shown.odometry.show(shown.buffer, Place(frames, np.array([at()]), "map"), None)
+    shown.odometry.show(shown.buffer, DrawnFrames(frames, np.array([at()]), "map"), None)
     assert shown.lines() == []

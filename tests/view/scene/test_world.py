@@ -15,7 +15,7 @@ from helpers.scene_drawing import at, handles, is_visible, pose_in_fixed, sent_m
 from zstate.buffer.buffer import TransformBuffer  # noqa: E402
 from zstate.scans import Grid, Scan  # noqa: E402
 from zstate.transform import Transform  # noqa: E402
-from zstate.view.scene.world import Place, World  # noqa: E402
+from zstate.view.scene.world import DrawnFrames, World  # noqa: E402
 from zstate.view.world_source import SensorScans, WorldSource, WriterName  # noqa: E402
 
 MS = 1_000_000
@@ -66,10 +66,10 @@ class Shown:
         for stamp in (0, 10 * MS):
             self.buffer.insert(laser_at(stamp))
 
-    def show(self, at: int | None = None, place: Place | None = None) -> None:
-        self.world.show(self.source, self.buffer, place or Place(TREE, HERE, "odom"), at)
+    def show(self, at: int | None = None, place: DrawnFrames | None = None) -> None:
+        self.world.show(self.source, self.buffer, place or DrawnFrames(TREE, HERE, "odom"), at)
 
-    def show_maps(self, place: Place | None = None) -> None:
+    def show_maps(self, place: DrawnFrames | None = None) -> None:
         def complete() -> bool:
             self.show(place=place)
             return not self.world.busy
@@ -198,7 +198,7 @@ def test_scans_begin_again_if_time_is_set_back(shown):
 def test_clouds_are_placed_again_in_another_fixed_frame(shown):
     shown.source.front.add(scan_at(2 * MS))
     shown.show()
-    shown.show(place=Place(TREE, HERE, "r1/laser"))
+    shown.show(place=DrawnFrames(TREE, HERE, "r1/laser"))
     # In the moving laser itself each ray is as measured.
     assert np.allclose(shown.clouds()[0].points, [[1, 0, 0], [0, 1, 0], [-1, 0, 0]], atol=1e-6)
 
@@ -207,7 +207,7 @@ def test_scans_of_an_unconnected_robot_are_drawn_where_it_is(shown):
     apart = tree({"map": None, "odom": None, "r1/laser": "odom"})
     shown.buffer.insert_static(Transform("map", "camera", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
     shown.source.front.add(scan_at(2 * MS))
-    shown.show(place=Place(apart, np.array([at(), at(0, 5, 0), at(0, 5, 0)]), "map"))
+    shown.show(place=DrawnFrames(apart, np.array([at(), at(0, 5, 0), at(0, 5, 0)]), "map"))
     (path,) = handles(shown.server, viser.PointCloudHandle)
     assert pose_in_fixed(shown.server, path)[:3] == pytest.approx((0.0, 5.0, 0.0))
     assert shown.clouds()[0].points[1] == pytest.approx([3.0, 1.0, 0.0])
@@ -216,7 +216,7 @@ def test_scans_of_an_unconnected_robot_are_drawn_where_it_is(shown):
 def test_scans_vanish_with_their_frame_and_by_the_checkbox(shown):
     shown.source.front.add(scan_at(2 * MS))
     shown.show()
-    shown.show(place=Place(tree({"odom": None}), HERE[:1], "odom"))
+    shown.show(place=DrawnFrames(tree({"odom": None}), HERE[:1], "odom"))
     assert shown.clouds() == []
     shown.show()
     assert len(shown.clouds()) == 1
@@ -281,7 +281,7 @@ def test_map_is_encoded_once_for_each_change_and_vanishes_when_it_is_withdrawn(s
 
 def test_map_follows_its_frame_and_is_hidden_by_the_checkbox(shown):
     shown.source.set_map(Grid([[100]], 2.0, (0.0, 0.0, 0.0), "odom"))
-    shown.show_maps(Place(TREE, np.array([at(5, 0, 0), at()]), "r1/laser"))
+    shown.show_maps(DrawnFrames(TREE, np.array([at(5, 0, 0), at()]), "r1/laser"))
     (path,) = shown.images()
     assert pose_in_fixed(shown.server, path)[:2] == pytest.approx((6.0, 1.0))
     shown.world.maps = False

@@ -53,7 +53,7 @@ def ros1_command(
     .venv/bin/pip install zstate
     """
     from zstate.bridges.ros1.bridge import Ros1Bridge
-    from zstate.bridges.ros1.node import Node
+    from zstate.bridges.ros1.node import Ros1Node
     from zstate.clock import SystemClock
     from zstate.model.load import load_model
     from zstate.rate import Rate
@@ -66,7 +66,7 @@ def ros1_command(
         raise click.UsageError("--model needs --from-ros; the model of a robot in zstate is already known")
     model = None if source is None else load_model(source)
     with (
-        Node() as node,
+        Ros1Node() as node,
         open_session(network) as session,
         Ros1Bridge(
             session,

@@ -9,7 +9,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.bridges.ros1.directions import NativeToRos1, Ros1ToNative
 from zstate.bridges.ros1.messages import Ros1FrameNames
-from zstate.bridges.ros1.node import Node
+from zstate.bridges.ros1.node import Ros1Node
 from zstate.errors import InvalidInput, NetworkError, Unreachable
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -31,7 +31,7 @@ class Ros1Bridge(Closeable):
     def __init__(
         self,
         session: Session,
-        node: Node,
+        node: Ros1Node,
         robot: str,
         *,
         to_ros: bool = False,

@@ -14,9 +14,9 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.bridges.ros1.messages import (
-    JointStateReader,
-    RobotWriter,
+    RobotEncoder,
     Ros1FrameNames,
+    Ros1JointReader,
     TransformsWriter,
     get_stamp,
     partial_joint_state,
@@ -24,7 +24,7 @@ from zstate.bridges.ros1.messages import (
     read_transforms,
     refusal_reason,
 )
-from zstate.bridges.ros1.node import NAME, Node, sender
+from zstate.bridges.ros1.node import NAME, Ros1Node, sender
 from zstate.bridges.transforms import TransformRelay, edge_writer_of_node
 from zstate.errors import Closed, InvalidInput, MessageError, ModelError, SecondWriter, Unreachable
 from zstate.model.robot import RobotModel
@@ -68,7 +68,7 @@ class NativeToRos1(Closeable):
     def __init__(
         self,
         session: Session,
-        node: Node,
+        node: Ros1Node,
         names: Ros1FrameNames,
         refusals: Refusals,
         *,
@@ -77,7 +77,7 @@ class NativeToRos1(Closeable):
         with_description: bool = True,
     ) -> None:
         self.carried = 0
-        self.robot: RobotWriter | None = None
+        self.robot: RobotEncoder | None = None
         self._node = node
         self._names = names
         self._is_own = is_own
@@ -138,7 +138,7 @@ class NativeToRos1(Closeable):
             self._refusals.count("robot description", str(error))
             return
         with self._joints_lock:
-            self.robot = RobotWriter(model, self._node.ros, self._names)
+            self.robot = RobotEncoder(model, self._node.ros, self._names)
             self._merger = JointStateMerger(model, MAX_AGE_S)
         if not self._with_description:
             return
@@ -240,7 +240,7 @@ class Ros1ToNative(Closeable):
     def __init__(
         self,
         session: Session,
-        node: Node,
+        node: Ros1Node,
         model: RobotModel,
         names: Ros1FrameNames,
         refusals: Refusals,
@@ -257,7 +257,7 @@ class Ros1ToNative(Closeable):
         self._takeover = not at_once
         self._links = frozenset(model.links)
         self._model_children = frozenset(joint.child for joint in model.joints)
-        self._reader = JointStateReader(model)
+        self._reader = Ros1JointReader(model)
         self._merger = JointStateMerger(model, MAX_AGE_S, others=True)
         self._lock = threading.Lock()
         self._closed = False

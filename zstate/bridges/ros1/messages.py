@@ -109,7 +109,7 @@ class TransformsWriter:
         return self._message
 
 
-class RobotWriter:
+class RobotEncoder:
     """Encodes samples of one model as ROS 1 messages."""
 
     def __init__(self, model: RobotModel, ros: RospyModules, names: Ros1FrameNames) -> None:
@@ -169,7 +169,7 @@ def pose_from_ros(transform: Any) -> tuple[float, ...]:
     return (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
 
 
-class JointStateReader:
+class Ros1JointReader:
     """Decodes JointState messages with names in any order into the order of ``model``."""
 
     def __init__(self, model: RobotModel) -> None:

@@ -111,7 +111,7 @@ def load_ros() -> RospyModules:
         logging.setLoggerClass(logger_class)
 
 
-class Node(Closeable):
+class Ros1Node(Closeable):
     """A node of ROS 1; a process can have one in its lifetime, because rospy cannot be restarted.
 
     Raises LibraryMissing without rospy, Unreachable without a master.

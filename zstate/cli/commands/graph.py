@@ -136,26 +136,27 @@ def graph_drawing(graph: Graph) -> Drawing:
 
     The edges of each writer have a colour. A group without a writer has a dashed red box.
     """
-    from zstate.cli.output.drawing import ALARM, INK, LINE, PALETTE, Drawing, Edge, Node
+    from zstate.cli.output.drawing import ALARM, INK, LINE, PALETTE, Drawing, DrawnEdge, DrawnNode
 
-    nodes: list[Node] = []
+    nodes: list[DrawnNode] = []
     writes: list[tuple[str, str]] = []
     reads: list[tuple[str, str]] = []
     for number, group in enumerate(graph.groups):
         name, labels = f"streams {number}", [stream.label for stream in group.streams]
         lines, unwritten = [group.robot, *labels] if group.robot else labels, not group.writers
         stroke = ALARM if unwritten else LINE
-        nodes.append(Node(name, lines, stroke=stroke, dashed=unwritten, text_color=INK))
+        nodes.append(DrawnNode(name, lines, stroke=stroke, dashed=unwritten, text_color=INK))
         writes += [(f"program {one}", name) for one in group.writers]
         reads += [(name, f"program {one}") for one in group.readers]
     for program in graph.programs:
         name, at, place = program.partition("@")
         lines = [name, place] if at and name else [program]
-        nodes.append(Node(f"program {program}", lines, rounded=True, fill=_PROGRAM_FILL))
+        nodes.append(DrawnNode(f"program {program}", lines, rounded=True, fill=_PROGRAM_FILL))
     writers = dict.fromkeys(writer for writer, _ in writes)
     colors = {writer: PALETTE[number % len(PALETTE)] for number, writer in enumerate(writers)}
     edges = [
-        Edge(start, end, stroke=colors.get(start, colors.get(end, LINE))) for start, end in (*writes, *reads)
+        DrawnEdge(start, end, stroke=colors.get(start, colors.get(end, LINE)))
+        for start, end in (*writes, *reads)
     ]
     return Drawing("zstate", "flow", nodes, edges)
 

@@ -118,7 +118,7 @@ class MessageStatistics:
 
     def add(self, received: TimedSample) -> None:
         """Add a sample. Several samples of one message count once."""
-        from zstate.net.topic_statistics import Received
+        from zstate.net.topic_statistics import Arrival
         from zstate.wire.messages import StampedMessage
 
         sample, statistics = received.sample, self._statistics
@@ -126,7 +126,7 @@ class MessageStatistics:
         if self._gaps.add(sample.session, sample.seq):
             if sample.session != statistics.session and not self._of_all:
                 statistics.clear()
-            statistics.add(Received(received.arrival, sample.stamp, sample.seq, 0), sample.session)
+            statistics.add(Arrival(received.arrival, sample.stamp, sample.seq, 0), sample.session)
 
     def facts(self) -> dict[str, Any] | None:
         """The printed figures; None before two messages. ``missed`` counts since the start."""

@@ -258,14 +258,14 @@ def _rate_and_age(frame: FrameInfo, now: int) -> tuple[str, str]:
 
 def tree_drawing(frames: Sequence[FrameInfo], now: int, *, in_full: bool) -> Drawing:
     """The tree; each edge has its kind, rate, age, and the colour of its writer. ``now`` [ns] is for ages."""
-    from zstate.cli.output.drawing import ALARM, LINE, MUTED, PALETTE, Drawing, Edge, Node
+    from zstate.cli.output.drawing import ALARM, LINE, MUTED, PALETTE, Drawing, DrawnEdge, DrawnNode
     from zstate.clock import SYSTEM
     from zstate.ingest.deadline import is_stale
 
     writers = [frame.writer for frame in frames if frame.writer]
     colors = {writer: PALETTE[n % len(PALETTE)] for n, writer in enumerate(dict.fromkeys(writers))}
-    nodes: list[Node] = []
-    edges: list[Edge] = []
+    nodes: list[DrawnNode] = []
+    edges: list[DrawnEdge] = []
     for _, frame in _walk(frames):
         is_static, newest = frame.kind == "static", frame.newest_in(SYSTEM)
         lines, text_color = [_shown_name(frame, in_full)], MUTED
@@ -277,7 +277,7 @@ def tree_drawing(frames: Sequence[FrameInfo], now: int, *, in_full: bool) -> Dra
         elif not is_static:
             lines.append(frame.kind)
         nodes.append(
-            Node(
+            DrawnNode(
                 frame.name,
                 lines,
                 label=frame.name,
@@ -289,7 +289,7 @@ def tree_drawing(frames: Sequence[FrameInfo], now: int, *, in_full: bool) -> Dra
         )
         if frame.parent is not None:
             label = frame.kind if frame.rate_hz is None else f"{frame.kind} {rate_text(frame.rate_hz)}"
-            edges.append(Edge(frame.parent, frame.name, label, dashed=is_static))
+            edges.append(DrawnEdge(frame.parent, frame.name, label, dashed=is_static))
     legend = [
         (color, f"{writer}: {count_text(writers.count(writer), 'edge')}") for writer, color in colors.items()
     ]

@@ -26,7 +26,7 @@ _BOLD = 1.05
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class DrawnNode:
     """A box with lines of text, the first one bold.
 
     ``label`` is the text in DOT and Mermaid, by default the same lines; a ``bar`` is a filled left edge.
@@ -55,7 +55,7 @@ class Node:
 
 
 @dataclass(frozen=True, slots=True)
-class Edge:
+class DrawnEdge:
     """An edge from one node to another, by their names; its ``label`` is not in SVG."""
 
     start: str
@@ -74,8 +74,8 @@ class Drawing:
 
     name: str
     form: Literal["tree", "flow"]
-    nodes: Sequence[Node]
-    edges: Sequence[Edge]
+    nodes: Sequence[DrawnNode]
+    edges: Sequence[DrawnEdge]
     legend: Sequence[tuple[str, str]] = ()
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.joint_history import JointHistory
 from zstate.odometry import Wheels
 from zstate.odometry.messages import Imu, Pose, Velocity
 from zstate.wire.messages import StampedMessage, from_block
@@ -92,7 +92,7 @@ class Motions:
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         return Series(self._times(messages), np.unwrap(yaw))
 
-    def of_wheels(self, wheels: Wheels, joints: JointTrajectory) -> tuple[Series, Series]:
+    def of_wheels(self, wheels: Wheels, joints: JointHistory) -> tuple[Series, Series]:
         """Their yaw at the readings, and their speed in the middle between two of them."""
         seconds = _seconds(joints.stamps, self._origin)
         rows = [dict(zip(joints.coordinates, row, strict=True)) for row in joints.positions.tolist()]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from zstate.buffer.buffer import TransformBuffer
 from zstate.cli.output.text_layout import Table
 from zstate.errors import InvalidInput, LookupFailed, NoData, UnknownFrame
-from zstate.model.joint_trajectory import JointTrajectory
+from zstate.model.joint_history import JointHistory
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, SourceHealth
 from zstate.odometry.cli.delay import Delay, Motions
@@ -245,7 +245,7 @@ def _against(
     return compared(str(name), odometry, reference_path(name, messages))
 
 
-def _add_joints(base: BaseEstimator, joints: JointTrajectory, row: int) -> None:
+def _add_joints(base: BaseEstimator, joints: JointHistory, row: int) -> None:
     names = joints.velocity_coordinates
     base.joints(
         int(joints.stamps[row]),

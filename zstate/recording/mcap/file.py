@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from zstate.errors import RecordingError
-from zstate.recording.mcap.index import DataRange, Scan, Summary, read_header
+from zstate.recording.mcap.index import DataRange, FileScan, Summary, read_header
 from zstate.recording.mcap.records import MAGIC, MESSAGE, BoundedFile, CorruptData, iter_records, parse_record
 from zstate.recording.storage import Channel, Format, ReadFilter, Record, SortedPart
 
@@ -59,7 +59,7 @@ class McapFile:
             try:
                 self._index = index = Summary(file).index()
             except CorruptData:
-                self._index = index = Scan(file).index
+                self._index = index = FileScan(file).index
         self.profile, self.library = index.header.profile, index.header.library
         self._channels: dict[int, Channel] = {}
         for number, channel in index.channels.items():

@@ -201,7 +201,7 @@ class Summary:
         return Index(self._header, schemas, channels, counts, span, tuple(ranges), complete=True)
 
 
-class Scan:
+class FileScan:
     """Contents of a file: its rebuilt ``index``, ``metadata`` and ``attachments``.
 
     Raises CorruptData if not even its header can be read.

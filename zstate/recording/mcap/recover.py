@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 
 from zstate.errors import RecordingError
 from zstate.recording.mcap.file import explain_unreadable, open_errors
-from zstate.recording.mcap.index import DataLoss, Scan
+from zstate.recording.mcap.index import DataLoss, FileScan
 from zstate.recording.mcap.records import MESSAGE, BoundedFile, iter_records
 from zstate.recording.mcap.writer import LIBRARY, McapOutput
 
@@ -54,7 +54,7 @@ def recover(
             )
         if target.exists() and target.samefile(source):
             raise RecordingError(f"{str(source)!r} cannot be recovered into itself", path=str(source))
-        scan = Scan(file)
+        scan = FileScan(file)
         index = scan.index
         library = f"{LIBRARY}, recovered from {index.header.library}"
         output = McapOutput(target, overwrite=overwrite, profile=index.header.profile, library=library)
@@ -68,7 +68,7 @@ def recover(
     return RecoverReport(source, target, counts, index.span, index.complete, index.losses)
 
 
-def _copy(file: BoundedFile, scan: Scan, output: McapOutput) -> Counter[str]:
+def _copy(file: BoundedFile, scan: FileScan, output: McapOutput) -> Counter[str]:
     """Copy everything; the number of messages by topic."""
     index, writer = scan.index, output.writer
     for metadata in scan.metadata:

@@ -12,7 +12,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FrameTable
 from zstate.buffer.tracks import PoseTrack
 from zstate.errors import LookupFailed
-from zstate.view.scene.world import Place, move_node
+from zstate.view.scene.world import DrawnFrames, move_node
 
 _PERIOD_NS = 100_000_000
 _ELLIPSE_SEGMENTS = 64
@@ -45,7 +45,7 @@ class OdometryPaths:
         self._paths: dict[Edge, EdgePath] = {}
         self._count = 0
 
-    def show(self, buffer: TransformBuffer, place: Place, at: int | None) -> None:
+    def show(self, buffer: TransformBuffer, place: DrawnFrames, at: int | None) -> None:
         """Draw the paths until ``at`` [ns]; None: until the newest samples."""
         if place.tree is not self._tree:
             self._tree, self._edges = place.tree, _uncertain_edges(place.tree)
@@ -85,7 +85,7 @@ class EdgePath:
         self._label: viser.LabelHandle | None = None
         self._drawn: tuple[int, float] | None = None
 
-    def show(self, buffer: TransformBuffer, place: Place, at: int | None, path_s: float) -> None:
+    def show(self, buffer: TransformBuffer, place: DrawnFrames, at: int | None, path_s: float) -> None:
         """Draw the last ``path_s`` seconds until ``at``; nothing without, or if it has no pose."""
         pose, newest = place.pose(self._edge[0]), _newest(buffer, self._edge)
         if pose is None or newest is None or path_s <= 0.0:

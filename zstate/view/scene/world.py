@@ -30,7 +30,7 @@ _MAP_SINK_M = 0.005
 
 
 @dataclass(frozen=True)
-class Place:
+class DrawnFrames:
     """Where the frames are drawn: ``placed`` (N, 7) are the poses of the frames of ``tree`` in ``fixed``.
 
     Trees that are not connected to ``fixed`` have poses, too.
@@ -85,7 +85,7 @@ class World:
         """Grows when a map appears."""
         return self._images.version
 
-    def show(self, source: WorldData, buffer: TransformBuffer, place: Place, at: int | None) -> None:
+    def show(self, source: WorldData, buffer: TransformBuffer, place: DrawnFrames, at: int | None) -> None:
         """Draw the maps and the last scans ``at`` a stamp [ns]; None: the newest."""
         missing: list[tuple[str, str]] = []
         sensors = source.sensors
@@ -106,7 +106,7 @@ class World:
         missing += self._images.show(source.maps_at(at), place, is_on=self.maps)
         self.missing = missing
 
-    def corners(self, place: Place) -> NDArray[np.float64]:
+    def corners(self, place: DrawnFrames) -> NDArray[np.float64]:
         """The corners of all drawn maps in the fixed frame: (N, 3) [m]."""
         return self._images.corners(place)
 
@@ -132,7 +132,7 @@ class ScanClouds:
         self._count = 0
         self._state: tuple[Sequence[Scan], str, int, bool] | None = None
 
-    def show(self, sensor: Sensor, place: Place, count: int, at: int | None) -> None:
+    def show(self, sensor: Sensor, place: DrawnFrames, count: int, at: int | None) -> None:
         """Draw the last ``count`` scans of ``sensor`` until ``at`` [ns]."""
         frame = sensor.frame
         if frame is None:
@@ -229,7 +229,9 @@ class MapImages:
         """Whether a map is being encoded."""
         return self._encoding is not None
 
-    def show(self, maps: Mapping[WriterName, Grid], place: Place, *, is_on: bool) -> list[tuple[str, str]]:
+    def show(
+        self, maps: Mapping[WriterName, Grid], place: DrawnFrames, *, is_on: bool
+    ) -> list[tuple[str, str]]:
         """Draw ``maps``. Returns those that cannot be drawn, with the reason."""
         self._take_encoded()
         for name in self._drawn.keys() - maps.keys():
@@ -247,7 +249,7 @@ class MapImages:
                 missing.append((f"map {name}", f"its frame {grid.frame!r} has no pose in {place.fixed!r}"))
         return missing
 
-    def corners(self, place: Place) -> NDArray[np.float64]:
+    def corners(self, place: DrawnFrames) -> NDArray[np.float64]:
         """The corners of all drawn maps: (N, 3) [m]."""
         corners: list[se3.Vector] = []
         for image in self._drawn.values():
@@ -298,7 +300,7 @@ class MapImages:
         self._drawn[name] = image
 
 
-def _place_image(image: _MapImage, place: Place, *, is_on: bool) -> None:
+def _place_image(image: _MapImage, place: DrawnFrames, *, is_on: bool) -> None:
     if image.handle is None:
         return
     pose = place.pose(image.grid.frame)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from zstate.model.joint_trajectory import JointTrajectory, concatenate
+from zstate.model.joint_history import JointHistory, concatenate
 
 
-def of(stamps: list[int], first: float = 0.0, efforts: bool = False) -> JointTrajectory:
+def of(stamps: list[int], first: float = 0.0, efforts: bool = False) -> JointHistory:
     """One joint; row i is ``first + i``, with efforts of ten times that."""
     positions = np.arange(first, first + len(stamps))[:, None]
     names = ("lift",)
     block = 10 * positions if efforts else None
-    return JointTrajectory(names, names, names, np.array(stamps, dtype=np.int64), positions, None, block)
+    return JointHistory(names, names, names, np.array(stamps, dtype=np.int64), positions, None, block)
 
 
 def test_parts_are_joined_in_order_of_stamps_and_the_later_of_two_equal_ones_counts():
@@ -39,6 +39,6 @@ def test_length_duration_and_text_describe_the_rows():
     trajectory = of([1_000_000_000, 3_500_000_000], efforts=True)
     assert len(trajectory) == 2
     assert trajectory.duration_s == 2.5
-    assert repr(trajectory) == "<JointTrajectory of 1 joints: 2 samples in 2.500 s>"
+    assert repr(trajectory) == "<JointHistory of 1 joints: 2 samples in 2.500 s>"
     assert trajectory.select(slice(1, None)).efforts.tolist() == [[10.0]]
     assert len(trajectory.select(slice(0))) == trajectory.select(slice(0)).duration_s == 0

@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class JointTrajectory:
+class JointHistory:
     """The joints of one robot at T instants: row i of each array is of ``stamps[i]``.
 
     ``stamps`` (T,) [ns] ascend. ``positions`` (T, nq) [rad] or [m] has a column for each of ``coordinates``:
@@ -36,7 +36,7 @@ class JointTrajectory:
 
     def __repr__(self) -> str:
         joints = len(self.joint_names)
-        return f"<JointTrajectory of {joints} joints: {len(self)} samples in {self.duration_s:.3f} s>"
+        return f"<JointHistory of {joints} joints: {len(self)} samples in {self.duration_s:.3f} s>"
 
     @property
     def duration_s(self) -> float:
@@ -49,7 +49,7 @@ class JointTrajectory:
         blocks = {"velocity": self.velocities, "effort": self.efforts}
         return {kind for kind, block in blocks.items() if block is not None}
 
-    def with_kinds(self, kinds: Set[str]) -> JointTrajectory:
+    def with_kinds(self, kinds: Set[str]) -> JointHistory:
         """The same with arrays of these ``kinds`` too: NaN if they are not known."""
         unknown = np.full((len(self), len(self.velocity_coordinates)), np.nan)
         return replace(
@@ -58,7 +58,7 @@ class JointTrajectory:
             efforts=unknown if "effort" in kinds - self.kinds else self.efforts,
         )
 
-    def select(self, rows: NDArray[np.intp] | slice) -> JointTrajectory:
+    def select(self, rows: NDArray[np.intp] | slice) -> JointHistory:
         """The instants ``rows``, which ascend; a slice shares the memory of this trajectory."""
         return replace(
             self,
@@ -69,14 +69,14 @@ class JointTrajectory:
         )
 
 
-def concatenate(parts: Sequence[JointTrajectory]) -> JointTrajectory:
+def concatenate(parts: Sequence[JointHistory]) -> JointHistory:
     """The instants of ``parts``, at least one, of the same joints, in ascending order of stamps.
 
     Of two rows with one stamp the later one counts, as in a buffer.
     """
     stamps = np.concatenate([part.stamps for part in parts])
     first = parts[0]
-    whole = JointTrajectory(
+    whole = JointHistory(
         first.joint_names,
         first.coordinates,
         first.velocity_coordinates,
@@ -93,7 +93,7 @@ def concatenate(parts: Sequence[JointTrajectory]) -> JointTrajectory:
 
 
 def _stacked(
-    blocks: Sequence[Floats | None], stamps: NDArray[np.int64], parts: Sequence[JointTrajectory]
+    blocks: Sequence[Floats | None], stamps: NDArray[np.int64], parts: Sequence[JointHistory]
 ) -> Floats | None:
     """Velocities or efforts of all parts, NaN for those that have none."""
     known = next((block for block in blocks if block is not None), None)
