@@ -14,7 +14,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.bridges.ros1.messages import (
-    RobotEncoder,
+    Ros1Encoder,
     Ros1FrameNames,
     Ros1JointReader,
     TransformsWriter,
@@ -77,7 +77,7 @@ class NativeToRos1(Closeable):
         with_description: bool = True,
     ) -> None:
         self.carried = 0
-        self.robot: RobotEncoder | None = None
+        self.robot: Ros1Encoder | None = None
         self._node = node
         self._names = names
         self._is_own = is_own
@@ -138,7 +138,7 @@ class NativeToRos1(Closeable):
             self._refusals.count("robot description", str(error))
             return
         with self._joints_lock:
-            self.robot = RobotEncoder(model, self._node.ros, self._names)
+            self.robot = Ros1Encoder(model, self._node.ros, self._names)
             self._merger = JointStateMerger(model, MAX_AGE_S)
         if not self._with_description:
             return

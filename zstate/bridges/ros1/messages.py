@@ -109,7 +109,7 @@ class TransformsWriter:
         return self._message
 
 
-class RobotEncoder:
+class Ros1Encoder:
     """Encodes samples of one model as ROS 1 messages."""
 
     def __init__(self, model: RobotModel, ros: RospyModules, names: Ros1FrameNames) -> None:
