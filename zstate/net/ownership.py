@@ -68,14 +68,15 @@ _STARTUP_S = 1.0
 """Each sample checks for this long: by then the tokens of writers that opened at the same time are here."""
 
 
-def _moving_streams() -> tuple[StreamName, ...]:
+def moving_streams() -> tuple[StreamName, ...]:
+    """The streams whose writers each own the edges that they move."""
     return (*edge_streams(), "partial_joint_states")
 
 
 @cache
 def _all_histories_of_edges() -> tuple[str, ...]:
     """Queries that each writer of moving edges or of some joints receives, and to which none has samples."""
-    return tuple(f"{stream_expression(ANY, stream)}?session=0" for stream in _moving_streams())
+    return tuple(f"{stream_expression(ANY, stream)}?session=0" for stream in moving_streams())
 
 
 _Handler: TypeAlias = "zenoh.handlers.Handler[zenoh.Sample]"
@@ -267,7 +268,7 @@ class WriterClaim(Closeable):
         claimed = {claimed.stream for claimed in self._claimed}
         if "partial_joint_states" in {first.stream, *claimed} and first.stream not in claimed:
             advice = "stop it first, for it and this writer would publish the same joints"
-        elif first.stream in _moving_streams() or is_measured(first.stream):
+        elif first.stream in moving_streams() or is_measured(first.stream):
             advice = "stop it first, or give this writer another name"
         elif first.stream == "joint_commands":
             advice = "a robot has one commander at a time: close the first"
@@ -504,7 +505,7 @@ def frame_conflict(first: Announcement, edge: Edge, verb: str) -> SecondWriter:
     """The error of a writer whose edge excludes ``edge`` of the writer ``first``."""
     parent, child = edge
     advice = "stop or withdraw that first, or use takeover=True (--takeover)"
-    if first.stream in _moving_streams():
+    if first.stream in moving_streams():
         verb, advice = "places", "stop that first"
     text = (
         f"{writer_text(first.writer)} {verb} {child!r} on {parent!r} already, as {first.name!r} of "
