@@ -32,6 +32,7 @@ import numpy as np
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
 from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.edge_rules import loop_refusal
 from zstate.buffer.tracks import JointTrack
 from zstate.clock import Clock, MonotonicClock
 from zstate.errors import InsertRefused
@@ -671,7 +672,7 @@ class FrameOwnership:
                 return InsertRefused(rule, reason=FOREIGN_FRAME, edge=names)
         there = accepted.get(child)
         if there is None:
-            return _loop(names, by, accepted)
+            return loop_refusal(parent, child, by, accepted.get)
         is_same_edge = there.parent == parent
         # Of static edges the last value counts; samples of two writers would alternate. ROS allows that.
         both_move = there.claim is not None and there.pose is None and claim.pose is None
@@ -737,25 +738,3 @@ class FrameOwnership:
         """Call ``on_conflict`` if ``error`` refuses an edge of ``source`` because of another writer."""
         if error.reason in (*CONTESTED, FOREIGN_FRAME) and self._on_conflict is not None:
             self._on_conflict(stream, source, error)
-
-
-def _loop(names: EdgeNames, by: str, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
-    """The refusal of an edge that would close a loop."""
-    parent, child = names
-    if parent == child:
-        return InsertRefused(
-            f"{parent!r} -> {child!r}: a frame cannot be placed on itself", reason="self edge", edge=names
-        )
-    ring, below, writer = [parent], child, by
-    while ring[-1] != child:
-        above = accepted.get(ring[-1])
-        if above is None:
-            return None
-        below, writer = ring[-1], above.writer
-        ring.append(above.parent)
-    path = " -> ".join(map(repr, reversed(ring)))
-    text = (
-        f"{parent!r} -> {child!r} by {by} would close the loop {path} -> {child!r}; "
-        f"{child!r} -> {below!r} is written by {writer}"
-    )
-    return InsertRefused(text, reason="loop", edge=names)
