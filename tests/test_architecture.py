@@ -54,7 +54,7 @@ NEIGHBOURS = {
 }
 
 # The modules of the buffer that other packages may import.
-BUFFER_MODULES = {"buffer", "frame_tree", "snapshot", "tracks"}
+BUFFER_MODULES = {"buffer", "edge_rules", "frame_tree", "snapshot", "tracks"}
 
 HOMES = {
     "pinocchio": "model",

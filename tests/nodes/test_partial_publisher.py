@@ -21,6 +21,7 @@ from zstate.transform import Transform
 MS = 1_000_000
 SHOULDER, ELBOW = RRBOT.joint_names
 
+SECOND_DRIVER = rf"gripper\.py.* joint '{ELBOW}' of 'r1'; refused: 'both\.py"
 LIMIT = '<limit lower="-3" upper="3" velocity="1" effort="1"/>'
 SIDEWAYS = f'<axis xyz="0 1 0"/>{LIMIT}'
 FINGERS = load_model(
@@ -137,11 +138,29 @@ def test_late_listener_gets_the_parts_of_the_last_seconds(sessions):
 
 def test_second_driver_of_a_joint_is_refused_with_both_names(sessions):
     first, second = sessions
-    with (
-        PartialStatePublisher(first, RRBOT, [ELBOW], "r1", program="gripper.py"),
-        pytest.raises(SecondWriter, match=rf"gripper\.py.* joint '{ELBOW}' of 'r1'; refused: 'both\.py"),
-    ):
-        PartialStatePublisher(second, RRBOT, [SHOULDER, ELBOW], "r1", program="both.py")
+    with PartialStatePublisher(first, RRBOT, [ELBOW], "r1", program="gripper.py"):
+        until(lambda: any("partial_joint_states" in dict(info.writers) for info in discover(second)))
+        with pytest.raises(SecondWriter, match=SECOND_DRIVER):
+            PartialStatePublisher(second, RRBOT, [SHOULDER, ELBOW], "r1", program="both.py")
+
+
+@pytest.mark.parametrize("joints", [[ELBOW], [SHOULDER, ELBOW]])
+def test_later_of_two_drivers_that_missed_each_other_ends_once_the_first_publishes(
+    sessions, monkeypatch, joints
+):
+    def missed(*_: object) -> frozenset[str]:
+        return frozenset()
+
+    with PartialStatePublisher(sessions[0], RRBOT, [ELBOW], "r1", program="gripper.py") as first:
+        with monkeypatch.context() as at_once:  # the tokens of the first are on the way
+            at_once.setattr("zstate.net.ownership.confirmed_tokens", missed)
+            second = PartialStatePublisher(sessions[1], RRBOT, joints, "r1", program="both.py")
+        with second:
+            with pytest.raises(SecondWriter, match=SECOND_DRIVER):
+                until(lambda: first.publish([0.0]) or second.publish([0.0] * len(joints)))
+            first.publish([0.0])
+            with pytest.raises(SecondWriter, match=SECOND_DRIVER):
+                second.publish([0.0] * len(joints))
 
 
 def test_all_joints_and_some_joints_exclude_each_other(sessions):

@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 from zstate import se3
 from zstate._util.format import html_of_fields
 from zstate.buffer.clock_domain import ClockDomain
+from zstate.buffer.edge_rules import by, loop_refusal
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage
 from zstate.checks import name_problem
 from zstate.errors import AmbiguousFrame, ClockMismatch, Disconnected, InsertRefused, UnknownFrame
@@ -252,28 +253,17 @@ class FrameTree:
     def check_edge(self, parent: str, child: str, writer: str | None) -> None:
         """Raises InsertRefused for bad names, a self edge, a second parent and a loop."""
         self.check_names(parent, child)
-        if parent == child:
-            text = f"{parent!r} -> {child!r}: a frame cannot be placed on itself"
-            raise InsertRefused(text, reason="self edge", edge=(parent, child))
         existing = self.frames.get(child)
-        if existing is not None and existing.parent != parent:
+        if parent == child or (existing is None and child in self.frames):  # no frame is below a new one
+            refusal = loop_refusal(parent, child, writer, self.frames.get)
+            if refusal is not None:
+                raise refusal
+        elif existing is not None and existing.parent != parent:
             text = (
-                f"{child!r} has the parent {existing.parent!r}{_by(existing.writer)} and cannot get a second "
-                f"one, {parent!r}{_by(writer)}; withdraw({child!r}) first if it really moved"
+                f"{child!r} has the parent {existing.parent!r}{by(existing.writer)} and cannot get a second "
+                f"one, {parent!r}{by(writer)}; withdraw({child!r}) first if it really moved"
             )
             raise InsertRefused(text, reason="second parent", edge=(parent, child))
-        if existing is not None or child not in self.frames:
-            return
-        chain = [child]
-        for edge in self.edges_above(parent):
-            chain.insert(1, edge.child)
-            if edge.parent == child:
-                text = (
-                    f"{parent!r} -> {child!r}{_by(writer)} would close the loop "
-                    f"{' -> '.join(map(repr, chain))} -> {child!r}; "
-                    f"{edge.parent!r} -> {edge.child!r} is written{_by(edge.writer) or ' by hand'}"
-                )
-                raise InsertRefused(text, reason="loop", edge=(parent, child))
 
     @staticmethod
     def check_names(parent: str, child: str) -> None:
@@ -445,7 +435,3 @@ class FrameTree:
             return name
         candidates = self.names.with_bare(name)
         return candidates[0] if len(candidates) == 1 else None
-
-
-def _by(writer: str | None) -> str:
-    return f" by {writer}" if writer else ""

@@ -5,17 +5,8 @@ keys, whatever name they announce. Other writers may place a robot's root, the f
 writers places, in frames of theirs. A prefix that is no robot on the network, such as the ``fleet`` of
 ``fleet/map``, has no owner; every writer may place its frames.
 
-Of edges that exclude each other (a second parent, a loop) the first in this list is accepted, in whatever
-order they arrive:
-
-1. edges of a robot's own model,
-2. edges that the robot's own writers publish, and edges of frames without an owner,
-3. edges by which other writers place the robot's root.
-
-Among equals, an edge that places the root of a model yields to one that does not, then an edge of a writer
-that has left, or that moves it without being announced, to one of a writer that is announced, then a static
-edge to a moving one, then the later edge to the earlier one. Refused edges are kept, and accepted once
-nothing conflicts with them: the buffer depends on what is published, not on the order of arrival.
+Of edges that exclude each other (a second parent, a loop) the first ``EdgePrecedence`` is accepted, in
+whatever order they arrive (``zstate.ingest.precedence``).
 """
 
 from __future__ import annotations
@@ -23,6 +14,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
 from typing import NamedTuple
@@ -32,10 +24,13 @@ import numpy as np
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
 from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.edge_rules import loop_refusal
+from zstate.buffer.frame_tree import Edge
 from zstate.buffer.tracks import JointTrack
 from zstate.clock import Clock, MonotonicClock
 from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
+from zstate.ingest.precedence import EdgePrecedence, Rank
 from zstate.model.robot import RobotModel
 from zstate.streams import StreamName
 from zstate.transform import Transform
@@ -50,13 +45,15 @@ MAX_MOVING_FRAMES = 100_000
 # A static edge this close to the model's [m, or the sine of an angle] was computed from the same URDF.
 _SAME_POSE = 1e-6
 
-# The ranks of edges; the lowest is that of edges inserted by the caller.
-_MODEL, _OWN, _OTHERS, _CALLER = range(4)
-
 
 @dataclass(eq=False, slots=True)
 class EdgeClaim:
-    """An edge that one source publishes. ``pose`` is None for a moving one."""
+    """An edge that one source publishes. ``pose`` is None for a moving one.
+
+    ``is_placed`` means that this pose was the last to be inserted for the child. ``order`` numbers edges as
+    they appear. It is 0 for an edge of the buffer that no source publishes: of a model, or of the buffer's
+    user.
+    """
 
     source: EdgeSource
     parent: str
@@ -65,12 +62,24 @@ class EdgeClaim:
     published: int = 0
     pose: Transform | None = None
     is_accepted: bool = False
+    is_placed: bool = False
     refusal: InsertRefused | None = None
 
     @property
     def names(self) -> EdgeNames:
         """(parent, child)."""
         return self.parent, self.child
+
+    @property
+    def writer(self) -> str:
+        """The printed name of the writer."""
+        return self.source.name
+
+    def is_as_good_as(self, other: EdgeClaim) -> bool:
+        """Whether both fix the child at the same pose, as a ROS robot_state_publisher repeats the model."""
+        if self.pose is None or other.pose is None:
+            return False
+        return np.allclose(self.pose.matrix, other.pose.matrix, rtol=0.0, atol=_SAME_POSE)
 
 
 @dataclass(eq=False, slots=True)
@@ -98,20 +107,36 @@ class Admitted(NamedTuple):
     refusal: InsertRefused | None = None
 
 
-class _AcceptedEdge(NamedTuple):
-    """An edge accepted so far, while conflicts are resolved; ``claim`` is None for the caller's own edges."""
+@dataclass(slots=True)
+class _Owner:
+    """What is known of the owner of frames ``owner/...``: a robot, or a name that no robot has."""
 
-    parent: str
-    writer: str
-    rank: int
-    claim: EdgeClaim | None
-    pose: Transform | None
+    sources: dict[EdgeSource, None] = field(default_factory=dict["EdgeSource", None])
+    """Its writers that have claims."""
+    own: Counter[str] = field(default_factory=Counter[str])
+    """Its frames in edges by which these writers place its frames."""
+    outside: dict[EdgeClaim, None] = field(default_factory=dict["EdgeClaim", None])
+    """The edges with one of its frames by which writers place frames that are not their own robot's."""
+    links: frozenset[str] = frozenset()
+    """The frames of its model in the buffer."""
+    moved: set[str] = field(default_factory=set[str])
+    """All frames that its writers have moved."""
+    is_described: bool = False
+    """Whether the edges of its model are published: the moving ones, and the fixed ones apart."""
+    has_fixed_edges: bool = False
+    """Whether the fixed ones, maybe none, are known."""
 
-    def is_as_good_as(self, claim: EdgeClaim) -> bool:
-        """Whether both fix the child at the same pose, as a ROS robot_state_publisher repeats the model."""
-        if self.pose is None or claim.pose is None:
+    def is_stray(self, frame: str) -> bool:
+        """Whether the robot places frames, but neither this one nor any on this one.
+
+        False until the fixed edges of a described model arrive: they may place others on the frame.
+        """
+        if frame in self.links or frame in self.own:
             return False
-        return np.allclose(self.pose.matrix, claim.pose.matrix, rtol=0.0, atol=_SAME_POSE)
+        return bool(self.links or self.own) and (self.has_fixed_edges or not self.is_described)
+
+
+_UNKNOWN = _Owner()
 
 
 class FrameOwnership:
@@ -147,24 +172,14 @@ class FrameOwnership:
         self._placers = placers
         self._on_conflict = on_conflict
         self._robots: set[str] = set()
-        self._moved: dict[str, set[str]] = {}
+        self._owners: dict[str, _Owner] = {}
         self._departed: BoundedDict[tuple[str, int], None] = BoundedDict()
         self._claims: dict[str, list[EdgeClaim]] = {}
-        self._sources: dict[str, dict[EdgeSource, None]] = {}
-        # The edges that place frames of other robots, by each robot that they name.
-        self._outside: dict[str, dict[EdgeClaim, None]] = {}
-        # The frames of a robot that its own edges name, those of its model, and those of model edges.
-        self._own_frames: dict[str, Counter[str]] = {}
-        self._links: dict[str, frozenset[str]] = {}
-        # The robots with a model of published edges, and those whose fixed ones, maybe none, are known.
-        self._described: set[str] = set()
-        self._with_fixed_edges: set[str] = set()
+        # The frames of published edges of models.
         self._model_parents: Counter[str] = Counter()
         self._model_children: Counter[str] = Counter()
-        self._refused: dict[EdgeClaim, None] = {}
-        self._loops: dict[EdgeClaim, None] = {}
-        """The refused edges that would close a loop."""
-        self._placed: dict[str, EdgeClaim] = {}
+        self._refused: Counter[str] = Counter()
+        """How many edges are refused, by reason."""
         self._unresolved: set[str] = set()
         """Frames whose edges must be compared again."""
         self._counter = count(1)
@@ -177,14 +192,14 @@ class FrameOwnership:
         with self._lock:
             self._robots.add(robot)
             self._compare_outside(robot)
-            self._resolve_marked()
+            self.resolve()
 
     def add_description(self, robot: str) -> None:
         """Add a robot whose model's edges are published: the moving ones, and the fixed ones apart."""
         with self._lock:
-            self._described.add(robot)
+            self._owner(robot).is_described = True
             self._compare_outside(robot)
-            self._resolve_marked()
+            self.resolve()
 
     def add_writer(self, robot: str, session: int) -> None:
         """Add an announced writer of edges."""
@@ -200,17 +215,15 @@ class FrameOwnership:
 
     def _resolve_contested(self, robot: str, session: int) -> None:
         """Compare the edges of a writer that has joined or left with those that they conflict with."""
-        if self._refused:
-            for source in self._sources.get(robot, ()):
+        owner = self._owners.get(robot)
+        if owner is not None and self._refused.total():
+            has_loops = self._refused["loop"] > 0
+            for source in owner.sources:
                 if source.session == session:
                     for claim in source.claims.values():
-                        if claim.refusal or self._loops or len(self._claims[claim.child]) > 1:
+                        if claim.refusal or has_loops or len(self._claims[claim.child]) > 1:
                             self._unresolved.add(claim.child)
-        self._resolve_marked()
-
-    def _resolve_marked(self) -> None:
-        if self._unresolved:
-            self.resolve()
+        self.resolve()
 
     def rename(self, source: EdgeSource, name: str) -> None:
         """Set the printed name of a source, if it is announced later than its edges."""
@@ -223,8 +236,8 @@ class FrameOwnership:
     def place_model(self, robot: str, model: RobotModel, before: JointTrack | None) -> JointTrack:
         """Replace the track ``before`` by a model; conflicting edges are withdrawn. Raises InsertRefused."""
         with self._lock:
-            links = {f"{robot}/{link}" for link in model.links} | self._links.get(robot, frozenset())
-            if self._loops:  # before the edges of an earlier model are gone
+            links = {f"{robot}/{link}" for link in model.links} | self._owner(robot).links
+            if self._refused["loop"]:  # before the edges of an earlier model are gone
                 self._unresolved.update(*map(self._ring, links))
             if before is not None:
                 self.buffer.remove_robot(before)
@@ -235,7 +248,7 @@ class FrameOwnership:
             self._withdraw_overlapping(robot, model)
             try:
                 track = self.buffer.add_robot(model, robot)
-                self._links[robot] = frozenset(f"{robot}/{link}" for link in model.links)
+                self._owner(robot).links = frozenset(f"{robot}/{link}" for link in model.links)
                 if self._is_shared:
                     self.model_edges[robot] = edges
                 return track
@@ -243,7 +256,7 @@ class FrameOwnership:
                 self.version += self._is_shared
                 self._unresolved.update(link for link in links if link in self._claims)
                 self._compare_outside(robot)
-                self._resolve_marked()
+                self.resolve()
 
     def _drop_repeated(self, edges: frozenset[EdgeNames]) -> None:
         """Remove moving edges that a model has too: those that arrived before it."""
@@ -254,34 +267,32 @@ class FrameOwnership:
 
     def _withdraw_overlapping(self, robot: str, model: RobotModel) -> None:
         """Withdraw the edges that conflict with a model."""
-        links = {f"{robot}/{link}" for link in model.links}
-        joints = {f"{robot}/{joint.child}": joint for joint in model.joints}
-        taken = [frame for frame in self.buffer.frames(joints) if frame.parent is not None]
-        for frame in taken:
-            self.buffer.withdraw(frame.name)
-            if frame.name not in self._claims:  # claims are reported when they are resolved
-                text = f"{frame.writer or 'hand'!r} placed {frame.name!r}, a link of the model"
-                self.counters.for_robot(robot).count_refusal("second writer", text)
-        root = f"{robot}/{model.root}"
-        top = root
-        while (above := self.buffer.frames((top,))) and above[0].parent is not None:
-            top = above[0].parent
-        if top in links and top != root:
+        for joint in model.joints:
+            self._withdraw(robot, joint.child, "second writer", "a link of the model")
+        root = top = f"{robot}/{model.root}"
+        while (above := self.buffer.edge_of(top)) is not None:
+            top = above.parent
+        if top != root and top in {f"{robot}/{link}" for link in model.links}:
             # The edges between are valid children of the model; the one that places its root closes the loop.
-            (frame,) = self.buffer.frames((root,))
-            self.buffer.withdraw(root)
-            if root not in self._claims:
-                text = f"{frame.writer or 'hand'!r} placed {root!r}, the root of the model, below the model"
-                self.counters.for_robot(robot).count_refusal("loop", text)
+            self._withdraw(robot, model.root, "loop", "the root of the model, below the model")
+
+    def _withdraw(self, robot: str, link: str, reason: str, what: str) -> None:
+        """Withdraw an edge that conflicts with a model. Claims are reported when they are resolved."""
+        frame = f"{robot}/{link}"
+        edge = self.buffer.edge_of(frame)
+        if edge is not None:
+            self.buffer.withdraw(frame)
+            if frame not in self._claims:
+                text = f"{edge.writer or 'hand'!r} placed {frame!r}, {what}"
+                self.counters.for_robot(robot).count_refusal(reason, text)
 
     def set_statics(
         self, source: EdgeSource, edges: Mapping[EdgeNames, Transform], *, adds: bool = False
     ) -> None:
         """Replace the static edges of ``source``; with ``adds``, as in ROS, only of the same children."""
         with self._lock:
-            if source.is_model and source.robot not in self._with_fixed_edges:
-                self._with_fixed_edges.add(source.robot)
-                self._compare_outside(source.robot)
+            if source.is_model and not self._owner(source.robot).has_fixed_edges:
+                self._set_fixed_edges(source.robot, are_known=True)
             edges = {self._named(names): pose for names, pose in edges.items()}
             children = {child for _, child in edges}
             for names, claim in list(source.claims.items()):
@@ -289,35 +300,25 @@ class FrameOwnership:
                     self._drop(claim)
             published: list[EdgeClaim] = []
             for names, pose in edges.items():
-                if names[0] == names[1]:
-                    text = f"{names[0]!r} -> {names[1]!r}: a frame cannot be placed on itself"
-                    self._report(source, InsertRefused(text, reason="self edge", edge=names))
-                    continue
                 claim = self._claim(source, names)
                 claim.pose, claim.published = pose, next(self._counter)
                 published.append(claim)
             contested = [claim for claim in published if not self._insert_uncontested(claim)]
             self._unresolved.update(claim.child for claim in contested)
-            if self._unresolved:
-                self.resolve(contested)
+            self.resolve(contested)
 
     def _insert_uncontested(self, claim: EdgeClaim) -> bool:
         """Insert a claim that conflicts with nothing; False if conflicts must be resolved first."""
-        if not self._is_uncontested(claim):
-            return False
-        try:
-            self._insert(claim)
-        except InsertRefused as error:
-            if error.reason in CONTESTED:
-                return False
-            self._drop(claim)
-            self._report(claim.source, error)
-        return True
+        if self._is_uncontested(claim):
+            with suppress(InsertRefused):  # the buffer has an edge that no source publishes
+                self._insert(claim)
+                return True
+        return False
 
     def _is_uncontested(self, claim: EdgeClaim) -> bool:
         """Whether no rule and no other edge conflicts with it; those of the buffer's caller still may."""
         is_alone = claim.refusal is None and len(self._claims[claim.child]) == 1
-        if not is_alone or claim.child in self._unresolved or self._rank(claim) == _OTHERS:
+        if not is_alone or claim.child in self._unresolved or self._rank(claim) == Rank.OTHERS:
             return False
         return not self._may_close_loop(claim)
 
@@ -356,7 +357,7 @@ class FrameOwnership:
             for claim in fresh:
                 claim.is_accepted = self._is_uncontested(claim)
             self._unresolved.update(claim.child for claim in claims.values() if not claim.is_accepted)
-            self._resolve_marked()
+            self.resolve()
             refusals = (claim.refusal for claim in claims.values() if claim.refusal is not None)
             refusal = next(refusals, None)
             if refusal is not None and self._is_shared:
@@ -380,7 +381,7 @@ class FrameOwnership:
         return any(names in edges for edges in self.model_edges.values())
 
     def _count_frames(self, robot: str, edges: Collection[EdgeNames]) -> None:
-        moved = self._moved.setdefault(robot, set())
+        moved = self._owner(robot).moved
         new = {child for _, child in edges}.difference(moved)
         if new and len(moved) + len(new) > MAX_MOVING_FRAMES:
             text = (
@@ -394,16 +395,19 @@ class FrameOwnership:
         """Remove the static edges of ``source``."""
         with self._lock:
             if source.is_model:
-                self._with_fixed_edges.discard(source.robot)
-                self._compare_outside(source.robot)
+                self._set_fixed_edges(source.robot, are_known=False)
             self.release(source)
+
+    def _set_fixed_edges(self, robot: str, *, are_known: bool) -> None:
+        self._owner(robot).has_fixed_edges = are_known
+        self._compare_outside(robot)
 
     def release(self, source: EdgeSource) -> None:
         """Remove all edges of ``source``."""
         with self._lock:
             for claim in list(source.claims.values()):
                 self._drop(claim)
-            self._resolve_marked()
+            self.resolve()
 
     def remove_child(self, child: str) -> None:
         """Remove all published edges of ``child``."""
@@ -442,37 +446,42 @@ class FrameOwnership:
         if claim is None:
             claim = source.claims[names] = EdgeClaim(source, *names, next(self._counter))
             self._claims.setdefault(names[1], []).append(claim)
-            self._sources.setdefault(source.robot, {})[source] = None
+            self._owner(source.robot).sources[source] = None
             if frame_owner(names[1]) == source.robot:
                 self._count_own(claim, 1)
             else:
                 for robot in set(map(frame_owner, names)):
-                    self._outside.setdefault(robot, {})[claim] = None
+                    self._owner(robot).outside[claim] = None
         return claim
+
+    def _owner(self, name: str) -> _Owner:
+        owner = self._owners.get(name)
+        if owner is None:
+            owner = self._owners[name] = _Owner()
+        return owner
 
     def _count_own(self, claim: EdgeClaim, number: int) -> None:
         """Count an edge of a robot's own for the rules that ask what the robot places."""
         robot = claim.source.robot
-        own = self._own_frames.setdefault(robot, Counter())
+        own = self._owner(robot).own
         before = len(own)
         for frame in claim.names:
             if frame_owner(frame) == robot:
-                own[frame] += number
+                own[frame] = own.get(frame, 0) + number
                 if not own[frame]:
                     del own[frame]
         if len(own) != before:
             self._compare_outside(robot)
-        if not own:
-            del self._own_frames[robot]
-        if self._rank(claim) == _MODEL:
+        if self._rank(claim) == Rank.MODEL:
             self._model_parents[claim.parent] += number
             self._model_children[claim.child] += number
-            if self._refused:
+            if self._refused.total():
                 self._unresolved.update(frame for frame in claim.names if frame in self._claims)
 
     def _compare_outside(self, robot: str) -> None:
         """Compare the edges of other robots' writers that name a frame of ``robot``."""
-        self._unresolved.update(claim.child for claim in self._outside.get(robot, ()))
+        if owner := self._owners.get(robot):
+            self._unresolved.update(claim.child for claim in owner.outside)
 
     def _is_root_of_model(self, frame: str) -> bool:
         is_published = self._model_parents[frame] > 0 and not self._model_children[frame]
@@ -480,13 +489,11 @@ class FrameOwnership:
 
     def _drop(self, claim: EdgeClaim) -> None:
         source, child = claim.source, claim.child
-        if self._loops and claim.is_accepted:  # before the edge is gone
+        if self._refused["loop"] and claim.is_accepted:  # before the edge is gone
             self._unresolved |= self._ring(child)
         del source.claims[claim.names]
         if not source.claims:
-            del self._sources[source.robot][source]
-            if not self._sources[source.robot]:
-                del self._sources[source.robot]
+            del self._owner(source.robot).sources[source]
         rest = self._claims[child]
         rest.remove(claim)
         if claim.is_accepted:
@@ -496,35 +503,27 @@ class FrameOwnership:
             self._unresolved.discard(child)
         if frame_owner(child) == source.robot:
             self._count_own(claim, -1)
-        for robot in set(map(frame_owner, claim.names)).intersection(self._outside):
-            self._outside[robot].pop(claim, None)
-            if not self._outside[robot]:
-                del self._outside[robot]
-        self._refused.pop(claim, None)
-        self._loops.pop(claim, None)
+        for robot in {source.robot, *map(frame_owner, claim.names)}:
+            owner = self._owner(robot)
+            owner.outside.pop(claim, None)
+            if owner == _UNKNOWN:
+                del self._owners[robot]
+        self._set_refusal(claim, None)
         # If all writers share all frames, samples that are refused as a whole have no claims.
         self.version += self._is_shared or claim.pose is None
         if self._is_in_buffer(claim):
             self.buffer.withdraw(claim.child)
-        if self._placed.get(claim.child) is claim:
-            del self._placed[claim.child]
 
     def _is_in_buffer(self, claim: EdgeClaim) -> bool:
         """Whether it places its child there: the caller may have changed the buffer, too."""
-        is_placed = claim.pose is None or self._placed.get(claim.child) is claim
-        if not is_placed or not claim.is_accepted:
-            return False
-        kind = "pose" if claim.pose is None else "static"
-        for frame in self.buffer.frames((claim.child,)):
-            is_ours = claim.pose is None or frame.writer == claim.source.name
-            return (frame.parent, frame.kind) == (claim.parent, kind) and is_ours
-        return False
+        return claim.is_accepted and _is_edge_of(claim, self.buffer.edge_of(claim.child))
 
     def _insert(self, claim: EdgeClaim) -> None:
         assert claim.pose is not None
         self._add_frames(claim)
         self.buffer.insert_static(claim.pose, writer=claim.source.name)
-        self._placed[claim.child] = claim
+        for other in self._claims[claim.child]:
+            other.is_placed = other is claim
         claim.is_accepted = True
         self._set_refusal(claim, None)
 
@@ -533,11 +532,24 @@ class FrameOwnership:
         if self.buffer.edge_named(claim.names) != claim.names:
             self.buffer.add_frames(claim.names)
 
-    def _rank(self, claim: EdgeClaim) -> int:
+    def _rank(self, claim: EdgeClaim) -> Rank:
         robot, owner = claim.source.robot, frame_owner(claim.child)
+        if not claim.order:
+            return Rank.MODEL if claim.source.is_model else Rank.CALLER
         if self._is_shared or owner == robot:
-            return _MODEL if claim.source.is_model else _OWN
-        return _OTHERS if owner in self._robots else _OWN
+            return Rank.MODEL if claim.source.is_model else Rank.OWN
+        return Rank.OTHERS if owner in self._robots else Rank.OWN
+
+    def _precedence(self, claim: EdgeClaim) -> EdgePrecedence:
+        is_departed = self._is_departed(claim)
+        return EdgePrecedence(
+            self._rank(claim),
+            self._is_root_of_model(claim.child),
+            is_departed,
+            is_departed and not claim.is_accepted,
+            claim.pose is not None,
+            claim.order,
+        )
 
     def resolve_edges(self, edges: Collection[EdgeNames]) -> None:
         """Compare these edges with those that the buffer holds, for instance of its caller."""
@@ -552,53 +564,42 @@ class FrameOwnership:
         accepted depends on no others. Reports refused static edges that were ``published`` just now, or
         accepted before.
         """
+        if not self._unresolved:
+            return
         with self._lock:
             frames = self._compared_frames()
-            accepted = {frame: edge for frame in frames if (edge := self._caller_edge(frame)) is not None}
+            accepted = {frame: edge for frame in frames if (edge := self._unclaimed_edge(frame)) is not None}
             claims = [claim for frame in frames for claim in self._claims.get(frame, ())]
-
-            def precedence(claim: EdgeClaim) -> tuple[int, bool, bool, bool, bool, int]:
-                is_departed, is_static = self._is_departed(claim), claim.pose is not None
-                is_over = is_departed and not claim.is_accepted  # of departed writers the last one counts
-                is_root = self._is_root_of_model(claim.child)
-                return self._rank(claim), is_root, is_departed, is_over, is_static, claim.order
-
-            claims.sort(key=precedence)
             refusals: dict[EdgeClaim, InsertRefused] = {}
-            for claim in claims:
+            for claim in sorted(claims, key=self._precedence):
                 error = self._refusal(claim, accepted)
                 if error is not None:
                     refusals[claim] = error
                 elif self._prevails(claim, accepted.get(claim.child)):
-                    by, rank = claim.source.name, self._rank(claim)
-                    accepted[claim.child] = _AcceptedEdge(claim.parent, by, rank, claim, claim.pose)
+                    accepted[claim.child] = claim
             before = [claim for claim in claims if claim.is_accepted]
             for claim in refusals:
                 if self._is_in_buffer(claim):
                     self.buffer.withdraw(claim.child)
-                if self._placed.get(claim.child) is claim:
-                    del self._placed[claim.child]
+                claim.is_placed = False
             for claim in claims:
                 self.version += claim.pose is None and claim.is_accepted == (claim in refusals)
                 claim.is_accepted = claim not in refusals
                 self._set_refusal(claim, refusals.get(claim))
             self._unresolved.clear()
-            for edge in accepted.values():
-                claim = edge.claim
-                if claim is not None and (claim in published or not self._is_in_buffer(claim)):
+            for claim in accepted.values():
+                if claim.order and (claim in published or not self._is_in_buffer(claim)):
                     self._insert_accepted(claim)
             for claim in {*before, *published}.intersection(refusals):
                 if claim.pose is not None:
                     self._report(claim.source, refusals[claim])
 
     def _set_refusal(self, claim: EdgeClaim, refusal: InsertRefused | None) -> None:
-        claim.refusal = refusal
-        self._refused.pop(claim, None)
-        self._loops.pop(claim, None)
+        if claim.refusal is not None:
+            self._refused[claim.refusal.reason] -= 1
         if refusal is not None:
-            self._refused[claim] = None
-            if refusal.reason == "loop":
-                self._loops[claim] = None
+            self._refused[refusal.reason] += 1
+        claim.refusal = refusal
 
     def _compared_frames(self) -> list[str]:
         """The unresolved frames, each with those that may form a loop with it."""
@@ -629,39 +630,34 @@ class FrameOwnership:
 
     def _candidate_parents(self, child: str) -> set[str]:
         parents = {claim.parent for claim in self._claims.get(child, ())}
-        edge = self.buffer.edge_of(child)
-        return parents if edge is None else parents | {edge.parent}
+        if edge := self.buffer.edge_of(child):
+            parents.add(edge.parent)
+        return parents
 
-    def _caller_edge(self, child: str) -> _AcceptedEdge | None:
-        """The edge in the buffer that places ``child``, unless it is a claim."""
+    def _unclaimed_edge(self, child: str) -> EdgeClaim | None:
+        """The edge in the buffer that places ``child``, unless a source publishes it."""
         edge = self.buffer.edge_of(child)
         if edge is None:
             return None
         is_static, is_model = edge.kind == "static", edge.robot is not None
-        if is_static:
-            placed, found = self._placed.get(child), (edge.parent, edge.static_writer)
-            is_claimed = placed is not None and found == (placed.parent, placed.source.name)
-        else:
-            claims = self._claims.get(child, ())
-            is_claimed = any(claim.pose is None and claim.parent == edge.parent for claim in claims)
-        if is_claimed and not is_model:
+        if any(_is_edge_of(claim, edge) for claim in self._claims.get(child, ())):
             return None
         pose = Transform.from_pose7(edge.parent, child, edge.pose) if is_static else None
-        rank = _MODEL if is_model else _CALLER
-        return _AcceptedEdge(edge.parent, edge.writer or "hand", rank, None, pose)
+        source = EdgeSource("", edge.writer or "hand", is_model=is_model)
+        return EdgeClaim(source, edge.parent, child, 0, pose=pose)
 
     def _is_departed(self, claim: EdgeClaim) -> bool:
         is_unannounced = not self._is_shared and claim.pose is None and not self._is_live(claim.source)
         return is_unannounced or (claim.source.robot, claim.source.session) in self._departed
 
-    def _refusal(self, claim: EdgeClaim, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
+    def _refusal(self, claim: EdgeClaim, accepted: Mapping[str, EdgeClaim]) -> InsertRefused | None:
         """The refusal of an edge that conflicts with the edges accepted before it."""
         parent, child = names = claim.names
-        by, rank = claim.source.name, self._rank(claim)
-        if rank == _OTHERS:
+        by, rank = claim.writer, self._rank(claim)
+        if rank == Rank.OTHERS:
             rule = foreign_edge_problem(claim.source.robot, names, self._robots, self._placers)
-            if not rule and self._is_stray(child):
-                owner = frame_owner(child)
+            owner = frame_owner(child)
+            if not rule and self._owner(owner).is_stray(child):
                 rule = (
                     f"{child!r} is a frame of robot {owner!r}, but not its root, which is all that writers "
                     f"of robot {claim.source.robot!r} may place; publish it as robot {owner!r} "
@@ -671,15 +667,16 @@ class FrameOwnership:
                 return InsertRefused(rule, reason=FOREIGN_FRAME, edge=names)
         there = accepted.get(child)
         if there is None:
-            return _loop(names, by, accepted)
+            return loop_refusal(parent, child, by, accepted.get)
         is_same_edge = there.parent == parent
         # Of static edges the last value counts; samples of two writers would alternate. ROS allows that.
-        both_move = there.claim is not None and there.pose is None and claim.pose is None
-        is_own = there.claim is not None and there.claim.source.is_of_writer_of(claim.source)
-        may_share = is_own or (there.rank == rank and (self._is_shared or not both_move))
+        both_move = there.order > 0 and there.pose is None and claim.pose is None
+        is_own = there.source.is_of_writer_of(claim.source)
+        there_rank = self._rank(there)
+        may_share = is_own or (there_rank == rank and (self._is_shared or not both_move))
         if is_same_edge and (there.is_as_good_as(claim) or may_share):
             return None
-        if rank == _OTHERS and there.rank < _OTHERS:
+        if rank == Rank.OTHERS and there_rank < Rank.OTHERS:
             text = (
                 f"{child!r} is placed on {there.parent!r} by robot {frame_owner(child)!r} itself "
                 f"({there.writer}), whose edge counts; that of robot {claim.source.robot!r}, on {parent!r}, "
@@ -695,29 +692,17 @@ class FrameOwnership:
         )
         return InsertRefused(text, reason="second parent", edge=names)
 
-    def _is_stray(self, frame: str) -> bool:
-        """Whether its robot places frames, but neither this one nor any on this one.
-
-        False until the fixed edges of a described model arrive: they may place others on the frame.
-        """
-        robot = frame_owner(frame)
-        links, own = self._links.get(robot, ()), self._own_frames.get(robot, ())
-        if frame in links or frame in own:
-            return False
-        is_complete = robot not in self._described or robot in self._with_fixed_edges
-        return bool(links or own) and is_complete
-
-    def _prevails(self, claim: EdgeClaim, there: _AcceptedEdge | None) -> bool:
+    def _prevails(self, claim: EdgeClaim, there: EdgeClaim | None) -> bool:
         """Whether it is the claim that is inserted, of all claims of the same edge."""
         if there is None:
             return True
-        if there.claim is None or there.pose is None or claim.pose is None:
+        if not there.order or there.pose is None or claim.pose is None:
             return False
-        if there.rank != self._rank(claim):
+        if self._rank(there) != self._rank(claim):
             return False
-        if self._is_departed(claim) != self._is_departed(there.claim):
-            return self._is_departed(there.claim)
-        return claim.published > there.claim.published
+        if self._is_departed(claim) != self._is_departed(there):
+            return self._is_departed(there)
+        return claim.published > there.published
 
     def _insert_accepted(self, claim: EdgeClaim) -> None:
         if claim.pose is not None:
@@ -739,23 +724,10 @@ class FrameOwnership:
             self._on_conflict(stream, source, error)
 
 
-def _loop(names: EdgeNames, by: str, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
-    """The refusal of an edge that would close a loop."""
-    parent, child = names
-    if parent == child:
-        return InsertRefused(
-            f"{parent!r} -> {child!r}: a frame cannot be placed on itself", reason="self edge", edge=names
-        )
-    ring, below, writer = [parent], child, by
-    while ring[-1] != child:
-        above = accepted.get(ring[-1])
-        if above is None:
-            return None
-        below, writer = ring[-1], above.writer
-        ring.append(above.parent)
-    path = " -> ".join(map(repr, reversed(ring)))
-    text = (
-        f"{parent!r} -> {child!r} by {by} would close the loop {path} -> {child!r}; "
-        f"{child!r} -> {below!r} is written by {writer}"
-    )
-    return InsertRefused(text, reason="loop", edge=names)
+def _is_edge_of(claim: EdgeClaim, edge: Edge | None) -> bool:
+    """Whether ``edge``, which places the child in the buffer, was inserted for ``claim``."""
+    if edge is None or edge.parent != claim.parent:
+        return False
+    if claim.pose is None:
+        return edge.kind == "pose"
+    return claim.is_placed and edge.kind == "static" and edge.static_writer == claim.writer

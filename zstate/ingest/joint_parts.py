@@ -1,15 +1,10 @@
 """Several drivers of one robot: which of them moves which joint, and the ingest of their joint states.
 
-A driver of some joints publishes a *part* of the robot's joint states. Each joint has one writer. Of writers
-that contradict each other the first in this list moves the joints they have in common:
-
-1. an announced writer; of two the one that started later, as among writers of all joints,
-2. the one that left last, or appeared last, of the others: the samples of a writer that has left stay until
-   another one moves the joint, and the first samples of a new one may arrive before its token.
+A driver of some joints publishes a *part* of the robot's joint states. Each joint has one writer: of those
+that contradict each other the first ``JointPrecedence`` (``zstate.ingest.precedence``).
 
 A part in which such a joint is missing would be half a robot at an instant, so it is refused as a whole, and
-accepted once the other writer has left. A writer of all joints keeps those that no part moves. The result
-depends on the writers, not on the order of arrival.
+accepted once the other writer has left. A writer of all joints keeps those that no part moves.
 """
 
 from __future__ import annotations
@@ -29,12 +24,11 @@ from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, MessageError
 from zstate.ingest.base import ClockSetBack, StreamIngest
 from zstate.ingest.frame_ownership import EdgeSource, FrameOwnership
+from zstate.ingest.precedence import JointPrecedence, Presence
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.streams import StreamName
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.messages import JointState, RobotDescription, Sample
-
-_ANNOUNCED, _LEFT_OR_UNANNOUNCED, _NO_WRITER = range(3)
 
 _MAX_SETS = 16
 """Sets of joints that one writer may publish; a driver publishes one."""
@@ -236,15 +230,14 @@ class RobotParts:
         tracks = {joint: part.track for joint, part in movers.items() if part is not whole}
         self._buffer.assign_joints(whole.track, tracks)
 
-    def _precedence(self, part: JointPart) -> tuple[int, int, int, int, tuple[str, ...]]:
-        """Sort key: the first moves a joint. Of a writer's own parts that is the one with more joints."""
+    def _precedence(self, part: JointPart) -> JointPrecedence:
         session = part.session or 0
-        rank, moment = _LEFT_OR_UNANNOUNCED, self._departed.get(session, part.appeared)
+        presence, moment = Presence.DEPARTED, self._departed.get(session, part.appeared)
         if part.session is None:
-            rank = _NO_WRITER
+            presence = Presence.NONE
         elif session in self._since:
-            rank, moment = _ANNOUNCED, self._since[session]
-        return rank, -moment, session, -len(part.joints), part.joints
+            presence, moment = Presence.ANNOUNCED, self._since[session]
+        return JointPrecedence(presence, -moment, session, -len(part.joints), part.joints)
 
     def _refuse(self, part: JointPart, joint: str, first: JointPart) -> None:
         text, reason = f"joint {joint!r} is published by {self._writer(first)}", "second writer"

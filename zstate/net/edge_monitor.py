@@ -1,13 +1,14 @@
-"""Detects two writers that publish one moving edge, although each owned it when it began.
+"""Detects two writers that publish one moving edge or joint, although each owned it when it began.
 
-That happens on networks that are joined later, and if a writer was frozen or cut off for so long that its
-tokens expired, and another one took over its edge.
+That happens between peers if the second claims it before the token of the first has arrived, on networks that
+are joined later, and if a writer was frozen or cut off for so long that its tokens expired, and another one
+took over its edge.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from typing import NamedTuple, TypeAlias
@@ -16,14 +17,21 @@ import zenoh
 
 from zstate._util.closeable import Closeable
 from zstate.errors import MessageError
-from zstate.net.ownership import CHECK_PERIOD_S, Edge, frame_conflict, named_edges, seniority
+from zstate.net.ownership import (
+    CHECK_PERIOD_S,
+    Edge,
+    frame_conflict,
+    moving_streams,
+    named_edges,
+    seniority,
+)
 from zstate.net.session import Session
 from zstate.net.streams import CAPACITY, Ring, to_serialized
 from zstate.plugins import edge_streams
 from zstate.streams import SAMPLE_BYTES
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import stream_key, writer_expression
-from zstate.wire.messages import TransformSample
+from zstate.wire.messages import JointState, TransformSample
 from zstate.wire.native import NativeWire
 
 _WATCHED_S = 10.0
@@ -47,13 +55,22 @@ class EdgeMonitor(Closeable):
 
     Of two writers that publish one edge the later one ends: its ``check`` raises SecondWriter. A token alone
     displaces no writer, whatever start time it carries: its holder must also publish the edge. Writers whose
-    sessions are in ``allowed`` do not conflict.
+    sessions are in ``allowed`` do not conflict. ``joints`` are the edges that a driver moves, by the names of
+    its coordinates in joint states: then other drivers of them are watched, too.
     """
 
-    def __init__(self, session: Session, writer: Announcement, allowed: Container[int] = ()) -> None:
+    def __init__(
+        self,
+        session: Session,
+        writer: Announcement,
+        allowed: Container[int] = (),
+        joints: Mapping[str, Edge] | None = None,
+    ) -> None:
         self._session = session
         self._writer = writer
         self._allowed = allowed
+        self._joints = joints or {}
+        self._streams = moving_streams() if joints else edge_streams()
         self._children: set[str] = set()
         # Of writers, not of edges: a router's replies leave out some of the tokens that are subscribed.
         self._tokens: _Subscriber | None = None
@@ -89,7 +106,7 @@ class EdgeMonitor(Closeable):
 
     def _on_token(self, token: zenoh.Sample, now: float) -> None:
         for rival in _WIRE.parse_token(str(token.key_expr), self._writer.robot):
-            if rival.stream not in edge_streams():
+            if rival.stream not in self._streams:
                 continue
             is_older = seniority(rival) < seniority(self._writer) and bool(rival.name)
             if token.kind == zenoh.SampleKind.DELETE:
@@ -109,6 +126,10 @@ class EdgeMonitor(Closeable):
                 ):
                     if isinstance(message, TransformSample) and message.session == rival.writer.session:
                         yield from named_edges(rival.robot, message.edges or ())
+                    elif isinstance(message, JointState) and message.session == rival.writer.session:
+                        yield from (
+                            self._joints[name] for name in message.names or () if name in self._joints
+                        )
 
     def _stop_watching(self, rival: Announcement) -> None:
         watched = self._watched.pop(rival, None)

@@ -24,6 +24,7 @@ import zenoh
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
+from zstate.buffer.edge_rules import loop_refusal
 from zstate.errors import InsertRefused, InvalidInput, MessageError, SecondWriter, format_duration
 from zstate.net.latched import cached_values
 from zstate.net.presence import ANSWER_WITHIN_S, announce, confirmed_tokens
@@ -68,14 +69,15 @@ _STARTUP_S = 1.0
 """Each sample checks for this long: by then the tokens of writers that opened at the same time are here."""
 
 
-def _moving_streams() -> tuple[StreamName, ...]:
+def moving_streams() -> tuple[StreamName, ...]:
+    """The streams whose writers each own the edges that they move."""
     return (*edge_streams(), "partial_joint_states")
 
 
 @cache
 def _all_histories_of_edges() -> tuple[str, ...]:
     """Queries that each writer of moving edges or of some joints receives, and to which none has samples."""
-    return tuple(f"{stream_expression(ANY, stream)}?session=0" for stream in _moving_streams())
+    return tuple(f"{stream_expression(ANY, stream)}?session=0" for stream in moving_streams())
 
 
 _Handler: TypeAlias = "zenoh.handlers.Handler[zenoh.Sample]"
@@ -264,7 +266,7 @@ class WriterClaim(Closeable):
         claimed = {claimed.stream for claimed in self._claimed}
         if "partial_joint_states" in {first.stream, *claimed} and first.stream not in claimed:
             advice = "stop it first, for it and this writer would publish the same joints"
-        elif first.stream in _moving_streams() or is_measured(first.stream):
+        elif first.stream in moving_streams() or is_measured(first.stream):
             advice = "stop it first, or give this writer another name"
         elif first.stream == "joint_commands":
             advice = "a robot has one commander at a time: close the first"
@@ -407,7 +409,7 @@ class _Placement(NamedTuple):
     """The parent of a frame, and what places it there."""
 
     parent: str
-    by: str
+    writer: str
     is_model: bool
 
 
@@ -421,9 +423,9 @@ class _Placements:
         for owner, name, statics in _current_statics(session):
             if owner == robot or name == MODEL_WRITER:
                 is_model = name == MODEL_WRITER
-                by = f"the model of {owner!r}" if is_model else f"{name!r} of {owner!r}"
+                writer = f"the model of {owner!r}" if is_model else f"{name!r} of {owner!r}"
                 for parent, child in named_edges(owner, statics.edges):
-                    self._by_child[child] = _Placement(parent, by, is_model)
+                    self._by_child[child] = _Placement(parent, writer, is_model)
 
     def check(self, edge: Edge) -> None:
         """Raise InsertRefused if a model places the child, or if the edge closes a loop."""
@@ -432,25 +434,16 @@ class _Placements:
         if placement is not None and placement.is_model:
             raise InsertRefused(
                 f"{parent!r} -> {child!r}: {child!r} is a link, placed on {placement.parent!r} by "
-                f"{placement.by}, and readers refuse another edge for it; publish a frame that the model "
+                f"{placement.writer}, and readers refuse another edge for it; publish a frame that the model "
                 "does not place",
                 reason="second writer" if placement.parent == parent else "second parent",
                 edge=edge,
             )
-        ring, others = [parent], list[str]()
-        while ring[-1] != child:
-            above = self._get(ring[-1])
-            if above is None or above.parent in ring:
-                return
-            ring.append(above.parent)
-            others.append(above.by)
-        if others:
-            loop = " -> ".join(map(repr, reversed(ring)))
+        loop = loop_refusal(parent, child, None, self._get)
+        if loop is not None and parent != child:  # the writer's own buffer refuses that
             raise InsertRefused(
-                f"{parent!r} -> {child!r} would close the loop {loop} -> {child!r} with edges of "
-                f"{' and '.join(dict.fromkeys(others))}, and readers refuse it; the second frame is the one "
-                f"that is placed, and {child!r} is above {parent!r} already: turn the edge round, or place "
-                "another frame",
+                f"{loop}; readers refuse it: the second frame is the one that is placed, and {child!r} is "
+                f"above {parent!r} already: turn the edge round, or place another frame",
                 reason="loop",
                 edge=edge,
             )
@@ -501,7 +494,7 @@ def frame_conflict(first: Announcement, edge: Edge, verb: str) -> SecondWriter:
     """The error of a writer whose edge excludes ``edge`` of the writer ``first``."""
     parent, child = edge
     advice = "stop or withdraw that first, or use takeover=True (--takeover)"
-    if first.stream in _moving_streams():
+    if first.stream in moving_streams():
         verb, advice = "places", "stop that first"
     text = (
         f"{writer_text(first.writer)} {verb} {child!r} on {parent!r} already, as {first.name!r} of "

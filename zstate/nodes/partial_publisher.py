@@ -11,6 +11,7 @@ from zstate.clock import Clock, check_stamp
 from zstate.errors import SecondWriter
 from zstate.model.joint_limits import JointLimits
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.net.edge_monitor import EdgeMonitor
 from zstate.net.ownership import claim_edges
 from zstate.net.session import Session
 from zstate.nodes.publisher import Positions, positions_block
@@ -84,22 +85,46 @@ class PartialStatePublisher(SamplePublisher):
 
     def _own_joints(self, announced: Announcement) -> None:
         """Become the one writer of the joints on the native wire. Raises SecondWriter."""
-        movers = {f"{self.robot}/{joint.child}": joint for joint in self.model.joints}
-        edges = [(f"{self.robot}/{joint.parent}", child) for child, joint in movers.items()]
+        session, opened = self._out.session, self._out.opened
+        movers = {
+            joint.child: (f"{self.robot}/{joint.parent}", f"{self.robot}/{joint.child}")
+            for joint in self.model.joints
+        }
+        edges = list(movers.values())
+        coordinates = {
+            name: movers[joint.child]
+            for joint in self.model.driven_joints
+            for name in coordinate_names(self.model.part([joint.name]))
+        }
+        monitor = opened.enter_context(EdgeMonitor(session, announced, joints=coordinates))
+
+        def check() -> None:
+            try:
+                monitor.check()
+            except SecondWriter as error:
+                raise self._second_writer(error) from None
+
         try:
-            self._out.opened.enter_context(claim_edges(self._out.session, announced, edges))
+            opened.enter_context(claim_edges(session, announced, edges))
         except SecondWriter as error:
-            assert error.edge is not None
-            joint = self.model.mimic_of(movers[error.edge[1]]).joint
-            raise SecondWriter(
-                f"{str(error.first)!r} already publishes the joint {joint!r} of {self.robot!r}; refused: "
-                f"{str(announced.writer)!r}; one joint has one writer: stop the first, or leave that joint "
-                "to it",
-                robot=self.robot,
-                stream="partial_joint_states",
-                first=error.first,
-                edge=error.edge,
-            ) from None
+            raise self._second_writer(error) from None
+        monitor.add(edges)
+        self._out.checks.append(check)
+
+    def _second_writer(self, error: SecondWriter) -> SecondWriter:
+        """``error`` about an edge, with the joint that moves it."""
+        assert error.edge is not None
+        child = error.edge[1].removeprefix(f"{self.robot}/")
+        moved = next(joint for joint in self.model.joints if joint.child == child)
+        return SecondWriter(
+            f"{str(error.first)!r} already publishes the joint {self.model.mimic_of(moved).joint!r} of "
+            f"{self.robot!r}; refused: {str(self._out.identity)!r}; one joint has one writer: stop the "
+            "first, or leave that joint to it",
+            robot=self.robot,
+            stream="partial_joint_states",
+            first=error.first,
+            edge=error.edge,
+        )
 
     def publish(
         self,
