@@ -24,7 +24,7 @@ from zstate.net.session import Session
 from zstate.net.writer import WireWriter
 from zstate.rate import RateReport
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import driver_expression, driver_key, robot_from_key
+from zstate.wire.keys import robot_from_key, stream_expression, stream_key
 from zstate.wire.messages import (
     DriverState,
     JointState,
@@ -104,7 +104,7 @@ class DriverStatePublisher(Closeable):
 
     def __init__(self, session: Session, robot: str, build: Callable[[], DriverState]) -> None:
         self._build = build
-        self._latched = LatchedPublisher(session, driver_key(robot), ENCODINGS[DriverState])
+        self._latched = LatchedPublisher(session, stream_key(robot, "driver"), ENCODINGS[DriverState])
         self._has_changed = fork_safe(threading.Event())
         self._closed = False
         self._has_failed = False
@@ -205,7 +205,7 @@ def cached_state(session: Session, robot: str, timeout_s: float) -> DriverState 
 
     What a subscriber receives first may be older: a sample that is still under way.
     """
-    for value in cached_values(session, driver_key(robot), timeout_s):
+    for value in cached_values(session, stream_key(robot, "driver"), timeout_s):
         with suppress(MessageError):
             return decode(value.payload, value.encoding, DriverState)
     return None
@@ -251,7 +251,7 @@ class DriverStateListener(Closeable):
         self._on_state = on_state
         self._lock = fork_safe_lock()
         self._newest: BoundedDict[str, tuple[DriverState, float]] = BoundedDict()
-        self._subscriber = LatchedSubscriber(session, driver_expression(robot), self._on_value)
+        self._subscriber = LatchedSubscriber(session, stream_expression(robot, "driver"), self._on_value)
 
     def get(self, robot: str) -> ReceivedState | None:
         """The newest state of the driver of ``robot``, however old it is; None if none has arrived."""

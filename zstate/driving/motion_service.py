@@ -42,7 +42,7 @@ from zstate.errors import InvalidInput, MessageError, format_duration
 from zstate.net.queryable import Reply, RequestAnswer, RequestQueryable
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.wire.keys import motion_key
+from zstate.wire.keys import MOTION
 from zstate.wire.messages import (
     MOTION_POINTS,
     JointTrajectory,
@@ -429,7 +429,7 @@ class MotionService(Closeable):
         self._places = threading.BoundedSemaphore(_MOST_PLANS)
         with ExitStack() as opening:
             opening.callback(self._planner.shutdown, wait=False, cancel_futures=True)
-            opening.enter_context(RequestQueryable(session, motion_key(robot), self._answer))
+            opening.enter_context(RequestQueryable(session, MOTION.key(robot), self._answer))
             if controller is not None:
                 on_samples = partial(self._on_ros_samples, controller)
                 opening.enter_context(StreamSubscriber(session, controller.trajectories, on_samples))

@@ -28,7 +28,7 @@ from zstate.net.session import Session
 from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READERS, parse_reader_key, shortened
+from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READER_TOKEN, shortened
 from zstate.wire.protocol import Wire, WriterTokens
 from zstate.wire.registry import get_wire
 
@@ -131,9 +131,9 @@ def discover_readers(session: Session, timeout_s: float = 1.0) -> tuple[Announce
     Queries like ``discover``. Programs that subscribe to keys without zstate are not announced.
     """
     found: set[Announcement] = set()
-    for token in discover_tokens(session, READERS, timeout_s):
+    for token in discover_tokens(session, READER_TOKEN.expression(), timeout_s):
         with suppress(InvalidInput):
-            found.update(Announcement.parse_all(*parse_reader_key(token)))
+            found.update(Announcement.parse_all(*READER_TOKEN.parse(token)))
     return tuple(sorted(found, key=lambda one: (one.robot, one.stream, one.writer)))
 
 

@@ -13,7 +13,7 @@ from zstate.net.session import Session
 from zstate.net.status import PERIOD_S
 from zstate.net.streams import StreamSubscriber, call_for_each
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import parse_status_key, status_expression
+from zstate.wire.keys import STATUS
 from zstate.wire.messages import Status
 from zstate.wire.native import decode
 from zstate.wire.protocol import SerializedSample
@@ -42,7 +42,7 @@ class StatusSubscriber(StreamSubscriber):
             else:
                 callback(name, status)
 
-        super().__init__(session, status_expression(robot), lambda samples: call_for_each(samples, on_sample))
+        super().__init__(session, STATUS.expression(robot), lambda samples: call_for_each(samples, on_sample))
 
 
 class StatusMonitor(StatusSubscriber):
@@ -68,7 +68,7 @@ def _decode_status(sample: SerializedSample) -> tuple[str, Status]:
     if len(sample.payload) > MAX_STATUS_BYTES:
         text = f"a Status of {len(sample.payload)} bytes, more than {MAX_STATUS_BYTES}"
         raise MessageError(text, reason="too large")
-    robot, identity = parse_status_key(sample.key)
+    robot, identity = STATUS.parse(sample.key)
     status = decode(sample.payload, sample.encoding, Status)
     if status.session != WriterId.parse(identity).session:
         raise MessageError(f"the Status of another writer on {sample.key!r}", reason="foreign")

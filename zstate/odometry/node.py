@@ -36,7 +36,7 @@ from zstate.odometry.source_noise import PoseNoise, VelocityNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.keys import check_robot, odometry_request_key, shortened
+from zstate.wire.keys import ODOMETRY_REQUEST, check_robot, shortened
 from zstate.wire.messages import Imu, Pose, Velocity, covariance_matrix, from_block, with_full_names
 from zstate.wire.registry import get_wire
 
@@ -254,7 +254,7 @@ class OdometryNode(Closeable):
             self._publisher = opening.enter_context(
                 OdometryPublisher(session, robot, writer, program=program)
             )
-            request_key = odometry_request_key(robot, self._publisher.writer)
+            request_key = ODOMETRY_REQUEST.key(robot, self._publisher.writer)
             opening.enter_context(Queryable(session, request_key, self._on_request, is_exact=True))
             if has_joints:
                 joints = JointStateListener(session, robot, on_reading=self._on_joints)

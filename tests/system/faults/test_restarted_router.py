@@ -18,7 +18,7 @@ from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import stream_key, writer_key
+from zstate.wire.keys import WRITER_TOKEN, stream_key
 from zstate.wire.messages import Odometry, WriterTransforms, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
@@ -44,7 +44,7 @@ class Fleet:
         for number in range(ROBOTS):
             robot, writer = f"r{number}", WriterId("robot", "host", 1 + number, 1, 1 + number)
             identity = Announcement(robot, stream, writer, NAME).identity
-            self._tokens.append(announce(session, writer_key(robot, stream, identity)))
+            self._tokens.append(announce(session, WRITER_TOKEN.key(robot, stream, identity)))
             key = stream_key(robot, stream, NAME)
             publisher = KeyPublisher(session, key, ENCODINGS[self._message])
             self._writers.append((writer.session, publisher))
