@@ -67,21 +67,18 @@ class MeasuredOffset:
 def measure_offsets(
     session: Session,
     robot: str,
-    rounds: int = _ROUNDS,
     *,
     clock: Clock | None = None,
     timeout_s: float = 0.5,
 ) -> tuple[MeasuredOffset, ...]:
     """How far the clock of each writer of ``robot`` ("*": of all robots) is ahead of ``clock``, sorted.
 
-    ``clock`` is this machine's by default. The shortest round trip of ``rounds`` counts. Empty without a
+    ``clock`` is this machine's by default. The shortest of eight round trips counts. Empty without a
     reply within ``timeout_s``. Raises InvalidInput and Closed.
     """
-    if rounds < 1:
-        raise InvalidInput(f"rounds is 1 or more; got {rounds}")
     check_timeout(timeout_s)
     return tuple(
-        sorted(_measure(session, WRITER_CLOCK.expression(robot), rounds, clock or SystemClock(), timeout_s))
+        sorted(_measure(session, WRITER_CLOCK.expression(robot), _ROUNDS, clock or SystemClock(), timeout_s))
     )
 
 
