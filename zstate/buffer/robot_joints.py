@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from zstate.buffer.path import TrackUse, TransformPath, ViewReader, Views, joint_interpolators
 from zstate.buffer.tracks import JointTrack
+from zstate.checks import Floats
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.model.robot import POSITION_COUNTS, coordinate_names, velocity_columns_by_position
-
-Floats = NDArray[np.float64]
 
 
 class RobotJoints:

@@ -34,6 +34,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
+from zstate.checks import Floats
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
 from zstate.driving.limits import Limits
 from zstate.driving.trajectory import Trajectory
@@ -60,7 +61,6 @@ from zstate.wire.protocol import SerializedSample
 if TYPE_CHECKING:
     from zstate.wire.ros2.wire import Ros2Controller
 
-Floats = NDArray[np.float64]
 
 _Findings: TypeAlias = tuple[str, ...]
 

@@ -20,6 +20,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
 from zstate._util.format import format_duration
 from zstate._util.refusals import Refusals
+from zstate.checks import Floats
 from zstate.clock import SYSTEM, Clock
 from zstate.errors import Closed, InPast, InvalidInput, NoData, SecondWriter
 from zstate.model.robot import POSITION_COUNTS, RobotModel
@@ -29,7 +30,6 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
-from zstate.odometry.invariant_filter import Floats
 from zstate.odometry.publishers import OdometryPublisher
 from zstate.odometry.requests import apply_request
 from zstate.odometry.source_noise import PoseNoise, VelocityNoise

@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.checks import Floats
 from zstate.model.joint_trajectory import JointTrajectory
 from zstate.odometry import Wheels
 from zstate.wire.messages import Imu, Pose, StampedMessage, Velocity, from_block
-
-Floats = NDArray[np.float64]
 
 _REACH_S, _STEP_S = 0.5, 0.01
 """Delays are searched up to this size, in these steps: a base does not change its turn in less."""
