@@ -160,7 +160,7 @@ class WriterClaim(Closeable):
             older = {rival for rival in self._rivals if self._is_older(rival)}
             if now > self._established_at:
                 older = {rival for rival in older if self._publishes(rival)}
-            # Zenoh sometimes keeps reporting a closed token in the session that subscribed to it.
+            # zenoh 1.10, a closed token is sometimes reported on in a subscribed session: delete when fixed
             alive = older.intersection(self._current_rivals()) if older else older
             self._rivals -= older - alive
             if not alive:
