@@ -447,9 +447,9 @@ class TransformBuffer(BufferCore):
     def joint_states(self, robot: str, start: int | None = None, end: int | None = None) -> JointTrajectory:
         """The samples of a robot that are kept, with stamps in [start, end): copies; efforts are not kept.
 
-        Of a robot with several drivers: an instant for each sample of any of them that all of them cover,
-        with the other joints interpolated as in lookups, and their velocities NaN. Raises InvalidInput as
-        ``joint_positions``.
+        A robot with several drivers has a row for the stamp of each driver's sample, if all drivers have
+        samples around it. The joints of the other drivers are interpolated as in lookups; their velocities
+        are NaN. Raises InvalidInput as ``joint_positions``.
         """
         start, end = (None if stamp is None else check_stamp(stamp) for stamp in (start, end))
         return self._robot_joints(self._robot_track(robot)).samples(start, end)
