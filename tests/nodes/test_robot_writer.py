@@ -75,8 +75,8 @@ def test_readers_can_measure_the_clock_unless_it_is_simulated(sessions, clock: C
     with RobotWriter(writer, "r1", ("native",), clock=clock) as out:
         out.own([])
         if replies:
-            until(lambda: len(measure_offsets(reader, "r1", 1)) == replies)
-        assert len(measure_offsets(reader, "r1", 1)) == replies
+            until(lambda: len(measure_offsets(reader, "r1")) == replies)
+        assert len(measure_offsets(reader, "r1")) == replies
 
 
 def test_a_second_writer_closes_all_and_is_raised_again(sessions):
