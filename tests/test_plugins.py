@@ -22,7 +22,7 @@ from zstate.net.presence import discover
 from zstate.net.session import Session
 from zstate.streams import Stream
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import parse_reader_key
+from zstate.wire.keys import READER_TOKEN
 from zstate.wire.native import NativeWire
 
 ROOT = Path(__file__).parents[1]
@@ -220,7 +220,7 @@ def test_metrics_count_its_messages_and_writers(sessions: tuple[Session, Session
 def test_a_reader_of_several_streams_announces_those_of_others_apart():
     """A program without the package ignores a token that names its stream."""
     tokens = NativeWire().reader_tokens("panda", ("battery", "tf", "imu"), WRITER, "zid", lambda: 1)
-    assert [parse_reader_key(token)[1] for token in tokens] == [("tf", "imu"), ("battery",)]
+    assert [READER_TOKEN.parse(token)[1] for token in tokens] == [("tf", "imu"), ("battery",)]
 
 
 def test_plugins_are_listed_with_what_they_bring(battery_plugin: Stream):

@@ -77,7 +77,7 @@ SIGNATURES = {
     "Transform.from_se3": "(target, source, placement, stamp=None)",
     "Transform.from_rpy": "(target, source, translation, rpy, stamp=None)",
     "TransformBuffer": "(history_s=10.0, clock=None)",
-    "TransformBuffer.add_robot": "(model, prefix='', *, interpolation='linear')",
+    "TransformBuffer.add_robot": "(model, prefix='')",
     "TransformBuffer.insert_joints": "(track, stamp, positions, velocities=None)",
     "TransformBuffer.insert": "(transform, *, writer=None)",
     "TransformBuffer.insert_many": "(edges, stamp, poses, *, covariances=None, writer=None)",

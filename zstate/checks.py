@@ -14,8 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput
 
+Floats: TypeAlias = NDArray[np.float64]
 Points: TypeAlias = NDArray[np.float32 | np.float64]
 """Points as rows x y z [m]: (N, 3)."""
+
+QUATERNION_TOLERANCE = 1e-3
+"""Quaternions whose length is this close to 1 are normalised, others refused; in _kernel/history.h, too."""
 
 _FLOAT64 = np.dtype(np.float64)
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate._util.format import SECOND_NS
 from zstate.checks import is_masked
 from zstate.errors import InvalidInput
 
@@ -198,5 +199,5 @@ def check_stamps_of_points(stamps: ArrayLike, count: int) -> NDArray[np.int64]:
 
 def format_stamp(stamp: int) -> str:
     """A stamp as seconds with all nine digits."""
-    seconds, nanoseconds = divmod(abs(stamp), 1_000_000_000)
+    seconds, nanoseconds = divmod(abs(stamp), SECOND_NS)
     return f"{'-' if stamp < 0 else ''}{seconds}.{nanoseconds:09d}"

@@ -226,7 +226,7 @@ class Closed(NetworkError):
 
 
 class WriterLike(Protocol):
-    """The part of a ``zstate.wire.identity.Writer`` that a SecondWriter carries."""
+    """The part of a ``zstate.wire.identity.WriterId`` that a SecondWriter carries."""
 
     @property
     def program(self) -> str: ...

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from zstate import se3
 from zstate._util.format import html_table
-from zstate.checks import check_names, real_numbers
+from zstate.checks import QUATERNION_TOLERANCE, check_names, real_numbers
 from zstate.clock import Clock, check_stamp, format_stamp
 from zstate.errors import FrameMismatch, InvalidInput, LibraryMissing, format_duration
 from zstate.extension import kernel
@@ -26,9 +26,6 @@ F = TypeVar("F", bound="TransformFields")
 
 # By decreasing certainty: the kind of a product is the later one of its factors.
 KINDS: tuple[Kind, ...] = ("static", "exact", "interpolated", "predicted")
-
-# Quaternions within this distance of length one are normalised; others are refused.
-QUATERNION_TOLERANCE = 1e-3
 
 
 def combine_kinds(*kinds: Kind) -> Kind:

@@ -9,7 +9,7 @@ import pytest
 
 from zstate import InFuture, InPast, Kinematics, NoData, Stale, Transform, TransformBuffer, load_model
 from zstate.buffer.tracks import JointTrack, PoseTrack
-from zstate.errors import InsertRefused, InvalidInput
+from zstate.errors import InsertRefused
 
 MS = 1_000_000
 
@@ -114,8 +114,3 @@ def test_track_of_another_buffer_is_refused_and_unchanged() -> None:
     poses = PoseTrack((("a", "b"),), 10, None)
     with pytest.raises(InsertRefused, match="'a -> b' belongs to another buffer"):
         ours.restart(poses)
-
-
-def test_unknown_interpolation_is_refused() -> None:
-    with pytest.raises(InvalidInput, match="linear, hermite; got 'cubic'"):
-        TransformBuffer().add_robot(load_model("rrbot"), interpolation="cubic")  # type: ignore[arg-type]

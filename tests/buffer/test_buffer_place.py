@@ -196,14 +196,6 @@ def test_mimic_joint_of_a_wrapped_encoder_is_placed_as_looked_up() -> None:
     assert assert_placed_as_looked_up(buffer, points, stamps, "half", "wheel").all()
 
 
-def test_hermite_interpolation_is_that_of_lookups() -> None:
-    buffer, track = every_joint("hermite")
-    for n in range(3):
-        buffer.insert_joints(track, NOW + n * S, pose_of_every(track, bend=n * n), np.full(12, 0.5))
-    stamps = np.arange(NOW, NOW + 2 * S, S // 20)
-    assert assert_placed_as_looked_up(buffer, np.ones((40, 3)), stamps, "second", "root").all()
-
-
 def test_one_stamp_is_that_of_all_points() -> None:
     buffer = driving()
     at = NOW + 333 * MS

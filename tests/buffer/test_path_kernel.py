@@ -176,12 +176,6 @@ def test_small_and_large_turns_agree(spread: float) -> None:
         assert_agree(*both_paths(buffer, "a", "b"), stamp)
 
 
-def test_hermite_paths_use_the_reference() -> None:
-    buffer, track = every_joint("hermite")
-    buffer.insert_joints(track, NOW, [*(0.0,) * 6, 1.0, *(0.0,) * 6], np.zeros(12))
-    assert type(buffer.path("root", "tip")) is TransformPath
-
-
 def test_unusual_input_falls_back_to_the_reference() -> None:
     """The extension reports input that it cannot handle, and the reference handles it."""
     history = History(3, SPAN_NS)

@@ -167,7 +167,7 @@ class OvertakenBuffer(TransformBuffer):
 
 def test_first_velocities_of_a_robot_do_not_disturb_a_snapshot_of_the_samples_before():
     buffer = OvertakenBuffer()
-    track = buffer.add_robot(RRBOT, "r1", interpolation="hermite")
+    track = buffer.add_robot(RRBOT, "r1")
     for second in (0, 1):
         buffer.insert_joints(track, second * SECOND, [float(second), 0.0])
     before = buffer.snapshot(SECOND // 2)

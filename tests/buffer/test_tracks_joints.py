@@ -9,7 +9,6 @@ import pytest
 from helpers.buffers import EVERY_JOINT, NOW, S, every_joint, failure, pose_of_every
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.tracks import JointTrack
 from zstate.errors import InvalidInput, NoData
 from zstate.model.kinematics import Kinematics
 from zstate.model.load import load_model
@@ -177,29 +176,9 @@ def test_velocities_may_start_later_and_be_missing_again() -> None:
         buffer.insert_joints(track, 3 * S, pose_of_every(track), [0.0])
 
 
-def swing(interpolation: str, *, missing: bool = False) -> tuple[TransformBuffer, JointTrack]:
-    """The arm goes as t^3 - t from 0 s to 2 s, sampled at both ends with velocities 3 t^2 - 1."""
-    buffer, track = every_joint(interpolation)
-    for t in (0, 2):
-        rates = np.zeros(track.model.velocity_count)
-        rates[track.model.velocity_columns["bend"]] = 3 * t * t - 1
-        given = None if missing and t == 2 else rates
-        buffer.insert_joints(track, t * S, pose_of_every(track, bend=float(t**3 - t)), given)
-    return buffer, track
-
-
-def test_hermite_passes_through_both_samples_with_both_velocities() -> None:
-    buffer, _ = swing("hermite")
-    for tenth in range(0, 21):
-        t = tenth / 10
-        answer = buffer.lookup("body", "arm", tenth * S // 10)
-        assert turns_equal(yaw_of(answer), t**3 - t)
-        assert buffer.twist("arm", "body", tenth * S // 10).angular[2] == pytest.approx(3 * t * t - 1)
-
-
-@pytest.mark.parametrize(("interpolation", "missing"), [("linear", False), ("hermite", True)])
-def test_interpolation_is_linear_without_hermite_or_without_velocities(
-    interpolation: str, missing: bool
-) -> None:
-    buffer, _ = swing(interpolation, missing=missing)
+def test_positions_between_samples_with_velocities_are_linear() -> None:
+    buffer, track = every_joint()
+    for t, bend in ((0, 0.0), (2, 6.0)):
+        rates = np.full(track.model.velocity_count, 11.0)
+        buffer.insert_joints(track, t * S, pose_of_every(track, bend=bend), rates)
     assert yaw_of(buffer.lookup("body", "arm", S // 2)) == pytest.approx(0.25 * 6.0)

@@ -14,7 +14,7 @@ from helpers.processes import repeated
 
 from zstate import StatePublisher, connect, load_model
 from zstate.net.presence import local_writer
-from zstate.wire.keys import reader_key, writer_key
+from zstate.wire.keys import READER_TOKEN, WRITER_TOKEN
 
 ROBOTS = 300
 
@@ -27,8 +27,8 @@ def fleet() -> Iterator[None]:
         for number in range(ROBOTS):
             identity = local_writer(number, "driver").identity
             for token in (
-                writer_key(f"r{number}", "joint_states", identity),
-                reader_key(f"r{number}", "joint_states", identity),
+                WRITER_TOKEN.key(f"r{number}", "joint_states", identity),
+                READER_TOKEN.key(f"r{number}", "joint_states", identity),
             ):
                 opened.callback(session.zenoh.liveliness().declare_token(token).undeclare)
         publisher = opened.enter_context(StatePublisher(session, load_model(RRBOT), robot="rrbot"))

@@ -32,7 +32,7 @@ from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.sources import JointStateListener
-from zstate.wire.keys import release_key, writer_expression, writer_key
+from zstate.wire.keys import RELEASE, WRITER_TOKEN
 from zstate.wire.messages import order_digest, to_block
 from zstate.wire.native import encode, encoding_of
 
@@ -254,7 +254,9 @@ def raw_commands(sessions: tuple[Session, Session]) -> Iterator:
     """``put`` for commands of the announced sessions 7 and 8, which the session of the host knows."""
     host, session = sessions
     key, known = "zstate/arm/joint_commands", set[str]()
-    keys = [writer_key("arm", "joint_commands", local_writer(number, "raw").identity) for number in (7, 8)]
+    keys = [
+        WRITER_TOKEN.key("arm", "joint_commands", local_writer(number, "raw").identity) for number in (7, 8)
+    ]
     # A command may overtake the token of its session.
     watched = host.zenoh.liveliness().declare_subscriber(
         "zstate/arm/@writer/**", lambda token: known.add(str(token.key_expr))
@@ -610,7 +612,7 @@ def test_readings_are_published_in_the_order_of_the_model(sessions, rates):
 def test_one_robot_has_one_host(sessions):
     with StatePublisher(sessions[0], RRBOT, "arm"):
         # A session that has just connected may discover the first later than it opens.
-        until(lambda: confirmed_tokens(sessions[1], writer_expression("arm")))
+        until(lambda: confirmed_tokens(sessions[1], WRITER_TOKEN.expression("arm")))
         with pytest.raises(SecondWriter):
             DriverHost(sessions[1], RecordingDriver(), RRBOT, "arm", limits=LIMITS)
 
@@ -1198,7 +1200,7 @@ def test_a_driver_without_a_reading_yet_is_ready_with_that_reason(sessions):
 def test_a_command_from_before_the_release_that_arrives_after_it_is_refused(sessions):
     driver = RecordingDriver()
     releaser = local_writer(7)  # the session of ``command``
-    key = release_key("arm", releaser.identity)
+    key = RELEASE.key("arm", releaser.identity)
     numbers = itertools.count()
     with (
         running(sessions[0], driver) as host,
@@ -1230,7 +1232,7 @@ def test_a_stop_that_is_released_before_the_next_tick_is_obeyed(sessions):
 
     driver = Slow()
     releaser = local_writer(8)
-    key = release_key("arm", releaser.identity)
+    key = RELEASE.key("arm", releaser.identity)
     with (
         running(sessions[0], driver, ttl_s=10.0) as host,
         Commander(sessions[1], "arm") as arm,

@@ -32,14 +32,7 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session, connect
 from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import (
-    driver_key,
-    relax_key,
-    release_expression,
-    release_key,
-    stop_expressions,
-    stop_key,
-)
+from zstate.wire.keys import RELAX, RELEASE, STOP, stream_key
 from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
 
@@ -143,7 +136,7 @@ def test_a_latch_keeps_how_its_host_stopped_for_the_next_one(sessions):
 
 def test_a_late_release_of_a_hosts_first_stop_does_not_end_its_second(sessions):
     commander = local_writer(8)
-    key = release_key("arm", commander.identity)
+    key = RELEASE.key("arm", commander.identity)
     with (
         StopLatch(sessions[0], "arm", HOST, Refusals()) as latch,
         KeyPublisher(sessions[1], key, encoding_of(Release)) as releases,
@@ -185,7 +178,7 @@ def test_a_stop_that_is_not_confirmed_is_sent_again_after_a_quarter_of_a_second_
     def receive(sample: SerializedSample) -> None:
         received.append(decode(sample.payload, sample.encoding, Stop))
 
-    with LatchedSubscriber(sessions[0], stop_expressions("arm"), receive):
+    with LatchedSubscriber(sessions[0], (STOP.expression("arm"), RELAX.expression("arm")), receive):
         with pytest.raises(Unreachable):
             stop(sessions[1], "arm", timeout_s=3.0)
         with pytest.raises(Unreachable):
@@ -216,7 +209,8 @@ def test_parallel_stops_of_one_session_are_all_confirmed(sessions):
 
     with hosted(sessions[0], Slow(RRBOT)), Commander(sessions[1], "arm") as arm, ExitStack() as joined:
         arm.wait_for_driver()
-        joined.enter_context(LatchedSubscriber(sessions[0], stop_expressions("arm"), on_stop))
+        expressions = STOP.expression("arm"), RELAX.expression("arm")
+        joined.enter_context(LatchedSubscriber(sessions[0], expressions, on_stop))
         may_read.clear()
         # No tick while both are sent: the driver obeys them together.
         for reason in ("first", "second"):
@@ -279,14 +273,14 @@ def test_a_release_returns_once_the_driver_is_no_longer_stopped(sessions):
     present = [stopped]
     states: list[str] = []
     with (
-        LatchedPublisher(sessions[0], driver_key("arm"), encoding_of(DriverState)) as values,
+        LatchedPublisher(sessions[0], stream_key("arm", "driver"), encoding_of(DriverState)) as values,
         repeated(lambda: values.set(encode(present[-1]))),
         Commander(sessions[1], "arm") as arm,
     ):
         until(lambda: arm.wait_for_driver().stops)
         releasing = threading.Thread(target=lambda: states.append(arm.release(DEADLINE_S).state))
         on_release = StreamSubscriber(
-            sessions[0], release_expression("arm"), lambda _: present.append(without_stops)
+            sessions[0], RELEASE.expression("arm"), lambda _: present.append(without_stops)
         )
         with on_release:
             releasing.start()
@@ -309,7 +303,7 @@ def forger(session: Session, key: str) -> Iterator[Callable[[Stop | bytes], None
 def key_of(stopped: DriverState) -> tuple[str, int, int]:
     """A key with the session of the only stop of ``stopped``, its session and its number."""
     ((session, seq),) = stopped.stops
-    return stop_key("arm", WriterId("operator", "desk", 1, 1, session).identity), session, seq
+    return STOP.key("arm", WriterId("operator", "desk", 1, 1, session).identity), session, seq
 
 
 def stops_in_file() -> list[dict[str, Any]]:
@@ -347,7 +341,7 @@ def test_a_forged_stop_and_its_release_do_not_end_the_stop_of_the_program_that_i
         assert "a test" in state.reason
         release = Release(0, 0, local_writer(8).session, ((session, seq + 1),))
         releases = KeyPublisher(
-            sessions[1], release_key("arm", local_writer(8).identity), encoding_of(Release)
+            sessions[1], RELEASE.key("arm", local_writer(8).identity), encoding_of(Release)
         )
         with releases, repeated(lambda: releases.put(encode(release))):
             until(lambda: arm.wait_for_driver().stops == ((session, seq),))
@@ -378,7 +372,7 @@ def test_a_stop_in_the_name_of_the_host_does_not_end_its_reports(sessions, seq):
     driver = Silent(RRBOT)
     with hosted(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
         own = arm.wait_for_driver().session
-        key = stop_key("arm", WriterId("drive", "desk", 1, 1, own).identity)
+        key = STOP.key("arm", WriterId("drive", "desk", 1, 1, own).identity)
         with forger(sessions[1], key) as forge:
             forge(Stop(0, seq, own, "hold", "forged"))
             refused = "foreign" if seq < 2**63 else "malformed"
@@ -404,7 +398,7 @@ def test_a_state_that_cannot_be_encoded_is_published_without_what_cannot(session
 
     with (
         DriverStatePublisher(sessions[0], "arm", lambda: present[-1]) as publisher,
-        LatchedSubscriber(sessions[1], driver_key("arm"), on_state),
+        LatchedSubscriber(sessions[1], stream_key("arm", "driver"), on_state),
     ):
         for state in (bad, good):
             present.append(state)
@@ -574,7 +568,7 @@ def test_a_stop_that_others_displace_within_one_tick_is_confirmed(sessions):
     ):
         arm.wait_for_driver()
         opened.callback(may_read.set)
-        send = opened.enter_context(forger(sessions[1], stop_key("arm", honest.identity)))
+        send = opened.enter_context(forger(sessions[1], STOP.key("arm", honest.identity)))
         may_read.clear()
         send(Stop(0, 3, honest.session, "hold", "honest"))
         until(lambda: any(one.session == honest.session for one in host._stops.latched))
@@ -592,7 +586,7 @@ def test_a_stop_that_others_displace_within_one_tick_is_confirmed(sessions):
 def put_stop(session: Session, number: int, seq: int) -> None:
     """A stop of the session with that number, which is not cached for late joiners."""
     payload = encode(Stop(0, seq, number, "hold", f"flood {seq}"))
-    key = stop_key("arm", WriterId("flood", "desk", 1, 1, number).identity)
+    key = STOP.key("arm", WriterId("flood", "desk", 1, 1, number).identity)
     session.zenoh.put(key, payload, encoding=encoding_of(Stop), congestion_control=CongestionControl.BLOCK)
 
 
@@ -646,7 +640,7 @@ def test_many_stops_that_arrive_together_are_written_to_the_file_at_once(session
     writer = local_writer(99)
     with (
         StopLatch(sessions[0], "arm", HOST, Refusals()) as latch,
-        forger(sessions[1], stop_key("arm", writer.identity)) as send,
+        forger(sessions[1], STOP.key("arm", writer.identity)) as send,
     ):
         send(Stop(0, 0, writer.session, "hold", ""))
         until(lambda: latch.latched)
@@ -684,7 +678,7 @@ def test_every_name_may_hold_a_driver_and_reads_that_it_has_stopped_and_only_com
                 stop(users[name], "arm", name, how="relax", timeout_s=0.5)
             payload = encode(Stop(0, 0, 9, "relax", name))
             users[name].zenoh.put(
-                relax_key("arm", local_writer(9).identity), payload, encoding=encoding_of(Stop)
+                RELAX.key("arm", local_writer(9).identity), payload, encoding=encoding_of(Stop)
             )
         assert set(driver.hows) == {"hold"}
         assert not arm.release(DEADLINE_S).stops
@@ -695,7 +689,7 @@ def test_every_name_may_hold_a_driver_and_reads_that_it_has_stopped_and_only_com
 
 def test_a_stop_that_asks_for_relax_on_the_key_of_all_programs_holds(sessions):
     driver, writer = StoppedDriver(), local_writer(9)
-    with hosted(sessions[0], driver) as host, forger(sessions[1], stop_key("arm", writer.identity)) as send:
+    with hosted(sessions[0], driver) as host, forger(sessions[1], STOP.key("arm", writer.identity)) as send:
         send(Stop(0, 3, writer.session, "relax", "drop it"))
         until(lambda: host.state == "stopped")
         assert driver.hows == ["hold"]
@@ -709,7 +703,7 @@ def test_a_driver_without_torque_stays_so_until_that_stop_is_released(sessions):
         until(lambda: len(stops_in_file()) == 2)
         held = {(one["session"], one["seq"]) for one in stops_in_file() if one["how"] == "hold"}
         until(lambda: held <= set(arm.wait_for_driver().stops))
-        key = release_key("arm", local_writer(8).identity)
+        key = RELEASE.key("arm", local_writer(8).identity)
         with KeyPublisher(sessions[1], key, encoding_of(Release)) as releases:
             message = encode(Release(0, 0, local_writer(8).session, tuple(held)))
             with repeated(lambda: releases.put(message)):
@@ -745,7 +739,7 @@ def test_the_reason_of_a_stop_is_cut_after_1000_characters():
 def test_a_driver_obeys_a_stop_of_another_writer_whatever_its_text_is(sessions, text):
     writer = local_writer(9)
     payload = encode(Stop(0, 3, writer.session, "hold", ""))[:-1] + text
-    with hosted(sessions[0]) as host, forger(sessions[1], stop_key("arm", writer.identity)) as send:
+    with hosted(sessions[0]) as host, forger(sessions[1], STOP.key("arm", writer.identity)) as send:
         send(payload)
         until(lambda: host.state == "stopped")
         until(stops_in_file)
@@ -764,7 +758,7 @@ def test_a_commander_that_was_stopped_may_move_again_by_a_release_after_that_of_
             until(lambda: host.state == "active")
             state = stop(sessions[1], "arm")
             releaser = local_writer(8)
-            key = release_key("arm", releaser.identity)
+            key = RELEASE.key("arm", releaser.identity)
             with KeyPublisher(sessions[1], key, encoding_of(Release)) as releases:
                 message = encode(Release(0, 0, releaser.session, state.stops))
                 with repeated(lambda: releases.put(message)):
@@ -776,7 +770,7 @@ def test_a_commander_that_was_stopped_may_move_again_by_a_release_after_that_of_
 def test_a_release_in_the_name_of_another_program_is_refused(sessions):
     with hosted(sessions[0]) as host, Commander(sessions[1], "arm"):
         stopped = stop(sessions[1], "arm")
-        key = release_key("arm", local_writer(8).identity)
+        key = RELEASE.key("arm", local_writer(8).identity)
         releases = KeyPublisher(sessions[1], key, encoding_of(Release))
         with releases, repeated(lambda: releases.put(encode(Release(0, 0, 9, stopped.stops)))):
             until(lambda: host.report().refused.get("foreign"))

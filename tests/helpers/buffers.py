@@ -96,10 +96,10 @@ EVERY_JOINT = """
 """
 
 
-def every_joint(interpolation: str = "linear") -> tuple[TransformBuffer, JointTrack]:
+def every_joint() -> tuple[TransformBuffer, JointTrack]:
     """A buffer with a robot that has one joint of each type."""
     buffer = TransformBuffer()
-    return buffer, buffer.add_robot(load_model(EVERY_JOINT), interpolation=interpolation)  # type: ignore[arg-type]
+    return buffer, buffer.add_robot(load_model(EVERY_JOINT))
 
 
 def pose_of_every(

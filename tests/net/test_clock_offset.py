@@ -17,7 +17,7 @@ from zstate.net.session import connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
+from zstate.wire.keys import WRITER_CLOCK
 from zstate.wire.messages import ClockMessage
 from zstate.wire.native import encode, encoding_of
 
@@ -95,7 +95,7 @@ def test_invalid_and_missing_replies_are_ignored(sessions):
 @pytest.mark.parametrize("session", [5, 6])
 def test_reply_needs_the_key_and_the_session_of_its_writer(sessions, session):
     ours = WriterId("driver", "nuc", 3, 1, 5)
-    key = clock_key("r1", ours.identity)
+    key = WRITER_CLOCK.key("r1", ours.identity)
     payload = encode(ClockMessage(time.time_ns(), 0, session))
     answer = lambda query: query.reply(key, payload, encoding=encoding_of(ClockMessage))  # noqa: E731
     queryable = sessions[0].zenoh.declare_queryable(key, answer)
@@ -105,8 +105,6 @@ def test_reply_needs_the_key_and_the_session_of_its_writer(sessions, session):
 
 
 def test_invalid_arguments_and_a_closed_session_are_refused(sessions):
-    with pytest.raises(InvalidInput, match="rounds is 1 or more"):
-        measure_offsets(sessions[0], "r1", rounds=0)
     with pytest.raises(InvalidInput, match=r"timeout_s is 0.0; give a positive number of seconds"):
         measure_offsets(sessions[0], "r1", timeout_s=0.0)
     sessions[0].close()
@@ -115,11 +113,11 @@ def test_invalid_arguments_and_a_closed_session_are_refused(sessions):
 
 
 def test_clock_key_contains_robot_and_identity():
-    assert clock_expression("*") == "zstate/*/@clock/*"
-    assert parse_clock_key(clock_key("r1", "driver,host,1,2,3")) == ("r1", "driver,host,1,2,3")
+    assert WRITER_CLOCK.expression("*") == "zstate/*/@clock/*"
+    assert WRITER_CLOCK.parse(WRITER_CLOCK.key("r1", "driver,host,1,2,3")) == ("r1", "driver,host,1,2,3")
     for other in ("zstate/r1/@writer/clock", "zstate/r1/tf", "r1/x/@clock/y"):
         with pytest.raises(InvalidInput, match="is not of the form"):
-            parse_clock_key(other)
+            WRITER_CLOCK.parse(other)
 
 
 def test_failed_lookup_mentions_a_wrong_writer_clock(sessions):
@@ -221,7 +219,7 @@ def test_silent_writers_of_one_robot_do_not_delay_the_offset_of_another(sessions
 def test_reply_of_another_writer_does_not_count(sessions):
     writer, reader = sessions
     asked, other = (WriterId("p", "h", 1, 1, session) for session in (7, 8))
-    key = clock_key("r1", asked.identity)
+    key = WRITER_CLOCK.key("r1", asked.identity)
 
     def answer(session: int) -> Reply:
         return Reply(encode(ClockMessage(STAMP, 0, session)), encoding_of(ClockMessage))
@@ -240,8 +238,8 @@ def test_a_query_that_no_writer_receives_is_told_from_one_that_times_out(session
     )
     with StatePublisher(writer, RRBOT, "r1"):
         (measured,) = measure_offsets(reader, "r1", timeout_s=5.0)
-        queryable = writer.zenoh.declare_queryable(clock_key("r1", frozen.identity), queries.append)
-        querier = reader.zenoh.declare_querier(clock_key("r1", frozen.identity))
+        queryable = writer.zenoh.declare_queryable(WRITER_CLOCK.key("r1", frozen.identity), queries.append)
+        querier = reader.zenoh.declare_querier(WRITER_CLOCK.key("r1", frozen.identity))
         until(lambda: querier.matching_status.matching)
         of_robot = {("r1", one) for one in (frozen, absent, measured.writer)}
         assert unanswered(reader, of_robot, 1.0) == {("r1", frozen): True, ("r1", absent): False}

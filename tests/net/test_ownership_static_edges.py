@@ -23,7 +23,7 @@ from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import edge_key, writer_expression
+from zstate.wire.keys import EDGE_TOKEN
 
 ROUTER = """
     import sys
@@ -81,7 +81,7 @@ def test_one_of_two_simultaneous_static_writers_of_a_frame_gets_second_writer(pa
             StaticPublisher(pair[1], "r2", "room", program="room") as room,
         ):
             for session in pair:
-                until(lambda s=session: len(current_tokens(s, writer_expression("*", "tf_static"), 1.0)) == 2)
+                until(lambda s=session: len(current_tokens(s, "zstate/*/@writer/$*tf_static$*/*", 1.0)) == 2)
             errors = run_together(
                 lambda mount=mount: mount.set(edge("fleet/base", 1.0)),
                 lambda room=room: room.set(edge("fleet/base", 2.0)),
@@ -133,7 +133,7 @@ def test_frame_is_free_after_a_claiming_writer_has_left(sessions):
     ours, theirs = sessions
     early = Announcement("r2", "tf_static", WriterId("room", "laptop", 9, 1, 8), "room")
     with StaticPublisher(ours, "r1", "mount") as mount:
-        with announce(theirs, edge_key("r2", ("fleet/base", "fleet/camera"), early.identity)):
+        with announce(theirs, EDGE_TOKEN.key("r2", "fleet/camera", "fleet/base", early.identity)):
             until(lambda: current_tokens(ours, "zstate/*/@edge/**", 1.0))
             with pytest.raises(SecondWriter, match="is placing 'fleet/camera' on 'fleet/base'") as raised:
                 mount.set(edge("fleet/base", 1.0))

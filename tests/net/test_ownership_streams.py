@@ -23,7 +23,7 @@ from zstate.nodes.static_publisher import StaticPublisher
 from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import writer_key
+from zstate.wire.keys import WRITER_TOKEN
 
 FIRST = WriterId("driver", "jetson", 412, 1_000_000_000, 7)
 SECOND = WriterId("simulator", "laptop", 9, 2_000_000_000, 8)
@@ -37,7 +37,7 @@ def announcement(
 
 
 def announced(session: Session, content: Announcement):
-    return announce(session, writer_key(content.robot, content.stream, content.identity))
+    return announce(session, WRITER_TOKEN.key(content.robot, content.stream, content.identity))
 
 
 def await_tokens(session: Session, count: int) -> None:
@@ -152,7 +152,7 @@ def test_claim_needs_no_thread_and_a_check_is_cheaper_than_a_claim(sessions):
 def test_token_that_comes_during_a_check_is_read_by_the_next_one(sessions):
     """Zenoh's thread may report it between the last change that a check reads and the time of the next."""
     ours, theirs = sessions
-    key = writer_key("r1", "joint_states", FIRST.identity)
+    key = WRITER_TOKEN.key("r1", "joint_states", FIRST.identity)
 
     class Changes(deque[tuple[str, zenoh.SampleKind]]):
         """The first writer comes when a check has read all changes."""

@@ -21,7 +21,7 @@ from zstate.net.presence import (
 from zstate.net.session import Session, connect
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import check_writer, writer_key
+from zstate.wire.keys import WRITER_TOKEN, check_writer
 from zstate.wire.registry import get_wire
 
 DRIVER = WriterId("arm driver", "jetson", 412, 5, 7)
@@ -31,8 +31,8 @@ WRITER = """
     import sys
     from zstate.net.presence import announce, local_writer
     from zstate.net.session import connect
-    from zstate.wire.keys import writer_key
-    token = writer_key(sys.argv[1], "joint_states", local_writer(3, "driver").identity)
+    from zstate.wire.keys import WRITER_TOKEN
+    token = WRITER_TOKEN.key(sys.argv[1], "joint_states", local_writer(3, "driver").identity)
     with connect() as session, announce(session, token):
         print("announced")
         sys.stdin.readline()
@@ -40,7 +40,7 @@ WRITER = """
 
 
 def announced(session: Session, robot: str, stream: StreamName, writer: WriterId) -> LivelinessToken:
-    return announce(session, writer_key(robot, stream, writer.identity))
+    return announce(session, WRITER_TOKEN.key(robot, stream, writer.identity))
 
 
 def test_writer_text_is_program_host_and_pid():
@@ -176,7 +176,7 @@ def test_writer_of_two_tokens_for_one_stream_leaves_with_the_last_of_them():
     ):
         with announced(writer, "r1", "tf", DRIVER):
             until(lambda: events == [("tf", True)])
-            with announce(writer, writer_key("r1", ["tf", "joint_states"], DRIVER.identity)):
+            with announce(writer, WRITER_TOKEN.key("r1", ["tf", "joint_states"], DRIVER.identity)):
                 until(lambda: events[1:] == [("joint_states", True)])
             until(lambda: events[2:] == [("joint_states", False)])
         until(lambda: events[3:] == [("tf", False)])

@@ -12,9 +12,9 @@ from zstate.errors import Unreachable
 from zstate.net.presence import RouterLossDetector, WriterWatch, announce, discover
 from zstate.net.session import connect
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import writer_key
+from zstate.wire.keys import WRITER_TOKEN
 
-TOKEN = writer_key("r1", "joint_states", WriterId("driver", "jetson", 412, 5, 7).identity)
+TOKEN = WRITER_TOKEN.key("r1", "joint_states", WriterId("driver", "jetson", 412, 5, 7).identity)
 
 ROUTER = """
     import sys

@@ -29,7 +29,7 @@ from zstate.net.writer import WireWriter, write_all
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import reader_key, writer_key
+from zstate.wire.keys import READER_TOKEN, WRITER_TOKEN
 from zstate.wire.messages import StaticTransforms, to_block
 from zstate.wire.registry import get_wire
 
@@ -47,8 +47,8 @@ def many_tokens(session: Session, count: int) -> Iterator[list[str]]:
         key
         for number in range(count)
         for key in (
-            writer_key(f"r{number}", "joint_states", local_writer(number).identity),
-            reader_key(f"r{number}", "joint_states", local_writer(number).identity),
+            WRITER_TOKEN.key(f"r{number}", "joint_states", local_writer(number).identity),
+            READER_TOKEN.key(f"r{number}", "joint_states", local_writer(number).identity),
         )
     ]
     with ExitStack() as declared:

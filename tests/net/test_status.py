@@ -21,7 +21,7 @@ from zstate.net.streams import KeyPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import status_key
+from zstate.wire.keys import STATUS
 from zstate.wire.messages import Status
 from zstate.wire.native import encode, encoding_of
 
@@ -189,7 +189,7 @@ def test_ended_process_sends_no_status(spawn):
 
 def test_invalid_status_is_counted_and_ignored(sessions):
     received = Statuses(sessions[1], "r1")
-    key = status_key("r1", ME)
+    key = STATUS.key("r1", ME)
     with ExitStack() as opened:
         publishers = {
             encoding: opened.enter_context(KeyPublisher(sessions[0], key, encoding))
@@ -205,7 +205,7 @@ def test_invalid_status_is_counted_and_ignored(sessions):
 
 def test_a_status_counts_only_on_the_key_of_its_own_writer(sessions):
     received = Statuses(sessions[1])
-    wait_for_reader(sessions[0], status_key("r1", ME))
+    wait_for_reader(sessions[0], STATUS.key("r1", ME))
     theirs = WriterId("driver", "nuc", 3, 1, 99).identity
     wrong = [("r1", theirs, OK), ("*", ME, OK), ("r1", ME, replace(OK, rate_hz=float("nan")))]
     wrong += [("r1", "me", OK), ("r1", ME, replace(OK, text="a" * 70_000))]

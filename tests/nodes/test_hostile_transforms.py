@@ -23,7 +23,7 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.streams import SAMPLE_BYTES
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import edge_key, writer_key
+from zstate.wire.keys import EDGE_TOKEN, WRITER_TOKEN
 from zstate.wire.messages import WriterTransforms, order_digest, to_block
 from zstate.wire.native import encode, encoding_of
 
@@ -164,9 +164,8 @@ def test_malformed_tokens_disturb_no_writer_and_a_made_up_one_is_named(sessions,
             ):
                 opened.enter_context(announce(sessions[1], token))
         good.publish()
-        opened.enter_context(announce(sessions[1], writer_key("r1", "transforms", thief.identity)))
-        edge = ("r1/odom", "r1/cup")
-        opened.enter_context(announce(sessions[1], edge_key("r1", edge, thief.identity)))
+        opened.enter_context(announce(sessions[1], WRITER_TOKEN.key("r1", "transforms", thief.identity)))
+        opened.enter_context(announce(sessions[1], EDGE_TOKEN.key("r1", "r1/cup", "r1/odom", thief.identity)))
         until(lambda: current_tokens(sessions[0], "zstate/r1/@edge/r1%2Fcup/*/*", 1.0))
         hand = opened.enter_context(TransformPublisher(sessions[0], "r1", "hand"))
         with pytest.raises(SecondWriter, match=r"thief@laptop.* places 'r1/cup' on 'r1/odom'"):

@@ -23,7 +23,7 @@ from zstate.plugins import is_named
 from zstate.sources import SineSource
 from zstate.transform import Transform
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import stream_key, writer_expression, writer_key
+from zstate.wire.keys import WRITER_TOKEN, stream_key
 from zstate.wire.messages import JointState, RobotDescription, order_digest
 from zstate.wire.native import encode, encoding_of
 
@@ -58,7 +58,7 @@ RIVAL = """
 
 
 def writers_seen(session: Session) -> int:
-    return len(current_tokens(session, writer_expression("r1", "joint_states"), 1.0))
+    return len(current_tokens(session, "zstate/r1/@writer/$*joint_states$*/*", 1.0))
 
 
 def edge(child: str) -> Transform:
@@ -147,8 +147,8 @@ def test_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_pu
     with StatePublisher(ours, RRBOT, "r1") as publisher:
         for _ in range(2):
             publisher.publish([0.0, 0.0])
-        with announce(theirs, writer_key("r1", stream, stranger.identity)):
-            until(lambda: len(current_tokens(ours, writer_expression("r1"), 1.0)) == 2)
+        with announce(theirs, WRITER_TOKEN.key("r1", stream, stranger.identity)):
+            until(lambda: len(current_tokens(ours, WRITER_TOKEN.expression("r1"), 1.0)) == 2)
             looked_until = time.monotonic() + 0.3
             while time.monotonic() < looked_until:
                 publisher.publish([0.0, 0.0])
@@ -259,7 +259,7 @@ def test_takeover_of_an_edge_is_reported_to_listeners(sessions):
 
 def test_second_static_writer_of_one_name_is_refused(sessions):
     with StaticPublisher(sessions[0], "r1", "mount"):
-        until(lambda: current_tokens(sessions[1], writer_expression("r1", "tf_static"), 1.0))
+        until(lambda: current_tokens(sessions[1], "zstate/r1/@writer/$*tf_static$*/*", 1.0))
         with pytest.raises(SecondWriter, match="under the name 'mount'"):
             StaticPublisher(sessions[1], "r1", "mount")
         StaticPublisher(sessions[1], "r2", "mount").close()

@@ -12,7 +12,7 @@ from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net.clock_offset import measure_offsets
 from zstate.net.session import Session
 from zstate.nodes.robot_writer import RobotWriter
-from zstate.wire.keys import writer_expression
+from zstate.wire.keys import WRITER_TOKEN
 from zstate.wire.messages import JointState, order_digest, to_block
 
 NAMES = ("lift",)
@@ -42,9 +42,9 @@ def test_what_was_open_is_closed_if_opening_fails(sessions):
         out.own([out.announcement("joint_states")])
         out.open_wires()
         out.open_stream("native", "joint_states")
-        until(lambda: current_tokens(reader, writer_expression("r1"), 1.0))
+        until(lambda: current_tokens(reader, WRITER_TOKEN.expression("r1"), 1.0))
         raise ZeroDivisionError
-    until(lambda: not current_tokens(reader, writer_expression("r1"), 1.0))
+    until(lambda: not current_tokens(reader, WRITER_TOKEN.expression("r1"), 1.0))
     opened(writer, "native").close()
 
 
@@ -75,8 +75,8 @@ def test_readers_can_measure_the_clock_unless_it_is_simulated(sessions, clock: C
     with RobotWriter(writer, "r1", ("native",), clock=clock) as out:
         out.own([])
         if replies:
-            until(lambda: len(measure_offsets(reader, "r1", 1)) == replies)
-        assert len(measure_offsets(reader, "r1", 1)) == replies
+            until(lambda: len(measure_offsets(reader, "r1")) == replies)
+        assert len(measure_offsets(reader, "r1")) == replies
 
 
 def test_a_second_writer_closes_all_and_is_raised_again(sessions):

@@ -24,7 +24,7 @@ from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import writer_key
+from zstate.wire.keys import WRITER_TOKEN
 from zstate.wire.messages import Status, WriterTransforms, order_digest, to_block
 from zstate.wire.native import encode, encoding_of
 from zstate.wire.protocol import SerializedSample
@@ -208,7 +208,7 @@ def test_token_of_an_earlier_writer_ends_none_that_publishes_an_edge(sessions):
         KeyPublisher(theirs, "zstate/r1/transforms/stranger", encoding_of(WriterTransforms)) as stream,
     ):
         wheels.publish([pose("odom", "base_link")])
-        with announce(theirs, writer_key("r1", "transforms", stranger.identity)):
+        with announce(theirs, WRITER_TOKEN.key("r1", "transforms", stranger.identity)):
             until(lambda: len(current_tokens(ours, "zstate/r1/@writer/*/*", 1.0)) == 2)
 
             def publish_both(child: str, seconds: float) -> bool:

@@ -33,7 +33,7 @@ from zstate.recording.recorder import Recorder
 from zstate.scans import ScanPublisher
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
-from zstate.wire.keys import writer_expression
+from zstate.wire.keys import WRITER_TOKEN
 from zstate.wire.messages import (
     JointState,
     TransformSample,
@@ -86,7 +86,7 @@ def replay(session, path: Path, **options: object) -> int:
 
 def test_samples_of_an_active_writer_are_played_only_with_takeover(sessions, cart: Path):
     with StatePublisher(sessions[0], RRBOT, "cart", streams=["tf"], program="driver"):
-        until(lambda: current_tokens(sessions[1], writer_expression("cart", "tf"), 1.0))
+        until(lambda: current_tokens(sessions[1], "zstate/cart/@writer/$*tf$*/*", 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], cart)
         assert (raised.value.stream, raised.value.first.program) == ("tf", "driver")
@@ -110,7 +110,7 @@ def test_playback_excludes_other_writers_of_its_streams(sessions, cart: Path):
     with Player(sessions[0], cart, rate=0.01) as replayer:
         thread = threading.Thread(target=replayer.run)
         thread.start()
-        until(lambda: current_tokens(sessions[1], writer_expression("cart", "tf"), 1.0))
+        until(lambda: current_tokens(sessions[1], "zstate/cart/@writer/$*tf$*/*", 1.0))
         with pytest.raises(SecondWriter):
             StatePublisher(sessions[1], RRBOT, "cart", streams=["tf"])
         replayer.close()
@@ -135,7 +135,7 @@ def test_ownership_is_the_same_behind_a_router(cart: Path, free_port: int):
         connect(mode="client", endpoints=endpoint) as theirs,
         StatePublisher(theirs, RRBOT, "cart", streams=["tf"]),
     ):
-        until(lambda: current_tokens(ours, writer_expression("cart", "tf"), 1.0))
+        until(lambda: current_tokens(ours, "zstate/cart/@writer/$*tf$*/*", 1.0))
         with pytest.raises(SecondWriter):
             replay(ours, cart)
 
@@ -231,7 +231,7 @@ def test_covariances_are_played_with_their_samples(sessions, tmp_path: Path):
 
 def test_transforms_of_an_active_writer_are_played_only_with_takeover(sessions, tracked: Path):
     with TransformPublisher(sessions[0], "cart", "odometry", program="driver") as live:
-        until(lambda: current_tokens(sessions[1], writer_expression("cart"), 1.0))
+        until(lambda: current_tokens(sessions[1], WRITER_TOKEN.expression("cart"), 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], tracked)
         assert (raised.value.edge, raised.value.first.program) == (None, "driver")
@@ -304,7 +304,7 @@ def test_drivers_are_played_on_the_keys_of_their_names(sessions, drivers: Path):
 
 def test_joints_of_an_active_driver_are_played_only_with_takeover(sessions, drivers: Path):
     with PartialStatePublisher(sessions[0], RRBOT, [ELBOW], "arm", writer="wrist", program="wrist.py"):
-        until(lambda: current_tokens(sessions[1], writer_expression("arm", "partial_joint_states"), 1.0))
+        until(lambda: current_tokens(sessions[1], "zstate/arm/@writer/$*partial_joint_states$*/*", 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], drivers)
         assert raised.value.first.program == "wrist.py"

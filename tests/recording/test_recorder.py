@@ -44,7 +44,7 @@ from zstate.recording.recording import Recording
 from zstate.scans import Grid, MapPublisher, ScanPublisher
 from zstate.sources import SineSource
 from zstate.transform import Transform
-from zstate.wire.keys import writer_key
+from zstate.wire.keys import WRITER_TOKEN
 from zstate.wire.messages import (
     ClockMessage,
     JointState,
@@ -763,7 +763,7 @@ def test_commands_are_recorded_as_joint_states_and_not_replayed(sessions, tmp_pa
     with (
         StatePublisher(sessions[0], RRBOT, "arm") as publisher,
         Recorder(sessions[1], path, ["arm"]) as recorder,
-        announce(sessions[0], writer_key("arm", "joint_commands", teleop.identity)),
+        announce(sessions[0], WRITER_TOKEN.key("arm", "joint_commands", teleop.identity)),
         KeyPublisher(sessions[0], "zstate/arm/joint_commands", encoding_of(JointCommand)) as commands,
     ):
         wait_for_stream_readers(sessions[0], "arm", "joint_states", "joint_commands")

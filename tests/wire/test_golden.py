@@ -21,7 +21,7 @@ from zstate.driving.messages import MotionOutcome
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.urdf import parse_urdf
 from zstate.net.sample_history import MAX_PAGE_BYTES
-from zstate.plugins import all_streams, is_named, latched_streams
+from zstate.plugins import all_streams, is_named, latched_streams, own_streams
 from zstate.streams import StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
@@ -303,7 +303,7 @@ def test_integers_are_accepted_in_the_range_of_the_page_only(title: str, form: s
 def test_the_page_lists_every_stream_with_its_key_its_message_and_how_it_is_delivered():
     rows = {row[0].strip("`"): row for row in rows_of(section("Keys"))}
     for stream, kind in ((row.name, row.type) for row in all_streams()):
-        ends = [f"/{stream}", *(f"/{stream}/<{name}>" for name in ("writer", "sensor", "id"))]
+        ends = [f"/{stream}", *(f"/{stream}/<{name}>" for name in ("writer", "sensor", "identity"))]
         (row,) = (row for key, row in rows.items() if any(key.endswith(end) for end in ends))
         assert row[1].partition(" ")[0] == kind.__name__
         assert row[0].endswith(">`") is (is_named(stream))
@@ -320,6 +320,15 @@ def test_the_digest_in_the_page_is_that_of_its_names():
         == digest
         == blake2b(bytes.fromhex(payload), digest_size=8).hexdigest()
     )
+
+
+def test_the_keys_of_the_page_are_those_of_the_code():
+    forms = {one.form for one in vars(keys).values() if isinstance(one, keys.Key)} | {keys.CLOCK_KEY}
+    streams = [row for row in own_streams() if row.name not in ("clock", *STOP_STREAMS)]
+    forms |= {f"zstate/<robot>/{row.name}" + "/<writer>" * row.named for row in streams}
+    page = [row[0].strip("`").replace("<sensor>", "<writer>") for row in rows_of(section("Keys"))[2:]]
+    assert len(page) == len(set(page))
+    assert set(page) == forms
 
 
 def test_the_size_limits_of_the_page_are_those_of_the_code():
@@ -349,33 +358,23 @@ def parsed_key(key: str) -> Json | None:
         numbers = {"pid": str(one.pid), "since": str(one.since), "session": str(one.session)}
         return {"program": one.program, "host": one.host, **numbers, **({"name": name} if name else {})}
 
-    def edge(robot: str, names: tuple[str, str], identity: str) -> Json:
+    def edge(robot: str, child: str, parent: str, identity: str) -> Json:
         one = Announcement.parse(robot, "transforms", identity)
-        ends = {"parent": names[0], "child": names[1]}
-        return {"robot": robot, **ends, "id": parts(one.writer, one.name)}
+        return {"robot": robot, "parent": parent, "child": child, "id": parts(one.writer, one.name)}
 
     forms: dict[str, Callable[[], Json]] = {
-        "writer": lambda: writer(*keys.parse_writer_key(key)),
-        "reader": lambda: writer(*keys.parse_reader_key(key)),
-        "edge": lambda: edge(*keys.parse_edge_key(key)),
-        "clock": lambda: owned(*keys.parse_clock_key(key)),
-        "status": lambda: owned(*keys.parse_status_key(key)),
-        "release": lambda: owned(*release(key)),
-        "motion": lambda: of_robot(keys.motion_key),
-        "lookup": lambda: of_robot(keys.lookup_key),
+        "writer": lambda: writer(*keys.WRITER_TOKEN.parse(key)),
+        "reader": lambda: writer(*keys.READER_TOKEN.parse(key)),
+        "edge": lambda: edge(*keys.EDGE_TOKEN.parse(key)),
+        "clock": lambda: owned(*keys.WRITER_CLOCK.parse(key)),
+        "status": lambda: owned(*keys.STATUS.parse(key)),
+        "release": lambda: owned(*keys.RELEASE.parse(key)),
+        "motion": lambda: of_robot(*keys.MOTION.parse(key)),
+        "lookup": lambda: of_robot(*keys.LOOKUP.parse(key)),
         "stream": lambda: stream(stream_of(key)),
     }
 
-    def release(key: str) -> tuple[str, str]:
-        robot, identity = keys.robot_from_key(key), key.rpartition("/")[2]
-        if keys.release_key(robot, identity) != key:
-            raise InvalidInput(key)
-        return robot, identity
-
-    def of_robot(key_of: Callable[[str], str]) -> Json:
-        robot = keys.robot_from_key(key)
-        if key_of(robot) != key:
-            raise InvalidInput(key)
+    def of_robot(robot: str) -> Json:
         return {"robot": robot}
 
     def owned(robot: str, identity: str) -> Json:

@@ -11,9 +11,9 @@ from datetime import UTC, datetime
 from difflib import get_close_matches
 from typing import Any, cast
 
-_SECOND_NS = 1_000_000_000
-DAY_NS = 86_400 * _SECOND_NS
-_UNITS = (("seconds", _SECOND_NS), ("milliseconds", 1_000_000), ("microseconds", 1_000))
+SECOND_NS = 1_000_000_000
+DAY_NS = 86_400 * SECOND_NS
+_UNITS = (("seconds", SECOND_NS), ("milliseconds", 1_000_000), ("microseconds", 1_000))
 
 # Notebooks align cells to the right and collapse line breaks; a page of documentation leaves no room.
 _CELL = 'style="text-align:left;white-space:pre-wrap;padding:0.1em 0.6em 0.1em 0"'
@@ -27,7 +27,7 @@ def format_duration(nanoseconds: int) -> str:
     size = abs(nanoseconds)
     if size >= 2 * DAY_NS:
         return f"{nanoseconds / DAY_NS:.1f} days"
-    for unit, scale in (("s", _SECOND_NS), ("ms", 1_000_000), ("us", 1_000)):
+    for unit, scale in (("s", SECOND_NS), ("ms", 1_000_000), ("us", 1_000)):
         if size >= scale:
             return f"{nanoseconds / scale:.1f} {unit}"
     return f"{nanoseconds} ns"
@@ -36,8 +36,8 @@ def format_duration(nanoseconds: int) -> str:
 def format_time(stamp: int) -> str:
     """A stamp [ns] as date and time, or as seconds if it is within ten years of zero."""
     if counts_from_start(stamp):
-        return f"{stamp / _SECOND_NS:.3f} s"
-    return f"{datetime.fromtimestamp(stamp // _SECOND_NS, UTC):%Y-%m-%d %H:%M:%S} UTC"
+        return f"{stamp / SECOND_NS:.3f} s"
+    return f"{datetime.fromtimestamp(stamp // SECOND_NS, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def counts_from_start(stamp: int) -> bool:

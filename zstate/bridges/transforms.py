@@ -9,13 +9,13 @@ from typing import NamedTuple, TypeVar
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
+from zstate.checks import Floats
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter, ZStateError
 from zstate.model.robot import RobotModel
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import OdometryPublisher
 from zstate.odometry.messages import Odometry
 from zstate.transform import Transform
-from zstate.wire.joint_order import Floats
 from zstate.wire.keys import full_name
 from zstate.wire.messages import Edges, covariance_matrix, covariances_of, from_block, poses_from_block
 

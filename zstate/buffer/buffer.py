@@ -80,8 +80,8 @@ class TransformBuffer(BufferCore):
     def __init__(self, history_s: float = DEFAULT_HISTORY_S, clock: Clock | None = None) -> None:
         super().__init__(history_s, clock)
         self._snapshot_readers: dict[frozenset[str], SnapshotReader] = {}
-        # Those of one version of the tree, by the robot's track and the width of the rows that they read.
-        self._joint_readers: tuple[int, dict[tuple[JointTrack, int | None], RobotJoints]] = (0, {})
+        # Those of one version of the tree, by the robot's track and whether its parts are read.
+        self._joint_readers: tuple[int, dict[tuple[JointTrack, bool], RobotJoints]] = (0, {})
 
     def __repr__(self) -> str:
         robots = [repr(track.name) for track in list(self._tree.robots.values()) if track is not None]
@@ -447,9 +447,9 @@ class TransformBuffer(BufferCore):
     def joint_states(self, robot: str, start: int | None = None, end: int | None = None) -> JointHistory:
         """The samples of a robot that are kept, with stamps in [start, end): copies; efforts are not kept.
 
-        Of a robot with several drivers: an instant for each sample of any of them that all of them cover,
-        with the other joints interpolated as in lookups, and their velocities NaN. Raises InvalidInput as
-        ``joint_positions``.
+        A robot with several drivers has a row for the stamp of each driver's sample, if all drivers have
+        samples around it. The joints of the other drivers are interpolated as in lookups; their velocities
+        are NaN. Raises InvalidInput as ``joint_positions``.
         """
         start, end = (None if stamp is None else check_stamp(stamp) for stamp in (start, end))
         return self._robot_joints(self._robot_track(robot)).samples(start, end)
@@ -468,19 +468,19 @@ class TransformBuffer(BufferCore):
             raise NotFinite(track.frame(track.model.root), track.frame(link), requested=stamp)
         return poses, stamp
 
-    def _robot_joints(self, robot: JointTrack, width: int | None = None) -> RobotJoints:
+    def _robot_joints(self, robot: JointTrack, *, with_parts: bool = True) -> RobotJoints:
         # The version is read first: a reader newer than its version is made again, never kept.
         version = self._tree.version
         if self._joint_readers[0] != version:
             self._joint_readers = version, {}
         readers = self._joint_readers[1]
-        reader = readers.get((robot, width))
+        reader = readers.get((robot, with_parts))
         if reader is None:
-            reader = readers[robot, width] = RobotJoints(robot, self._read_views, width)
+            reader = readers[robot, with_parts] = RobotJoints(robot, self._read_views, with_parts=with_parts)
         return reader
 
     def _positions_in(self, view: HistoryView, track: JointTrack, at: int) -> NDArray[np.float64]:
-        return self._robot_joints(track, view.rows.shape[1]).positions(at, (view,))[0]
+        return self._robot_joints(track, with_parts=False).positions(at, (view,))[0]
 
     def snapshot(
         self, at: int | None = None, *, robots: Collection[str] = (), hold_s: float = 0.0

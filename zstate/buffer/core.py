@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from numbers import Real
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,7 +28,7 @@ from zstate.buffer.pose_tracks import (
     checked_rows,
     second_writer,
 )
-from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack, Track, TrackOwner
+from zstate.buffer.tracks import JointTrack, PoseTrack, Track, TrackOwner
 from zstate.buffer.waiting import Waiter, WaiterRegistry
 from zstate.checks import check_names, name_problem
 from zstate.clock import Clock, SystemClock, check_stamp
@@ -108,23 +108,17 @@ class BufferCore:
         """Let errors about unknown frames end with ``hint()`` as long as no frame has been received."""
         self._tree.hint = hint
 
-    def add_robot(
-        self, model: RobotModel, prefix: str = "", *, interpolation: Interpolation = "linear"
-    ) -> JointTrack:
+    def add_robot(self, model: RobotModel, prefix: str = "") -> JointTrack:
         """Add all links of ``model``; its fixed joints need no samples. Returns the track for the others.
 
-        With a ``prefix`` the frames are named ``prefix/link``. ``interpolation="hermite"`` connects
-        samples that have velocities by cubic curves. Raises InsertRefused if one of the links has a
+        With a ``prefix`` the frames are named ``prefix/link``. Raises InsertRefused if one of the links has a
         parent already, InvalidInput for a prefix that cannot begin a frame name.
         """
         if prefix != "":
             if problem := name_problem(prefix):
                 raise InvalidInput(f"the prefix of a robot begins its frames' names; {problem}")
             prefix = prefix.removesuffix("/")
-        if interpolation not in get_args(Interpolation):
-            kinds = ", ".join(get_args(Interpolation))
-            raise InvalidInput(f"interpolation is one of {kinds}; got {interpolation!r}")
-        track = JointTrack(model, prefix, self._span_ns, interpolation)
+        track = JointTrack(model, prefix, self._span_ns)
         track.owner = self._owner
         with self._lock, self._tree.transaction():
             if prefix and self._tree.robots.get(prefix) is not None:
@@ -171,7 +165,7 @@ class BufferCore:
         Its positions are in the order of ``joints``. It moves no edge before ``assign_joints``. Raises
         InvalidInput as ``RobotModel.part``, InsertRefused for a track that is not of this buffer.
         """
-        track = JointTrack(robot.model.part(joints), robot.prefix, self._span_ns, robot.interpolation)
+        track = JointTrack(robot.model.part(joints), robot.prefix, self._span_ns)
         with self._lock:
             self._check_owned(robot)
             track.owner, track.writer, track.model_writer = self._owner, writer, robot.model_writer

@@ -109,13 +109,11 @@ def _published(va: Component, vb: Component, now: Bracket) -> Component:
 class LinearInterpolator:
     """A number that changes linearly from row to row: revolute and prismatic joints, x and y.
 
-    ``velocity`` is the column of its published velocity, -1 without one. With ``cubic``, the
-    curve between two samples that have velocities is the cubic Hermite curve through both.
+    ``velocity`` is the column of its published velocity, -1 without one.
     """
 
     column: int
     velocity: int
-    cubic: bool = False
 
     def difference(self, now: Bracket) -> Component:
         """The change from one row to the other."""
@@ -123,15 +121,7 @@ class LinearInterpolator:
 
     def value(self, now: Bracket) -> Component:
         """The number at the instant."""
-        start, difference = now.a[self.column], self.difference(now)
-        straight = start + now.ratio * difference
-        if not self.cubic or self.velocity < 0:
-            return straight
-        r, dt = now.ratio, now.seconds
-        va, vb = now.a[self.velocity] * dt, now.b[self.velocity] * dt
-        curved = start + r * (va + r * (3.0 * difference - 2.0 * va - vb + r * (va + vb - 2.0 * difference)))
-        # Velocities that were not published are NaN; only NaN differs from itself.
-        return now.f.select(va + vb == va + vb, curved, straight)
+        return now.a[self.column] + now.ratio * self.difference(now)
 
     def rate(self, now: Bracket) -> Component:
         """Per second: as published, between samples linear in their velocities; else the slope."""
@@ -141,11 +131,8 @@ class LinearInterpolator:
         )
         if self.velocity < 0:
             return slope
-        r, va, vb = now.ratio, now.a[self.velocity], now.b[self.velocity]
-        published = _published(va, vb, now)
-        if self.cubic:
-            curved = va + r * (6.0 * slope - 4.0 * va - 2.0 * vb + r * (3.0 * (va + vb) - 6.0 * slope))
-            published = now.f.select(curved == curved, curved, published)  # noqa: PLR0124 - a test for NaN
+        published = _published(now.a[self.velocity], now.b[self.velocity], now)
+        # Velocities that were not published are NaN; only NaN differs from itself.
         return now.f.select(published == published, published, slope)  # noqa: PLR0124
 
     def extrapolate(self, row: Row, rate: float, seconds: float, f: Backend) -> float:

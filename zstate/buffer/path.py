@@ -3,7 +3,7 @@
 An evaluation searches once in each track of the path, reads only the joints on it, and multiplies. All
 numbers of an answer come from one view of each track: its samples at one moment, whatever writers do since.
 ``TransformPath`` is the reference in Python. ``CompiledPath`` evaluates lookups in the C extension, which has
-no formula for cubic interpolation, prediction and velocities: the reference computes those.
+no formula for prediction and velocities: the reference computes those.
 """
 
 from __future__ import annotations
@@ -407,8 +407,7 @@ def compile_path(
     by_track: dict[Track, TrackUse] = {}
     steps_to_target, steps_to_source = _steps(edges.to_target, by_track), _steps(edges.to_source, by_track)
     uses = tuple(by_track.values())
-    is_cubic = any(getattr(one, "cubic", False) for use in uses for one in use.interpolators)
-    kind = CompiledPath if compiled and kernel == "c" and not is_cubic else TransformPath
+    kind = CompiledPath if compiled and kernel == "c" else TransformPath
     return kind(target, source, steps_to_target, steps_to_source, uses, read_views, edges.domain)
 
 
@@ -442,21 +441,20 @@ def _step(edge: Edge, uses: dict[Track, TrackUse]) -> Step:
     return JointStep(form, *place)
 
 
-def joint_interpolators(track: JointTrack, index: int, width: int | None = None) -> list[Interpolator]:
-    """What reads the positions of ``track.model.joints[index]``, in rows of ``width``: now or of a view."""
+def joint_interpolators(track: JointTrack, index: int) -> list[Interpolator]:
+    """The interpolators of the positions of ``track.model.joints[index]``."""
     form = track.forms[index]
     column, velocity = form.column, -1
-    if (track.history.width if width is None else width) > track.position_count:
+    if track.history.width > track.position_count:
         velocity = track.position_count + form.velocity_column
-    cubic = track.interpolation == "hermite"
     if form.kind == "floating":
         return [PoseInterpolator(column, velocity)]
     if form.kind == "planar":
         offsets = (0, 1, 2) if velocity >= 0 else (0, 0, 0)
-        x, y, yaw = ((column + n, velocity + offsets[n], cubic) for n in range(3))
+        x, y, yaw = ((column + n, velocity + offsets[n]) for n in range(3))
         return [LinearInterpolator(*x), LinearInterpolator(*y), ContinuousAngleInterpolator(*yaw)]
     kind = ContinuousAngleInterpolator if track.is_continuous(index) else LinearInterpolator
-    return [kind(column, velocity, cubic)]
+    return [kind(column, velocity)]
 
 
 def _step_tuples(steps: Sequence[Step], uses: Sequence[TrackUse]) -> tuple[StepTuple, ...]:

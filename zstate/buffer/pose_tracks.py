@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.frame_tree import Edge, FrameTree
 from zstate.buffer.tracks import PoseTrack, TrackOwner
-from zstate.checks import real_numbers
+from zstate.checks import QUATERNION_TOLERANCE, real_numbers
 from zstate.errors import InsertRefused, InvalidInput
-from zstate.transform import COVARIANCE_NUMBERS, QUATERNION_TOLERANCE
+from zstate.transform import COVARIANCE_NUMBERS
 
 EdgeNames: TypeAlias = tuple[str, str]
 Poses: TypeAlias = NDArray[np.float64]

@@ -10,29 +10,28 @@ from numpy.typing import NDArray
 
 from zstate.buffer.path import TrackUse, TransformPath, ViewReader, Views, joint_interpolators
 from zstate.buffer.tracks import JointTrack
+from zstate.checks import Floats
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import POSITION_COUNTS, coordinate_names, velocity_columns_by_position
-
-Floats = NDArray[np.float64]
 
 
 class RobotJoints:
     """Reads the joints of ``robot``, each from the track that moves it, and interpolated as in lookups.
 
-    Positions are in the order of the robot's ``joint_names``. With a ``width`` only the joints of this track
-    are read, in views with rows of that width, though parts of the robot may move some of them.
+    Positions are in the order of the robot's ``joint_names``. Without ``with_parts`` all of them are read
+    from the robot's own track, though parts of the robot may move some.
     """
 
-    def __init__(self, robot: JointTrack, read_views: ViewReader, width: int | None = None) -> None:
+    def __init__(self, robot: JointTrack, read_views: ViewReader, *, with_parts: bool) -> None:
         self._robot = robot
-        parts: Mapping[str, JointTrack] = robot.parts if width is None else {}
+        parts: Mapping[str, JointTrack] = robot.parts if with_parts else {}
         joints: dict[JointTrack, list[str]] = {}
         for name in robot.model.joint_names:
             joints.setdefault(parts.get(name, robot), []).append(name)
         self._tracks = tuple(joints)
         root = robot.frame(robot.model.root)
         at_root = TrackUse(robot, [], (root, root))
-        uses = [_use(track, names, width) for track, names in joints.items()] or [at_root]
+        uses = [_use(track, names) for track, names in joints.items()] or [at_root]
         # A path without steps: it reads the values, and its errors name the limiting joint's edge.
         self._path = TransformPath(root, root, (), (), uses, read_views)
         self._columns = [_columns(robot, names) for names in joints.values()]
@@ -104,8 +103,8 @@ def _columns(robot: JointTrack, names: list[str]) -> NDArray[np.intp]:
     return np.array(columns, dtype=np.intp)
 
 
-def _use(track: JointTrack, names: list[str], width: int | None) -> TrackUse:
+def _use(track: JointTrack, names: list[str]) -> TrackUse:
     """How a path reads these joints of a track; its errors name the edge of the first."""
     indices = {joint.name: index for index, joint in enumerate(track.model.joints)}
-    interpolators = [one for name in names for one in joint_interpolators(track, indices[name], width)]
+    interpolators = [one for name in names for one in joint_interpolators(track, indices[name])]
     return TrackUse(track, interpolators, track.edge(track.forms[indices[names[0]]]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,6 @@ from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.transform import COVARIANCE_NUMBERS
 
-Interpolation = Literal["linear", "hermite"]
 ClockOffsets: TypeAlias = dict[str, Callable[[], ClockOffset | None]]
 
 
@@ -51,14 +50,11 @@ class JointTrack:
     part of the robot's (``RobotModel.part``): ``parts`` of the robot's own track has them by joint.
     """
 
-    def __init__(
-        self, model: RobotModel, prefix: str, span_ns: int, interpolation: Interpolation = "linear"
-    ) -> None:
+    def __init__(self, model: RobotModel, prefix: str, span_ns: int) -> None:
         self.model = model
         self.prefix = prefix
         self._table = shared_transforms(model)
         self.forms = self._table.forms
-        self.interpolation: Interpolation = interpolation
         self.writer: str | None = None
         self.model_writer: str | None = None
         self.owner: TrackOwner | None = None

@@ -51,7 +51,7 @@ from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
 from zstate.net.writer import WireWriter
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import check_robot, driver_key, motion_key, release_key
+from zstate.wire.keys import MOTION, RELEASE, check_robot, stream_key
 from zstate.wire.messages import order_digest, to_block
 from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
@@ -125,9 +125,11 @@ class Commander(Closeable):
             writer = opening.enter_context(WireWriter(session, get_wire("native"), self.robot, identity))
             self._writer = writer.open_stream("joint_commands")
             self._claim.confirm()
-            key = release_key(self.robot, identity.identity)
+            key = RELEASE.key(self.robot, identity.identity)
             self._releases = opening.enter_context(KeyPublisher(session, key, encoding_of(Release)))
-            opening.enter_context(LatchedSubscriber(session, driver_key(self.robot), self._on_state))
+            opening.enter_context(
+                LatchedSubscriber(session, stream_key(self.robot, "driver"), self._on_state)
+            )
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:
@@ -381,7 +383,7 @@ class Commander(Closeable):
         So is a cancellation that the driver has not carried out. The last one is waited for until the driver
         would refuse it, so that nothing starts after that.
         """
-        key, deadline = motion_key(self.robot), time.monotonic() + _REPLY_WITHIN_S
+        key, deadline = MOTION.key(self.robot), time.monotonic() + _REPLY_WITHIN_S
         refused = ""
         while (left_s := deadline - time.monotonic()) > 0.0:
             sent = self._with_echo(message)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
+from zstate.checks import Floats
 from zstate.driving.driver import Mode
 from zstate.driving.messages import JointCommand
 from zstate.driving.setpoint_limiter import JointRate, Rates
@@ -32,7 +33,6 @@ from zstate.wire.protocol import SerializedSample
 if TYPE_CHECKING:
     from zstate.driving.ros2 import Ros2Controller
 
-Floats = NDArray[np.float64]
 
 _WAITING = 32
 """Commands that wait for a tick, of which each takes time to check; of more, the oldest are refused."""

@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterable
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.refusals import Refusals
+from zstate.checks import Floats
 from zstate.clock import Clock, MonotonicClock
 from zstate.driving.commands import Command, Targets
 from zstate.driving.driver import Setpoint, StopMode
@@ -30,7 +30,6 @@ from zstate.sources import JointReading
 
 _LOG = logging.getLogger("zstate")
 
-Floats = NDArray[np.float64]
 StateName = Literal["off", "ready", "active", "holding", "stopped", "fault"]
 
 NO_READING = "no two readings that agree have arrived yet"

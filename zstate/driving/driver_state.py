@@ -25,7 +25,7 @@ from zstate.net.session import Session
 from zstate.net.writer import WireWriter
 from zstate.rate import RateReport
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import driver_expression, driver_key, robot_from_key
+from zstate.wire.keys import robot_from_key, stream_expression, stream_key
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
@@ -98,7 +98,7 @@ class DriverStatePublisher(Closeable):
 
     def __init__(self, session: Session, robot: str, build: Callable[[], DriverState]) -> None:
         self._build = build
-        self._latched = LatchedPublisher(session, driver_key(robot), encoding_of(DriverState))
+        self._latched = LatchedPublisher(session, stream_key(robot, "driver"), encoding_of(DriverState))
         self._has_changed = fork_safe(threading.Event())
         self._closed = False
         self._has_failed = False
@@ -199,7 +199,7 @@ def cached_state(session: Session, robot: str, timeout_s: float) -> DriverState 
 
     What a subscriber receives first may be older: a sample that is still under way.
     """
-    for value in cached_values(session, driver_key(robot), timeout_s):
+    for value in cached_values(session, stream_key(robot, "driver"), timeout_s):
         with suppress(MessageError):
             return decode(value.payload, value.encoding, DriverState)
     return None
@@ -245,7 +245,7 @@ class DriverStateListener(Closeable):
         self._on_state = on_state
         self._lock = fork_safe_lock()
         self._newest: BoundedDict[str, tuple[DriverState, float]] = BoundedDict()
-        self._subscriber = LatchedSubscriber(session, driver_expression(robot), self._on_value)
+        self._subscriber = LatchedSubscriber(session, stream_expression(robot, "driver"), self._on_value)
 
     def get(self, robot: str) -> ReceivedState | None:
         """The newest state of the driver of ``robot``, however old it is; None if none has arrived."""

@@ -12,15 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zstate._util.format import suggestion_text
-from zstate.checks import real_numbers, reduced_to_fields
+from zstate.checks import Floats, real_numbers, reduced_to_fields
 from zstate.errors import InvalidInput
 from zstate.model.robot import POSITION_COUNTS, DeclaredLimits, Joint, Mimic, RobotModel, near_joint
 from zstate.wire.keys import shortened
-
-Floats = NDArray[np.float64]
 
 ROUNDING = 1e-9
 """[rad] or [m], and as a ratio for rates: rounding of interpolated values, far below any encoder."""

@@ -34,6 +34,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
+from zstate.checks import Floats
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
 from zstate.driving.limits import Limits
 from zstate.driving.messages import (
@@ -52,7 +53,7 @@ from zstate.errors import InvalidInput, MessageError, format_duration
 from zstate.net.queryable import Reply, RequestAnswer, RequestQueryable
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.wire.keys import motion_key
+from zstate.wire.keys import MOTION
 from zstate.wire.messages import from_block
 from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
@@ -60,7 +61,6 @@ from zstate.wire.protocol import SerializedSample
 if TYPE_CHECKING:
     from zstate.driving.ros2 import Ros2Controller
 
-Floats = NDArray[np.float64]
 
 _Findings: TypeAlias = tuple[str, ...]
 
@@ -429,7 +429,7 @@ class MotionService(Closeable):
         self._places = threading.BoundedSemaphore(_MOST_PLANS)
         with ExitStack() as opening:
             opening.callback(self._planner.shutdown, wait=False, cancel_futures=True)
-            opening.enter_context(RequestQueryable(session, motion_key(robot), self._answer))
+            opening.enter_context(RequestQueryable(session, MOTION.key(robot), self._answer))
             if controller is not None:
                 on_samples = partial(self._on_ros_samples, controller)
                 opening.enter_context(StreamSubscriber(session, controller.trajectories, on_samples))

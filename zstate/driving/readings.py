@@ -8,15 +8,12 @@ is further from that than ``following_error``.
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from zstate.checks import Floats
 from zstate.driving.limits import FARTHEST, Limits
 from zstate.errors import InvalidInput, format_duration
-
-Floats: TypeAlias = NDArray[np.float64]
 
 MOST_OUTSIDE = 0.35
 """[rad] or [m]; a joint that is further outside its limits, or by more than its range, is not moved.

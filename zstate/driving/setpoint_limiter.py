@@ -26,13 +26,12 @@ from itertools import compress
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from zstate.checks import Floats
 from zstate.driving.driver import Mode
 from zstate.driving.limits import ROUNDING, Limits
 from zstate.errors import InvalidInput
-
-Floats = NDArray[np.float64]
 
 _UNBOUNDED = 1e100
 """In place of infinity, whose product with zero is NaN."""

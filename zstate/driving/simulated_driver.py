@@ -8,13 +8,13 @@ from typing import Any, Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate.checks import Floats
 from zstate.driving.driver import Mode, Setpoint, StopMode
 from zstate.errors import InvalidInput
 from zstate.model.pinocchio_solver import load_pinocchio
 from zstate.model.robot import POSITION_COUNTS, RobotModel
 from zstate.sources import JointReading
 
-Floats = NDArray[np.float64]
 Plant: TypeAlias = Literal["mirror", "lag", "dynamics"]
 
 _LAG_S = 0.05

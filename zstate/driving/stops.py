@@ -40,14 +40,12 @@ from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, call_for_each
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import (
+    RELAX,
+    RELEASE,
+    STOP,
     check_robot,
-    driver_key,
-    parse_release_key,
-    parse_stop_key,
-    relax_key,
-    release_expression,
-    stop_expressions,
-    stop_key,
+    stream_from_key,
+    stream_key,
 )
 from zstate.wire.native import decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample
@@ -152,7 +150,7 @@ class _Stopper:
 
     def _publisher(self, session: Session, how: StopMode) -> LatchedPublisher:
         if how not in self._publishers:
-            key = (stop_key if how == "hold" else relax_key)(self._robot, self._writer.identity)
+            key = (STOP if how == "hold" else RELAX).key(self._robot, self._writer.identity)
             self._publishers[how] = LatchedPublisher(session, key, encoding_of(Stop), urgent=True)
         return self._publishers[how]
 
@@ -191,7 +189,7 @@ def wait_for_state(
                 found.append(state)
                 has_found.set()
 
-    with LatchedSubscriber(session, driver_key(robot), on_value):
+    with LatchedSubscriber(session, stream_key(robot, "driver"), on_value):
         has_found.wait(timeout_s)
     return found[0] if found else None
 
@@ -199,7 +197,8 @@ def wait_for_state(
 @lru_cache(4096)  # called for each stop of a flood
 def _parse_key(key: str) -> tuple[WriterId, str]:
     """The writer of a stop, and whether its key is that of a "stop" or "relax"."""
-    _, identity, stream = parse_stop_key(key)
+    stream = stream_from_key(key)
+    _, identity = (RELAX if stream == "relax" else STOP).parse(key)
     return WriterId.parse(identity), stream
 
 
@@ -362,7 +361,7 @@ class StopLatch(StopRegister, Closeable):
             self._read_file()
             self._write_file(is_opening=True)
             wait_for_discovery(session)
-            expressions = stop_expressions(robot)
+            expressions = STOP.expression(robot), RELAX.expression(robot)
             for keyexpr in expressions:
                 call_for_each(cached_values(session, keyexpr, _CACHES_WITHIN_S), self._on_stop)
             self.save()
@@ -370,7 +369,7 @@ class StopLatch(StopRegister, Closeable):
                 session, expressions, self._on_stop, on_batch_end=self.save, capacity=_MOST_WAITING
             )
             opening.enter_context(stops)
-            releases = StreamSubscriber(session, release_expression(robot), self._on_releases)
+            releases = StreamSubscriber(session, RELEASE.expression(robot), self._on_releases)
             opening.enter_context(releases)
             self._opened = opening.pop_all()
 
@@ -407,7 +406,7 @@ class StopLatch(StopRegister, Closeable):
         releases: list[Release] = []
         for sample in samples:
             try:
-                _, identity = parse_release_key(sample.key)
+                _, identity = RELEASE.parse(sample.key)
                 session = WriterId.parse(identity).session
                 release = decode(sample.payload, sample.encoding, Release)
             except (MessageError, InvalidInput) as error:

@@ -27,15 +27,13 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zstate._util.format import suggestion_text
-from zstate.checks import real_numbers
+from zstate.checks import Floats, real_numbers
 from zstate.driving.limits import ROUNDING, Limits, check_joint_names
 from zstate.errors import InvalidInput
 from zstate.model.robot import near_joint
-
-Floats = NDArray[np.float64]
 
 _LEAST_LEADING = 1e-8
 """Of the largest coefficient. Adds a root far outside of 0 to 1 to a polynomial of a lower degree, and moves

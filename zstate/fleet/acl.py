@@ -28,9 +28,12 @@ from zstate.net.security.credentials import check_identity
 from zstate.plugins import is_named, latched_streams
 from zstate.wire.keys import (
     CLOCK_KEY,
-    MOTION_CHUNK,
-    ODOMETRY_CHUNK,
-    VERBATIM_CHUNKS,
+    EDGE_TOKEN,
+    MOTION,
+    ODOMETRY_REQUEST,
+    READER_TOKEN,
+    WRITER_CLOCK,
+    WRITER_TOKEN,
     check_robot,
     check_writer,
 )
@@ -43,7 +46,10 @@ Rule = dict[str, object]
 PUBLISH = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
 SUBSCRIBE = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 
-_WRITER, _, _EDGE, _READER = VERBATIM_CHUNKS
+_WRITER, _EDGE, _READER = WRITER_TOKEN.verbatim, EDGE_TOKEN.verbatim, READER_TOKEN.verbatim
+_REQUESTS = (MOTION, ODOMETRY_REQUEST)
+_VERBATIM = ("@adv", _WRITER, WRITER_CLOCK.verbatim, _EDGE, _READER)
+"""What viewers read although ``zstate/**`` does not match it: cached values, tokens and clocks."""
 _READING = ("NN", "MS", "SC")  # tokens of nodes, of their subscribers and of their service clients
 _NODE_TOPICS = ("rosout", "parameter_events")  # outside of all namespaces; each ROS node writes them
 _SECTIONS = ("rules", "subjects", "policies")
@@ -124,8 +130,9 @@ Grants = Iterator[tuple[Sequence[str], Rule]]
 
 
 def _native_rules(roles: AclRoles) -> Grants:
-    root = f"{roles.namespace}/zstate" if roles.namespace else "zstate"
-    everything, clock = _below(root), root.removesuffix("zstate") + CLOCK_KEY
+    site = f"{roles.namespace}/" if roles.namespace else ""
+    root = f"{site}zstate"
+    everything, clock = _below(root), site + CLOCK_KEY
     latched = tuple(
         f"{root}/*/{stream}/*{end}"
         for stream in latched_streams()
@@ -135,10 +142,10 @@ def _native_rules(roles: AclRoles) -> Grants:
     # A program that may stop a driver reads whether that has stopped.
     drivers = tuple(f"{root}/*/driver{end}" for end in ("", "/@adv/**"))
     shared = (*latched, *drivers, f"{root}/*/{_EDGE}/**", f"{root}/*/{_WRITER}/**", clock)
-    requests = (f"{root}/*/{MOTION_CHUNK}", f"{root}/*/{ODOMETRY_CHUNK}/*")
+    requests = tuple(site + key.expression() for key in _REQUESTS)
     for robot in dict.fromkeys(roles.robots):
         prefix = f"{root}/{check_robot(robot)}"
-        keys = (*_below(prefix), f"{prefix}/{MOTION_CHUNK}", f"{prefix}/{ODOMETRY_CHUNK}/*")
+        keys = (*_below(prefix), *(site + key.expression(robot) for key in _REQUESTS))
         yield (robot,), _ingress(f"{robot} writes", PUBLISH, keys)
         yield (robot,), _ingress(f"{robot} reads", SUBSCRIBE, keys)
         yield (robot,), _egress(f"{robot} is given", PUBLISH, keys)
@@ -174,7 +181,7 @@ def _native_rules(roles: AclRoles) -> Grants:
 
 
 def _below(key: str) -> tuple[str, ...]:
-    return (f"{key}/**", *(f"{key}/**/{chunk}/**" for chunk in ("@adv", *VERBATIM_CHUNKS)))
+    return (f"{key}/**", *(f"{key}/**/{chunk}/**" for chunk in _VERBATIM))
 
 
 class _Ros2Rules:

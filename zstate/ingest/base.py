@@ -373,7 +373,11 @@ class StreamIngest(ABC):
 
     @abstractmethod
     def _fast_place(self, sample: Sample) -> JointTrack | Edges | None:
-        """The track or the edges for ``sample``, inserted just now, if its numbers are a row unchanged."""
+        """The track or edges that the fast path inserts the next samples into; None if it cannot.
+
+        It copies the numbers of a sample as a row. ``sample`` was inserted just now, and shows whether the
+        writer's samples have such numbers.
+        """
 
     @abstractmethod
     def _drop_history(self) -> None:

@@ -3,7 +3,7 @@
 A writer is stale after ten of its periods without a sample, and never before half a second. Commands, the
 page and the events of a listener all apply this rule. The floor is 0.5 s because a
 fast writer on a busy host or a wireless link pauses for tenths of a second without being in trouble, and
-because ``Event`` has always promised it. A writer with an unknown period, of fewer than two samples, is
+because ``WriterEvent`` documents it. A writer with an unknown period, of fewer than two samples, is
 never stale: its robot may just not have moved.
 """
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from zstate.checks import Floats
 
 
 @dataclass(frozen=True, eq=False, slots=True)

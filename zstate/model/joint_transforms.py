@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate.checks import QUATERNION_TOLERANCE, Floats
 from zstate.errors import InvalidInput
 from zstate.extension import kernel
-from zstate.model.robot import NORM_TOLERANCE, Joint, Pose7, RobotModel, Vector3
+from zstate.model.robot import Joint, Pose7, RobotModel, Vector3
 from zstate.se3 import SCALARS, multiply, normalize, rotate, to_matrix
 
 if TYPE_CHECKING or kernel == "c":
@@ -30,7 +31,6 @@ if TYPE_CHECKING or kernel == "c":
 
 EdgeKind = Literal["fixed", "revolute", "prismatic", "planar", "floating"]
 Quaternion = tuple[float, float, float, float]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,17 +111,17 @@ class JointTransforms:
     def has_unit_quaternions(self, positions: Floats) -> NDArray[np.bool_]:
         """Of each row (N, nq): whether ``normalised`` accepts its quaternions."""
         off = np.abs(self._norms(positions) - 1.0).max(axis=(1, 2), initial=0.0)
-        return np.asarray(off) <= NORM_TOLERANCE
+        return np.asarray(off) <= QUATERNION_TOLERANCE
 
     def normalised(self, positions: Floats) -> Floats:
         """``positions`` with the quaternions of floating joints at unit length.
 
-        Raises InvalidInput if a length is off by more than ``NORM_TOLERANCE``.
+        Raises InvalidInput if a length is off by more than ``QUATERNION_TOLERANCE``.
         """
         if not self._floats:
             return positions
         norms = self._norms(positions)
-        if not np.all(np.abs(norms - 1.0) <= NORM_TOLERANCE):
+        if not np.all(np.abs(norms - 1.0) <= QUATERNION_TOLERANCE):
             worst = int(np.abs(norms - 1.0).argmax())
             form = self._floats[worst % len(self._floats)]
             raise InvalidInput(

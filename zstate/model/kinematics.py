@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import did_you_mean
+from zstate.checks import Floats
 from zstate.errors import InvalidInput, LibraryMissing, ModelError
-from zstate.model.joint_transforms import Floats, JointTransforms
+from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel
 
 if TYPE_CHECKING:

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate.checks import Floats
 from zstate.errors import LibraryMissing
 from zstate.extension import kernel
-from zstate.model.joint_transforms import Floats, JointTransform
+from zstate.model.joint_transforms import JointTransform
 from zstate.model.robot import RobotModel
 
 if TYPE_CHECKING or kernel == "c":

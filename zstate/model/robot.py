@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate._util.format import html_table, suggestion_text
-from zstate.checks import real_numbers, reduced_to_fields
+from zstate.checks import QUATERNION_TOLERANCE, real_numbers, reduced_to_fields
 from zstate.errors import FindingLike, InvalidInput
 
 Pose7 = tuple[float, float, float, float, float, float, float]
@@ -51,9 +51,6 @@ POSITION_COUNTS: dict[JointType, int] = {
     "floating": 7,
 }
 VELOCITY_COUNTS: dict[JointType, int] = {**POSITION_COUNTS, "floating": 6}
-
-NORM_TOLERANCE = 1e-3
-"""A floating joint's quaternion is normalised if its length is this close to 1, else refused."""
 
 _SHOWN_JOINTS = 40
 """The joints in the table of a notebook; larger robots have the most."""
@@ -263,7 +260,7 @@ class RobotModel:
         for joint in self._floating_joints:
             column = self.columns[joint.name] + 3
             length = math.hypot(*vector[column : column + 4].tolist())
-            if abs(length - 1.0) > NORM_TOLERANCE:
+            if abs(length - 1.0) > QUATERNION_TOLERANCE:
                 raise InvalidInput(
                     f"the floating joint {joint.name!r} of {joint.parent!r} -> {joint.child!r} was given a "
                     f"quaternion of length {length:.6g}; its last four numbers are qx qy qz qw of length 1"

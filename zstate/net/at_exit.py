@@ -45,6 +45,7 @@ _CALLBACK_THREAD = "pyo3-closure"
 """Part of the name of each thread that Zenoh starts for a callback."""
 
 
+# zenoh 1.10, freeing a session in a forked child waits for the parent's threads: delete when fixed
 def leak(entity: object) -> None:
     """Never free ``entity``, not even when the interpreter ends.
 
@@ -73,6 +74,7 @@ class ClosedAtExit(Protocol):
         """Never free the parts that need Zenoh's threads, which a fork leaves behind."""
 
 
+# CPython before 3.14 unwinds threads of Zenoh at exit, python/cpython#87135: delete with Python 3.13
 class _Process:
     """The sessions of this process, and its exit thread. A forked child has its own."""
 

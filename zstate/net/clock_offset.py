@@ -25,7 +25,7 @@ from zstate.net.queryable import check_timeout, query
 from zstate.net.sample_history import RoundRobinQueue
 from zstate.net.session import Session
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
+from zstate.wire.keys import WRITER_CLOCK
 from zstate.wire.messages import ClockMessage
 from zstate.wire.native import decode
 
@@ -67,21 +67,18 @@ class MeasuredOffset:
 def measure_offsets(
     session: Session,
     robot: str,
-    rounds: int = _ROUNDS,
     *,
     clock: Clock | None = None,
     timeout_s: float = 0.5,
 ) -> tuple[MeasuredOffset, ...]:
     """How far the clock of each writer of ``robot`` ("*": of all robots) is ahead of ``clock``, sorted.
 
-    ``clock`` is this machine's by default. The shortest round trip of ``rounds`` counts. Empty without a
+    ``clock`` is this machine's by default. The shortest of eight round trips counts. Empty without a
     reply within ``timeout_s``. Raises InvalidInput and Closed.
     """
-    if rounds < 1:
-        raise InvalidInput(f"rounds is 1 or more; got {rounds}")
     check_timeout(timeout_s)
     return tuple(
-        sorted(_measure(session, clock_expression(robot), rounds, clock or SystemClock(), timeout_s))
+        sorted(_measure(session, WRITER_CLOCK.expression(robot), _ROUNDS, clock or SystemClock(), timeout_s))
     )
 
 
@@ -113,7 +110,7 @@ def unanswered(
         handler = zenoh.handlers.Callback(
             partial(on_reply, (robot, writer)), partial(on_end, (robot, writer)), indirect=False
         )
-        session.zenoh.get(clock_key(robot, writer.identity), handler, timeout=timeout_s)
+        session.zenoh.get(WRITER_CLOCK.key(robot, writer.identity), handler, timeout=timeout_s)
     with ended:
         ended.wait_for(lambda: len(durations_s) == len(writers), timeout_s + _DISCOVERY_S)
     return {
@@ -158,7 +155,7 @@ def _offset_in(reply: zenoh.Reply, sent: int, round_trip_ns: int) -> MeasuredOff
     if reply.ok is None:
         return None
     try:
-        robot, identity = parse_clock_key(str(reply.ok.key_expr))
+        robot, identity = WRITER_CLOCK.parse(str(reply.ok.key_expr))
         writer = WriterId.parse(identity)
         message = decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), ClockMessage)
     except (InvalidInput, MessageError):
@@ -196,7 +193,9 @@ class ClockOffsetMonitor(Closeable):
         """A function that returns the clock offset of ``writer``; measured now, and again after 30 s."""
         offset = self._watched.get(writer)
         if offset is None:
-            offset = self._watched[writer] = _WriterOffset(self, robot, clock_key(robot, writer.identity))
+            offset = self._watched[writer] = _WriterOffset(
+                self, robot, WRITER_CLOCK.key(robot, writer.identity)
+            )
             offset()
             self._offsets[str(writer)] = offset
         return offset

@@ -9,7 +9,7 @@ from zstate.clock import Clock
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import clock_key
+from zstate.wire.keys import WRITER_CLOCK
 from zstate.wire.messages import ClockMessage
 from zstate.wire.native import encode, encoding_of
 
@@ -22,4 +22,4 @@ class ClockService(Queryable):
             message = ClockMessage(clock.now(), self.answered, writer.session)
             return Reply(encode(message), encoding_of(ClockMessage))
 
-        super().__init__(session, clock_key(robot, writer.identity), answer)
+        super().__init__(session, WRITER_CLOCK.key(robot, writer.identity), answer)

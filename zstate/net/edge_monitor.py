@@ -30,7 +30,7 @@ from zstate.net.streams import CAPACITY, Ring, to_serialized
 from zstate.plugins import edge_streams
 from zstate.streams import SAMPLE_BYTES
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import stream_key, writer_expression
+from zstate.wire.keys import WRITER_TOKEN, stream_key
 from zstate.wire.messages import JointState, TransformSample
 from zstate.wire.native import NativeWire
 
@@ -81,7 +81,7 @@ class EdgeMonitor(Closeable):
         """Watch these edges, which ``claim_edges`` owns now."""
         if self._tokens is None:
             self._tokens = self._session.zenoh.liveliness().declare_subscriber(
-                writer_expression(self._writer.robot),
+                WRITER_TOKEN.expression(self._writer.robot),
                 zenoh.handlers.RingChannel(CAPACITY),
                 history=True,
             )

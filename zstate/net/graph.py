@@ -16,12 +16,11 @@ from zstate._util.closeable import Closeable
 from zstate.errors import NetworkError, Unreachable
 from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
-from zstate.net.status_monitor import StatusSubscriber
+from zstate.net.status_monitor import StatusMonitor, WriterState
 from zstate.plugins import edge_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MODEL_WRITER
-from zstate.wire.messages import Status
 
 if TYPE_CHECKING:
     from zstate.wire.ros2.graph import DdsToken, EndpointToken, NodeToken
@@ -34,7 +33,6 @@ _FIRST_PERIOD_S = 0.5
 _DISCOVERY_TIMEOUT_S = 0.3
 _IDLE_AFTER_S = 3.0
 _JOIN_TIMEOUT_S = 1.0
-_MAX_STATUSES = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,15 +137,6 @@ def build_graph(
     return Graph(tuple(uses))
 
 
-@dataclass(frozen=True, slots=True)
-class WriterState:
-    """The newest status of a publisher of ``robot``, received ``age_s`` ago."""
-
-    robot: str
-    status: Status
-    age_s: float
-
-
 class GraphMonitor(Closeable):
     """Keeps the graph and the status of all publishers up to date, from its own thread.
 
@@ -157,11 +146,9 @@ class GraphMonitor(Closeable):
     def __init__(self, session: Session) -> None:
         self._session = session
         self._graph = Graph()
-        self._statuses: dict[tuple[str, int], tuple[Status, float]] = {}
         self._used_at = -_IDLE_AFTER_S
-        self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._status = StatusSubscriber(session, ANY, self._on_status)
+        self._statuses = StatusMonitor(session, ANY)
         self._thread = threading.Thread(target=self._run, name="zstate graph", daemon=True)
         self._thread.start()
 
@@ -172,17 +159,7 @@ class GraphMonitor(Closeable):
 
     def states(self) -> tuple[WriterState, ...]:
         """The newest status of every announced publisher, sorted by robot and program."""
-        with self._lock:
-            statuses = list(self._statuses.items())
-        now = time.monotonic()
-        states = (WriterState(robot, status, now - at) for (robot, _), (status, at) in statuses)
-        return tuple(sorted(states, key=lambda state: (state.robot, state.status.program)))
-
-    def _on_status(self, robot: str, status: Status) -> None:
-        key = (robot, status.session)
-        with self._lock:
-            if key in self._statuses or len(self._statuses) < _MAX_STATUSES:
-                self._statuses[key] = (status, time.monotonic())
+        return self._statuses.states()
 
     def _run(self) -> None:
         while not self._stop.wait(_PERIOD_S if self._graph.streams else _FIRST_PERIOD_S):
@@ -197,14 +174,13 @@ class GraphMonitor(Closeable):
                 return
             # The process of this monitor may itself read all robots, which is no stream of a robot.
             self._graph = Graph(tuple(stream for stream in graph.streams if stream.robot != ANY))
-            alive = {(robot.name, writer.session) for robot in robots for _, writer in robot.writers}
-            with self._lock:
-                for key in self._statuses.keys() - alive:
-                    del self._statuses[key]
+            self._statuses.keep(
+                {(robot.name, writer.session) for robot in robots for _, writer in robot.writers}
+            )
 
     def close(self) -> None:
         self._stop.set()
-        self._status.close()
+        self._statuses.close()
         self._thread.join(_JOIN_TIMEOUT_S)
 
 

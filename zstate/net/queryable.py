@@ -32,6 +32,7 @@ from zstate.wire.keys import shortened
 MAX_REPLIES = 100_000
 """Limit of the replies to one query that are used. More are counted, and logged as a warning."""
 
+# zenoh 1.10, a channel that is full of a session's own replies blocks it for ever: delete when fixed
 _NEVER_FULL = 2**24
 """Zenoh itself would need more than 10 GB for as many tokens. The channel allocates only what it holds."""
 
@@ -40,8 +41,8 @@ CAPACITY = 64
 
 MAX_PAUSE_S = 0.2
 
+# zenoh 1.10, longer timeouts and infinity are refused as negative: delete when fixed
 _LONGEST_TIMEOUT_S = 1e9
-"""Zenoh takes longer ones, and infinity, for negative."""
 
 _LOG = logging.getLogger("zstate")
 

@@ -104,13 +104,14 @@ class RendezvousRegistration:
     @property
     def is_registered(self) -> bool:
         """Whether the session sees a rendezvous peer there now."""
-        # bool in the stub, but it is an object and always true
+        # zenoh 1.10, a MatchingStatus, always true, is a bool in the stub: delete the comment when fixed
         return bool(self._publisher.matching_status.matching)  # pyright: ignore
 
     def _register(self, stop: threading.Event) -> None:
         self._publisher.put(b"")  # has no receiver, but fails if the session is closed
-        # An open session cannot be made to connect. But the rendezvous peer connects to each endpoint that
-        # gossip brings it, and a temporary peer that connects to both of them gossips ours.
+        # zenoh 1.10, an open session cannot be made to connect: delete when it can. But the rendezvous peer
+        # connects to each endpoint that gossip brings it, and a temporary peer that connects to both of them
+        # gossips ours.
         config = default_config("peer", self._endpoints, ())
         config.insert_json5("scouting/gossip/autoconnect", '{"peer": []}')  # to these two only
         deadline = time.monotonic() + REGISTRATION_TIMEOUT_S
@@ -237,8 +238,8 @@ class _Address:
         try:
             session = open_zenoh(default_config("peer", (), [self.endpoint]))
             peer.callback(session.close)
-            # Closing undeclares nothing: a session that connects at that moment would see the subscription
-            # for ever. So it is undeclared first.
+            # zenoh 1.10, closing undeclares nothing, and a session that connects at that moment sees the
+            # subscription for ever: delete when fixed. So it is undeclared first.
             peer.callback(session.declare_subscriber(self._key, zenoh.handlers.RingChannel(1)).undeclare)
         except zenoh.ZError:
             return  # another process was quicker

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Container
+from dataclasses import dataclass
 
 from zstate._util.bounded import BoundedDict
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.session import Session
 from zstate.net.status import PERIOD_S
 from zstate.net.streams import StreamSubscriber, call_for_each
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import parse_status_key, status_expression
+from zstate.wire.keys import STATUS
 from zstate.wire.messages import Status
 from zstate.wire.native import decode
 from zstate.wire.protocol import SerializedSample
@@ -42,7 +44,16 @@ class StatusSubscriber(StreamSubscriber):
             else:
                 callback(name, status)
 
-        super().__init__(session, status_expression(robot), lambda samples: call_for_each(samples, on_sample))
+        super().__init__(session, STATUS.expression(robot), lambda samples: call_for_each(samples, on_sample))
+
+
+@dataclass(frozen=True, slots=True)
+class WriterState:
+    """The newest status of a publisher of ``robot``, received ``age_s`` ago."""
+
+    robot: str
+    status: Status
+    age_s: float
 
 
 class StatusMonitor(StatusSubscriber):
@@ -50,17 +61,34 @@ class StatusMonitor(StatusSubscriber):
 
     def __init__(self, session: Session, robot: str) -> None:
         self._newest: BoundedDict[tuple[str, int], tuple[Status, float]] = BoundedDict()
+        self._lock = fork_safe_lock()
         super().__init__(session, robot, self._on_status)
 
     def _on_status(self, robot: str, status: Status) -> None:
-        self._newest[robot, status.session] = status, time.monotonic()
+        with self._lock:
+            self._newest[robot, status.session] = status, time.monotonic()
+
+    def states(self) -> tuple[WriterState, ...]:
+        """All of them, sorted by robot and program."""
+        with self._lock:
+            newest = list(self._newest.items())
+        now = time.monotonic()
+        states = [WriterState(robot, status, now - at) for (robot, _), (status, at) in newest]
+        return tuple(sorted(states, key=lambda state: (state.robot, *_program(state.status))))
 
     def recent(self, robot: str) -> list[Status]:
         """Those of ``robot`` received in the last 3 s, sorted by program."""
-        since = time.monotonic() - _RECENT_S
-        newest = self._newest.copy().items()
-        found = [status for (name, _), (status, at) in newest if name == robot and at >= since]
-        return sorted(found, key=lambda status: (status.program, status.host, status.pid, status.session))
+        return [one.status for one in self.states() if one.robot == robot and one.age_s <= _RECENT_S]
+
+    def keep(self, publishers: Container[tuple[str, int]]) -> None:
+        """Forget all publishers but these (robot, session)."""
+        with self._lock:
+            for key in [key for key in self._newest if key not in publishers]:
+                del self._newest[key]
+
+
+def _program(status: Status) -> tuple[str, str, int, int]:
+    return status.program, status.host, status.pid, status.session
 
 
 def _decode_status(sample: SerializedSample) -> tuple[str, Status]:
@@ -68,7 +96,7 @@ def _decode_status(sample: SerializedSample) -> tuple[str, Status]:
     if len(sample.payload) > MAX_STATUS_BYTES:
         text = f"a Status of {len(sample.payload)} bytes, more than {MAX_STATUS_BYTES}"
         raise MessageError(text, reason="too large")
-    robot, identity = parse_status_key(sample.key)
+    robot, identity = STATUS.parse(sample.key)
     status = decode(sample.payload, sample.encoding, Status)
     if status.session != WriterId.parse(identity).session:
         raise MessageError(f"the Status of another writer on {sample.key!r}", reason="foreign")

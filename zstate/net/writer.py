@@ -46,7 +46,7 @@ class SampleWriter(KeyPublisher):
         super().__init__(session, encoder.key, encoder.encoding)
         self.encoder = encoder
         self.path: PublishPath | None = None
-        """What else publishes samples of this writer, and counts them."""
+        """The extension's publisher of this writer's usual samples, which counts them; None without it."""
         self._samples = self._bytes = 0
         self._attachment = encoder.attachment
 

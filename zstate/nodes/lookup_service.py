@@ -13,7 +13,7 @@ from zstate.net.queryable import Queryable, Reply
 from zstate.net.sample_history import SampleCache
 from zstate.net.session import Session
 from zstate.transform import Transform
-from zstate.wire.keys import full_name, lookup_key
+from zstate.wire.keys import LOOKUP, full_name
 from zstate.wire.lookup_request import LookupRequest, error_to_json, to_json
 from zstate.wire.messages import from_block
 from zstate.wire.native import decode_joint_state
@@ -46,7 +46,7 @@ class LookupService(Queryable):
             except ZStateError as error:
                 return Reply(error_to_json(error), _JSON, is_error=True)
 
-        super().__init__(session, lookup_key(robot), answer)
+        super().__init__(session, LOOKUP.key(robot), answer)
 
 
 class RecentBuffer:

@@ -193,7 +193,7 @@ class StatePublisher(SamplePublisher):
         return f"<StatePublisher of {self.robot!r} on {wires}: {self._sent} samples{closed}>"
 
     def _open_path(self, joints: Sequence[SampleWriter]) -> PublishPath | None:
-        """What publishes usual samples in one call; None without the extension, or with several wires."""
+        """The extension's publisher of usual samples; None without the extension, or with several wires."""
         out, encoder = self._out, self._encoder.compiled
         if encoder is None or len(joints) != 1:
             return None

@@ -12,14 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zstate.checks import Floats
 from zstate.odometry.fusion import MOST_BIAS, Estimate, Inertia, started
-from zstate.odometry.invariant_filter import (
-    GRAVITY,
-    POSITION,
-    ROTATION,
-    Floats,
-    initial_state,
-)
+from zstate.odometry.invariant_filter import GRAVITY, POSITION, ROTATION, initial_state
 from zstate.odometry.rotations import rotation_exp, skew
 from zstate.transform import Transform
 

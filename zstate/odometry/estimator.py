@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 from zstate import se3
 from zstate._util.format import did_you_mean, format_duration
 from zstate.buffer.buffer import TransformBuffer, check_duration
+from zstate.checks import Floats
 from zstate.clock import Clock, check_stamp
 from zstate.errors import InFuture, InPast, InvalidInput, NoData
 from zstate.odometry.alignment import COARSE_S, Alignment, align, start_at
@@ -45,7 +46,7 @@ from zstate.odometry.fusion import (
     odom_pose,
 )
 from zstate.odometry.health import Outcome, SourceHealth, SourceRecord
-from zstate.odometry.invariant_filter import FilterState, Floats, ImuNoise, Measurement
+from zstate.odometry.invariant_filter import FilterState, ImuNoise, Measurement
 from zstate.odometry.legs import Legs
 from zstate.odometry.measurements import (
     MAX_SIGMA,

@@ -32,6 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zstate import se3
+from zstate.checks import Floats
 from zstate.odometry.health import Outcome, gate
 from zstate.odometry.invariant_filter import (
     GRAVITY,
@@ -40,7 +41,6 @@ from zstate.odometry.invariant_filter import (
     ROTATION,
     VELOCITY,
     FilterState,
-    Floats,
     ImuNoise,
     Innovation,
     Measurement,

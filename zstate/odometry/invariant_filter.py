@@ -29,8 +29,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zstate.checks import Floats
 from zstate.errors import InvalidInput
-from zstate.odometry.rotations import SKEW, Floats, gammas, skew
+from zstate.odometry.rotations import SKEW, gammas, skew
 
 GRAVITY = np.array([0.0, 0.0, -9.80665])
 """[m/s^2] in the world: standard gravity."""

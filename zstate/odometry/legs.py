@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zstate._util.format import did_you_mean, suggestion_text
+from zstate.checks import Floats
 from zstate.errors import InvalidInput
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import Joint, RobotModel, near_joint
@@ -27,7 +28,6 @@ from zstate.odometry.invariant_filter import (
     without_contact,
 )
 from zstate.odometry.measurements import contact
-from zstate.odometry.rotations import Floats
 
 _STANCE_NS, _STANCE_MOTION = 500_000_000, 0.003
 """The means of so long of where feet are differ by less [m] while a robot stands on all of them."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from zstate import se3
-from zstate.checks import real_numbers
+from zstate.checks import Floats, real_numbers
 from zstate.errors import InvalidInput
 from zstate.odometry.invariant_filter import (
     GYRO_BIAS,
@@ -21,7 +21,6 @@ from zstate.odometry.invariant_filter import (
     ROTATION,
     VELOCITY,
     FilterState,
-    Floats,
     Measurement,
     contact_row,
 )

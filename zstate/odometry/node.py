@@ -20,6 +20,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
 from zstate._util.format import format_duration
 from zstate._util.refusals import Refusals
+from zstate.checks import Floats
 from zstate.clock import SYSTEM, Clock
 from zstate.errors import Closed, InPast, InvalidInput, NoData, SecondWriter
 from zstate.model.robot import POSITION_COUNTS, RobotModel
@@ -29,7 +30,6 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
-from zstate.odometry.invariant_filter import Floats
 from zstate.odometry.messages import Imu, Pose, Velocity, with_full_names
 from zstate.odometry.publishers import OdometryPublisher
 from zstate.odometry.requests import apply_request
@@ -37,7 +37,7 @@ from zstate.odometry.source_noise import PoseNoise, VelocityNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.keys import check_robot, odometry_request_key, shortened
+from zstate.wire.keys import ODOMETRY_REQUEST, check_robot, shortened
 from zstate.wire.messages import covariance_matrix, from_block
 from zstate.wire.registry import get_wire
 
@@ -255,7 +255,7 @@ class OdometryNode(Closeable):
             self._publisher = opening.enter_context(
                 OdometryPublisher(session, robot, writer, program=program)
             )
-            request_key = odometry_request_key(robot, self._publisher.writer)
+            request_key = ODOMETRY_REQUEST.key(robot, self._publisher.writer)
             opening.enter_context(Queryable(session, request_key, self._on_request, is_exact=True))
             if has_joints:
                 joints = JointStateListener(session, robot, on_reading=self._on_joints)

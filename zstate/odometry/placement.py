@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from zstate import se3
+from zstate.checks import Floats
 from zstate.odometry.fusion import Drift, Estimate, at_its_estimate, odom_pose
-from zstate.odometry.invariant_filter import POSITION, ROTATION, VELOCITY, FilterState, Floats
+from zstate.odometry.invariant_filter import POSITION, ROTATION, VELOCITY, FilterState
 from zstate.odometry.measurements import frame_pose
 from zstate.odometry.rotations import skew
 from zstate.transform import Transform

@@ -17,7 +17,7 @@ from zstate.net.queryable import check_timeout, query
 from zstate.net.session import Session
 from zstate.odometry.estimator import BaseEstimator
 from zstate.transform import Transform
-from zstate.wire.keys import odometry_request_key, shortened
+from zstate.wire.keys import ODOMETRY_REQUEST, shortened
 
 _RETRY_S = 0.02
 
@@ -39,7 +39,7 @@ def request_odometry(
     the reason if the node refuses, and Unreachable without a reply within ``timeout_s`` [s].
     """
     check_timeout(timeout_s)
-    key = odometry_request_key(robot, writer)
+    key = ODOMETRY_REQUEST.key(robot, writer)
     selector = f"{key}?do={action}"
     if odom_from_base is not None:
         selector += f";pose={','.join(map(repr, odom_from_base.pose7.tolist()))}"

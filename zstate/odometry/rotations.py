@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from zstate.checks import Floats
 
 SKEW = np.zeros((3, 9))
 """``(v @ SKEW).reshape(3, 3)`` is [v], the matrix of the cross product with v; also for rows of vectors."""

@@ -17,16 +17,16 @@ from random import Random
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zstate._util.fork_safe import fork_safe_lock
+from zstate.checks import Floats
 from zstate.errors import InvalidInput
 from zstate.odometry.invariant_filter import ImuNoise
 from zstate.sources import JointReading
 from zstate.sources.square_drive import SquareDriveState, WheelPair
 from zstate.transform import Transform
 
-Floats: TypeAlias = NDArray[np.float64]
 WheelRates: TypeAlias = tuple[float, float]
 """Of the left and the right wheel [rad/s]."""
 

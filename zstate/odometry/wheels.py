@@ -17,13 +17,11 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zstate._util.format import did_you_mean
-from zstate.checks import real_numbers
+from zstate.checks import Floats, real_numbers
 from zstate.errors import InvalidInput
-
-Floats = NDArray[np.float64]
 
 _TURN_LIMIT = math.pi * (1.0 + 1e-9)
 _MOST_TURNED = 1e9

@@ -22,7 +22,7 @@ from zstate.scans.messages import LaserScan
 from zstate.wire.keys import full_name
 from zstate.wire.messages import from_float32_block, to_float32_block
 
-Floats = NDArray[np.float32]
+Floats32 = NDArray[np.float32]
 
 # A full turn as float32, which sensors publish, is larger than that of a float64.
 _FULL_TURN = math.tau + 1e-5
@@ -46,11 +46,11 @@ class Scan:
     angle_min: float
     angle_increment: float
     ray_ns: int
-    ranges: Floats
+    ranges: Floats32
     range_min: float
     range_max: float
     frame: str = "laser"
-    intensities: Floats | None = None
+    intensities: Floats32 | None = None
 
     def __init__(  # noqa: PLR0917 - the order is that of LaserScan
         self,
@@ -140,7 +140,7 @@ class Scan:
         # The limits are rounded to float32 here, as the ranges are. NaN fails each comparison.
         return (ranges >= self.range_min) & (ranges <= self.range_max) & (ranges < math.inf)
 
-    def points(self) -> Floats:
+    def points(self) -> Floats32:
         """The measured points in ``frame``: (N, 3), x y z [m], NaN for rays that are not valid."""
         measured = np.where(self.valid, self.ranges, np.float32(math.nan))
         return _directions(self.angle_min, self.angle_increment, len(measured)) * measured[:, None]
@@ -198,7 +198,7 @@ def scan_from_message(message: LaserScan, robot: str) -> Scan:
 
 
 @lru_cache(maxsize=64)  # a sensor keeps its geometry
-def _directions(angle_min: float, angle_increment: float, count: int) -> Floats:
+def _directions(angle_min: float, angle_increment: float, count: int) -> Floats32:
     """Unit vectors along the rays of a scan: (count, 3), read-only."""
     angles = angle_min + angle_increment * np.arange(count)
     vectors = np.stack((np.cos(angles), np.sin(angles), np.zeros(count)), axis=-1).astype(np.float32)
@@ -211,7 +211,7 @@ def _offsets(ray_ns: int, count: int) -> NDArray[np.int64]:
     return ray_ns * np.arange(count, dtype=np.int64)
 
 
-def _float32(values: Any, what: str) -> Floats:
+def _float32(values: Any, what: str) -> Floats32:
     """A read-only copy of ``values``, (N,). Raises InvalidInput for other shapes."""
     numbers = real_numbers(values, what)
     if numbers.ndim != 1:

@@ -36,8 +36,8 @@ _LEVEL_M = 1e-6
 """A laser up to this height is in the plane of the map, and measures no floor."""
 
 _WALL_HEIGHT_M = 2.5
-_SET_BACK_NS = 10**9
-"""A clock earlier by more than this was set back; by less, a tick was late."""
+_RESTART_NS = 10**9
+"""A clock earlier by more than this was set back, and the laser starts again; by less, a tick was late."""
 
 _FARTHEST = 1000  # cells; a smaller square is free as well
 
@@ -208,7 +208,7 @@ class MountedLaser:
         at the start of each loop of a recording, starts again.
         """
         target = self.target
-        if stamp < self._last - _SET_BACK_NS:
+        if stamp < self._last - _RESTART_NS:
             self._last = -1
         try:
             end = min(stamp, self._newest(target, stamp))

@@ -15,8 +15,6 @@ from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, JointType, Robo
 from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.wire.messages import JointState
 
-Floats = NDArray[np.float64]
-
 _MAX_PARTS = 64
 
 

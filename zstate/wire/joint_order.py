@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate.checks import Floats
 from zstate.errors import MessageError
 from zstate.wire.messages import Edges, JointState, from_block, order_digest
 
-Floats = NDArray[np.float64]
 _Indices = NDArray[np.intp]
 
 

@@ -1,41 +1,18 @@
 """The native key space: one prefix for each robot, one chunk for its name.
 
-================================================  ==========================================
-``zstate/<robot>/joint_states``                   JointState, each sample; a query returns a HistoryPage
-``zstate/<robot>/partial_joint_states/<writer>``  JointState with the names of its joints; likewise
-``zstate/<robot>/tf``                             TransformSample, each sample; likewise
-``zstate/<robot>/tf_static/<writer>``             StaticTransforms, latched
-``zstate/<robot>/transforms/<writer>``            WriterTransforms, each sample; likewise
-``zstate/<robot>/robot_description``              RobotDescription, latched
-``zstate/<robot>/<stream>/<writer>``              any other stream with names, such as ``imu`` and ``scan``;
-                                                  on ``odometry``, a query returns a HistoryPage
-``zstate/<robot>/joint_commands``                 JointCommand, to a driver
-``zstate/<robot>/joint_setpoints``                JointState with joint names, of a driver, while read
-``zstate/<robot>/driver``                         DriverState, latched
-``zstate/<robot>/stop/<id>``                      Stop, latched: of one program that stops the driver
-``zstate/<robot>/relax/<id>``                     Stop, latched: of one that switches its torque off, too
-``zstate/<robot>/release/<id>``                   Release, of a commander
-``zstate/<robot>/@motion``                        a queryable: JointTrajectory or MotionCancel, to a driver
-``zstate/<robot>/lookup``                         a queryable
-``zstate/<robot>/status/<id>``                    Status of one writer, once a second while read
-``zstate/<robot>/@writer/<streams>/<id>``         liveliness token of one writer, with all its streams
-``zstate/<robot>/@clock/<id>``                    a queryable: the time by that writer's clock
-``zstate/<robot>/@edge/<child>/<parent>/<id>``    liveliness token of a writer that places a moving edge, or
-                                                  is about to place a static one
-``zstate/@reader/<robot>/<streams>/<id>``         liveliness token of one reader, likewise
-``zstate/clock``                                  ClockMessage
-================================================  ==========================================
+A stream has the key ``zstate/<robot>/<stream>``, or ``zstate/<robot>/<stream>/<writer>`` if its writers have
+names (``stream_key``); the simulated time has ``zstate/clock``. All other keys are a ``Key`` below. The table
+in docs/wire.md has all of them, with what is sent on each.
 
-``<id>`` is the identity of a writer or reader, already one chunk; ``<streams>`` are joined by commas. A
-writer has one token for all, because what tokens cost a router grows with the square of their number.
-Functions that build a key raise InvalidInput for names that are not one chunk of a key, and functions that
-parse one for any other key. An expression for the robot ``"*"`` matches all robots.
+``<identity>`` is that of a writer or reader, already one chunk; ``<streams>`` are joined by commas. A writer
+has one token for all, because what tokens cost a router grows with the square of their number.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
+from typing import Any, Generic, NamedTuple, TypeVarTuple, cast
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput
@@ -47,18 +24,6 @@ ANY = "*"
 
 STOP_STREAMS: tuple[StreamName, ...] = ("stop", "relax")
 """The streams of stops. Access control lets every identity write the first, which never drops a load."""
-
-READERS = "zstate/@reader/*/*/*"
-"""The key expression of the tokens of all readers."""
-
-VERBATIM_CHUNKS = ("@writer", "@clock", "@edge", "@reader")
-"""The chunks of tokens and clocks: ``*`` and ``**`` do not match them (Zenoh: verbatim chunks)."""
-
-MOTION_CHUNK = "@motion"
-"""The chunk of requests for motions. It is verbatim, too: access control lets viewers query ``zstate/**``."""
-
-ODOMETRY_CHUNK = "@odometry"
-"""The chunk of requests to the writer of an odometry, likewise verbatim."""
 
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""
@@ -117,228 +82,6 @@ def shortened(text: str) -> str:
     return text if len(text) <= MAX_NAME_LENGTH else f"{text[:MAX_NAME_LENGTH]}..."
 
 
-def stream_key(robot: str, stream: StreamName, writer: str = "") -> str:
-    """The key of ``stream``: of the named ones one for each ``writer``; ``clock`` has only one."""
-    if stream == "clock":
-        return CLOCK_KEY
-    key = f"zstate/{check_robot(robot)}/{stream}"
-    return f"{key}/{check_writer(writer)}" if is_named(stream) else key
-
-
-def stream_from_key(key: str) -> StreamName:
-    """The stream of a ``stream_key``. Raises InvalidInput for any other key."""
-    chunks = _chunks(key)
-    stream = find_stream(chunks[2]) if len(chunks) > 2 and chunks[0] == "zstate" else None
-    if stream is not None and len(chunks) == (4 if stream.named else 3):
-        return stream.name
-    raise _form_error(key, "zstate/<robot>/<stream>")
-
-
-def stream_expression(robot: str, stream: StreamName) -> str:
-    """The key expression of every writer of ``stream``."""
-    if stream == "clock":
-        return CLOCK_KEY
-    key = f"zstate/{_check_robot_or_any(robot)}/{stream}"
-    return f"{key}/*" if is_named(stream) else key
-
-
-def lookup_key(robot: str) -> str:
-    """The key of the queryable that serves lookups to devices without a buffer."""
-    return f"zstate/{check_robot(robot)}/lookup"
-
-
-def status_key(robot: str, identity: str) -> str:
-    """The key on which one writer publishes its Status."""
-    return f"zstate/{check_robot(robot)}/status/{identity}"
-
-
-def status_expression(robot: str) -> str:
-    """The key expression of every status of ``robot``."""
-    return f"zstate/{_check_robot_or_any(robot)}/status/*"
-
-
-def parse_status_key(key: str) -> tuple[str, str]:
-    """Robot and identity in a ``status_key``."""
-    robot, identity = _parse(key, "zstate/<robot>/status/<identity>")
-    return check_robot(robot), identity
-
-
-def driver_key(robot: str) -> str:
-    """The key on which the driver of a robot publishes its DriverState."""
-    return f"zstate/{check_robot(robot)}/driver"
-
-
-def driver_expression(robot: str) -> str:
-    """The key expression of the ``driver_key`` of ``robot``, or of all robots."""
-    return f"zstate/{_check_robot_or_any(robot)}/driver"
-
-
-def stop_key(robot: str, identity: str) -> str:
-    """The key on which one program stops the driver of a robot, whose joints hold."""
-    return f"zstate/{check_robot(robot)}/stop/{identity}"
-
-
-def relax_key(robot: str, identity: str) -> str:
-    """The key on which one program stops the driver of a robot, and switches its torque off.
-
-    Access control separates it from the ``stop_key``: without torque, joints without brakes fall.
-    """
-    return f"zstate/{check_robot(robot)}/relax/{identity}"
-
-
-def stop_expressions(robot: str) -> tuple[str, ...]:
-    """The key expressions of every Stop of ``robot``, on both keys."""
-    return tuple(stream_expression(robot, stream) for stream in STOP_STREAMS)
-
-
-def parse_stop_key(key: str) -> tuple[str, str, str]:
-    """Robot, identity, and whether it is a "stop" or "relax", in a ``stop_key`` or ``relax_key``."""
-    robot, stream, identity = _parse(key, "zstate/<robot>/<stream>/<identity>")
-    if stream not in STOP_STREAMS:
-        raise _form_error(key, "zstate/<robot>/stop/<identity>")
-    return check_robot(robot), identity, stream
-
-
-def release_key(robot: str, identity: str) -> str:
-    """The key on which a commander releases stops. Access control separates it from that of stops."""
-    return f"zstate/{check_robot(robot)}/release/{identity}"
-
-
-def release_expression(robot: str) -> str:
-    """The key expression of every Release of ``robot``."""
-    return f"zstate/{_check_robot_or_any(robot)}/release/*"
-
-
-def parse_release_key(key: str) -> tuple[str, str]:
-    """Robot and identity in a ``release_key``."""
-    robot, identity = _parse(key, "zstate/<robot>/release/<identity>")
-    return check_robot(robot), identity
-
-
-def motion_key(robot: str) -> str:
-    """The key of the queryable of a driver that takes requests for motions."""
-    return f"zstate/{check_robot(robot)}/{MOTION_CHUNK}"
-
-
-def odometry_request_key(robot: str, writer: str) -> str:
-    """The key of the queryable of an odometry node that starts anew, or sets its pose, on request."""
-    return f"zstate/{check_robot(robot)}/{ODOMETRY_CHUNK}/{check_writer(writer)}"
-
-
-def writer_key(robot: str, streams: StreamName | Collection[StreamName], identity: str) -> str:
-    """The liveliness token of one writer of ``streams``."""
-    return f"zstate/{check_robot(robot)}/@writer/{_joined(streams)}/{identity}"
-
-
-def writer_expression(robot: str, stream: StreamName | None = None) -> str:
-    """The key expression of all writer tokens of ``robot``, or of those with ``stream`` in their streams.
-
-    The tokens of streams whose names contain that of ``stream`` match, too.
-    """
-    streams = "*" if stream is None else f"$*{stream}$*"
-    return f"zstate/{_check_robot_or_any(robot)}/@writer/{streams}/*"
-
-
-def parse_writer_key(key: str) -> tuple[str, tuple[StreamName, ...], str]:
-    """Robot, streams and identity in a ``writer_key``."""
-    robot, streams, identity = _parse(key, "zstate/<robot>/@writer/<streams>/<identity>")
-    return check_robot(robot), _split(streams), identity
-
-
-def reader_key(robot: str, streams: StreamName | Collection[StreamName], identity: str) -> str:
-    """The liveliness token of one reader of ``streams``; robot ``"*"`` means all.
-
-    Readers write below no robot's prefix.
-    """
-    return f"zstate/@reader/{quote(robot, safe='')}/{_joined(streams)}/{identity}"
-
-
-def parse_reader_key(key: str) -> tuple[str, tuple[StreamName, ...], str]:
-    """Robot, streams and identity in a ``reader_key``."""
-    robot, streams, identity = _parse(key, "zstate/@reader/<robot>/<streams>/<identity>")
-    return _check_robot_or_any(unquote(robot)), _split(streams), identity
-
-
-def _joined(streams: StreamName | Collection[StreamName]) -> str:
-    """``streams`` in one chunk, each once, in one canonical order."""
-    return ",".join(in_canonical_order((streams,) if isinstance(streams, str) else streams))
-
-
-def _split(chunk: str) -> tuple[StreamName, ...]:
-    """The streams in a chunk. Raises InvalidInput unless they are in canonical form."""
-    streams = in_canonical_order(chunk.split(","))
-    # One canonical form: two tokens of one writer would count as two writers.
-    if not streams or ",".join(streams) != chunk:
-        order = ", ".join(row.name for row in all_streams())
-        raise InvalidInput(f"{shortened(chunk)!r} is not a list of streams, each once, in the order {order}")
-    return streams
-
-
-def clock_key(robot: str, identity: str) -> str:
-    """The key of the queryable that replies with the time of one writer's clock."""
-    return f"zstate/{check_robot(robot)}/@clock/{identity}"
-
-
-def clock_expression(robot: str) -> str:
-    """The key expression of the clocks of all writers of ``robot``."""
-    return f"zstate/{_check_robot_or_any(robot)}/@clock/*"
-
-
-def parse_clock_key(key: str) -> tuple[str, str]:
-    """Robot and identity in a ``clock_key``."""
-    robot, identity = _parse(key, "zstate/<robot>/@clock/<identity>")
-    return check_robot(robot), identity
-
-
-def edge_key(robot: str, edge: tuple[str, str], identity: str) -> str:
-    """The token of a writer of ``edge``, or of the joint that moves it: full names of parent and child."""
-    parent, child = (quote(frame, safe="") for frame in edge)
-    return f"zstate/{check_robot(robot)}/@edge/{child}/{parent}/{identity}"
-
-
-def edge_expression(child: str) -> str:
-    """The key expression of the edge tokens of ``child``, from writers of any robot."""
-    return f"zstate/*/@edge/{quote(child, safe='')}/*/*"
-
-
-def parse_edge_key(key: str) -> tuple[str, tuple[str, str], str]:
-    """Robot, edge and identity in an ``edge_key``."""
-    robot, child, parent, identity = _parse(key, "zstate/<robot>/@edge/<child>/<parent>/<identity>")
-    check_robot(robot)
-    edge = unquote(parent), unquote(child)
-    for frame in edge:
-        full_name(robot, frame)
-    return robot, edge, identity
-
-
-@lru_cache(4096)  # called for each received sample
-def robot_from_key(key: str) -> str:
-    """The robot of a key under ``zstate/<robot>/``; a wildcard is refused, as it makes it several keys."""
-    chunks = _chunks(key)
-    if len(chunks) < 3 or chunks[0] != "zstate" or not chunks[1] or "*" in key:
-        raise _form_error(key, "zstate/<robot>/...")
-    return check_robot(chunks[1])
-
-
-def _parse(key: str, form: str) -> list[str]:
-    """The chunks of ``key`` at the placeholders of ``form``."""
-    names, chunks = form.split("/"), _chunks(key)
-    if len(chunks) != len(names):
-        raise _form_error(key, form)
-    for name, chunk in zip(names, chunks, strict=True):
-        if name[0] != "<" and name != chunk:
-            raise _form_error(key, form)
-    return [chunk for name, chunk in zip(names, chunks, strict=True) if name[0] == "<"]
-
-
-def _chunks(key: str) -> list[str]:
-    return key.split("/") if len(key) <= _MAX_KEY_LENGTH else []
-
-
-def _form_error(key: str, form: str) -> InvalidInput:
-    return InvalidInput(f"the key {shortened(key)!r} is not of the form {form!r}")
-
-
 def full_name(robot: str, frame: str) -> str:
     """The name of a frame of ``robot`` among several robots: ``robot/frame``; a name with a slash is one.
 
@@ -365,16 +108,198 @@ def wire_name(robot: str, link: str) -> str:
     return f"{robot}/{link}" if "/" in link else link
 
 
+def frame_owner(frame: str) -> str:
+    """The first part of a full name: the robot that owns the frame, if there is such a robot."""
+    return frame.partition("/")[0]
+
+
+def _joined(streams: StreamName | Collection[StreamName]) -> str:
+    """``streams`` in one chunk, each once, in one canonical order."""
+    return ",".join(in_canonical_order((streams,) if isinstance(streams, str) else streams))
+
+
+def _split(chunk: str) -> tuple[StreamName, ...]:
+    """The streams in a chunk. Raises InvalidInput unless they are in canonical form."""
+    streams = in_canonical_order(chunk.split(","))
+    # One canonical form: two tokens of one writer would count as two writers.
+    if not streams or ",".join(streams) != chunk:
+        order = ", ".join(row.name for row in all_streams())
+        raise InvalidInput(f"{shortened(chunk)!r} is not a list of streams, each once, in the order {order}")
+    return streams
+
+
+class _Chunk(NamedTuple):
+    """How a value is written as one chunk of a key, and read from it."""
+
+    write: Callable[[Any], str]
+    read: Callable[[str], Any]
+
+
+def _quoted(text: str) -> str:
+    return quote(text, safe="")
+
+
+def _read_reader_robot(chunk: str) -> str:
+    return _check_robot_or_any(unquote(chunk))
+
+
+_NAME_CHUNKS = {
+    "robot": _Chunk(check_robot, check_robot),
+    "writer": _Chunk(check_writer, check_writer),
+    "identity": _Chunk(str, str),
+    "streams": _Chunk(_joined, _split),
+    "child": _Chunk(_quoted, unquote),
+    "parent": _Chunk(_quoted, unquote),
+}
+_READER_ROBOT = _Chunk(_quoted, _read_reader_robot)
+
+Values = TypeVarTuple("Values")
+
+
+class Key(Generic[*Values]):
+    """A form of keys, such as ``zstate/<robot>/status/<identity>``: one value for each placeholder.
+
+    ``check`` raises InvalidInput for parsed values that are invalid together.
+    """
+
+    def __init__(self, form: str, check: Callable[[*Values], None] | None = None, **chunks: _Chunk) -> None:
+        self.form = form
+        self._check = check
+        self._form = form.split("/")
+        by_name = _NAME_CHUNKS | chunks
+        names = [(place, text[1:-1]) for place, text in enumerate(self._form) if text[0] == "<"]
+        self._placeholders = [(place, name, by_name[name]) for place, name in names]
+        self._fixed = [(place, text) for place, text in enumerate(self._form) if text[0] != "<"]
+
+    @property
+    def verbatim(self) -> str:
+        """Its chunk that begins with ``@``, which ``*`` and ``**`` do not match (Zenoh: verbatim chunks)."""
+        return next(chunk for chunk in self._form if chunk[0] == "@")
+
+    def key(self, *values: *Values) -> str:
+        """The key with ``values``. Raises InvalidInput for names that are not one chunk of a key."""
+        chunks = self._form.copy()
+        for (place, _, chunk), value in zip(self._placeholders, values, strict=True):
+            chunks[place] = chunk.write(value)
+        return "/".join(chunks)
+
+    def expression(self, robot: str = ANY, **others: str) -> str:
+        """The key expression of all keys with these values; a value that is not given, or ``"*"``, is any."""
+        values, chunks = {"robot": robot, **others}, self._form.copy()
+        for place, name, chunk in self._placeholders:
+            value = values.get(name, ANY)
+            chunks[place] = value if value == ANY else chunk.write(value)
+        return "/".join(chunks)
+
+    def parse(self, key: str) -> tuple[*Values]:
+        """The values in ``key``. Raises InvalidInput for a key of another form, or with invalid names."""
+        chunks = _chunks(key)
+        if len(chunks) != len(self._form) or any(chunks[place] != text for place, text in self._fixed):
+            raise _form_error(key, self.form)
+        parsed = tuple(chunk.read(chunks[place]) for place, _, chunk in self._placeholders)
+        values = cast("tuple[*Values]", parsed)
+        if self._check is not None:
+            self._check(*values)
+        return values
+
+
+def _chunks(key: str) -> list[str]:
+    return key.split("/") if len(key) <= _MAX_KEY_LENGTH else []
+
+
+def _form_error(key: str, form: str) -> InvalidInput:
+    return InvalidInput(f"the key {shortened(key)!r} is not of the form {form!r}")
+
+
+def _check_frames(robot: str, child: str, parent: str, _identity: str) -> None:
+    full_name(robot, parent)
+    full_name(robot, child)
+
+
+STATUS = Key[str, str]("zstate/<robot>/status/<identity>")
+"""The Status of one writer, once a second while it is read."""
+
+LOOKUP = Key[str]("zstate/<robot>/lookup")
+"""A queryable of transforms, for devices without a buffer."""
+
+WRITER_CLOCK = Key[str, str]("zstate/<robot>/@clock/<identity>")
+"""A queryable of the time by one writer's clock."""
+
+WRITER_TOKEN = Key[str, Sequence[StreamName], str]("zstate/<robot>/@writer/<streams>/<identity>")
+"""The liveliness token of one writer of all its streams."""
+
+EDGE_TOKEN = Key[str, str, str, str]("zstate/<robot>/@edge/<child>/<parent>/<identity>", _check_frames)
+"""The liveliness token of a writer that places a moving edge, or is about to place a static one.
+
+A joint that moves an edge counts as that edge. The frames are full names.
+"""
+
+READER_TOKEN = Key[str, Sequence[StreamName], str](
+    "zstate/@reader/<robot>/<streams>/<identity>", robot=_READER_ROBOT
+)
+"""The liveliness token of one reader of a robot or of all, ``"*"``. Readers write below no robot's prefix."""
+
+STOP = Key[str, str]("zstate/<robot>/stop/<identity>")
+"""The Stop of one program, latched: the driver's joints hold."""
+
+RELAX = Key[str, str]("zstate/<robot>/relax/<identity>")
+"""The Stop of one program, latched, that switches the driver's torque off.
+
+Access control separates it from ``STOP``: without torque, joints without brakes fall.
+"""
+
+RELEASE = Key[str, str]("zstate/<robot>/release/<identity>")
+"""The Release of stops by one commander. Access control separates it from ``STOP``, too."""
+
+MOTION = Key[str]("zstate/<robot>/@motion")
+"""A queryable of a driver, for a JointTrajectory or MotionCancel.
+
+``@`` keeps it from viewers: access control lets them query ``zstate/**``, which does not match.
+"""
+
+ODOMETRY_REQUEST = Key[str, str]("zstate/<robot>/@odometry/<writer>")
+"""A queryable of an odometry node, which starts anew or sets its pose; kept from viewers likewise."""
+
+
+def stream_key(robot: str, stream: StreamName, writer: str = "") -> str:
+    """The key of ``stream``: of the named ones one for each ``writer``; ``clock`` has only one."""
+    if stream == "clock":
+        return CLOCK_KEY
+    key = f"zstate/{check_robot(robot)}/{stream}"
+    return f"{key}/{check_writer(writer)}" if is_named(stream) else key
+
+
+def stream_from_key(key: str) -> StreamName:
+    """The stream of a ``stream_key``. Raises InvalidInput for any other key."""
+    chunks = _chunks(key)
+    stream = find_stream(chunks[2]) if len(chunks) > 2 and chunks[0] == "zstate" else None
+    if stream is not None and len(chunks) == (4 if stream.named else 3):
+        return stream.name
+    raise _form_error(key, "zstate/<robot>/<stream>")
+
+
+def stream_expression(robot: str, stream: StreamName) -> str:
+    """The key expression of every writer of ``stream``."""
+    if stream == "clock":
+        return CLOCK_KEY
+    key = f"zstate/{_check_robot_or_any(robot)}/{stream}"
+    return f"{key}/*" if is_named(stream) else key
+
+
+@lru_cache(4096)  # called for each received sample
+def robot_from_key(key: str) -> str:
+    """The robot of a key under ``zstate/<robot>/``; a wildcard is refused, as it makes it several keys."""
+    chunks = _chunks(key)
+    if len(chunks) < 3 or chunks[0] != "zstate" or not chunks[1] or "*" in key:
+        raise _form_error(key, "zstate/<robot>/...")
+    return check_robot(chunks[1])
+
+
 EdgeNames = tuple[str, str]
 """Full names of parent and child."""
 
 FOREIGN_FRAME = "foreign frame"
 """The reason of an InsertRefused for an edge that places another robot's frame."""
-
-
-def frame_owner(frame: str) -> str:
-    """The first part of a full name: the robot that owns the frame, if there is such a robot."""
-    return frame.partition("/")[0]
 
 
 def foreign_edge_problem(

@@ -144,7 +144,7 @@ class NativeStreamEncoder:
         self.key = keys.stream_key(robot, stream, name)
         self.encoding = stream_encoding(stream)
         identity = Announcement(robot, stream, writer, name if is_named(stream) else "").identity
-        self.token = None if stream == "clock" else keys.writer_key(robot, stream, identity)
+        self.token = None if stream == "clock" else keys.WRITER_TOKEN.key(robot, stream, identity)
 
     encode = staticmethod(encode)
 
@@ -182,7 +182,7 @@ class NativeWire:
         # A program that does not know a stream ignores all of its token.
         own = [stream for stream in streams if is_own(stream)]
         others = [[stream] for stream in streams if not is_own(stream)]
-        return tuple(keys.reader_key(robot, one, identity) for one in (own, *others) if one)
+        return tuple(keys.READER_TOKEN.key(robot, one, identity) for one in (own, *others) if one)
 
     def expression(self, robot: str, stream: StreamName) -> str:
         return keys.stream_expression(robot, stream)
@@ -205,7 +205,7 @@ class NativeWire:
         return keys.check_writer(key.rpartition("/")[2])
 
     def writers_expression(self, robot: str) -> str:
-        return keys.writer_expression(robot)
+        return keys.WRITER_TOKEN.expression(robot)
 
     def joined_tokens(self, tokens: Sequence[str]) -> Sequence[str]:
         announced = [one for token in tokens for one in self.parse_token(token, keys.ANY)]
@@ -214,11 +214,11 @@ class NativeWire:
             return tokens
         # With the name, if one has it.
         identity = max((one.identity for one in announced), key=len)
-        return (keys.writer_key(announced[0].robot, [one.stream for one in announced], identity),)
+        return (keys.WRITER_TOKEN.key(announced[0].robot, [one.stream for one in announced], identity),)
 
     def parse_token(self, token: str, robot: str) -> tuple[Announcement, ...]:
         try:
-            return Announcement.parse_all(*keys.parse_writer_key(token))
+            return Announcement.parse_all(*keys.WRITER_TOKEN.parse(token))
         except InvalidInput:
             return ()
 

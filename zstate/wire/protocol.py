@@ -76,9 +76,10 @@ class StreamEncoder(Protocol):
         ...
 
     def compile_joint_states(self) -> RosJointStateEncoder | None:
-        """The extension's encoder of usual joint states; None if that of the native wire serves.
+        """The extension's encoder of usual joint states in this wire format.
 
-        Its attachments and those of ``attachment`` are numbered together.
+        None if its payloads are those of the native wire. ``attachment`` continues the numbers of the
+        attachments that the encoder makes.
         """
         ...
 

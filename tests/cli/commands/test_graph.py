@@ -14,7 +14,7 @@ from zstate.cli.output.drawing import dot, mermaid, svg
 from zstate.driving import Commander
 from zstate.net.graph import Graph, StreamUse
 from zstate.net.presence import announce, local_writer
-from zstate.wire.keys import reader_key
+from zstate.wire.keys import READER_TOKEN
 
 DRIVER, PUBLISH, VIEWER = "driver@jetson pid 4", "zstate-publish@nuc pid 5", "viewer@desk pid 6"
 
@@ -68,7 +68,7 @@ def test_writers_and_readers_of_a_robot_are_seen_with_rates():
 
 def test_stream_with_readers_but_no_writer_is_marked():
     identity = local_writer(7, "zstate-publish").identity
-    with connect() as session, announce(session, reader_key("rrbot", "joint_states", identity)):
+    with connect() as session, announce(session, READER_TOKEN.key("rrbot", "joint_states", identity)):
         lines = run_cli("graph").stdout.splitlines()
     assert lines[:2] == ["rrbot: joint_states", "  written by  none"]
     assert lines[2].startswith("  read by     zstate-publish@")

@@ -30,7 +30,7 @@ from zstate.odometry import ImuPublisher, OdometryPublisher, SensorListener
 from zstate.sources import JointStateListener
 from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
-from zstate.wire.keys import reader_key, writer_key
+from zstate.wire.keys import READER_TOKEN, WRITER_TOKEN
 from zstate.wire.messages import JointState, order_digest
 from zstate.wire.native import encode, encoding_of
 
@@ -282,7 +282,7 @@ def test_readers_of_other_programs_wait_for_nothing_that_a_robot_lacks():
         OdometryPublisher(session, "cart", "odometry") as odometry,
         TransformListener(session, "cart"),
         connect() as other,
-        announce(other, reader_key("cart", "imu", WriterId("zstate-echo", "desk", 9, 1, 7).identity)),
+        announce(other, READER_TOKEN.key("cart", "imu", WriterId("zstate-echo", "desk", 9, 1, 7).identity)),
         repeated(lambda: odometry.publish(edge, [0, 0, 0], [0, 0, 0])),
     ):
         until(lambda: any(one.stream == "imu" for one in discover_readers(session)))
@@ -297,7 +297,7 @@ def test_a_fifth_of_lost_samples_is_a_warning():
     with (
         connect() as session,
         StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]),
-        announce(session, writer_key("rrbot", "joint_states", writer.identity)),
+        announce(session, WRITER_TOKEN.key("rrbot", "joint_states", writer.identity)),
     ):
 
         def publish() -> None:
@@ -319,7 +319,7 @@ def test_a_writer_whose_samples_arrive_is_not_frozen_though_it_does_not_reply():
     with (
         connect() as session,
         TransformPublisher(session, "cart", "odometry") as odometry,
-        announce(session, writer_key("cart", "joint_states", writer.identity)),
+        announce(session, WRITER_TOKEN.key("cart", "joint_states", writer.identity)),
         repeated(lambda: odometry.publish([Transform("odom", "base", (0, 0, 0), (0, 0, 0, 1))])),
     ):
         (info,) = discover(session)

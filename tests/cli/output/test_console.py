@@ -17,7 +17,7 @@ from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import announce
 from zstate.net.streams import KeyPublisher
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import reader_key, status_key, stream_key, writer_key
+from zstate.wire.keys import READER_TOKEN, STATUS, WRITER_TOKEN, stream_key
 from zstate.wire.messages import StaticTransforms, Status, to_block
 from zstate.wire.native import encode, encoding_of
 
@@ -37,9 +37,9 @@ def stranger() -> Iterator[None]:
         publisher.publish([0.0, 0.0])
         statics = Announcement("rrbot", "tf_static", EVIL, f"mount{FAKE}")
         for token in (
-            writer_key("rrbot", "joint_commands", EVIL.identity),
-            writer_key("rrbot", "tf_static", statics.identity),
-            reader_key("rrbot", "joint_states", EVIL.identity),
+            WRITER_TOKEN.key("rrbot", "joint_commands", EVIL.identity),
+            WRITER_TOKEN.key("rrbot", "tf_static", statics.identity),
+            READER_TOKEN.key("rrbot", "joint_states", EVIL.identity),
         ):
             opened.enter_context(announce(session, token))
         mount = LatchedPublisher(
@@ -48,7 +48,7 @@ def stranger() -> Iterator[None]:
         opened.enter_context(mount)
         for frame in ("gauge", f"cam{FAKE}"):
             mount.set(encode(StaticTransforms(77, (("tool", frame),), pose)))
-        status_publisher = KeyPublisher(session, status_key("rrbot", EVIL.identity), encoding_of(Status))
+        status_publisher = KeyPublisher(session, STATUS.key("rrbot", EVIL.identity), encoding_of(Status))
         opened.enter_context(status_publisher)
         opened.enter_context(repeated(lambda: status_publisher.put(encode(status))))
         yield

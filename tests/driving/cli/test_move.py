@@ -24,7 +24,7 @@ from zstate.driving import Commander, stop
 from zstate.driving.messages import DriverState, state_text
 from zstate.net.latched import LatchedSubscriber
 from zstate.sources import JointStateListener
-from zstate.wire.keys import driver_key
+from zstate.wire.keys import stream_key
 from zstate.wire.native import decode
 from zstate.wire.protocol import SerializedSample
 
@@ -37,7 +37,7 @@ def states_of(robot: str) -> Generator[list[str]]:
     def on_value(sample: SerializedSample) -> None:
         lines.append(state_text(decode(sample.payload, sample.encoding, DriverState)))
 
-    with connect() as session, LatchedSubscriber(session, driver_key(robot), on_value):
+    with connect() as session, LatchedSubscriber(session, stream_key(robot, "driver"), on_value):
         yield lines
 
 

@@ -19,7 +19,7 @@ from zstate.net.streams import KeyPublisher
 from zstate.odometry.messages import Odometry
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import stream_key, writer_key
+from zstate.wire.keys import WRITER_TOKEN, stream_key
 from zstate.wire.messages import WriterTransforms, order_digest, to_block
 from zstate.wire.native import encode, encoding_of
 
@@ -45,7 +45,7 @@ class Fleet:
         for number in range(ROBOTS):
             robot, writer = f"r{number}", WriterId("robot", "host", 1 + number, 1, 1 + number)
             identity = Announcement(robot, stream, writer, NAME).identity
-            self._tokens.append(announce(session, writer_key(robot, stream, identity)))
+            self._tokens.append(announce(session, WRITER_TOKEN.key(robot, stream, identity)))
             key = stream_key(robot, stream, NAME)
             publisher = KeyPublisher(session, key, encoding_of(self._message))
             self._writers.append((writer.session, publisher))

@@ -11,7 +11,8 @@ from helpers.robots import SECOND, UPRIGHT
 
 from zstate import Transform, TransformBuffer, load_model
 from zstate.buffer.snapshot import FramePoses, FrameTable
-from zstate.net.graph import Graph, StreamUse, WriterState
+from zstate.net.graph import Graph, StreamUse
+from zstate.net.status_monitor import WriterState
 from zstate.view.panels import html
 from zstate.view.panels.display_panels import (
     disconnected_html,

@@ -26,6 +26,7 @@ from zstate.bridges.ros1.messages import (
 )
 from zstate.bridges.ros1.node import NAME, Ros1Node, sender
 from zstate.bridges.transforms import TransformRelay, edge_writer_of_node
+from zstate.checks import Floats
 from zstate.errors import Closed, InvalidInput, MessageError, ModelError, SecondWriter, Unreachable
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -39,7 +40,7 @@ from zstate.sources.joint_state_listener import MAX_AGE_S
 from zstate.sources.joint_state_merger import JointStateMerger
 from zstate.streams import JOINT_STREAMS
 from zstate.transform import Transform
-from zstate.wire.joint_order import Floats, JointNumbers
+from zstate.wire.joint_order import JointNumbers
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
     Edges,

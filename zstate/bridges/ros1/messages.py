@@ -14,20 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.bounded import BoundedDict
+from zstate._util.format import SECOND_NS
 from zstate.bridges.ros1.node import RospyModules
+from zstate.checks import Floats
 from zstate.errors import InsertRefused, MessageError, SecondWriter
 from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.sources.joint_source import JointStateValidator
-from zstate.wire.joint_order import Floats, JointNumbers
+from zstate.wire.joint_order import JointNumbers
 from zstate.wire.keys import wire_name
 from zstate.wire.messages import POSE_BYTES, JointState, order_digest, to_block
 
-_SECOND = 1_000_000_000
 _COUNT = Struct("<I")
 _HEADER = Struct("<III")  # sequence number, seconds and nanoseconds
 # A ROS 1 time is two unsigned numbers of 32 bits.
-_END_OF_TIME = 2**32 * _SECOND
+_END_OF_TIME = 2**32 * SECOND_NS
 
 
 def set_stamp(header: Any, stamp: int) -> None:
@@ -38,12 +39,12 @@ def set_stamp(header: Any, stamp: int) -> None:
             "2106, and zero means no stamp",
             reason="stamp",
         )
-    header.stamp.secs, header.stamp.nsecs = divmod(stamp, _SECOND)
+    header.stamp.secs, header.stamp.nsecs = divmod(stamp, SECOND_NS)
 
 
 def get_stamp(header: Any) -> int:
     """The stamp of a ROS header [ns], exactly. Raises MessageError for zero, which means none."""
-    stamp = header.stamp.secs * _SECOND + header.stamp.nsecs
+    stamp = header.stamp.secs * SECOND_NS + header.stamp.nsecs
     if not stamp:
         raise MessageError(
             "a JointState without a stamp; set header.stamp where it is published, for instance to "
@@ -148,7 +149,7 @@ def read_transforms(data: bytes) -> list[RosTransform]:
             child, position = _read_text(data, position)
             pose = data[position : position + POSE_BYTES]
             position += POSE_BYTES
-            transforms.append(RosTransform(seconds * _SECOND + nanoseconds, parent, child, pose))
+            transforms.append(RosTransform(seconds * SECOND_NS + nanoseconds, parent, child, pose))
     except (error, UnicodeDecodeError) as problem:
         raise MessageError(f"a malformed TFMessage: {problem}", reason="malformed") from None
     if position > len(data):

@@ -338,10 +338,10 @@ class _StateLines(Closeable):
 
     def __init__(self, session: Session, robot: str) -> None:
         from zstate.net.latched import LatchedSubscriber
-        from zstate.wire.keys import driver_key
+        from zstate.wire.keys import stream_key
 
         self._newest, self._opened_at = "", time.monotonic()
-        self._subscriber = LatchedSubscriber(session, driver_key(robot), self._on_state)
+        self._subscriber = LatchedSubscriber(session, stream_key(robot, "driver"), self._on_state)
 
     def close(self) -> None:
         self._subscriber.close()

@@ -415,10 +415,10 @@ def _driven_robots(session: Session) -> list[str]:
     """The robots that have a driver. Ends the command if there is none."""
     from zstate.net.latched import cached_values
     from zstate.net.ownership import wait_for_discovery
-    from zstate.wire.keys import driver_expression, robot_from_key
+    from zstate.wire.keys import ANY, robot_from_key, stream_expression
 
     wait_for_discovery(session)
-    values = cached_values(session, driver_expression("*"), _CACHES_WITHIN_S)
+    values = cached_values(session, stream_expression(ANY, "driver"), _CACHES_WITHIN_S)
     return sorted({robot_from_key(value.key) for value in values}) or fail("no robot has a driver")
 
 

@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.checks import Floats
 from zstate.model.joint_history import JointHistory
 from zstate.odometry import Wheels
 from zstate.odometry.messages import Imu, Pose, Velocity
 from zstate.wire.messages import StampedMessage, from_block
-
-Floats = NDArray[np.float64]
 
 _REACH_S, _STEP_S = 0.5, 0.01
 """Delays are searched up to this size, in these steps: a base does not change its turn in less."""

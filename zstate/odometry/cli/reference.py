@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.format import did_you_mean
+from zstate.checks import Floats
 from zstate.errors import InvalidInput
 from zstate.odometry.messages import Odometry, Pose
 from zstate.odometry.source_noise import PoseNoise
 from zstate.wire.keys import check_writer
 from zstate.wire.messages import covariance_matrix, from_block
-
-Floats = NDArray[np.float64]
 
 _LEAST_READINGS = 3
 _ITERATIONS = 20

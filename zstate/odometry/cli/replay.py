@@ -13,9 +13,9 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.checks import Floats
 from zstate.cli.output.text_layout import Table
 from zstate.errors import InvalidInput, LookupFailed, NoData, UnknownFrame
 from zstate.model.joint_history import JointHistory
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
 Stamped = TypeVar("Stamped", Imu, Velocity, Pose, Odometry)
 
 _HEALTH_NS = 500_000_000

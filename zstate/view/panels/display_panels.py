@@ -17,7 +17,8 @@ from zstate.clock import SYSTEM
 from zstate.errors import LookupFailed, format_duration
 from zstate.ingest.deadline import is_stale
 from zstate.model.catalog import example_name
-from zstate.net.graph import Graph, GraphMonitor, WriterState
+from zstate.net.graph import Graph, GraphMonitor
+from zstate.net.status_monitor import WriterState
 from zstate.view.data_source import FixedFrame, ViewSource
 from zstate.view.panels import html
 from zstate.view.panels.html import Rows, format_number, pose_rows

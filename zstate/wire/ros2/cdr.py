@@ -20,6 +20,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate._util.format import SECOND_NS
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.ros2.types import CLOCK, STRING
 
@@ -30,7 +31,6 @@ BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
 M = TypeVar("M")
 Span = tuple[int, int]  # first byte, and the one after the last
 
-SECOND_NS = 1_000_000_000
 _EARLIEST, _LATEST = -(2**31) * SECOND_NS, 2**31 * SECOND_NS - 1
 _TIME = Struct("<iI")
 _DOUBLE_BYTES = 8

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate._util.format import SECOND_NS
 from zstate.errors import MessageError
 from zstate.streams import StreamName
 from zstate.wire.messages import (
@@ -26,7 +27,6 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.ros2.cdr import (
-    SECOND_NS,
     STAMP_BYTES,
     CdrReader,
     TemplateCache,
