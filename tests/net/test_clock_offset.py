@@ -13,6 +13,7 @@ from zstate.clock import ManualClock
 from zstate.errors import Closed, InFuture, InPast, InvalidInput, Stale
 from zstate.net.clock_offset import ClockOffsetMonitor, measure_offsets, unanswered
 from zstate.net.queryable import Queryable, Reply
+from zstate.net.service_thread import ServiceThread
 from zstate.net.session import connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -175,8 +176,9 @@ def test_reading_an_offset_often_measures_it_once(sessions):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1", clock=OffsetClock(SECOND)),
-        ClockOffsetMonitor(reader, OffsetClock(0)) as monitor,
+        ServiceThread(reader, "requests") as thread,
     ):
+        monitor = ClockOffsetMonitor(reader, thread, OffsetClock(0))
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         ask = monitor.watch("r1", known.writer)
@@ -187,7 +189,8 @@ def test_reading_an_offset_often_measures_it_once(sessions):
 
 def test_monitor_of_a_closed_session_returns_none(sessions):
     writer, reader = sessions
-    with StatePublisher(writer, RRBOT, "r1"), ClockOffsetMonitor(reader, OffsetClock(0)) as monitor:
+    with StatePublisher(writer, RRBOT, "r1"), ServiceThread(reader, "requests") as thread:
+        monitor = ClockOffsetMonitor(reader, thread, OffsetClock(0))
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         reader.close()
@@ -201,8 +204,9 @@ def test_silent_writers_of_one_robot_do_not_delay_the_offset_of_another(sessions
     queryable = writer.zenoh.declare_queryable("zstate/r2/@clock/*", kept)
     with (
         StatePublisher(writer, RRBOT, "r1", clock=OffsetClock(SECOND)),
-        ClockOffsetMonitor(reader, OffsetClock(0)) as monitor,
+        ServiceThread(reader, "requests") as thread,
     ):
+        monitor = ClockOffsetMonitor(reader, thread, OffsetClock(0))
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         for one in silent:

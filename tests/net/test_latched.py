@@ -1,6 +1,7 @@
 import re
 import threading
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -96,6 +97,29 @@ def test_cached_value_does_not_overtake_the_live_ones_before_it():
             may_go_on.set()
             until(lambda: b"2" in received)
             assert received == [b"slow", b"1", b"2"]
+
+
+def test_a_cached_value_that_comes_late_does_not_undo_its_withdrawal():
+    cached, withdrawn = (
+        zenoh.Timestamp(datetime.fromtimestamp(second, UTC), b"publisher") for second in (1, 2)
+    )
+    with connect() as writer, connect() as reader:
+        token = f"{key('a')}/@adv/pub/{writer.zid}/uhlc/7"
+        requests: zenoh.Queryable = writer.zenoh.declare_queryable(token, zenoh.handlers.FifoChannel(8))
+        announced = writer.zenoh.liveliness().declare_token(token)
+        values = Values(reader)
+        pending: list[zenoh.Query] = []
+        until(lambda: pending.extend(iter(requests.try_recv, None)) or pending)
+        wait_for_reader(writer, key("a"))
+        writer.zenoh.delete(key("a"), timestamp=withdrawn)
+        until(lambda: values.received == [(key("a"), b"", "zenoh/bytes")])
+        with pending[0] as received:
+            received.reply(key("a"), b"value", timestamp=cached)
+        with LatchedPublisher(writer, key("b"), ENCODING) as value:
+            value.set(b"1")
+            until(lambda: values.values == {key("b"): b"1"})
+        assert len(values.received) == 2
+        del announced
 
 
 def test_late_joiner_receives_the_value_of_every_matching_writer():

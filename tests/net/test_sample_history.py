@@ -13,14 +13,16 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.queryable import Queryable, Reply
+from zstate.net.requests import Requests
 from zstate.net.sample_history import (
     CachedSample,
-    HistoryReader,
+    HistoryRequest,
     ReferenceRing,
     SampleCache,
     SampleRing,
     serve_history,
 )
+from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.wire.messages import HistoryPage, JointState
 from zstate.wire.native import decode, encode, encoding_of
@@ -134,7 +136,13 @@ class Pages:
         self.pages: list[list[SerializedSample]] = []
         self.errors: list[MessageError] = []
         self._most = limit
-        self.reader = HistoryReader(session, self._on_page, lambda _, error: self.errors.append(error))
+        self.thread = ServiceThread(session, "requests")
+        self.requests = Requests(session, self.thread, 4)
+
+    def request(self, key: str, writer: int) -> None:
+        self.requests.add(
+            HistoryRequest(key, writer, self._on_page, lambda _, error: self.errors.append(error))
+        )
 
     def _on_page(self, arrivals: list[SerializedSample], writer: int) -> bool:
         self.pages.append(arrivals)
@@ -154,9 +162,9 @@ def test_reader_receives_every_sample_as_sent_newest_page_first(sessions: tuple[
     writer, reader = sessions
     cache = cache_of(256 + 3)
     received = Pages(reader)
-    with serve_history(writer, "r1", "joint_states", cache), received.reader:
+    with serve_history(writer, "r1", "joint_states", cache), received.thread:
         wait_for_queryable(reader)
-        received.reader.request(KEY, 7)
+        received.request(KEY, 7)
         until(lambda: len(received.pages) == 2)
     assert received.seqs() == [list(range(3, 256 + 3)), [0, 1, 2]]
     assert received.pages[1] == [
@@ -169,9 +177,9 @@ def test_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Sess
     for numbers in (100, 10_000):
         cache = cache_of(100, numbers=numbers)
         received = Pages(reader, limit=3)
-        with serve_history(writer, "r1", "joint_states", cache), received.reader:
+        with serve_history(writer, "r1", "joint_states", cache), received.thread:
             wait_for_queryable(reader)
-            received.reader.request(KEY, 7)
+            received.request(KEY, 7)
             until(lambda received=received: len(received.pages) == 3)
         sizes = [sum(len(one.payload) for one in page) for page in received.pages]
         assert all(size <= 32_000 for size in sizes) if numbers == 100 else sizes[0] > 32_000
@@ -186,8 +194,8 @@ def test_writer_without_samples_replies_once_with_an_empty_page(sessions):
         wait_for_queryable(reader)
         before = service.answered
         received = Pages(reader)
-        with received.reader:
-            received.reader.request(KEY, 7)
+        with received.thread:
+            received.request(KEY, 7)
             until(lambda: service.answered == before + 1)
     assert (received.pages, received.errors) == ([], [])
 
@@ -207,8 +215,8 @@ def test_reply_on_another_key_is_ignored(sessions: tuple[Session, Session]):
     while asked.acquire(blocking=False):
         pass
     received = Pages(reader)
-    with received.reader:
-        received.reader.request(KEY, 7)
+    with received.thread:
+        received.request(KEY, 7)
         assert all(asked.acquire(timeout=5.0) for _ in range(2)), "no answer is asked for again"
     assert (received.pages, received.errors) == ([], [])
     forged.undeclare()
@@ -221,11 +229,11 @@ def test_each_writer_of_a_key_is_requested_separately(sessions: tuple[Session, S
     with (
         serve_history(writer, "r1", "joint_states", one),
         serve_history(writer, "r1", "joint_states", other),
-        received.reader,
+        received.thread,
     ):
         wait_for_queryable(reader)
         for session in (7, 8, 9):
-            received.reader.request(KEY, session)
+            received.request(KEY, session)
         until(lambda: len(received.pages) == 2)
     assert sorted(received.seqs()) == [[0, 1, 2], [0, 1, 2, 3, 4]]
 
@@ -234,10 +242,10 @@ def test_more_writers_than_the_in_flight_limit_are_all_requested(sessions: tuple
     writer, reader = sessions
     cache = cache_of(2)
     received = Pages(reader)
-    with serve_history(writer, "r1", "joint_states", cache), received.reader:
+    with serve_history(writer, "r1", "joint_states", cache), received.thread:
         wait_for_queryable(reader)
         for _ in range(30):
-            received.reader.request(KEY, 7)
+            received.request(KEY, 7)
         until(lambda: len(received.pages) == 30)
 
 
@@ -251,9 +259,9 @@ def test_more_writers_than_the_in_flight_limit_are_all_requested(sessions: tuple
 def test_invalid_page_is_reported_and_ends_the_requests(sessions, answer: Reply, reason: str):
     writer, reader = sessions
     received = Pages(reader)
-    with Queryable(writer, KEY, lambda _: answer), received.reader:
+    with Queryable(writer, KEY, lambda _: answer), received.thread:
         wait_for_queryable(reader)
-        received.reader.request(KEY, 7)
+        received.request(KEY, 7)
         until(lambda: len(received.errors) == 1)
     assert (received.errors[0].reason, received.pages) == (reason, [])
 
@@ -268,12 +276,12 @@ def test_writer_that_repeats_a_page_is_not_requested_for_ever(sessions):
         return Reply(page, encoding_of(HistoryPage))
 
     received = Pages(reader)
-    with Queryable(writer, KEY, answer), received.reader:
+    with Queryable(writer, KEY, answer), received.thread:
         wait_for_queryable(reader)
         asked.clear()
-        received.reader.request(KEY, 7)
+        received.request(KEY, 7)
         until(lambda: len(received.pages) == 2)
-        received.reader.request(KEY, 8)
+        received.request(KEY, 8)
         until(lambda: len(received.pages) == 4)
     assert asked == ["", "5", "", "5"]
 
@@ -281,8 +289,8 @@ def test_writer_that_repeats_a_page_is_not_requested_for_ever(sessions):
 def test_late_reply_is_received(sessions: tuple[Session, Session]):
     writer, reader = sessions
     received = Pages(reader)
-    with received.reader:
-        received.reader.request(KEY, 7)
+    with received.thread:
+        received.request(KEY, 7)
         asked = threading.Event()
 
         def answer(parameters):
@@ -303,9 +311,9 @@ def test_silent_writer_costs_no_thread_and_does_not_delay_close(sessions):
     writer, reader = sessions
     queryable = writer.zenoh.declare_queryable(KEY)
     received = Pages(reader)
-    received.reader.request(KEY, 7)
-    received.reader.close()
-    received.reader.close()
+    received.request(KEY, 7)
+    received.thread.close()
+    received.thread.close()
     assert (received.pages, received.errors) == ([], [])
     queryable.undeclare()
 
@@ -315,12 +323,12 @@ def test_silent_writers_of_one_robot_do_not_delay_the_history_of_another(session
     kept: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(10_000)
     silent = writer.zenoh.declare_queryable("zstate/r2/joint_states", kept)
     received = Pages(reader)
-    with serve_history(writer, "r1", "joint_states", cache_of(256 + 3)), received.reader:
+    with serve_history(writer, "r1", "joint_states", cache_of(256 + 3)), received.thread:
         wait_for_queryable(reader)
         for session in range(500):
-            received.reader.request("zstate/r2/joint_states", session)
+            received.request("zstate/r2/joint_states", session)
         until(silent.handler.try_recv)
-        received.reader.request(KEY, 7)
+        received.request(KEY, 7)
         until(lambda: len(received.pages) == 2)
     assert not received.errors
 
@@ -330,14 +338,14 @@ def test_silent_writer_is_requested_three_times(sessions):
     asked: list[str] = []
     silent = writer.zenoh.declare_queryable(KEY, zenoh.handlers.RingChannel(100))
     received, kept = Pages(reader), list[zenoh.Query]()
-    with received.reader:
-        received.reader.request(KEY, 7)
+    with received.thread:
+        received.request(KEY, 7)
 
         def requests_are_complete() -> bool:
             while (query := silent.handler.try_recv()) is not None:
                 asked.append(str(query.parameters))
                 kept.append(query)
-            return len(received.reader._waiting) == 0 and received.reader._in_flight == 0 and len(asked) >= 3
+            return len(asked) >= 3 and len(received.requests._waiting) == received.requests._in_flight == 0
 
         until(requests_are_complete)
     assert asked == ["session=7"] * 3
@@ -357,8 +365,8 @@ def test_first_of_many_replies_on_the_key_is_the_page(sessions):
 
     queryable = writer.zenoh.declare_queryable(KEY, answer)
     received = Pages(reader)
-    with received.reader:
-        received.reader.request(KEY, 7)
+    with received.thread:
+        received.request(KEY, 7)
         until(lambda: received.pages)
     assert [[one.payload for one in page] for page in received.pages] == [[b"right"]]
     queryable.undeclare()
@@ -371,9 +379,9 @@ def test_page_of_more_than_524288_bytes_is_refused(sessions, size: int, reason: 
     page = encode(HistoryPage(encoding_of(JointState), (bytes(size - others),)))
     assert len(page) == size
     received = Pages(reader)
-    with Queryable(writer, KEY, lambda _: Reply(page, encoding_of(HistoryPage))), received.reader:
+    with Queryable(writer, KEY, lambda _: Reply(page, encoding_of(HistoryPage))), received.thread:
         wait_for_queryable(reader)
-        received.reader.request(KEY, 7)
+        received.request(KEY, 7)
         until(lambda: received.errors or received.pages)
     assert [error.reason for error in received.errors] == [reason] * bool(reason)
     assert bool(received.pages) != bool(reason)
@@ -391,10 +399,11 @@ def test_failing_page_callback_does_not_end_other_requests(sessions, monkeypatch
             raise InvalidInput("the first")
         return True
 
-    reader_ = HistoryReader(reader, take, lambda *_: None)
-    with serve_history(writer, "r1", "joint_states", cache_of(3)), reader_:
+    thread = ServiceThread(reader, "requests")
+    requests = Requests(reader, thread, 4)
+    with serve_history(writer, "r1", "joint_states", cache_of(3)), thread:
         wait_for_queryable(reader)
-        reader_.request(KEY, 7)
-        reader_.request(KEY, 7)
+        for _ in range(2):
+            requests.add(HistoryRequest(KEY, 7, take, lambda *_: None))
         until(lambda: len(pages) == 2)
     assert len(raised) == 1

@@ -17,7 +17,9 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InPast, InvalidInput
 from zstate.model.load import load_model
 from zstate.net.presence import announce
-from zstate.net.sample_history import HistoryReader, SampleCache, serve_history
+from zstate.net.requests import Requests
+from zstate.net.sample_history import HistoryRequest, SampleCache, serve_history
+from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.lookup_service import RecentBuffer
@@ -308,7 +310,7 @@ def test_every_robot_of_a_fleet_provides_its_history(sessions: tuple[Session, Se
             expected = kinematic_pose(RRBOT, positions(number + 5), "world", "tool")
             assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
         asking = set(threading.enumerate()) - others
-        assert [thread.name for thread in asking].count("zstate past") == 1
+        assert [thread.name for thread in asking].count("zstate requests") == 1
     for publisher in publishers:
         publisher.close()
 
@@ -336,8 +338,15 @@ def test_history_equals_the_published_samples_byte_for_byte(sessions: tuple[Sess
         assert publisher.cache is not None
         expected = tap.payloads(2)
         pages: list[list[SerializedSample]] = []
-        with HistoryReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
-            past.request(JOINTS, publisher.cache.writer)
+        with ServiceThread(reader, "requests") as thread:
+            Requests(reader, thread, 1).add(
+                HistoryRequest(
+                    JOINTS,
+                    publisher.cache.writer,
+                    lambda page, _: bool(pages.append(page)),
+                    lambda *_: None,
+                )
+            )
             until(lambda: pages)
     assert [one.payload for one in pages[0]] == expected
     assert {one.encoding for one in pages[0]} == {encoding_of(JointState)}

@@ -8,6 +8,7 @@ from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import Counters
+from zstate.net.service_thread import ServiceThread
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.state_reader import StateReader
@@ -24,7 +25,17 @@ def test_reader_without_diagnostics_inserts_what_a_listener_inserts(sessions, fo
     with (
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "r1", follow=follow, history_on_join=False) as listener,
-        StateReader(reader, ("r1",), wire, follow, buffer, counters=counters, history_on_join=False) as alone,
+        ServiceThread(reader, "requests") as thread,
+        StateReader(
+            reader,
+            ("r1",),
+            wire,
+            follow,
+            buffer,
+            thread=thread,
+            counters=counters,
+            history_on_join=False,
+        ) as alone,
     ):
         wait_for_stream_readers(writer, "r1", follow)
         until(lambda: listener.buffer.domain.domain_of("r1") == "system")

@@ -16,13 +16,11 @@ from functools import partial
 
 import zenoh
 
-from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe_lock
 from zstate.clock import Clock, ClockOffset, SystemClock
-from zstate.errors import Closed, InvalidInput, MessageError
-from zstate.net.at_exit import join_at_exit
+from zstate.errors import InvalidInput, MessageError
 from zstate.net.queryable import check_timeout, query
-from zstate.net.sample_history import RoundRobinQueue
+from zstate.net.requests import ReplyHandler, Request, Requests
+from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import WRITER_CLOCK
@@ -43,6 +41,9 @@ Longer if the writer did not reply before.
 _ROUNDS = 8
 _FIRST_ROUNDS = 2
 """Fewer when a writer is first watched: a listener of a thousand robots measures all of them at once."""
+
+_MAX_IN_FLIGHT = 1
+"""Queries in flight together would delay each other."""
 
 _DISCOVERY_S = 0.05
 
@@ -166,36 +167,30 @@ def _offset_in(reply: zenoh.Reply, sent: int, round_trip_ns: int) -> MeasuredOff
     return MeasuredOffset(robot, writer, message.stamp - (sent + half), half, round_trip_ns)
 
 
-class ClockOffsetMonitor(Closeable):
-    """Measures the clock offsets of writers when they are read, in its own thread.
+class ClockOffsetMonitor:
+    """Measures the clock offsets of writers when they are read, by requests of ``thread``.
 
-    ``offsets`` has a function for the printed name of each watched writer, which returns its offset. The
-    thread lives only while there is something to measure. Robots take turns: silent writers of one robot do
-    not delay those of another for long.
+    ``offsets`` has a function for the printed name of each watched writer, which returns its offset. Robots
+    take turns: silent writers of one robot do not delay those of another for long.
     """
 
     def __init__(
         self,
         session: Session,
+        thread: ServiceThread,
         clock: Clock,
         offsets: dict[str, Callable[[], ClockOffset | None]] | None = None,
     ) -> None:
-        self._session = session
+        self._requests = Requests(session, thread, _MAX_IN_FLIGHT)
         self._clock = clock
         self._offsets = {} if offsets is None else offsets
         self._watched: dict[WriterId, _WriterOffset] = {}
-        self._requests: RoundRobinQueue[_WriterOffset] = RoundRobinQueue()
-        self._lock = fork_safe_lock()
-        self._is_running = False
-        self._is_open = True
 
     def watch(self, robot: str, writer: WriterId) -> Callable[[], ClockOffset | None]:
         """A function that returns the clock offset of ``writer``; measured now, and again after 30 s."""
         offset = self._watched.get(writer)
         if offset is None:
-            offset = self._watched[writer] = _WriterOffset(
-                self, robot, WRITER_CLOCK.key(robot, writer.identity)
-            )
+            offset = self._watched[writer] = _WriterOffset(self._requests, self._clock, robot, writer)
             offset()
             self._offsets[str(writer)] = offset
         return offset
@@ -206,61 +201,62 @@ class ClockOffsetMonitor(Closeable):
         if offset is not None and self._offsets.get(str(writer)) is offset:
             del self._offsets[str(writer)]
 
-    def request(self, offset: _WriterOffset) -> None:
-        """Measure ``offset`` after the ones that were requested before."""
-        with self._lock:
-            if not self._is_open:
-                return
-            self._requests.add(offset.robot, offset)
-            if not self._is_running:
-                self._is_running = True
-                thread = threading.Thread(target=self._run, name="zstate clock offsets", daemon=True)
-                try:
-                    join_at_exit(thread).start()
-                except RuntimeError:  # the interpreter is ending and starts no more threads
-                    self._is_open = False
 
-    def close(self) -> None:
-        """Stop measuring; the last offsets stay. A second call does nothing."""
-        with self._lock:
-            self._is_open = False
-            self._requests.clear()
+class _WriterOffset(Request):
+    """The offset of the clock of ``writer`` from ``clock``, if it is known; reading it requests it again."""
 
-    def _run(self) -> None:
-        while True:
-            with self._lock:
-                offset = self._requests.pop(0.0)
-                if offset is None:
-                    self._is_running = False
-                    return
-            timeout_s = _TIMEOUTS_S[min(offset.unanswered, len(_TIMEOUTS_S) - 1)]
-            try:
-                rounds = _FIRST_ROUNDS if offset.known is None else _ROUNDS
-                measured = _measure(self._session, offset.key, rounds, self._clock, timeout_s)
-            except (Closed, zenoh.ZError):
-                self.close()  # with the session
-                continue
-            for one in measured:
-                offset.known = ClockOffset(one.offset_ns, one.uncertainty_ns)
-            offset.unanswered = 0 if measured else offset.unanswered + 1
-            if 0 < offset.unanswered < len(_TIMEOUTS_S):
-                self.request(offset)
-
-
-@dataclass(eq=False)
-class _WriterOffset:
-    """The offset of one writer's clock, if it is ``known``."""
-
-    monitor: ClockOffsetMonitor
-    robot: str
-    key: str
-    known: ClockOffset | None = None
-    unanswered: int = 0
-    requested_s: float = -math.inf
+    def __init__(self, requests: Requests, clock: Clock, robot: str, writer: WriterId) -> None:
+        self.source = robot
+        self._requests = requests
+        self._clock = clock
+        self._key = WRITER_CLOCK.key(robot, writer.identity)
+        self._known: ClockOffset | None = None
+        self._unanswered = 0
+        self._requested_s = -math.inf
+        self._is_measuring = False
+        # Of a measurement: when it began [s], when its last query was sent by both clocks, and what came.
+        self._began_s = 0.0
+        self._sent_ns = self._sent = 0
+        self._reply: tuple[zenoh.Reply, int] | None = None
+        self._measured: list[MeasuredOffset] = []
 
     def __call__(self) -> ClockOffset | None:
         now_s = time.monotonic()
-        if now_s - self.requested_s >= (_UNANSWERED_REFRESH_S if self.known is None else REFRESH_S):
-            self.requested_s = now_s
-            self.monitor.request(self)
-        return self.known
+        period_s = _UNANSWERED_REFRESH_S if self._known is None else REFRESH_S
+        if now_s - self._requested_s >= period_s and not self._is_measuring:
+            self._requested_s, self._is_measuring = now_s, True
+            self._requests.add(self)
+        return self._known
+
+    @property
+    def _timeout_s(self) -> float:
+        return _TIMEOUTS_S[min(self._unanswered, len(_TIMEOUTS_S) - 1)]
+
+    def send(self, session: zenoh.Session, handler: ReplyHandler) -> None:
+        self._began_s = self._began_s or time.monotonic()
+        self._sent_ns, self._sent = time.monotonic_ns(), self._clock.now()
+        session.get(self._key, handler, timeout=self._timeout_s, consolidation=zenoh.ConsolidationMode.NONE)
+
+    def on_reply(self, reply: zenoh.Reply) -> None:
+        if self._reply is None and reply.ok is not None:
+            self._reply = reply, time.monotonic_ns() - self._sent_ns
+
+    def on_end(self) -> float | None:
+        # Not kept: a reply holds the memory it was received in, 10 to 20 kB.
+        reply, self._reply = self._reply, None
+        measured = None if reply is None else _offset_in(reply[0], self._sent, reply[1])
+        if measured is not None:
+            self._measured.append(measured)
+            if len(self._measured) < (_FIRST_ROUNDS if self._known is None else _ROUNDS):
+                return 0.0
+        elif not self._measured and time.monotonic() < self._began_s + self._timeout_s:
+            return _DISCOVERY_S  # a session that has just connected has not discovered all others yet
+        if self._measured:
+            best = min(self._measured, key=lambda one: one.round_trip_ns)
+            self._known = ClockOffset(best.offset_ns, best.uncertainty_ns)
+        self._unanswered = 0 if self._measured else self._unanswered + 1
+        self._began_s, self._measured = 0.0, []
+        if 0 < self._unanswered < len(_TIMEOUTS_S):
+            return 0.0
+        self._is_measuring = False
+        return None

@@ -10,11 +10,7 @@ from __future__ import annotations
 
 import logging
 import secrets
-import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
 
@@ -25,9 +21,10 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import Closed, InvalidInput
 from zstate.net.queryable import Queryable, Reply, query
-from zstate.net.sample_history import RoundRobinQueue
+from zstate.net.requests import ReplyHandler, Request, Requests
+from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
-from zstate.net.streams import Receiver, SharedSubscription, call_for_each, subscribe_to_all, to_serialized
+from zstate.net.streams import Receiver, call_for_each, to_serialized
 from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 4096
@@ -35,13 +32,9 @@ HEARTBEAT_S = 0.5
 
 _LOG = logging.getLogger("zstate")
 
-_TOKENS = 16_384
-"""Waiting announcements of publishers; more arrive together only if so many publishers exist."""
 _MAX_IN_FLIGHT = 8
 _MAX_ATTEMPTS = 3
 _ANSWER_WITHIN_S = 2.0
-_HANDLED_WITHIN_S = 0.5
-"""For a cached value that a full ring has dropped; a slow callback then has a few more waiting."""
 
 
 class LatchedPublisher(Closeable):
@@ -158,24 +151,19 @@ class _LargeValuePublisher:
         self._publisher.undeclare()
 
 
-@dataclass(frozen=True)
-class _CachedValue:
-    """The reply of a publisher's cache, in the order in which it arrived among the live samples."""
-
-    sample: zenoh.Sample
-    on_handled: Callable[[], None]
-
-
-class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
+class LatchedSubscriber(Receiver):
     """Subscriber to the current value of every matching key, then to each change.
 
-    ``on_value(sample)`` is called from one thread of this subscriber, for several key expressions too; the
-    payload is empty if the value was withdrawn. ``on_batch_end()`` is called after those that have arrived
-    together. ``Receiver`` describes slow and failing callbacks; ``capacity`` values wait at most.
+    ``on_value(sample)`` is called from one thread, of this subscriber unless ``thread`` is given; the payload
+    is empty if the value was withdrawn. ``on_batch_end()`` is called after those that have arrived together.
+    ``Receiver`` describes slow and failing callbacks; ``capacity`` values wait at most.
 
-    In ROS each message of a writer of /tf_static adds to the ones before, and its cache has the last one: so
-    a cached value is not handled before the live samples that arrived earlier.
+    The cached value of each publisher is requested once it is announced, now or later. In ROS each message
+    of a writer of /tf_static adds to the ones before, and its cache has the last one: so a cached value is
+    not handled before the live samples that arrived earlier.
     """
+
+    _is_mixed = True
 
     def __init__(
         self,
@@ -185,6 +173,7 @@ class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
         *,
         on_batch_end: Callable[[], object] | None = None,
         capacity: int = CAPACITY,
+        thread: ServiceThread | None = None,
     ) -> None:
         self._on_value = on_value
         self._on_batch_end = on_batch_end
@@ -192,39 +181,28 @@ class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
         keyexprs = (keyexprs,) if isinstance(keyexprs, str) else keyexprs
         recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
         declare = partial(zenoh.ext.declare_advanced_subscriber, session.zenoh, recovery=recovery)
-        live: SharedSubscription[zenoh.Sample | _CachedValue] = SharedSubscription(
-            keyexprs, capacity, declare
-        )
-        self._arrived = live.handler
-        super().__init__(session, live, capacity)
+        super().__init__(session, keyexprs, declare, capacity, thread=thread)
+        self._requests = Requests(session, self._thread, _MAX_IN_FLIGHT)
         try:
             # After subscribing, so that no change falls between a cached value and the live ones.
-            self._cached = _CachedValues(session, keyexprs, self._add_cached)
+            tokens = [f"{keyexpr}/@adv/pub/**" for keyexpr in keyexprs]
+            declare = partial(session.zenoh.liveliness().declare_subscriber, history=True)
+            self._subscribe(tokens, declare, self._on_token)
         except BaseException:
-            super().close()
+            self.close()
             raise
 
-    def _add_cached(self, sample: zenoh.Sample) -> None:
-        """Add the reply of a cache to what has arrived; wait until it is handled, at most half a second."""
-        handled = threading.Event()
-        self._arrived.put(_CachedValue(sample, handled.set))
-        handled.wait(_HANDLED_WITHIN_S)
+    def _on_token(self, token: zenoh.Sample) -> None:
+        """Called in a thread of Zenoh, which must not wait."""
+        if token.kind == zenoh.SampleKind.PUT:
+            self._requests.add(_CacheRequest(str(token.key_expr), self._put))
 
-    def _on_batch(self, batch: list[zenoh.Sample | _CachedValue]) -> None:
+    def _on_batch(self, batch: list[zenoh.Sample]) -> None:
         try:
-            call_for_each(batch, self._on_arrival)
+            call_for_each(batch, self._on_sample)
         finally:
             if self._on_batch_end is not None:
                 self._on_batch_end()
-
-    def _on_arrival(self, arrival: zenoh.Sample | _CachedValue) -> None:
-        if not isinstance(arrival, _CachedValue):
-            self._on_sample(arrival)
-            return
-        try:
-            self._on_sample(arrival.sample)
-        finally:
-            arrival.on_handled()
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         if self._is_newer(sample):
@@ -246,82 +224,49 @@ class LatchedSubscriber(Receiver[zenoh.Sample | _CachedValue]):
         self._numbers[publisher] = number
         return True
 
-    def close(self) -> None:
-        self._closed = True  # what is cached is no longer handled
-        self._cached.close()
-        super().close()
-
-
-@dataclass(eq=False)
-class _Request:
-    """The requests to the cache of one publisher, on the key of its token."""
-
-    token: str
-    attempts: int = 0
-    replies: Iterator[zenoh.Reply] | None = None
-
 
 # zenoh 1.10, an advanced subscriber queries all caches at once: delete when it has a limit
-class _CachedValues(Receiver[zenoh.Sample]):
-    """Requests the cached value of each publisher on ``keyexprs`` once it is announced, now or later.
+class _CacheRequest(Request):
+    """The requests to the cache of the publisher with ``token``; its value is ``put`` among the live ones.
 
-    At most eight requests are in flight. Keys take turns, so that many silent publishers of one key do not
-    delay the others. A request that times out is repeated twice; the third timeout is logged as a warning.
+    The request has ended for the thread once the value that it brought has been handled. One that times out
+    is repeated twice; the third timeout is logged as a warning.
     """
 
-    def __init__(
-        self, session: Session, keyexprs: Sequence[str], on_value: Callable[[zenoh.Sample], None]
-    ) -> None:
-        self._on_value = on_value
-        tokens = [f"{keyexpr}/@adv/pub/**" for keyexpr in keyexprs]
-        declare = partial(session.zenoh.liveliness().declare_subscriber, history=True)
-        super().__init__(session, subscribe_to_all(tokens, _TOKENS, declare), _TOKENS)
+    def __init__(self, token: str, put: Callable[[zenoh.Sample], None]) -> None:
+        self.source = token.partition("/@adv/")[0]
+        self._token = token
+        self._put = put
+        self._attempts = 0
+        self._has_timed_out = False
 
-    def _on_batch(self, batch: list[zenoh.Sample]) -> None:
-        call_for_each(self._values(batch), self._on_value)
-
-    def _values(self, tokens: list[zenoh.Sample]) -> Iterator[zenoh.Sample]:
-        """The values of the publishers with these ``tokens``, and of those announced while waiting."""
-        waiting: RoundRobinQueue[_Request] = RoundRobinQueue()
-        in_flight: deque[_Request] = deque()
-        # Undeclared, also at this moment by another thread (RuntimeError), or the session was closed.
-        with suppress(Closed, zenoh.ZError, RuntimeError):
-            while not self._closed:
-                for token in tokens:
-                    if token.kind == zenoh.SampleKind.PUT:
-                        self._add(waiting, _Request(str(token.key_expr)))
-                while len(in_flight) < _MAX_IN_FLIGHT and (request := waiting.pop(0.0)) is not None:
-                    self._send(request)
-                    in_flight.append(request)
-                if not in_flight:
-                    return
-                request = in_flight.popleft()
-                for reply in request.replies or ():
-                    if reply.ok is not None:
-                        yield reply.ok
-                    elif request.attempts < _MAX_ATTEMPTS:  # Zenoh's own reply at the timeout
-                        self._add(waiting, request)
-                    else:
-                        _log_silent_publisher(request.token)
-                tokens = list(iter(self._subscribed.handler.try_recv, None))
-
-    @staticmethod
-    def _add(waiting: RoundRobinQueue[_Request], request: _Request) -> None:
-        waiting.add(request.token.partition("/@adv/")[0], request)
-
-    def _send(self, request: _Request) -> None:
-        request.attempts += 1
-        request.replies = query(
-            self._session.zenoh,
-            f"{request.token}?_max=1",
-            _ANSWER_WITHIN_S,
+    def send(self, session: zenoh.Session, handler: ReplyHandler) -> None:
+        self._attempts += 1
+        self._has_timed_out = False
+        session.get(
+            f"{self._token}?_max=1",
+            handler,
+            timeout=_ANSWER_WITHIN_S,
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
         )
 
+    def on_reply(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._put(reply.ok)
+        else:  # Zenoh's own reply at the timeout
+            self._has_timed_out = True
 
-def _log_silent_publisher(token: str) -> None:
-    key = token.partition("/@adv/")[0]
+    def on_end(self) -> float | None:
+        if not self._has_timed_out:
+            return None
+        if self._attempts < _MAX_ATTEMPTS:
+            return 0.0
+        _log_silent_publisher(self.source)
+        return None
+
+
+def _log_silent_publisher(key: str) -> None:
     facts = {"event": "no latched value", "key": key}
     text = (
         "the publisher of %r is announced, but its current value did not arrive in %d requests of %g s each; "

@@ -12,7 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, Unreachable, ZStateError
 from zstate.net.queryable import MAX_REPLIES, Tokens, check_timeout, query_tokens
 from zstate.net.session import Session
-from zstate.net.streams import Receiver, call_for_each, subscribe_to_all
+from zstate.net.streams import Receiver, call_for_each
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READER_TOKEN, shortened
@@ -238,7 +238,7 @@ class RouterLossDetector(Closeable):
         self._session.release(self._events)
 
 
-class WriterWatch(Receiver[zenoh.Sample]):
+class WriterWatch(Receiver):
     """Watches the writers of ``robot`` ("*": of all robots; or of several), beginning with the current ones.
 
     ``callback(announced, alive)`` is called from one thread. The loss of a router removes every writer behind
@@ -272,7 +272,7 @@ class WriterWatch(Receiver[zenoh.Sample]):
         # In ROS robots share one expression.
         self._expressions = list(dict.fromkeys(self._wire.writers_expression(one) for one in robots))
         declare = partial(session.zenoh.liveliness().declare_subscriber, history=True)
-        super().__init__(session, subscribe_to_all(self._expressions, CAPACITY, declare), CAPACITY)
+        super().__init__(session, self._expressions, declare, CAPACITY)
 
     def _on_batch(self, batch: list[zenoh.Sample]) -> None:
         if len(batch) < CAPACITY:
@@ -334,10 +334,10 @@ class OtherTfSubscription(Closeable):
     compute it without a subscriber.
     """
 
-    def __init__(self, subscribe: Callable[[], ExitStack]) -> None:
+    def __init__(self, subscribe: Callable[[], Closeable]) -> None:
         self._subscribe = subscribe
         self._writers: set[Announcement] = set()
-        self._subscription: ExitStack | None = None
+        self._subscription: Closeable | None = None
 
     def on_writer(self, announced: Announcement, *, alive: bool) -> None:
         """Subscribe or unsubscribe, if this writer makes a difference."""

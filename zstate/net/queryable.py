@@ -25,8 +25,9 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput
 from zstate.net.query_workers import QueryWorkers, leave_workers, use_workers
+from zstate.net.service_thread import JOIN_WITHIN_S
 from zstate.net.session import Session
-from zstate.net.streams import JOIN_WITHIN_S, call_for_each
+from zstate.net.streams import call_for_each
 from zstate.wire.keys import shortened
 
 MAX_REPLIES = 100_000

@@ -9,42 +9,28 @@ The reply is one ``HistoryPage`` of at most 32 kB; without ``before`` it is the 
 that of any writer. A reader requests the next page when it has one, so at most one page is in flight to it.
 That fits into the queues on the way, and no live sample waits behind it. Page by page its history grows
 backwards from the present, at no moment with a gap.
-
-A listener of all robots requests the history and the clock of each announced writer, a few at a time. An
-announced writer may never reply: in the order of arrival a thousand silent writers of one robot would delay
-those of another robot by minutes. So robots take turns.
 """
 
 from __future__ import annotations
 
-import heapq
-import itertools
-import queue
-import sys
-import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
 import zenoh
 
-from zstate._util.closeable import Closeable
 from zstate.clock import SET_BACK_NS
-from zstate.errors import Closed, InvalidInput, MessageError
+from zstate.errors import InvalidInput, MessageError
 from zstate.extension import kernel
 from zstate.net.queryable import Queryable, Reply
+from zstate.net.requests import ReplyHandler, Request
 from zstate.net.session import Session
-from zstate.net.streams import JOIN_WITHIN_S, to_serialized
+from zstate.net.streams import to_serialized
 from zstate.streams import StreamName
 from zstate.wire.keys import stream_key
 from zstate.wire.messages import HistoryPage
 from zstate.wire.native import decode, encode, encoding_of, stream_encoding
 from zstate.wire.protocol import SerializedSample
-
-T = TypeVar("T")
 
 PAGE_BYTES = 32_000
 PAGE_SAMPLES = 256
@@ -64,55 +50,10 @@ MAX_PAGE_BYTES = 524_288
 _OVERHEAD = 300
 """Size of a cached sample without its numbers [bytes]."""
 
-_MAX_IN_FLIGHT = 4
+MAX_IN_FLIGHT = 4
+"""Requests for pages that a reader sends at the same time."""
+
 _MAX_PAGES = 4096
-
-
-class RoundRobinQueue(Generic[T]):
-    """Items of several sources, each due at a time: one item of each source in turn.
-
-    A source with a thousand items delays those of another source by one item, not by a thousand. ``add`` and
-    ``pop`` cost O(log n). Times are seconds of one clock. Not thread-safe.
-    """
-
-    def __init__(self) -> None:
-        self._later: list[tuple[float, int, str, T]] = []
-        """A heap; the number keeps the order of items that are due at the same time."""
-        self._due: dict[str, deque[T]] = {}
-        """By source; the first source is the next."""
-        self._numbers = itertools.count()
-
-    def __len__(self) -> int:
-        return len(self._later) + sum(map(len, self._due.values()))
-
-    def add(self, source: str, item: T, due_s: float = 0.0) -> None:
-        """Add an item that ``pop`` returns at ``due_s`` or later."""
-        heapq.heappush(self._later, (due_s, next(self._numbers), source, item))
-
-    def pop(self, now_s: float) -> T | None:
-        """The next item that is due; None if there is none."""
-        while self._later and self._later[0][0] <= now_s:
-            _, _, source, item = heapq.heappop(self._later)
-            self._due.setdefault(source, deque()).append(item)
-        if not self._due:
-            return None
-        source = next(iter(self._due))
-        items = self._due.pop(source)
-        item = items.popleft()
-        if items:
-            self._due[source] = items  # behind all other sources
-        return item
-
-    def next_s(self, now_s: float) -> float | None:
-        """When the next item is due, ``now_s`` at the earliest; None if there is no item."""
-        if self._due:
-            return now_s
-        return max(now_s, self._later[0][0]) if self._later else None
-
-    def clear(self) -> None:
-        """Drop all items."""
-        self._later.clear()
-        self._due.clear()
 
 
 class CachedSample(NamedTuple):
@@ -229,120 +170,58 @@ def serve_history(
     return Queryable(session, stream_key(robot, stream, writer), answer)
 
 
-@dataclass(eq=False)
-class _Request:
-    """The requests to one writer, and their progress."""
+class HistoryRequest(Request):
+    """Requests the cached samples on ``key`` from the session ``writer``, page by page from the newest.
 
-    key: str
-    writer: int
-    before: int | None = None
-    pages: int = 0
-    attempts: int = 0
-    timeouts: int = 0
-    sent_s: float = 0.0
-    reply: zenoh.Sample | None = None
-
-
-class HistoryReader(Closeable):
-    """Requests cached samples from writers; one worker thread serves all requests.
-
-    ``on_page(samples, writer)`` is called from that thread, page by page from the newest to the oldest; the
-    samples of a page are oldest first, and ``writer`` is the requested session. It returns whether to request
-    older ones. A request without a reply is repeated a few times; a page that cannot be decoded goes
-    to ``on_error``. Keys take turns, so that many silent writers of one robot do not delay those of another.
-    An exception of ``on_page`` ends the requests to that writer; the first goes to ``threading.excepthook``.
+    ``on_page(samples, writer)`` is called in the thread of the requests; the samples of a page are oldest
+    first. It returns whether to request older ones. A request without a reply is repeated a few times; a page
+    that cannot be decoded goes to ``on_error``.
     """
 
     def __init__(
         self,
-        session: Session,
+        key: str,
+        writer: int,
         on_page: Callable[[list[SerializedSample], int], bool],
         on_error: Callable[[str, MessageError], None],
     ) -> None:
-        self._session = session
+        self.source = self._key = key
+        self._writer = writer
         self._on_page = on_page
         self._on_error = on_error
-        self._events: queue.SimpleQueue[tuple[_Request, bool] | None] = queue.SimpleQueue()
-        """New requests, and requests whose query has ended (True)."""
-        self._waiting: RoundRobinQueue[_Request] = RoundRobinQueue()
-        self._in_flight = 0
-        self._failures = 0
-        self._closed = False
-        self._thread = threading.Thread(target=self._run, name="zstate past", daemon=True)
-        self._thread.start()
+        self._before: int | None = None
+        self._pages = self._attempts = self._timeouts = 0
+        self._reply: zenoh.Sample | None = None
 
-    def request(self, key: str, writer: int) -> None:
-        """Request the cached samples of ``key`` from the writer with that session. Returns at once."""
-        self._events.put((_Request(key, writer), False))
-
-    def _run(self) -> None:
-        while not self._closed:
-            now_s = time.monotonic()
-            next_s = self._waiting.next_s(now_s)
-            pause_s = None if next_s is None or self._in_flight >= _MAX_IN_FLIGHT else next_s - now_s
-            with suppress(queue.Empty):
-                event = self._events.get(timeout=pause_s)
-                if event is not None:
-                    self._on_event(*event)
-            now_s = time.monotonic()
-            while self._in_flight < _MAX_IN_FLIGHT and not self._closed:
-                request = self._waiting.pop(now_s)
-                if request is None:
-                    break
-                try:
-                    self._send(request)
-                    self._in_flight += 1
-                except (zenoh.ZError, Closed):
-                    self._closed = True  # with the session
-
-    def _on_event(self, request: _Request, has_ended: bool) -> None:
-        due_s: float | None = 0.0
-        if has_ended:
-            self._in_flight -= 1
-            try:
-                due_s = self._on_reply(request)
-            except Exception:
-                due_s = None
-                self._failures += 1
-                if self._failures == 1:
-                    threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
-        if due_s is not None:
-            self._waiting.add(request.key, request, due_s)
-
-    def _send(self, request: _Request) -> None:
-        selector = f"{request.key}?session={request.writer}"
-        if request.before is not None:
-            selector += f";before={request.before}"
-        request.reply, request.sent_s = None, time.monotonic()
-
-        def on_reply(reply: zenoh.Reply) -> None:
-            # The first is the page. More of them, or on another key, were not requested.
-            if request.reply is None and reply.ok is not None and str(reply.ok.key_expr) == request.key:
-                request.reply = reply.ok
-
-        # Called in a thread of Zenoh, which these functions do not block.
-        handler = zenoh.handlers.Callback(on_reply, lambda: self._events.put((request, True)), indirect=False)
-        self._session.zenoh.get(
+    def send(self, session: zenoh.Session, handler: ReplyHandler) -> None:
+        selector = f"{self._key}?session={self._writer}"
+        if self._before is not None:
+            selector += f";before={self._before}"
+        self._reply = None
+        session.get(
             selector,
             handler,
-            timeout=TIMEOUTS_S[request.timeouts],
+            timeout=TIMEOUTS_S[self._timeouts],
             consolidation=zenoh.ConsolidationMode.NONE,
             # Replies have the priority of their queries: behind live samples, and dropped under congestion.
             priority=zenoh.Priority.DATA_LOW,
             congestion_control=zenoh.CongestionControl.DROP,
         )
 
-    def _on_reply(self, request: _Request) -> float | None:
-        """Deliver the page, if there is a reply. Returns when [s] to request again; None for never."""
-        if request.reply is None:
+    def on_reply(self, reply: zenoh.Reply) -> None:
+        # The first is the page. More of them, or on another key, were not requested.
+        if self._reply is None and reply.ok is not None and str(reply.ok.key_expr) == self._key:
+            self._reply = reply.ok
+
+    def on_end(self) -> float | None:
+        if self._reply is None:
             # The token of a new writer may be known before its queryable; or a page was lost.
-            now_s = time.monotonic()
-            request.attempts += 1
-            request.timeouts += now_s - request.sent_s > 0.9 * TIMEOUTS_S[request.timeouts]
-            is_last = request.attempts >= MAX_ATTEMPTS or request.timeouts >= len(TIMEOUTS_S)
-            return None if is_last else now_s + RETRY_DELAY_S * 2**request.attempts
-        request.attempts = request.timeouts = 0
-        received = to_serialized(request.reply, request.key)
+            self._attempts += 1
+            self._timeouts += self.duration_s > 0.9 * TIMEOUTS_S[self._timeouts]
+            is_last = self._attempts >= MAX_ATTEMPTS or self._timeouts >= len(TIMEOUTS_S)
+            return None if is_last else RETRY_DELAY_S * 2**self._attempts
+        self._attempts = self._timeouts = 0
+        received = to_serialized(self._reply, self._key)
         if len(received.payload) > MAX_PAGE_BYTES:
             text = f"a page of {len(received.payload)} bytes, more than {MAX_PAGE_BYTES}"
             self._on_error(received.key, MessageError(text, reason="too large"))
@@ -353,15 +232,8 @@ class HistoryReader(Closeable):
             self._on_error(received.key, error)
             return None
         samples = [SerializedSample(received.key, sample, page.encoding) for sample in page.samples]
-        wants_more = bool(samples) and self._on_page(samples, request.writer)
-        request.pages += 1
-        goes_back = page.before is not None and (request.before is None or page.before < request.before)
-        request.before = page.before
-        return 0.0 if wants_more and goes_back and request.pages < _MAX_PAGES else None
-
-    def close(self) -> None:
-        """Stop the thread, within a second. A second call does nothing."""
-        self._closed = True
-        self._events.put(None)
-        if threading.current_thread() is not self._thread:
-            self._thread.join(JOIN_WITHIN_S)
+        wants_more = bool(samples) and self._on_page(samples, self._writer)
+        self._pages += 1
+        goes_back = page.before is not None and (self._before is None or page.before < self._before)
+        self._before = page.before
+        return 0.0 if wants_more and goes_back and self._pages < _MAX_PAGES else None

@@ -16,6 +16,7 @@ from zstate.ingest.counters import Counters, ListenerStats
 from zstate.ingest.diagnostics import WriterEvent
 from zstate.ingest.robot_ingests import Follow
 from zstate.net.presence import announced_robots
+from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.nodes.state_reader import StateReader
 from zstate.wire.keys import ANY, check_robot, shortened
@@ -87,9 +88,17 @@ class TransformListener(Closeable):
         self._counters = Counters()
         self._session, self._pid = session, os.getpid()
         with ExitStack() as opening:
+            # What may be slow, such as loading the model of a robot, does not delay samples.
+            thread = opening.enter_context(ServiceThread(session, "requests"))
             self._diagnostics = opening.enter_context(
                 ListenerDiagnostics(
-                    session, self._wire, follow, self.buffer, counters=self._counters, on_event=on_event
+                    session,
+                    self._wire,
+                    follow,
+                    self.buffer,
+                    thread=thread,
+                    counters=self._counters,
+                    on_event=on_event,
                 )
             )
             self._reader = opening.enter_context(
@@ -99,6 +108,7 @@ class TransformListener(Closeable):
                     self._wire,
                     follow,
                     self.buffer,
+                    thread=thread,
                     counters=self._counters,
                     history_on_join=history_on_join,
                     placers=placers,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
@@ -16,6 +15,7 @@ from zstate.ingest.frame_ownership import EdgeSource
 from zstate.ingest.robot_ingests import Follow, sample_streams
 from zstate.ingest.stamp_checks import StampCheck
 from zstate.net.clock_offset import ClockOffsetMonitor
+from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
@@ -26,8 +26,8 @@ from zstate.wire.protocol import Wire
 class ListenerDiagnostics(Diagnostics, Closeable):
     """Logs the events of writers, checks stamps, and measures the clocks of writers for ``buffer``.
 
-    Clocks are measured on the native wire, if the clock of ``buffer`` is a machine's. ``on_event`` is called
-    with each event on a thread of its own; see ``EventLog``.
+    Clocks are measured by ``thread``, on the native wire, if the clock of ``buffer`` is a machine's.
+    ``on_event`` is called with each event on a thread of its own; see ``EventLog``.
     """
 
     def __init__(
@@ -37,26 +37,23 @@ class ListenerDiagnostics(Diagnostics, Closeable):
         follow: Follow,
         buffer: TransformBuffer,
         *,
+        thread: ServiceThread,
         counters: Counters,
         on_event: Callable[[WriterEvent], None] | None,
     ) -> None:
         self._streams = sample_streams(wire, follow)
         self._stamp_check = StampCheck(buffer, counters, is_described=not wire.shared)
         self._clock_offsets: ClockOffsetMonitor | None = None
-        with ExitStack() as opening:
-            streams: tuple[StreamName, ...] = ("robot_description", "tf_static", *self._streams)
-            self._events = opening.enter_context(EventLog(streams, follow, wire.shared, on_event))
-            if not wire.shared and buffer.clock.domain == SYSTEM:
-                self._clock_offsets = opening.enter_context(
-                    ClockOffsetMonitor(session, buffer.clock, buffer.clock_offsets)
-                )
-            self._opened = opening.pop_all()
+        if not wire.shared and buffer.clock.domain == SYSTEM:
+            self._clock_offsets = ClockOffsetMonitor(session, thread, buffer.clock, buffer.clock_offsets)
+        streams: tuple[StreamName, ...] = ("robot_description", "tf_static", *self._streams)
+        self._events = EventLog(streams, follow, wire.shared, on_event)
         self._has_deadlines = on_event is not None
         if self._has_deadlines:
             self.on_usual_sample = self._events.on_sample
 
     def close(self) -> None:
-        self._opened.close()
+        self._events.close()
 
     def events(self) -> tuple[WriterEvent, ...]:
         return self._events.recent()

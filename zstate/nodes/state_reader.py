@@ -19,7 +19,9 @@ from zstate.ingest.robot_ingests import Follow, RobotIngests
 from zstate.ingest.stream_ingests import StreamIngests
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import OtherTfSubscription, WriterWatch, announce_reader
-from zstate.net.sample_history import HistoryReader
+from zstate.net.requests import Requests
+from zstate.net.sample_history import MAX_IN_FLIGHT, HistoryRequest
+from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.plugins import is_named
@@ -36,8 +38,9 @@ R = TypeVar("R")
 class StateReader(Closeable):
     """Inserts the state of ``robots``, received on ``wire``, into ``buffer``, until it is closed.
 
-    The part of a TransformListener that the poses in its buffer need. ``diagnostics`` observe it; without
-    them the same samples are inserted. Counts everything in ``counters``; no input ends it.
+    The part of a TransformListener that the poses in its buffer need. Latched values and history are handled
+    in ``thread``, samples in others. ``diagnostics`` observe it; without them the same samples are inserted.
+    Counts everything in ``counters``; no input ends it.
     """
 
     def __init__(
@@ -48,6 +51,7 @@ class StateReader(Closeable):
         follow: Follow,
         buffer: TransformBuffer,
         *,
+        thread: ServiceThread,
         counters: Counters,
         history_on_join: bool = True,
         placers: Collection[str] | None = None,
@@ -65,7 +69,7 @@ class StateReader(Closeable):
         self.ingests = RobotIngests(
             buffer, counters, wire, follow, placers=placers, diagnostics=self._diagnostics
         )
-        self._history: HistoryReader | None = None
+        self._history: Requests | None = None
         self._observers: tuple[Callable[[], object], ...] = ()
         with ExitStack() as opening:
             latched: dict[StreamName, Callable[[SerializedSample], None]] = {
@@ -73,13 +77,13 @@ class StateReader(Closeable):
                 "tf_static": self._on_statics,
             }
             for stream, handle in latched.items():
-                opening.enter_context(LatchedSubscriber(session, self._keys(stream), self._observed(handle)))
+                opening.enter_context(
+                    LatchedSubscriber(session, self._keys(stream), self._observed(handle), thread=thread)
+                )
             self._other_tf = self._subscribe_to_samples(opening)
             if history_on_join and wire.name == "native":
-                on_history = self._observed(self._on_history)
-                self._history = opening.enter_context(
-                    HistoryReader(session, on_history, self._count_undecodable)
-                )
+                self._history = Requests(session, thread, MAX_IN_FLIGHT)
+                self._on_page = self._observed(self._on_history)
             # History is requested from each writer found: after subscribing, so that no sample falls between.
             on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
             opening.enter_context(WriterWatch(session, robots, on_writer, wire, on_cut_off))
@@ -114,28 +118,25 @@ class StateReader(Closeable):
 
     def _subscribe_to_samples(self, opening: ExitStack) -> OtherTfSubscription | None:
         """Receive all streams of samples; in ROS /tf only while nodes add edges to those of models."""
-        streams = tuple(self.ingests.streams)
-        if len(streams) == 1 or not self._wire.shared:
-            opening.enter_context(self._subscribe(streams))
-            return None
-        opening.enter_context(self._subscribe([self._follow]))
-        return opening.enter_context(OtherTfSubscription(partial(self._subscribe, [self._wire.transforms])))
+        opening.enter_context(self._subscriber(self._follow))
+        others = [stream for stream in self.ingests.streams if stream != self._follow]
+        if others and self._wire.shared:
+            subscribe = partial(self._subscriber, self._wire.transforms)
+            return opening.enter_context(OtherTfSubscription(subscribe))
+        for stream in others:
+            opening.enter_context(self._subscriber(stream, is_dormant=True))
+        return None
 
-    def _subscribe(self, streams: Sequence[StreamName]) -> ExitStack:
-        """Receive the samples of ``streams`` until the stack is closed."""
-        with ExitStack() as opening:
-            for stream in streams:
-                opening.enter_context(self._subscriber(self._keys(stream), self.ingests.streams[stream]))
-            return opening.pop_all()
-
-    def _subscriber(self, keys: Sequence[str], samples: StreamIngests) -> StreamSubscriber:
+    def _subscriber(self, stream: StreamName, *, is_dormant: bool = False) -> StreamSubscriber:
+        keys, samples = self._keys(stream), self.ingests.streams[stream]
         samples.capacity = capacity_for(keys)
-        on_samples = partial(self._on_samples, samples)
-        envelope = self._wire.usual_envelope(samples.stream)
+        make = partial(
+            StreamSubscriber, self._session, keys, partial(self._on_samples, samples), is_dormant=is_dormant
+        )
+        envelope = self._wire.usual_envelope(stream)
         if not self._has_fast_path or envelope is None:
-            return StreamSubscriber(self._session, keys, on_samples)
-        insert_next = partial(self._insert_next, samples)
-        return StreamSubscriber(self._session, keys, on_samples, insert_next=insert_next, envelope=envelope)
+            return make()
+        return make(insert_next=partial(self._insert_next, samples), envelope=envelope)
 
     def _insert_next(self, samples: StreamIngests, key: str, message: bytes | None) -> bool:
         """Insert a sample in one call of the extension if it is the usual next one on its key."""
@@ -260,4 +261,6 @@ class StateReader(Closeable):
         has_key = bool(announced.name) or not is_named(stream)
         if self._history is not None and stream in self.ingests.streams and has_key:
             key = stream_key(announced.robot, stream, announced.name)
-            self._history.request(key, announced.writer.session)
+            self._history.add(
+                HistoryRequest(key, announced.writer.session, self._on_page, self._count_undecodable)
+            )
