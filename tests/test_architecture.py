@@ -160,6 +160,11 @@ def nodes_of(text: str) -> tuple[ast.AST, ...]:
     return tuple(ast.walk(ast.parse(text)))
 
 
+def called(call: ast.Call) -> str:
+    """The last name of what is called; empty for one without a name."""
+    return getattr(call.func, "attr", None) or getattr(call.func, "id", "")
+
+
 @dataclass(frozen=True)
 class Source:
     """A file of zstate, by its path in the package."""
@@ -182,7 +187,7 @@ class Source:
             elif isinstance(node, ast.ImportFrom):
                 assert node.level == 0, f"{self.path}: a relative import hides which floor it leads to"
                 yield from ((*(node.module or "").split("."), alias.name) for alias in node.names)
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            elif isinstance(node, ast.Call) and called(node) == "import_module":
                 yield from (tuple(a.value.split(".")) for a in node.args if isinstance(a, ast.Constant))
 
 
@@ -231,7 +236,7 @@ def impurities(source: Source) -> Iterator[str]:
             yield f"{source.path} imports {'.'.join([top, *rest])!r}"
     for node in source.nodes():
         if isinstance(node, ast.Call):
-            name = node.func.attr if isinstance(node.func, ast.Attribute) else ast.unparse(node.func)
+            name = called(node)
             if name in impure | {"print"}:
                 yield f"{source.path}:{node.lineno} calls {name!r}"
         elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):

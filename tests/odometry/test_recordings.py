@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ from helpers.recordings import HUSKY_REST_S, WHEELS, Recording, Score, Track, ca
 from zstate import Transform
 
 THREE_SIGMA = 3.5
+PART_S = 120.0
+"""A third of the Husky's recording, from its start in motion."""
 NO_WORSE = 1.1
 """A drive with GPS errors of 0.8 to 1.7 m tells errors of 3 m apart by no more than a tenth."""
 
@@ -33,9 +36,9 @@ def jackal() -> Recording:
     return recordings.load("jackal")
 
 
-def dead_reckoning(start: float = 0.0) -> float:
+def dead_reckoning(start: float = 0.0, end: float = math.inf) -> float:
     t, path = recordings.dead_reckoned(husky(), start=start)
-    return recordings.error_of(husky(), t, path)
+    return recordings.error_of(husky(), t[t < end], path[t < end])
 
 
 def changed_score(calls: list[Call], mount: Transform | None = None) -> tuple[Score, Track]:
@@ -43,13 +46,17 @@ def changed_score(calls: list[Call], mount: Transform | None = None) -> tuple[Sc
     return score(husky(), track), track
 
 
-def without(kind: str, begin: float, end: float) -> list[Call]:
-    return [call for call in calls_of(husky()) if call.kind != kind or not begin <= call.t < end]
+def calls_until(end: float, **options: Any) -> list[Call]:
+    return [call for call in calls_of(husky(), **options) if call.t < end]
 
 
-def imu_in_base(rate_factor: float, rate_offset: float) -> list[Call]:
+def without(kind: str, begin: float, seconds: float, end: float) -> list[Call]:
+    return [call for call in calls_until(end) if call.kind != kind or not begin <= call.t < begin + seconds]
+
+
+def imu_in_base(rate_factor: float, rate_offset: float, end: float = math.inf) -> list[Call]:
     """The calls with another yaw rate of the IMU."""
-    turn, calls = husky().mount.matrix[:3, :3], calls_of(husky())
+    turn, calls = husky().mount.matrix[:3, :3], calls_until(end)
     for row, call in enumerate(calls):
         if call.kind == "imu":
             rate = turn @ call.values[0]
@@ -70,6 +77,11 @@ def frozen(begin: float, end: float) -> list[Call]:
     return calls
 
 
+whole_or_in_part = pytest.mark.parametrize(
+    "end", [PART_S, pytest.param(math.inf, id="whole", marks=pytest.mark.soak)]
+)
+
+
 def test_wheels_and_gyro_alone_are_three_metres_off_after_359_metres():
     """The baseline of the others, by an integration that has nothing of the estimator."""
     assert dead_reckoning() == pytest.approx(3.06, abs=0.01)
@@ -78,9 +90,9 @@ def test_wheels_and_gyro_alone_are_three_metres_off_after_359_metres():
 @pytest.mark.parametrize(
     ("as_joints", "has_compass", "start"),
     [
-        pytest.param(False, False, 0.0, id="velocity-no compass-in motion"),
+        pytest.param(False, True, HUSKY_REST_S, id="velocity-bad compass-at rest"),
+        pytest.param(False, False, 0.0, id="velocity-no compass-in motion", marks=pytest.mark.long),
         pytest.param(True, True, 0.0, id="joints-bad compass-in motion", marks=pytest.mark.long),
-        pytest.param(False, True, HUSKY_REST_S, id="velocity-bad compass-at rest", marks=pytest.mark.long),
         pytest.param(True, False, HUSKY_REST_S, id="joints-no compass-at rest", marks=pytest.mark.long),
         pytest.param(False, True, 0.0, id="velocity-bad compass-in motion", marks=pytest.mark.soak),
         pytest.param(True, False, 0.0, id="joints-no compass-in motion", marks=pytest.mark.soak),
@@ -112,45 +124,49 @@ def test_a_husky_is_found_as_well_as_by_dead_reckoning_inside_its_claim_and_cont
         pytest.param(True, 3, id="joints-3", marks=pytest.mark.soak),
     ],
 )
-def test_slow_sensors_cost_accuracy_and_no_more(as_joints: bool, wheel_step: int):
+@whole_or_in_part
+def test_slow_sensors_cost_accuracy_and_no_more(as_joints: bool, wheel_step: int, end: float):
     """The IMU at 10 Hz, and the wheels at 10 or 3.3 Hz."""
-    calls = calls_of(husky(), as_joints=as_joints, imu_step=3, wheel_step=wheel_step)
+    calls = calls_until(end, as_joints=as_joints, imu_step=3, wheel_step=wheel_step)
     track = played(husky(), calls, wheels=WHEELS if as_joints else None)
     found = score(husky(), track)
-    assert found.error < 2.0 * dead_reckoning()
+    assert found.error < 2.0 * dead_reckoning(end=end)
     assert found.end_sigmas < THREE_SIGMA
 
 
 @pytest.mark.long
-def test_wheels_five_percent_too_fast_are_inside_the_claim():
+@whole_or_in_part
+def test_wheels_five_percent_too_fast_are_inside_the_claim(end: float):
     calls = [
         call._replace(values=(tuple(1.05 * part for part in call.values[0]),))
         if call.kind == "velocity"
         else call
-        for call in calls_of(husky())
+        for call in calls_until(end)
     ]
     found, _ = changed_score(calls)
-    assert found.error < 2.0 * dead_reckoning()  # 359 m times 5 % in a round
+    assert found.error < 2.0 * dead_reckoning(end=end)  # the whole: 359 m times 5 % in a round
     assert found.end_sigmas < THREE_SIGMA
 
 
 @pytest.mark.long
-def test_a_gyro_whose_bias_is_far_off_is_inside_the_claim():
+@whole_or_in_part
+def test_a_gyro_whose_bias_is_far_off_is_inside_the_claim(end: float):
     """0.02 rad/s, two sigmas of a start in motion: a quarter of a turn in each 80 s."""
-    found, _ = changed_score(imu_in_base(1.0, 0.02))
+    found, _ = changed_score(imu_in_base(1.0, 0.02, end))
     assert found.error < 15.0
     assert found.end_sigmas < THREE_SIGMA
 
 
 @pytest.mark.long
-def test_a_mount_that_is_wrong_by_five_degrees_costs_little_and_is_named():
+@pytest.mark.parametrize("end", [HUSKY_REST_S, pytest.param(math.inf, id="whole", marks=pytest.mark.soak)])
+def test_a_mount_that_is_wrong_by_five_degrees_costs_little_and_is_named(end: float):
     """It tilts the base, so the height is many sigmas off: the sentence says so."""
     angle = math.radians(5.0)
     wrong = Transform.from_rpy("base_link", "base_link_wrong", (0.0, 0.0, 0.0), (angle, angle, 0.0)).matrix
     turned = wrong @ husky().mount.matrix
     turned[:3, 3] = husky().mount.translation
-    found, track = changed_score(calls_of(husky()), Transform.from_matrix("base_link", "imu_link", turned))
-    assert found.error < 2.0 * dead_reckoning()
+    found, track = changed_score(calls_until(end), Transform.from_matrix("base_link", "imu_link", turned))
+    assert found.error < 2.0 * dead_reckoning(end=end)
     assert found.end_sigmas < THREE_SIGMA
     assert track.sentences.keys() == {"imu"}
     assert "the mount of the IMU is off" in track.sentences["imu"]
@@ -158,9 +174,13 @@ def test_a_mount_that_is_wrong_by_five_degrees_costs_little_and_is_named():
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["velocity", "imu"])
-def test_thirty_seconds_without_a_source_are_inside_the_claim(kind: str):
-    found, track = changed_score(without(kind, 150.0, 180.0))
-    assert found.error < 5.0 * dead_reckoning()
+@pytest.mark.parametrize(
+    ("begin", "end"),
+    [(60.0, PART_S), pytest.param(150.0, math.inf, id="whole", marks=pytest.mark.soak)],
+)
+def test_thirty_seconds_without_a_source_are_inside_the_claim(kind: str, begin: float, end: float):
+    found, track = changed_score(without(kind, begin, 30.0, end))
+    assert found.error < 5.0 * dead_reckoning(end=end)
     assert found.end_sigmas < THREE_SIGMA
     if kind == "imu":
         assert "silent" in track.sentences["imu"]

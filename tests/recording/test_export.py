@@ -27,6 +27,8 @@ from zstate.recording.recording import Recording
 from zstate.wire.messages import JointState, order_digest, to_block
 
 COUNT = 500
+SHORT = 200
+"""Samples of a recording that tests read again and again; windows are still a fraction of it."""
 POSITIONS = [f"position.{name}" for name in RRBOT.joint_names]
 VELOCITIES = [f"velocity.{name}" for name in RRBOT.joint_names]
 EFFORTS = [f"effort.{name}" for name in RRBOT.joint_names]
@@ -114,7 +116,7 @@ def test_poses_are_the_lookups_at_the_same_rows(run: Path, options: dict[str, ob
 @pytest.fixture
 def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows of a fraction of a second, in recordings of some seconds."""
-    for name, value in {"_ROWS": 37, "_RELOADED_ROWS": 500, "DELAYED_NS": 100 * MS}.items():
+    for name, value in {"_ROWS": 37, "_RELOADED_ROWS": 200, "DELAYED_NS": 100 * MS}.items():
         monkeypatch.setattr(f"zstate.recording.export.{name}", value)
 
 
@@ -131,28 +133,28 @@ def swing(builder: RecordingBuilder, numbers: range, offset: int = 0, **options:
 def new_model(builder: RecordingBuilder) -> None:
     """A writer with another model replaces the first."""
     urdf = RRBOT.urdf.replace('xyz="0 0', 'xyz="1 0')
-    builder.describe("arm", parse_urdf(urdf, "moved"), 2, START + COUNT * 10 * MS)
-    swing(builder, range(COUNT, COUNT + 100), session=2)
+    builder.describe("arm", parse_urdf(urdf, "moved"), 2, START + SHORT * 10 * MS)
+    swing(builder, range(SHORT, SHORT + 100), session=2)
 
 
 def base_on_a_map(builder: RecordingBuilder) -> None:
     """The base is placed in a map from now on, by a writer that replaced the first."""
-    for n in range(COUNT, COUNT + 100):
+    for n in range(SHORT, SHORT + 100):
         builder.edges("arm", START + n * 10 * MS, {("map", "world"): pose(n / 100)}, session=9)
         builder.edges("arm", START + n * 10 * MS, {("odom", "map"): pose(y=n)}, session=8)
 
 
 LATER: dict[str, Callable[[RecordingBuilder], None]] = {
     "nothing": lambda builder: None,
-    "more": lambda builder: swing(builder, range(COUNT, 2 * COUNT)),
-    "gap": lambda builder: swing(builder, range(3 * COUNT, 4 * COUNT)),
-    "clock set back": lambda builder: swing(builder, range(COUNT, 2 * COUNT), -4 * S, session=7),
-    "clock set back by an hour": lambda builder: swing(builder, range(COUNT, 2 * COUNT), -3600 * S),
+    "more": lambda builder: swing(builder, range(SHORT, 2 * SHORT)),
+    "gap": lambda builder: swing(builder, range(3 * SHORT, 4 * SHORT)),
+    "clock set back": lambda builder: swing(builder, range(SHORT, 2 * SHORT), -1600 * MS, session=7),
+    "clock set back by an hour": lambda builder: swing(builder, range(SHORT, 2 * SHORT), -3600 * S),
     "late sample": lambda builder: builder.edges(
-        "arm", START + S + MS, {("odom", "world"): pose(7)}, log_time=START + COUNT * 10 * MS
+        "arm", START + S + MS, {("odom", "world"): pose(7)}, log_time=START + SHORT * 10 * MS
     ),
     "late static edge": lambda builder: builder.statics(
-        "arm", START + COUNT * 10 * MS, {("tool", "tip"): pose(z=3)}
+        "arm", START + SHORT * 10 * MS, {("tool", "tip"): pose(z=3)}
     ),
     "frame on another": base_on_a_map,
     "new model": new_model,
@@ -166,7 +168,7 @@ def test_rows_are_lookups_in_the_whole_recording(tmp_path: Path, later: str, opt
     with RecordingBuilder(tmp_path / "r.mcap") as builder:
         builder.describe("arm")
         builder.statics("arm", START, {("tool", "tip"): pose(z=1)})
-        swing(builder, range(COUNT))
+        swing(builder, range(SHORT))
         LATER[later](builder)
     pairs = [("arm/odom", "arm/tip"), ("arm/world", "arm/tool")]
     columns, report = export(tmp_path / "r.mcap", "parquet", poses=pairs, **options)
