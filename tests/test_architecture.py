@@ -95,6 +95,7 @@ GUESTS = {
     ("recording/cli/snapshot_file.py", "msgspec"),
     ("odometry/cli/settings_file.py", "msgspec"),
     ("cli/up/cell.py", "msgspec"),
+    ("cli/up/command_table.py", "msgspec"),
     ("driving/cli/drive.py", "msgspec"),  # so is --param, into the types that a driver annotates
     ("scans/map_files.py", "PIL"),
     ("transform.py", "pinocchio"),  # `Transform.se3`, when it is read

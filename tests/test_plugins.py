@@ -139,6 +139,16 @@ def test_commands_know_the_stream(sessions: tuple[Session, Session], battery_plu
     assert "battery" in run_cli("hz", "--help").stdout
 
 
+@pytest.mark.usefixtures("battery_plugin")
+def test_a_command_of_the_package_is_a_table_of_up(tmp_path: Path):
+    file = tmp_path / "cell.toml"
+    file.write_text("[[battery]]\nrobot = 'panda'\n")
+    shown = run_cli("up", str(file), "--check").stdout
+    assert shown.split() == ["panda/battery", "zstate", "battery", "panda"]
+    file.write_text("[[battery]]\nrobots = 'panda'\n")
+    assert "battery[0].robots: there is no such key; did you mean 'robot'?" in run_cli("up", str(file)).stderr
+
+
 def doctors_checks() -> dict[str, tuple[str, str]]:
     """The state and the text of each check of doctor, by its name."""
     checks = json.loads(run_cli("doctor", "--json").stdout)["checks"]

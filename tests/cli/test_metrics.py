@@ -44,9 +44,6 @@ def test_publisher_serves_its_metrics(spawn: Spawn):
     labels = {"robot": "rrbot", "wire": "native"}
     url = url_of(command)
     rows = grown(url, row("zstate_publisher_samples_total", stream="joint_states", **labels))
-    rate = row("zstate_publisher_rate_hertz", stream="joint_states", **labels)
-    until(lambda: scraped(url)[rate] > 10.0)
-    assert scraped(url)[rate] > 0.0  # another scrape at once
     assert rows[row("zstate_publisher_suppressed_total", stream="tf", **labels)] > 0
     assert rows[row("zstate_publisher_commanded_hertz", robot="rrbot")] == 100.0
     assert rows[row("process_resident_memory_bytes")] > 0
@@ -65,7 +62,6 @@ def test_listener_serves_its_counts():
             assert received <= in_buckets <= received + 100
             assert rows[row("zstate_writers", robot="rrbot", stream="joint_states")] == 1
             assert rows[row("zstate_listener_missed_total", robot="rrbot")] == 0
-            until(lambda: scraped(url)[row("zstate_listener_rate_hertz", robot="rrbot")] > 10.0)
         until(lambda: scraped(url)[row("zstate_robots")] == 0)
 
     run_watched(scrape, "monitor", "--robots", "--robot", "rrbot", "--json", "--metrics", "0")

@@ -17,7 +17,6 @@ from zstate.errors import InFuture, InvalidInput
 from zstate.metrics.collectors import (
     MAX_ROBOTS,
     ConnectionMetrics,
-    CounterRates,
     DriverMetrics,
     ListenerMetrics,
     MetricFamilies,
@@ -187,69 +186,6 @@ def test_router_reports_its_sessions_and_links(free_port: int):
             assert rows[row("zstate_router_sessions", mode="client")] == 1
             assert rows[row("zstate_router_links", protocol="tcp")] == 2
         until(lambda: not any(connections(router).sessions.values()))
-
-
-class FakeClock:
-    def __init__(self) -> None:
-        self.time_s = 100.0
-
-    def __call__(self) -> float:
-        return self.time_s
-
-
-def updated(rates: CounterRates, clock: FakeClock, seconds: int, rate_hz: float, count: float = 0.0) -> float:
-    """The count after ``seconds`` with an update each second."""
-    for _ in range(seconds):
-        rates.update("a", count)
-        clock.time_s += 1.0
-        count += rate_hz
-    return count
-
-
-def test_the_first_reading_has_the_rate_of_the_window_before_it():
-    clock = FakeClock()
-    rates = CounterRates(clock)
-    count = updated(rates, clock, 35, 100.0)
-    assert rates.update("a", count) == 100.0
-
-
-def test_two_readers_of_a_rate_do_not_affect_each_other():
-    clock = FakeClock()
-    rates = CounterRates(clock)
-    count = updated(rates, clock, 20, 50.0)
-    for _ in range(100):
-        assert rates.update("a", count) == pytest.approx(50.0)
-        clock.time_s += 0.02
-        count += 1.0
-
-
-def test_a_rate_covers_the_last_ten_seconds():
-    clock = FakeClock()
-    rates = CounterRates(clock)
-    count = updated(rates, clock, 30, 100.0)
-    count = updated(rates, clock, 5, 0.0, count)
-    assert rates.update("a", count) == 50.0
-    count = updated(rates, clock, 5, 0.0, count)
-    assert rates.update("a", count) == 0.0
-
-
-def test_rare_readings_have_the_rate_since_the_previous_reading():
-    clock = FakeClock()
-    rates = CounterRates(clock)
-    assert rates.update("a", 40) == 0.0
-    clock.time_s += 20.0
-    assert rates.update("a", 240) == (240 - 40) / 20.0
-    clock.time_s += 20.0
-    assert rates.update("a", 240) == 0.0
-
-
-def test_a_restarted_counter_has_no_negative_rate():
-    clock = FakeClock()
-    rates = CounterRates(clock)
-    rates.update("a", 1000)
-    clock.time_s += 1.0
-    assert rates.update("a", 3) == 0.0
-    assert rates.update("b", 3) == 0.0
 
 
 def test_a_driver_has_its_state_refused_commands_and_the_age_of_the_newest(sessions, host_driver):

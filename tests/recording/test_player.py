@@ -279,10 +279,12 @@ def test_player_can_be_paused_and_resumed(sessions, arm: Path):
     wait_for_reader(sessions[0], "zstate/arm/joint_states")
     replayer = Player(sessions[0], arm)
     replayer.pause()
+    assert replayer.is_paused
     with replaying(replayer) as reports:
         until(lambda: len(clocks.arrivals) > CLOCK_HZ)  # at least a second, as long as the recording
         assert not tap.arrivals
         replayer.resume()
+        assert not replayer.is_paused
         tap.payloads(COUNT)
         until(lambda: reports)
     assert reports[0].rate > 0.5  # the pause does not count

@@ -97,16 +97,6 @@ COMPLETION_VARIABLE = "_ZSTATE_COMPLETE"
 
 # Robots on this host are discovered in a fraction of this; a longer delay is annoying at a prompt.
 _ROBOTS_WITHIN_S = 0.4
-# The arguments that are models, by command.
-_MODELS = {
-    "check": "file",
-    "demo": "robot",
-    "drive": "robot",
-    "init": "robot",
-    "joints": "robot",
-    "publish": "robot",
-}
-
 # Columns that click leaves free at the right.
 _MARGIN = 2
 # An example and its comment, in columns.
@@ -235,8 +225,10 @@ class _Completed(click.types.StringParamType):
 
 def _completed_type(command: str, argument: click.Argument) -> Any:
     """The type of an argument while a shell completes: robots, models, files and parameters."""
-    if _MODELS.get(command) == argument.name:
-        return _Completed(_catalog_names, or_file=True)
+    from zstate.cli.options import MODEL
+
+    if argument.type is MODEL:
+        return MODEL
     if argument.name == "driver":
         return _Completed(lambda _, incomplete: ["sim"] if "sim".startswith(incomplete) else [], or_file=True)
     if command == "move" and argument.name == "positions":
@@ -246,12 +238,6 @@ def _completed_type(command: str, argument: click.Argument) -> Any:
     if argument.name in ("robot", "robots"):
         return _Completed(_announced_names, or_file=False)
     return click.Path() if argument.name in ("file", "folder") else argument.type
-
-
-def _catalog_names(_: click.Context, incomplete: str) -> Iterator[str]:
-    from zstate.model.catalog import catalog
-
-    return (entry.name for entry in catalog() if entry.name.startswith(incomplete))
 
 
 def _announced_names(ctx: click.Context, incomplete: str) -> Iterator[str]:

@@ -18,6 +18,8 @@ from zstate.cli.session import SessionOptions
 from zstate.errors import InvalidInput, NoClock
 
 if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+
     from zstate.clock import Clock
     from zstate.metrics.endpoint import BindAddress
     from zstate.model.robot import RobotModel
@@ -79,6 +81,21 @@ class StreamChoice(click.Choice[str]):
         """click sets those that it is created with."""
 
 
+class _Model(click.types.StringParamType):
+    """A robot model: the name of a robot, or a file. A shell completes both."""
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        from click.shell_completion import CompletionItem
+
+        from zstate.model.catalog import catalog
+
+        names = [entry.name for entry in catalog() if entry.name.startswith(incomplete)]
+        return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+
+
+MODEL = _Model()
 RATE = number("HZ", _check_rate)
 SECONDS = number("S", _check_seconds)
 

@@ -285,7 +285,7 @@ class SetpointLimiter:
         ]
         if unlimited:
             raise InvalidInput(
-                f"efforts are commanded within limits, which these joints have not: {', '.join(unlimited)}; "
+                f"efforts are commanded within limits, and these joints have none: {', '.join(unlimited)}; "
                 "start the driver with limits=Limits.of(model, effort=...)"
             )
 

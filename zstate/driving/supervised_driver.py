@@ -181,7 +181,7 @@ class FollowingCheck:
         name, unit = self._limits.joint_names[row], self._limits.units[row]
         return (
             f"{name!r} is {errors[row]:.3g} {unit} from its setpoint, more than "
-            f"following_error={self.most:g}; has it power, and is it free to move?"
+            f"following_error={self.most:g}; does it have power, and is it free to move?"
         )
 
     def _travel_text(self, setpoint: Limited, measured: NDArray[np.float64], now: int) -> str:
@@ -203,8 +203,8 @@ class FollowingCheck:
         name, unit = self._limits.joint_names[row], self._limits.units[row]
         return (
             f"{name!r} has moved by {moved[row]:.3g} {unit} in {format_duration(now - travel.since)}, where "
-            f"its velocities add up to {travel.commanded[row]:.3g}; has it power, is it free to move, and do "
-            "its encoder and its motor turn the same way?"
+            f"its velocities add up to {travel.commanded[row]:.3g}; does it have power, is it free to move, "
+            "and do its encoder and its motor turn the same way?"
         )
 
 

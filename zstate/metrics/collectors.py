@@ -1,18 +1,14 @@
 """Prometheus collectors of publishers, listeners, writers, drivers, connections, recorders and bridges.
 
-Each reads existing counters at a scrape. ``CounterRates`` computes rates from them.
+Each reads existing counters at a scrape. Their rates are for PromQL to compute, by ``rate(...[10s])``.
 """
 
 from __future__ import annotations
 
-import threading
-import time
-from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Protocol
 
-from zstate._util.bounded import BoundedDict
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import ListenerStats
 from zstate.net.presence import connections
@@ -28,40 +24,6 @@ if TYPE_CHECKING:
     from zstate.net.session import Session
     from zstate.nodes.sample_publisher import SamplePublisher
     from zstate.recording.recorder import Recorder
-
-WINDOW_S = 10.0
-EVERY_S = 1.0
-
-
-class CounterRates:
-    """Rates [Hz] of counters over the last ten seconds, independent of when and how often they are read.
-
-    ``update`` is called about once a second; otherwise a rate is the one since the last reading that is at
-    least ten seconds old, or since the first. Thread-safe.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._readings: BoundedDict[Hashable, deque[tuple[float, float]]] = BoundedDict()
-        """Times [s] and counts, at most one a second."""
-        self._lock = threading.Lock()
-
-    def update(self, key: Hashable, count: float) -> float:
-        """Add a reading of the counter ``key``. Returns its rate; 0 at the first reading."""
-        with self._lock:
-            now = self._clock()
-            readings = self._readings.get(key)
-            if readings is None:
-                readings = self._readings[key] = deque[tuple[float, float]]()
-            if readings and count < readings[-1][1]:
-                readings.clear()  # the counter has restarted
-            if not readings or now - readings[-1][0] >= EVERY_S:
-                readings.append((now, count))
-            while len(readings) > 1 and now - readings[1][0] >= WINDOW_S:
-                readings.popleft()
-            first_s, first = readings[0]
-        return (count - first) / (now - first_s) if now > first_s else 0.0
-
 
 MAX_ROBOTS = 500
 """Robots with their own rows. Names come from the network, so further robots are only counted."""
@@ -119,14 +81,6 @@ class PublisherMetrics:
 
     def __init__(self, publishers: Sequence[SamplePublisher]) -> None:
         self._publishers = publishers
-        self._rates = CounterRates()
-        self.sample()
-
-    def sample(self) -> None:
-        """Read the counters for their rates; called once a second."""
-        for publisher in self._publishers:
-            for (wire, stream), counts in publisher.stats.streams.items():
-                self._rates.update((id(publisher), wire, stream), counts.samples)
 
     def collect(self) -> Iterable[Metric]:
         families = MetricFamilies()
@@ -141,8 +95,6 @@ class PublisherMetrics:
                 count("zstate_publisher_bytes", "Their payloads [bytes].", counts.bytes, **labels)
                 text = "Samples not published because the stream has no reader."
                 count("zstate_publisher_suppressed", text, counts.suppressed, **labels)
-                rate_hz = self._rates.update((id(publisher), wire, stream), counts.samples)
-                gauge("zstate_publisher_rate_hertz", "Samples published per second.", rate_hz, **labels)
             text = "Samples that could not be published."
             count("zstate_publisher_refused", text, stats.refused, robot=robot)
             if (rate := stats.rate) is not None:
@@ -175,13 +127,6 @@ class ListenerMetrics:
 
     def __init__(self, listeners: Callable[[], Sequence[Listened]]) -> None:
         self._listeners = listeners
-        self._rates = CounterRates()
-        self.sample()
-
-    def sample(self) -> None:
-        """Read the counters for their rates; called once a second."""
-        for listener in self._listeners():
-            self._rates.update(id(listener), listener.stats.received)
 
     def collect(self) -> Iterable[Metric]:
         families = MetricFamilies()
@@ -194,8 +139,6 @@ class ListenerMetrics:
             for name, count in counts.items():
                 text = f"Samples {name.replace('_', ' ')}, as TransformListener.stats counts them."
                 families.count(f"zstate_listener_{name}", text, count, robot=robot)
-            rate_hz = self._rates.update(id(listener), counts["received"])
-            families.gauge("zstate_listener_rate_hertz", "Samples received per second.", rate_hz, robot=robot)
             _add_ages(families, listener)
             if isinstance(buffer, InstrumentedBuffer):
                 text = "Time from a sample's stamp until it could be looked up."

@@ -18,7 +18,6 @@ from zstate import __version__, kernel
 from zstate._util.closeable import Closeable
 from zstate._util.endpoint import format_host, parse_host_port
 from zstate.errors import InvalidInput, LibraryMissing, PortBusy
-from zstate.metrics.collectors import EVERY_S
 from zstate.web_access import AccessCheck
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ class BindAddress(NamedTuple):
 
 
 class MetricsCollector(Protocol):
-    """Yields metrics at each scrape. An optional ``sample()`` is called once a second."""
+    """Yields metrics at each scrape."""
 
     def collect(self) -> Iterable[Metric]:
         """The metrics now."""
@@ -98,11 +97,9 @@ class MetricsEndpoint(Closeable):
                 text = f"{text} another program listens there; choose another port, or 0 for a free one"
                 raise PortBusy(text, endpoint=endpoint) from None
             raise InvalidInput(f"{text} {error.strerror}; give an address of this host") from None
-        samplers = [getattr(collector, "sample", None) for collector in collectors]
         self._server.access = AccessCheck(
             host, self._server.server_port, command="--metrics", host_option="HOST:PORT"
         )
-        self._server.samplers = [sampler for sampler in samplers if sampler is not None]
         # The library's types leave out the arguments of the application.
         make = cast("Callable[[CollectorRegistry], WSGIApplication]", exposition.make_wsgi_app)  # pyright: ignore
         self._server.set_app(make(registry))
@@ -120,16 +117,11 @@ class MetricsEndpoint(Closeable):
 
 
 class _Server(ThreadingMixIn, WSGIServer):
-    """Also calls ``samplers`` once a second, from the thread that accepts connections.
-
-    That thread also shuts down connections that send no whole request in time.
-    """
+    """The thread that accepts connections also shuts down those that send no whole request in time."""
 
     daemon_threads = True
     request_queue_size = 128  # connections to accept; with the 5 of socketserver a burst waits for seconds
     access: AccessCheck
-    samplers: Sequence[Callable[[], None]] = ()
-    _sampled_s = -EVERY_S
 
     def server_activate(self) -> None:
         self._open = threading.BoundedSemaphore(_MAX_CONNECTIONS)
@@ -144,10 +136,6 @@ class _Server(ThreadingMixIn, WSGIServer):
             for connection, since_s in self._waiting.items():
                 if now_s - since_s >= _REQUEST_WITHIN_S:
                     _shut_down(connection)
-        if now_s - self._sampled_s >= EVERY_S:
-            self._sampled_s = now_s
-            for sampler in self.samplers:
-                sampler()
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._open.acquire(blocking=False):

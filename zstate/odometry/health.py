@@ -12,6 +12,7 @@ from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
+from statistics import NormalDist
 from typing import Literal, NamedTuple
 
 from zstate._util.format import format_duration
@@ -215,11 +216,11 @@ def nis_band(dimension: int, count: int) -> tuple[float, float]:
 def chi_square_quantile(probability: float, degrees: int) -> float:
     """The value that a chi-square variable of so many degrees does not exceed with ``probability``.
 
-    Wilson and Hilferty's approximation ("The distribution of chi-square", PNAS 17 (1931)) with the normal
-    quantile by bisection, then Newton's iteration on the distribution.
+    Wilson and Hilferty's approximation ("The distribution of chi-square", PNAS 17 (1931)), then Newton's
+    iteration on the distribution.
     """
     spread = 2.0 / (9.0 * degrees)
-    x = degrees * max(1e-3, 1.0 - spread + _normal_quantile(probability) * math.sqrt(spread)) ** 3
+    x = degrees * max(1e-3, 1.0 - spread + NormalDist().inv_cdf(probability) * math.sqrt(spread)) ** 3
     half = 0.5 * degrees
     for _ in range(50):
         density = 0.5 * math.exp((half - 1.0) * math.log(0.5 * x) - 0.5 * x - math.lgamma(half))
@@ -228,15 +229,6 @@ def chi_square_quantile(probability: float, degrees: int) -> float:
         if abs(step) <= 1e-12 * x:
             break
     return x
-
-
-def _normal_quantile(probability: float) -> float:
-    low, high = -10.0, 10.0
-    while high - low > 1e-9:
-        middle = 0.5 * (low + high)
-        below = 0.5 * math.erfc(-middle / math.sqrt(2.0)) < probability
-        low, high = (middle, high) if below else (low, middle)
-    return low
 
 
 def _lower_gamma(a: float, x: float) -> float:

@@ -259,7 +259,7 @@ def test_check_prints_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     shown = run_cli("up", str(file_of(tmp_path, text)), "--check").stdout.split()
     assert shown[:3] == ["rrbot", "zstate", "publish"]
     assert " ".join(shown).endswith(
-        "--rate 20.0 --wire native --wire ros2 --takeover --metrics 127.0.0.1:9100"
+        "--source sine --rate 20 --wire native --wire ros2 --takeover --metrics 9100"
     )
 
 
@@ -272,11 +272,10 @@ def test_check_prints_the_commands_of_maps_and_scanners(tmp_path: Path):
     shown = run_cli("up", str(file_of(tmp_path, text)), "--check").stdout.splitlines()
     file = tmp_path / "hall.yaml"
     assert [" ".join(line.split()) for line in shown] == [
-        f"hall/map zstate map {file} --name hall --frame floor --wire native",
+        f"hall/map zstate map {file} --frame floor",
         f"r1/slam zstate map {file} --name r1 --writer slam --wire native --wire ros2",
-        f"r1/scan zstate scan r1 --frame laser --simulate {file} --map-frame hall/floor --rate 10.0 "
-        "--wire native",
-        "r1/front zstate scan r1 --dummy --frame laser --sensor front --wire native",
+        f"r1/scan zstate scan r1 --frame laser --simulate {file} --map-frame hall/floor --rate 10",
+        "r1/front zstate scan r1 --frame laser --dummy --sensor front",
     ]
 
 
@@ -286,6 +285,17 @@ def test_map_and_a_scanner_in_it_run(up, tmp_path: Path):
     scan = table("scan", robot="rrbot", frame="base", simulate="hall.yaml", after="rrbot")
     child = up(robot() + table("map", file="hall.yaml") + scan)
     lines_until(child, "hall: 2 x 1 cells", "rrbot: scans in base, 30 Hz")
+    interrupted(child)
+
+
+@pytest.mark.processes
+def test_a_driver_and_a_recorder_of_a_robot_run_in_the_folder_of_the_file(up, tmp_path: Path):
+    drive = table("drive", driver="sim", robot="rrbot", names="left right")
+    record = table("record", file="run.mcap", robots=["left", "right"], after=["left/drive", "right/drive"])
+    child = up(drive + record)
+    lines = lines_until(child, "driving 'left'", "driving 'right'")
+    assert {line.split()[0] for line in lines} == {"left/drive", "right/drive"}
+    until((tmp_path / "run.mcap").exists)
     interrupted(child)
 
 
@@ -304,11 +314,24 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
     (tmp_path / "network.toml").write_text("[network]\nmode = 'peer'\n")
     (tmp_path / "handeye.yaml").write_text("{target: panda_link0, source: eye, xyz: [0, 0, 1]}")
     (tmp_path / "hall.yaml").touch()
+    (tmp_path / "fleet").mkdir()
     lines = [line.strip() for line in help_text[help_text.index("include =") :].splitlines()]
     text = "\n".join(lines).replace('model = "panda"', f'model = "{RRBOT}"')
     shown = run_cli("up", str(file_of(tmp_path, text)), "--check", "rate=20")
     assert [line.split()[0] for line in shown.stdout.splitlines()] == (
-        ["router", "left", "right", "arm1", "arm2", "arm3", "static", "hall/map", "left/scan", "driver"]
+        [
+            "router",
+            "left",
+            "right",
+            "arm1",
+            "arm2",
+            "arm3",
+            "static",
+            "hall/map",
+            "left/scan",
+            "panda/drive",
+            "driver",
+        ]
     ), shown.stderr
     assert max(map(len, lines)) <= 78, "it wraps on a terminal of 80 columns"
 
@@ -325,10 +348,11 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
         ("[network]\nconnect = ['10.0.0.1']\n", "cell.toml:1: network: '10.0.0.1' is not an endpoint"),
         ("[network]\nmode = 'client'\n", "network: mode 'client' needs connect"),
         ("[robot]\nmodel = 'panda'\n", "cell.toml:1: robot: write [[robot]]"),
-        ("[[robots]]\nmodel = 'panda'\n", "robots: there is no such table; did you mean 'robot'?"),
+        ("[[robott]]\nmodel = 'panda'\n", "robott: there is no such table; did you mean 'robot'?"),
+        ("[[robots]]\nmodel = 'panda'\n", "cell.toml:1: robots: `zstate robots` cannot be a table"),
         (robot(model="rrbott"), "robot[0]: no robot is called 'rrbott'; did you mean 'rrbot'"),
-        (robot(rate=0), "robot[0]: a rate is above 0"),
-        (robot() + robot(rate="fast"), "cell.toml:7: robot[1].rate: Expected `float | null`, got `str`"),
+        (robot(rate=0), "robot[0].rate: a rate is above 0"),
+        (robot() + robot(rate="fast"), "cell.toml:7: robot[1].rate: 'fast' is not a valid float"),
         (robot() + robot(), "robot[1]: robot[0] is called 'rrbot' already"),
         (robot(name="a b"), "robot[0]: the robot name 'a b' contains ' '"),
         (robot(source="file"), "cell.toml:3: robot[0].source: 'file' is neither 'joints' nor"),
@@ -350,12 +374,27 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
             "[network]\ncerts = '.'\n" + robot(),
             "robot[0]: the certs of [network] need an identity",
         ),
+        ("[[up]]\nfile = 'a'\n", "cell.toml:1: up: `zstate up` cannot be a table: include ="),
+        ("[[snapshot]]\n", "snapshot[0]: `zstate snapshot` is several commands; write [[program]]"),
+        (table("drive", driver="sim"), "drive[0]: there is no robot, which `zstate drive` needs"),
+        (
+            table("drive", driver="arm.py:Arm", robot="rrbot"),
+            "cell.toml:2: drive[0].driver: there is no file 'arm.py'",
+        ),
+        (table("drive", drivr="sim"), "drive[0].drivr: there is no such key; did you mean 'driver'?"),
+        (table("hz", colour=1), "hz[0].colour: there is no such key; there are robot, stream"),
+        (table("map", wire="ros2", wires=["ros2"]), "map[0].wires: is there as wire already"),
+        (table("map", takeover=True), "map[0].takeover: there is no such key"),
+        (table("plot", path=["a"]), "plot[0].path: takes 2 values, not ['a']"),
+        (table("publish", robot="--help"), "publish[0].robot: '--help' would be an option"),
+        (robot(takeover="perhaps"), "robot[0].takeover: 'perhaps' is not a valid boolean"),
+        ("[network]\nrestart = 'always'\n", "network.restart: there is no such key"),
         ("include = 'cell.toml'\n", "cell.toml:1: include: 'cell.toml' includes this file again"),
         ("include = 'gone.toml'\n", "include: there is no file"),
         (table("program", run=""), "program[0].run: is empty"),
-        (table("map", file="gone.yaml"), "map[0].file: there is no file"),
-        (table("scan", robot="r1", frame="f"), "scan[0]: give simulate = 'MAP.yaml' or dummy = true"),
-        (table("scan", robot="r1", frame="f", simulate="gone.yaml"), "scan[0].simulate: there is no file"),
+        (table("map", file="gone.yaml"), "map[0].file: File"),
+        (table("scan", robot="r1", frame="f"), "scan[0]: give --simulate MAP.yaml or --dummy"),
+        (table("scan", robot="r1", frame="f", simulate="gone.yaml"), "scan[0].simulate: File"),
         (
             '[parameters]\nwho = "O\'Neill"\n' + table("program", run="echo ${who}"),
             'program[0].run: "echo O\'Neill" is not a command line (No closing quotation)',

@@ -21,6 +21,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     Grid([[0, 100]], 0.1, (0.0, 0.0, 0.0)).save(tmp_path / "hall.yaml")
+    (tmp_path / "certs").mkdir()
+    for name in ("secret.txt", "users.txt", "acl.toml", "zenoh.json5"):
+        (tmp_path / name).touch()
     return tmp_path
 
 
@@ -50,23 +53,22 @@ def test_user_and_certificates_of_the_network_are_options_of_every_command(folde
     robots = ROBOT + ROBOT + "name = 'other'\nidentity = 'arm'\n"
     found = commands(folder, network + robots + "[[map]]\nfile = 'hall.yaml'\n")
     options = (
-        f"--mode client --certs {folder}/certs --identity {{}} --user alice "
-        f"--password-file {folder}/secret.txt --connect tls/10.0.0.1:7447"
+        f"--mode client --connect tls/10.0.0.1:7447 --certs {folder}/certs --identity {{}} --user alice "
+        f"--password-file {folder}/secret.txt"
     )
-    published = f"zstate publish {RRBOT} --name {{}} --source joints --wire native"
     assert found == {
-        "rrbot": f"{published.format('rrbot')} {options.format('cell')}",
-        "other": f"{published.format('other')} {options.format('arm')}",
-        "hall/map": f"zstate map {folder}/hall.yaml --name hall --wire native {options.format('cell')}",
+        "rrbot": f"zstate publish {RRBOT} {options.format('cell')}",
+        "other": f"zstate publish {RRBOT} --name other {options.format('arm')}",
+        "hall/map": f"zstate map {folder}/hall.yaml {options.format('cell')}",
     }
 
 
 def test_a_zenoh_configuration_takes_the_place_of_the_router_of_the_file(folder: Path):
     router = "[router]\nlisten = ['tcp/0.0.0.0:7001']\n"
     joined = commands(folder, router + ROBOT)["rrbot"]
-    assert joined.endswith("--wire native --connect tcp/127.0.0.1:7001 --mode client")
+    assert joined.endswith("--mode client --connect tcp/127.0.0.1:7001")
     configured = commands(folder, router + "[network]\nconfig = 'zenoh.json5'\n" + ROBOT)["rrbot"]
-    assert configured.endswith(f"--wire native --config {folder}/zenoh.json5")
+    assert configured == f"zstate publish {RRBOT} --config {folder}/zenoh.json5"
 
 
 def test_keys_of_the_router_are_options_of_its_command_only(folder: Path):
@@ -77,8 +79,9 @@ def test_keys_of_the_router_are_options_of_its_command_only(folder: Path):
     )
     found = commands(folder, router + ROBOT)
     words = found["router"].split()
-    assert words[:3] == ["zstate", "router", "--ros2"]
-    options = sorted(zip(words[3::2], words[4::2], strict=True))
+    assert words[:2] == ["zstate", "router"]
+    words.remove("--ros2")
+    options = sorted(zip(words[2::2], words[3::2], strict=True))
     assert options == [
         ("--acl", f"{folder}/acl.toml"),
         ("--certs", f"{folder}/certs"),
@@ -91,7 +94,7 @@ def test_keys_of_the_router_are_options_of_its_command_only(folder: Path):
         ("--user", "hall"),
         ("--users", f"{folder}/users.txt"),
     ]
-    assert found["rrbot"].endswith("--wire native --connect tls/127.0.0.1:7001 --mode client")
+    assert found["rrbot"].endswith("--mode client --connect tls/127.0.0.1:7001")
 
 
 def test_a_router_with_certificates_listens_with_tls_by_default(folder: Path):
@@ -106,8 +109,7 @@ def test_xacro_arguments_and_the_clock_of_a_robot_are_options(folder: Path):
     )
     robot = "[[robot]]\nmodel = 'arm.urdf.xacro'\nclock = 'sim'\nxacro_args = {side = 'right', tool = true}\n"
     assert commands(folder, robot) == {
-        "arm": f"zstate publish {folder}/arm.urdf.xacro side:=right tool:=true --name arm --source joints "
-        "--wire native --clock sim"
+        "arm": f"zstate publish {folder}/arm.urdf.xacro side:=right tool:=true --clock sim"
     }
 
 
@@ -185,3 +187,39 @@ def test_variables_of_a_program_are_those_of_its_table_before_those_of_the_netwo
         "TRIES": "3",
         "SERIAL": "/dev/arm",
     }
+
+
+def test_a_table_is_the_command_of_its_name(folder: Path):
+    (folder / "arm.urdf").write_text(Path(RRBOT).read_text())
+    (folder / "arm.py").touch()
+    found = commands(
+        folder,
+        "[[drive]]\ndriver = 'arm.py:Arm'\nrobot = 'arm.urdf'\n"
+        "param = {gain = 0.5, port = '/dev/x', on = true}\n"
+        "velocities = ['shoulder=1', 2.0]\non-silence = 'relax'\nttl = 0.1\n"
+        "[[odometry]]\nrobot = 'r1'\ninitial_pose = [1, 2.5, 90]\nreset = false\n"
+        "[[record]]\nrobots = ['r1', 'r2']\nsplit_size = 10\n"
+        "[[transform]]\nname = 'marker'\ntarget = 'map'\nsource = 'marker'\nxyz = [1, 0, 0]\n",
+    )
+    assert found == {
+        "arm/drive": f"zstate drive arm.py:Arm {folder}/arm.urdf --param gain=0.5 --param port=/dev/x "
+        "--param on=true --ttl 0.1 --on-silence relax --velocity shoulder=1 --velocity 2.0",
+        "r1/odometry": "zstate odometry r1 --initial-pose 1 2.5 90",
+        "record": "zstate record rec-%Y%m%d-%H%M%S.mcap r1 r2 --split-size 10",
+        "marker/transform": "zstate transform map marker --xyz 1 0 0",
+    }
+
+
+def test_a_command_without_session_options_finds_the_network_in_its_environment(folder: Path):
+    text = "[router]\n[[info]]\nfile = 'run.mcap'\nenvironment = {LINES = 3}\n"
+    assert planned(folder, text)["info"].environment == {
+        "ZSTATE_MODE": "client",
+        "ZSTATE_CONNECT": "tcp/127.0.0.1:7447",
+        "LINES": "3",
+    }
+
+
+def test_each_process_of_a_loop_has_the_next_port_for_its_metrics(folder: Path):
+    text = "[[scan]]\nnames = 'a b'\nrobot = '${name}'\nframe = 'f'\ndummy = true\nmetrics = 9100\n"
+    ports = {name: words.split()[-1] for name, words in commands(folder, text).items()}
+    assert ports == {"a/scan": "9100", "b/scan": "127.0.0.1:9101"}

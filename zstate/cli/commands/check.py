@@ -29,7 +29,7 @@ _JOINT_HEADINGS = ("joint", "type", "parent", "child", "position", "range", "vel
 
 
 @click.command("check")
-@click.argument("file")
+@click.argument("file", type=options.MODEL)
 @options.xacro_arguments
 @click.option("--fix-hints", is_flag=True, help="Print a correction below each finding.")
 @click.option(

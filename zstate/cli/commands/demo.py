@@ -86,7 +86,7 @@ class Demo(NamedTuple):
 
 
 @click.command("demo")
-@click.argument("robot", required=False)
+@click.argument("robot", type=options.MODEL, required=False)
 @options.xacro_arguments
 @click.option("--world", is_flag=True, help="Put rrbot into a room, which its laser sweeps.")
 @options.rate_option

@@ -16,7 +16,7 @@ from zstate.cli.output.text_layout import in_columns
 
 
 @click.command("init")
-@click.argument("robot", default="rrbot", metavar="[ROBOT]")
+@click.argument("robot", type=options.MODEL, default="rrbot", metavar="[ROBOT]")
 @options.xacro_arguments
 @click.option("-o", "--output", metavar="FILE", help="Default: NAME.toml; - is standard output.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")

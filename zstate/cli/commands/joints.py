@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command("joints")
-@click.argument("robot")
+@click.argument("robot", type=options.MODEL)
 @options.xacro_arguments
 @click.option(
     "--only",

@@ -37,7 +37,7 @@ def _check_source(source: str) -> str:
 
 
 @click.command("publish")
-@click.argument("robot")
+@click.argument("robot", type=options.MODEL)
 @options.xacro_arguments
 @click.option(
     "--source",

@@ -31,7 +31,9 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     zstate up cell.toml --check
 
     With a [router] the other processes start once it is ready. They connect to it unless [network] says
-    otherwise, and so does zstate.connect() without arguments in a program. Paths are relative to FILE (TOML):
+    otherwise, and so does zstate.connect() without arguments in a program. Paths are relative to FILE (TOML).
+    [[COMMAND]] starts `zstate COMMAND`: its keys are the options and arguments of that command, those of
+    other packages as well.
 
     \b
     include = ["network.toml"]        # more such files
@@ -70,18 +72,23 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     [[static]]
     robot = "right"
     file = "handeye.yaml"             # of easy_handeye, or a TransformStamped
-    [[map]]                           # options of `zstate map`
-    file = "hall.yaml"                # of map_server
+    [[map]]                           # any command: its options and arguments
+    file = "hall.yaml"                # its process is hall/map
     identity = "hall"
-    [[scan]]                          # options of `zstate scan`
+    [[scan]]                          # ROBOT/SENSOR: left/scan
     robot = "left"
     frame = "laser"
     simulate = "hall.yaml"            # or dummy = true
     map_frame = "hall/map"
     identity = "left"
     after = "left"
+    [[drive]]                         # ROBOT/COMMAND: panda/drive
+    driver = "sim"                    # or FILE.py:CLASS
+    robot = "panda"
+    velocities = {panda_joint1 = 0.5} # --velocity panda_joint1=0.5; or a list
+    identity = "left"
     [[program]]                       # any other program
-    run = "python driver.py ${rate}"  # or "zstate drive ...", "zstate record"
+    run = "python driver.py ${rate}"
     identity = "left"
     after = ["left", "static"]        # starts when these are ready
     ready = "driver runs"             # text it prints when it is ready itself

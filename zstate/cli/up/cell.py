@@ -2,113 +2,36 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import fmod, radians
 from pathlib import Path
-from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from zstate._util.format import did_you_mean
-from zstate.cli.up.template import LOOP_KEYS, LOOPS, Located, expand
+from zstate.cli.up.command_table import CommandTable, Names, ProcessKeys, checked, read_command
+from zstate.cli.up.template import Located, expand
 from zstate.errors import InvalidInput
 from zstate.net.config import endpoint_list
-from zstate.rate import check_rate
 from zstate.transform import Transform
 from zstate.wire.registry import get_wire
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-Restart = Literal["never", "on-failure", "always"]
-Names = str | tuple[str, ...]
 
 
-class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    pass
+class ProgramSection(ProcessKeys, frozen=True):
+    """``[[program]]``: any program, or any command line of zstate.
 
-
-class _SessionSection(_Section, frozen=True):
-    """The keys that a router has like any other process."""
-
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
-    certs: str | None = None
-    identity: str | None = None
-    user: str | None = None
-    password_file: str | None = None
-
-    def __post_init__(self) -> None:
-        endpoint_list((*self.connect, *self.listen))
-
-
-class RouterSection(_SessionSection, frozen=True):
-    """``[router]``: the options of `zstate router`."""
-
-    ros2: bool = False
-    acl: str | None = None
-    users: str | None = None
-    metrics: str | int | None = None
-    restart: Restart = "never"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_metrics(self.metrics)
-
-
-class NetworkSection(_SessionSection, frozen=True):
-    """``[network]``: the session options of every process."""
-
-    mode: Literal["peer", "loopback", "lan", "client", "router"] | None = None
-    config: str | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.mode == "client" and not self.connect and not self.config:
-            raise InvalidInput("mode 'client' needs connect, for instance ['tcp/192.168.1.10:7447']")
-
-
-class RobotSection(_Section, frozen=True):
-    """``[[robot]]``: the options of `zstate publish`."""
-
-    model: str
-    xacro_args: dict[str, str | bool | int | float] = {}
-    name: str | None = None
-    source: str = "joints"
-    rate: float | None = None
-    wires: tuple[str, ...] = ("native",)
-    clock: Literal["system", "sim"] = "system"
-    takeover: bool = False
-    metrics: str | int | None = None
-    identity: str | None = None
-    after: Names = ()
-    restart: Restart = "never"
-
-    def __post_init__(self) -> None:
-        if self.rate is not None:
-            check_rate(self.rate)
-        _check_wires(self.wires)
-        _check_metrics(self.metrics)
-
-
-class ProgramSection(_Section, frozen=True):
-    """``[[program]]``: any program, or any other command of zstate.
-
-    It is ready once it prints a line with the text ``ready``. Without that text a program is ready when it
-    runs, and a command of zstate with its first line or its end.
+    Without the text ``ready`` a program is ready when it runs, and a command of zstate with its first line or
+    its end.
     """
 
-    run: Names
-    name: str | None = None
-    ready: str | None = None
-    environment: dict[str, str | int | float] = {}
+    run: Names = ()
     identity: str | None = None
-    after: Names = ()
-    restart: Restart = "never"
 
 
-class StaticSection(_Section, frozen=True):
+class StaticSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[[static]]``: the arguments of `zstate static`: a pose, or the ``file`` of a calibration.
 
     ``robot`` is the robot of the edge, a pattern such as "arm*", or a list. ``wires`` default to those of
@@ -158,53 +81,6 @@ class StaticSection(_Section, frozen=True):
             raise InvalidInput(f"{error}{degrees}") from None
 
 
-class MapSection(_Section, frozen=True):
-    """``[[map]]``: the arguments of `zstate map`.
-
-    The process is called ``NAME/WRITER``, such as "hall/map".
-    """
-
-    file: str
-    name: str | None = None
-    frame: str | None = None
-    writer: str | None = None
-    wires: tuple[str, ...] = ("native",)
-    identity: str | None = None
-    after: Names = ()
-    restart: Restart = "never"
-
-    def __post_init__(self) -> None:
-        _check_wires(self.wires)
-
-
-class ScanSection(_Section, frozen=True):
-    """``[[scan]]``: the arguments of `zstate scan`: ``simulate``, the file of a map, or ``dummy``.
-
-    The process is called ``ROBOT/SENSOR``, such as "r1/scan".
-    """
-
-    robot: str
-    frame: str
-    simulate: str | None = None
-    dummy: bool = False
-    map_frame: str | None = None
-    rate: float | None = None
-    sensor: str | None = None
-    wires: tuple[str, ...] = ("native",)
-    metrics: str | int | None = None
-    identity: str | None = None
-    after: Names = ()
-    restart: Restart = "never"
-
-    def __post_init__(self) -> None:
-        if self.dummy is (self.simulate is not None):
-            raise InvalidInput("give simulate = 'MAP.yaml' or dummy = true, one of them")
-        if self.rate is not None:
-            check_rate(self.rate)
-        _check_wires(self.wires)
-        _check_metrics(self.metrics)
-
-
 def as_tuple(names: Names) -> tuple[str, ...]:
     """One or several names as a tuple."""
     return (names,) if isinstance(names, str) else names
@@ -217,27 +93,16 @@ def _check_wires(wires: tuple[str, ...]) -> None:
         get_wire(wire)
 
 
-def _check_metrics(metrics: str | int | None) -> None:
-    if metrics is not None:
-        from zstate.metrics.endpoint import BindAddress  # loads an HTTP server
-
-        BindAddress.parse(str(metrics))
-
-
-_Table = TypeVar("_Table", bound=_Section)
-
-
 @dataclass(slots=True)
 class Cell:
     """The tables of a file and of those it includes; its own router and network take precedence."""
 
-    robot: list[Located[RobotSection]] = field(default_factory=list["Located[RobotSection]"])
+    robot: list[Located[CommandTable]] = field(default_factory=list["Located[CommandTable]"])
     static: list[Located[StaticSection]] = field(default_factory=list["Located[StaticSection]"])
-    map: list[Located[MapSection]] = field(default_factory=list["Located[MapSection]"])
-    scan: list[Located[ScanSection]] = field(default_factory=list["Located[ScanSection]"])
+    command: list[Located[CommandTable]] = field(default_factory=list["Located[CommandTable]"])
     program: list[Located[ProgramSection]] = field(default_factory=list["Located[ProgramSection]"])
-    router: Located[RouterSection] | None = None
-    network: Located[NetworkSection] | None = None
+    router: Located[CommandTable] | None = None
+    network: Located[CommandTable] | None = None
 
 
 def read_cell(path: str, settings: Mapping[str, str]) -> Cell:
@@ -249,32 +114,26 @@ def read_cell(path: str, settings: Mapping[str, str]) -> Cell:
     for kind, table in expand(Path(path), settings):
         match kind:
             case "router":
-                cell.router = _checked(kind, table, RouterSection)
+                cell.router = _with_endpoints(read_command(kind, table))
             case "network":
-                cell.network = _checked(kind, table, NetworkSection)
-            case "robot":
-                cell.robot.append(_checked(kind, table, RobotSection))
+                cell.network = _with_endpoints(read_command(kind, table))
+            case "robot" | "publish":
+                cell.robot.append(read_command(kind, table))
             case "static":
-                cell.static.append(_checked(kind, table, StaticSection))
-            case "map":
-                cell.map.append(_checked(kind, table, MapSection))
-            case "scan":
-                cell.scan.append(_checked(kind, table, ScanSection))
+                cell.static.append(checked(kind, table, StaticSection))
+            case "program":
+                cell.program.append(checked(kind, table, ProgramSection))
             case _:
-                cell.program.append(_checked(kind, table, ProgramSection))
+                cell.command.append(read_command(kind, table))
     return cell
 
 
-def _checked(kind: str, table: Located[dict[str, Any]], section: type[_Table]) -> Located[_Table]:
+def _with_endpoints(table: Located[CommandTable]) -> Located[CommandTable]:
+    words = table.section.words
     try:
-        # Not strict: values from the environment and the command line are text.
-        values = msgspec.convert(table.section, section, strict=False)
-    except msgspec.ValidationError as error:
-        text, _, place = str(error).partition(" - at `$")
-        unknown = re.search(r"unknown field `(.*)`", text)
-        if unknown is None:
-            raise table.file.error(f"{table.place}{place.strip('`')}", text) from None
-        valid = (*section.__struct_fields__, *(LOOP_KEYS if kind in LOOPS else ("when",)))
-        hint = did_you_mean(unknown[1], valid) or f"; there are {', '.join(valid)}"
-        raise table.error(f"there is no such key{hint}", unknown[1]) from None
-    return Located(values, table.file, table.place, table.iteration)
+        endpoint_list((*words.get("connect", ())[1::2], *words.get("listen", ())[1::2]))
+    except InvalidInput as error:
+        raise table.error(str(error)) from None
+    if "client" in words.get("mode", ()) and not words.keys() & {"connect", "config"}:
+        raise table.error("mode 'client' needs connect, for instance ['tcp/192.168.1.10:7447']")
+    return table

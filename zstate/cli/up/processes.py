@@ -12,31 +12,16 @@ from typing import Any
 
 from zstate._util.endpoint import format_host
 from zstate._util.format import did_you_mean
-from zstate.cli.options import load_robot, parse_xacro_args, place_name
-from zstate.cli.up.cell import (
-    Cell,
-    MapSection,
-    NetworkSection,
-    ProgramSection,
-    Restart,
-    RobotSection,
-    RouterSection,
-    ScanSection,
-    as_tuple,
-)
+from zstate.cli.options import load_robot, parse_xacro_args
+from zstate.cli.up.cell import Cell, ProgramSection, as_tuple
+from zstate.cli.up.command_table import CommandTable, ProcessKeys, Restart, Words, in_order, network_command
 from zstate.cli.up.static_edges import check_edges
 from zstate.cli.up.template import Located
 from zstate.errors import ConfigError, InvalidInput, ModelError
-from zstate.model.load import is_path
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import check_robot
 
-_Values = dict[str, tuple[str, ...]]
-"""Values by key. Options and environment variables are named after the keys of [network] and [router]."""
-
-_STARTED = "[router], [[robot]], [[static]], [[map]], [[scan]] or [[program]]"
-_NETWORK_PATHS = ("config", "certs", "password_file")
-_ROUTER_PATHS = ("acl", "certs", "password_file", "users")
+_PLACE = {"mode", "connect", "listen", "config"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +53,7 @@ def plan_processes(cell: Cell, file: Path, settings: Mapping[str, str]) -> list[
             raise table.error(f"{other} is called {spec.name!r} already; give one of them another `name`")
         specs[spec.name], tables[spec.name] = spec, table
     if not specs:
-        raise ConfigError(f"{file} starts nothing; it has no {_STARTED}")
+        raise ConfigError(f"{file} starts nothing; [[robot]], [[program]] and each [[COMMAND]] of zstate do")
     for name in specs:
         _check_order(name, specs, tables[name])
     return list(specs.values())
@@ -76,143 +61,69 @@ def plan_processes(cell: Cell, file: Path, settings: Mapping[str, str]) -> list[
 
 def robot_names(cell: Cell) -> tuple[str, ...]:
     """The names of the robots of the file."""
-    return tuple(_model_and_name(table)[1] for table in cell.robot)
+    return tuple(map(_robot_name, cell.robot))
 
 
 def _specs(cell: Cell, file: Path, settings: Mapping[str, str]) -> Iterator[tuple[ProcessSpec, Located[Any]]]:
-    router = cell.router
-    first = () if router is None else ("router",)
-    if router is not None:
-        yield _router_spec(router), router
+    if cell.router is not None:
+        router = cell.router.section
+        words = {**router.words, "listen": _router_endpoints(router)}
+        yield _command_spec("router", cell.router, words, ()), cell.router
+    first = () if cell.router is None else ("router",)
     for robot in cell.robot:
-        yield _robot_spec(robot, cell, first), robot
+        yield (
+            _command_spec(_robot_name(robot), robot, _joined(robot, robot.section.words, cell), first),
+            robot,
+        )
     if cell.static:
         check_edges(cell, robot_names(cell))
-        sets = {"set": tuple(f"{key}={value}" for key, value in settings.items())}
-        arguments = ("static", "--file", str(file), *_options(sets | _session_values(cell)))
+        sets = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+        arguments = ("static", "--file", str(file), *sets, *in_order(network_command, _session_words(cell)))
         yield ProcessSpec("static", arguments, first), cell.static[0]
-    for place in cell.map:
-        yield _map_spec(place, cell, first), place
-    for scan in cell.scan:
-        yield _scan_spec(scan, cell, first), scan
+    for table in cell.command:
+        command = table.section
+        words = _joined(table, command.words, cell)
+        yield _command_spec(command.process_name(), table, words, first), table
     for program in cell.program:
         yield _program_spec(program, cell, first), program
 
 
-def _router_spec(table: Located[RouterSection]) -> ProcessSpec:
-    router = table.section
-    values: _Values = {"listen": _router_endpoints(router), "connect": router.connect}
-    for key in _ROUTER_PATHS:
-        values[key] = (table.resolve(path),) if (path := getattr(router, key)) else ()
-    for key in ("identity", "user", "metrics"):
-        values[key] = () if (value := getattr(router, key)) is None else (str(value),)
-    ros2 = ("--ros2",) if router.ros2 else ()
-    return ProcessSpec("router", ("router", *ros2, *_options(values)), restart=router.restart)
-
-
-def _robot_spec(table: Located[RobotSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
-    robot = table.section
-    model, name = _model_and_name(table)
-    source = robot.source
-    if source not in ("joints", "sine"):
-        source = table.resolve(source)
-        if not Path(source).exists():
-            text = f"{robot.source!r} is neither 'joints' nor 'sine' nor a recording that exists"
-            raise table.error(text, "source")
-    metrics: tuple[str, ...] = ()
-    if robot.metrics is not None:
-        from zstate.metrics.endpoint import BindAddress  # loads an HTTP server
-
-        host, port = BindAddress.parse(str(robot.metrics))
-        # Each robot of a loop has the next port.
-        metrics = (f"{format_host(host)}:{port + table.iteration if port else 0}",)
-    _check_identity(table, cell)
-    values: _Values = {
-        "name": (name,),
-        "source": (source,),
-        "rate": () if robot.rate is None else (repr(robot.rate),),
-        "wire": robot.wires,
-        "clock": () if robot.clock == "system" else (robot.clock,),
-    }
-    arguments = (
-        *("publish", model, *_xacro_texts(robot), *_options(values)),
-        *(("--takeover",) if robot.takeover else ()),
-        *_options({"metrics": metrics, **_session_values(cell, robot.identity)}),
+def _command_spec(
+    name: str, table: Located[CommandTable], words: Words, first: tuple[str, ...]
+) -> ProcessSpec:
+    section = table.section
+    match section.values.get("metrics"):
+        case (str(host), int(port)) if port and table.iteration:  # each process of a loop has the next port
+            words = {**words, "metrics": ("--metrics", f"{format_host(host)}:{port + table.iteration}")}
+        case _:
+            pass
+    return ProcessSpec(
+        name,
+        section.arguments(words),
+        (*first, *as_tuple(section.keys.after)),
+        section.keys.restart,
+        section.keys.ready or "",
+        folder=str(table.file.folder.resolve()),
+        # What the command has no options for, zstate.connect() finds there.
+        environment=_environment(
+            {key: one for key, one in words.items() if key not in section.values}, section.keys
+        ),
     )
-    return ProcessSpec(name, arguments, (*first, *as_tuple(robot.after)), robot.restart)
 
 
-def _model_and_name(table: Located[RobotSection]) -> tuple[str, str]:
-    """The model as the child process finds it, and the name of the robot."""
-    model, path = table.section.model, table.resolve(table.section.model)
-    if is_path(model) or Path(path).is_file():
-        model = path
+def _robot_name(table: Located[CommandTable]) -> str:
+    """The name of the robot: a model that cannot be used is refused here."""
+    words, values = table.section.words, table.section.values
     try:
-        default = _default_name(model, table.section.name, _xacro_texts(table.section))
-        return model, check_robot(table.section.name or default)
+        (model,) = words["robot"]
+        return check_robot(_name_of(model, values["name"], words.get("xacro_args", ())))
     except (ModelError, InvalidInput) as error:
         raise table.error(str(error)) from None
 
 
 @lru_cache(maxsize=256)
-def _default_name(model: str, name: str | None, xacro_texts: tuple[str, ...]) -> str:
+def _name_of(model: str, name: str | None, xacro_texts: tuple[str, ...]) -> str:
     return load_robot(model, name, parse_xacro_args(xacro_texts))[1]
-
-
-def _xacro_texts(robot: RobotSection) -> tuple[str, ...]:
-    """Xacro arguments as on a command line; truth values of xacro are those of Python in lower case."""
-    return tuple(
-        f"{name}:={str(value).lower() if isinstance(value, bool) else value}"
-        for name, value in robot.xacro_args.items()
-    )
-
-
-def _map_spec(table: Located[MapSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
-    place, file = table.section, _map_file(table, "file", table.section.file)
-    _check_identity(table, cell)
-    name = place.name or place_name(file)
-    values: _Values = {
-        "name": (name,),
-        "frame": _optional(place.frame),
-        "writer": _optional(place.writer),
-        "wire": place.wires,
-    }
-    arguments = ("map", file, *_options(values | _session_values(cell, place.identity)))
-    return ProcessSpec(
-        f"{name}/{place.writer or 'map'}", arguments, (*first, *as_tuple(place.after)), place.restart
-    )
-
-
-def _scan_spec(table: Located[ScanSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
-    scan = table.section
-    simulate = () if scan.simulate is None else (_map_file(table, "simulate", scan.simulate),)
-    _check_identity(table, cell)
-    values: _Values = {
-        "frame": (scan.frame,),
-        "simulate": simulate,
-        "map_frame": _optional(scan.map_frame),
-        "rate": () if scan.rate is None else (repr(scan.rate),),
-        "sensor": _optional(scan.sensor),
-        "wire": scan.wires,
-        "metrics": () if scan.metrics is None else (str(scan.metrics),),
-    }
-    arguments = (
-        *("scan", scan.robot, *(("--dummy",) if scan.dummy else ())),
-        *_options(values | _session_values(cell, scan.identity)),
-    )
-    name = f"{scan.robot}/{scan.sensor or 'scan'}"
-    return ProcessSpec(name, arguments, (*first, *as_tuple(scan.after)), scan.restart)
-
-
-def _map_file(table: Located[Any], key: str, path: str) -> str:
-    file = table.resolve(path)
-    if not Path(file).is_file():
-        raise table.error(f"there is no file {file!r}", key)
-    return file
-
-
-def _optional(value: str | None) -> tuple[str, ...]:
-    return () if value is None else (value,)
 
 
 def _program_spec(table: Located[ProgramSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
@@ -227,12 +138,9 @@ def _program_spec(table: Located[ProgramSection], cell: Cell, first: tuple[str, 
     is_zstate = command[0] == "zstate"
     if command[0] in ("python", "python3"):
         command = (sys.executable, *command[1:])
-    _check_identity(table, cell)
     script = next((word for word in command if word.endswith(".py")), command[0])
     default = next(iter(command[1:]), "zstate") if is_zstate else Path(script).stem
-    session = _session_values(cell, program.identity).items()
-    environment = {f"ZSTATE_{key.upper()}": " ".join(values) for key, values in session if values}
-    environment |= {key: str(value) for key, value in program.environment.items()}
+    own = {"identity": ("--identity", program.identity)} if program.identity else {}
     return ProcessSpec(
         program.name or default,
         command[1:] if is_zstate else command,
@@ -241,17 +149,8 @@ def _program_spec(table: Located[ProgramSection], cell: Cell, first: tuple[str, 
         program.ready or "" if is_zstate else program.ready,
         is_program=not is_zstate,
         folder=str(table.file.folder.resolve()),
-        environment=environment,
+        environment=_environment(_joined(table, own, cell), program),
     )
-
-
-def _check_identity(table: Located[Any], cell: Cell) -> None:
-    network = NetworkSection() if cell.network is None else cell.network.section
-    identity = table.section.identity
-    if network.certs is not None and not (identity or network.identity):
-        raise table.error("the certs of [network] need an identity, here or there")
-    if identity and network.certs is None:
-        raise table.error("needs certs = in [network]", "identity")
 
 
 def _check_order(name: str, specs: Mapping[str, ProcessSpec], table: Located[Any]) -> None:
@@ -269,38 +168,35 @@ def _check_order(name: str, specs: Mapping[str, ProcessSpec], table: Located[Any
                 new.append(other)
 
 
-def _session_values(cell: Cell, identity: str | None = None) -> _Values:
-    """The values of [network], with ``identity`` if it is set.
+def _joined(table: Located[Any], own: Words, cell: Cell) -> dict[str, tuple[str, ...]]:
+    """``own`` words of a table and the session options, those of the table before those of [network]."""
+    words = {**_session_words(cell), **own}
+    if "certs" in words and "identity" not in words:
+        raise table.error("the certs of [network] need an identity, here or there")
+    if "identity" in own and "certs" not in words:
+        raise table.error("needs certs = in [network]", "identity")
+    return words
 
-    Without an endpoint or a mode, the processes connect to the router of the file.
-    """
-    network = NetworkSection() if cell.network is None else cell.network.section
-    values: _Values = {}
-    for key in ("mode", "config", "certs", "identity", "user", "password_file"):
-        if (value := getattr(network, key)) is not None:
-            values[key] = (value,)
-    if cell.network is not None:
-        values |= {key: (cell.network.resolve(values[key][0]),) for key in _NETWORK_PATHS if key in values}
-    if identity is not None:
-        values["identity"] = (identity,)
-    if "certs" not in values:
-        values.pop("identity", None)
-    values |= {"connect": network.connect, "listen": network.listen}
-    has_place = network.mode or network.connect or network.listen or network.config
-    if cell.router is not None and not has_place:
-        endpoint = _router_endpoints(cell.router.section)[0]
+
+def _session_words(cell: Cell) -> dict[str, tuple[str, ...]]:
+    """The session options of [network]; without a mode and an endpoint, those of a client of the router."""
+    words = {} if cell.network is None else dict(cell.network.section.words)
+    if "certs" not in words:
+        words.pop("identity", None)
+    if cell.router is not None and not words.keys() & _PLACE:
+        endpoint = _router_endpoints(cell.router.section)[1]
         # A client on this host cannot connect to a wildcard address.
         endpoint = endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
-        values |= {"mode": ("client",), "connect": (endpoint,)}
-    return values
+        words |= {"mode": ("--mode", "client"), "connect": ("--connect", endpoint)}
+    return words
 
 
-def _router_endpoints(router: RouterSection) -> tuple[str, ...]:
-    default = ROUTER_ENDPOINT if router.certs is None else ROUTER_ENDPOINT.replace("tcp/", "tls/", 1)
-    return router.listen or (default,)
+def _environment(session: Words, keys: ProcessKeys) -> dict[str, str]:
+    """The session options as variables, and those of a table, which take precedence."""
+    variables = {f"ZSTATE_{key.upper()}": " ".join(words[1::2]) for key, words in session.items()}
+    return variables | {key: str(value) for key, value in keys.environment.items()}
 
 
-def _options(values: _Values) -> tuple[str, ...]:
-    """The values as options of a command."""
-    pairs = [(f"--{key.replace('_', '-')}", value) for key in values for value in values[key]]
-    return tuple(word for pair in pairs for word in pair)
+def _router_endpoints(router: CommandTable) -> tuple[str, ...]:
+    default = ROUTER_ENDPOINT if "certs" not in router.words else ROUTER_ENDPOINT.replace("tcp/", "tls/", 1)
+    return router.words.get("listen", ("--listen", default))

@@ -15,13 +15,22 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from zstate._util.format import did_you_mean
+from zstate.cli.commands import load_other_command, own_commands
 from zstate.errors import ConfigError, InvalidInput
 
 SINGLE = ("router", "network")
-LISTS = ("robot", "static", "map", "scan", "program")
-_TABLES = (*LISTS, *SINGLE, "parameters", "include")
-LOOPS = ("robot", "program")
+NO_LOOPS = (*SINGLE, "static")
 LOOP_KEYS = ("names", "count", "when")
+
+# Commands that are no tables, and why.
+_NO_TABLES = {
+    "up": 'include = ["FILE.toml"] starts the processes of another file',
+    "demo": 'it has a network of its own; [[robot]] with source = "sine" is a robot that moves',
+    "init": "it writes a file, which `zstate up` then runs",
+    "completion": "it is for a shell",
+    "robots": "it prints names of models; a robot is [[robot]]",
+    "wait": "its NAMEs would be the names of a loop; write [[program]] with run = 'zstate wait ...'",
+}
 
 _PLACE = re.compile(r"(?P<table>\w+)(?:\[(?P<number>\d+)\])?(?:\.(?P<key>[\w-]+))?(?:\.(?P<inner>[\w-]+))?")
 _HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)")
@@ -148,21 +157,32 @@ def expand(path: Path, settings: Mapping[str, str]) -> Iterator[tuple[str, Locat
     files = list(_with_includes(TomlFile(path), (), set()))
     for file in files:
         for name, value in file.tables.items():
-            if name not in _TABLES:
-                raise file.error(name, f"there is no such table{did_you_mean(name, _TABLES)}")
-            tables = cast("list[Any]", value if isinstance(value, list) else [value])
-            are_tables = all(isinstance(one, dict) for one in tables)
-            if name != "include" and not (are_tables and isinstance(value, list) == (name in LISTS)):
-                brackets = f"[[{name}]]" if name in LISTS else f"[{name}]"
-                raise file.error(name, f"write {brackets}, and below it key = value")
+            _check_table(file, name, value)
     variables = _parameters(files, settings)
     for file in files:
-        for kind in SINGLE:
-            if kind in file.tables:
-                yield from _iterations(kind, Located(file.tables[kind], file, kind), variables)
-        for kind in LISTS:
-            for number, table in enumerate(file.tables.get(kind, [])):
-                yield from _iterations(kind, Located(table, file, f"{kind}[{number}]"), variables)
+        for kind, value in file.tables.items():
+            if kind in SINGLE:
+                yield from _iterations(kind, Located(value, file, kind), variables)
+            elif kind not in ("include", "parameters"):
+                for number, table in enumerate(value):
+                    yield from _iterations(kind, Located(table, file, f"{kind}[{number}]"), variables)
+
+
+def _check_table(file: TomlFile, name: str, value: Any) -> None:
+    """Raise ConfigError unless ``name`` is a table, in its form, or a command that may be one."""
+    if name == "include":
+        return
+    commands = [one for one in own_commands() if one not in _NO_TABLES]
+    known = ("robot", "program", "network", "parameters", *commands)
+    if name in _NO_TABLES:
+        raise file.error(name, f"`zstate {name}` cannot be a table: {_NO_TABLES[name]}")
+    if name not in known and load_other_command(name) is None:
+        raise file.error(name, f"there is no such table{did_you_mean(name, known)}")
+    is_list = name not in (*SINGLE, "parameters")
+    tables = cast("list[Any]", value if isinstance(value, list) else [value])
+    if isinstance(value, list) is not is_list or not all(isinstance(one, dict) for one in tables):
+        brackets = f"[[{name}]]" if is_list else f"[{name}]"
+        raise file.error(name, f"write {brackets}, and below it key = value")
 
 
 def parse_settings(texts: Sequence[str]) -> dict[str, str]:
@@ -267,8 +287,8 @@ def _loop_variables(
     loop = {key: table.section[key] for key in ("names", "count") if key in table.section}
     if not loop:
         return [{}]
-    if kind not in LOOPS:
-        raise table.error(f"only {' and '.join(LOOPS)} can be a loop of names or count")
+    if kind in NO_LOOPS:
+        raise table.error(f"a loop of names or count starts processes; {kind} cannot be one")
     loop = _substituted(table, loop, variables)
     if len(loop) > 1 or ("name" in table.section) is not ("count" in loop):
         raise table.error("a loop is names = ['left', 'right'], or count = 3 and name = 'arm${number}'")

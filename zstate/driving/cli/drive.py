@@ -92,7 +92,7 @@ _LIMIT = options.Checked("[JOINT=]V", _parse_limit)
 
 @click.command("drive")
 @click.argument("driver", type=options.Checked("text", _check_driver), metavar="FILE.py:CLASS|sim")
-@click.argument("robot")
+@click.argument("robot", type=options.MODEL)
 @options.xacro_arguments
 @click.option(
     "--param",

@@ -24,7 +24,18 @@ _RAYS_PER_TURN = 1440
 """Of a scanner with a ray every 0.25 degrees, which turns once per scan."""
 
 
-@click.command("scan")
+class _ScanCommand(click.Command):
+    """Wrong usage is refused before the command runs: a file of `zstate up` is checked in full."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        rest = super().parse_args(ctx, args)
+        is_simulated = ctx.params["map_file"] is not None
+        if ctx.params["dummy"] is is_simulated and not ctx.resilient_parsing:
+            raise click.UsageError("give --simulate MAP.yaml or --dummy, one of them", ctx)
+        return rest
+
+
+@click.command("scan", cls=_ScanCommand)
 @click.argument("robot")
 @click.option(
     "--frame", required=True, metavar="FRAME", help="The frame of the scanner: ray 0 degrees is along its x."
@@ -95,8 +106,6 @@ def scan_command(
     )
     from zstate.wire.keys import check_robot
 
-    if dummy is (map_file is not None):
-        raise click.UsageError("give --simulate MAP.yaml or --dummy, one of them")
     check_robot(robot)
     ray_ns = 0 if dummy else round(1e9 / (rate * _RAYS_PER_TURN))
     laser = None
