@@ -423,6 +423,6 @@ def test_a_driver_with_efforts_only_gets_them_inwards_and_against_the_motion():
 @pytest.mark.parametrize("effort", [0.0, math.inf])
 def test_efforts_of_joints_without_an_effort_limit_are_refused(effort: float):
     limiter = SetpointLimiter(replace(limits_of_elbow(), effort=np.array([effort])), ALL_MODES)
-    with pytest.raises(InvalidInput, match=rf"have not: 'elbow' \({effort:g}\); start the driver with"):
+    with pytest.raises(InvalidInput, match=rf"have none: 'elbow' \({effort:g}\); start the driver with"):
         limiter.check_rates({0: JointRate("effort", 1.0)})
     limiter.check_rates({0: JointRate("velocity", 1.0)})
