@@ -182,8 +182,9 @@ class RobotReadiness(Closeable):
                 listener.add_observer(self._waiter.notify)
                 self._listeners[robot].append(self._opened.enter_context(listener))
         for listener in self._listeners[robot]:
-            moving = [frame for frame in listener.buffer.frames() if frame.kind in ("joint", "pose")]
-            if (moving or robot in self._rigid) and all(frame.count for frame in moving):
+            frames = listener.buffer.frames()  # those of the model arrive by themselves
+            moving = [frame for frame in frames if frame.kind in ("joint", "pose")]
+            if (moving or (frames and robot in self._rigid)) and all(frame.count for frame in moving):
                 return ""
         refused = "; ".join(text for one in self._listeners[robot] for text in one.refusals.values())
         return refused or directory.no_sample_text(robot, stream)
