@@ -57,7 +57,14 @@ from zstate.odometry.invariant_filter import (
 from zstate.odometry.legs import Foot, Legs, Stance, stance_after, updated_by_feet
 from zstate.odometry.measurements import heading, yaw_rate, zero_velocity
 from zstate.odometry.rotations import rotation_exp, skew
-from zstate.odometry.turning import COMPARED_S, Turning, constant_difference, disagreement, turned
+from zstate.odometry.turning import (
+    COMPARED_S,
+    Difference,
+    Turning,
+    constant_difference,
+    disagreement,
+    turned,
+)
 
 SILENCE_NS = 100_000_000
 """Without samples of the IMU for longer, the base coasts."""
@@ -94,6 +101,8 @@ _UNKNOWN_BIAS = 0.008
 """[rad/s] A bias with a larger standard deviation was never measured."""
 _USUAL_BIAS = 0.002
 """[rad/s] The standard deviation of the biases of gyros that are calibrated."""
+_TELLING = 0.5
+"""Wheels correct a bias that is not contradicted if their standard deviation is this part of its own."""
 _FROZEN, _FROZEN_RATE = 10, 0.03
 """So many samples that repeat the one before, while wheels turn otherwise [rad/s], are of a frozen IMU. Those
 of a simulation without noise repeat as well, but turn as the wheels do."""
@@ -292,7 +301,8 @@ class Estimate(NamedTuple):
 
     ``rate`` and ``force`` are those of the IMU at ``stamp``, interpolated, or assumed if ``is_coasting``.
     ``moved_at`` is the stamp of the last velocity that was not zero, ``angular`` the rate by wheels in the
-    IMU's axes [rad/s], ``wheels_at`` their stamp. ``touching`` are the feet on the ground, if measured.
+    IMU's axes [rad/s], ``wheels_at`` their stamp, ``swept`` the integral of the gyro since then [rad], (3,).
+    ``touching`` are the feet on the ground, if measured.
     ``sampled_s`` is the mean time between samples of the IMU, over which the noise of a rate is averaged.
     ``tilts`` has for each direction the vertical less that of the base, in the IMU's axes, (3,). ``fastest``
     is the greatest speed that was measured [m/s]. ``anchor`` is the estimate at the last reading before
@@ -312,6 +322,7 @@ class Estimate(NamedTuple):
     is_coasting: bool = False
     sampled_s: float = _SAMPLED_S
     wheels_at: int | None = None
+    swept: Floats = np.zeros(3)
     moved_at: int = 0
     angular: Floats | None = None
     upright: Floats | None = None
@@ -381,6 +392,7 @@ class Fusion:
         if reading.is_still is not None:
             estimate = self._with_turn(estimate, reading)._replace(
                 wheels_at=reading.stamp,
+                swept=np.zeros(3),
                 moved_at=estimate.moved_at if reading.is_still else reading.stamp,
                 angular=reading.angular,
                 upright=reading.upright,
@@ -497,7 +509,9 @@ class Fusion:
         )
         is_standing = stance is not None and stance.is_still
         moved_at = estimate.moved_at if is_standing else reading.stamp
-        estimate = estimate._replace(stance=stance, wheels_at=reading.stamp, moved_at=moved_at)
+        estimate = estimate._replace(
+            stance=stance, wheels_at=reading.stamp, swept=np.zeros(3), moved_at=moved_at
+        )
         state, squares = updated_by_feet(estimate.state, reading.feet, touching, gate(3))
         estimate = _moved(estimate, state, is_step=True)
         if not squares:
@@ -553,7 +567,10 @@ class Fusion:
         state = predict(
             before.state, gyro, accel, dt_s, self.noise, contact_noise=self._foot_slip, white=white
         )
-        return before._replace(stamp=stamp, state=state, rate=rate, force=force, is_coasting=False)
+        swept = before.swept + gyro * dt_s
+        return before._replace(
+            stamp=stamp, state=state, rate=rate, force=force, swept=swept, is_coasting=False
+        )
 
     @property
     def _has_drift(self) -> bool:
@@ -592,6 +609,7 @@ class Fusion:
             state=state,
             rate=rate,
             force=force,
+            swept=before.swept + rate * left,
             is_coasting=True,
             vibration=before.vibration if before.is_frozen else None,
             rest=_new_rest(stamp),
@@ -646,21 +664,29 @@ class Fusion:
         return Vibration(values, change, variance, count, white, repeated)
 
     def _with_turn(self, estimate: Estimate, reading: Reading) -> Estimate:
-        """The estimate after the yaw rate of wheels, which is compared with that of the gyro."""
+        """The estimate after the yaw rate of wheels, which is compared with that of the gyro.
+
+        Both are means since the reading before: of a gyro that vibrates, a sample says little.
+        """
         axis, angular, wheels_at = reading.upright, reading.angular, estimate.wheels_at
         vibration = estimate.vibration
         if axis is None or angular is None or wheels_at is None or vibration is None or reading.is_still:
             return estimate
-        dt_s = min((reading.stamp - wheels_at) * 1e-9, _LONGEST_STEP_S)
-        if dt_s <= 0.0:
+        if not 0 < reading.stamp - wheels_at <= _PAUSE_NS:
             return estimate
-        gyro = float(axis @ (estimate.rate - estimate.state.gyro_bias))
-        noise = float((axis * axis) @ vibration.variance[:3])
+        dt_s = (reading.stamp - wheels_at) * 1e-9
+        if estimate.angular is not None:
+            angular = 0.5 * (estimate.angular + angular)
+        gyro = float(axis @ (estimate.swept / dt_s - estimate.state.gyro_bias))
+        noise = float((axis * axis) @ vibration.variance[:3]) * min(1.0, estimate.sampled_s / dt_s)
         estimate = estimate._replace(
             turning=turned(estimate.turning, float(axis @ angular), gyro, noise, dt_s)
         )
         compared = constant_difference(estimate.turning)
-        return estimate if compared is None else _with_bias_by_wheels(estimate, axis, gyro, *compared)
+        if compared is None:
+            return estimate
+        rate = float(axis @ (estimate.rate - estimate.state.gyro_bias))
+        return _with_bias_by_wheels(estimate, axis, rate, compared)
 
     def _at_end_of_rest(self, estimate: Estimate) -> tuple[Estimate, Outcome | None]:
         """The estimate with a zero velocity, if the base stood in this interval and in the one before."""
@@ -783,25 +809,28 @@ def _is_recent(estimate: Estimate, stamp: int | None) -> bool:
     return stamp is not None and estimate.stamp - stamp < _REMEMBERED_NS
 
 
-def _with_bias_by_wheels(
-    estimate: Estimate, axis: Floats, gyro: float, apart: float, sigma: float
-) -> Estimate:
-    """The estimate after a comparison: wheels turn by ``apart`` more than the gyro about ``axis`` [rad/s].
+def _with_bias_by_wheels(estimate: Estimate, axis: Floats, gyro: float, difference: Difference) -> Estimate:
+    """The estimate after a comparison: wheels turn by ``difference`` more than the gyro about ``axis``.
 
-    ``sigma`` is the standard deviation of that, ``gyro`` the rate that the gyro reads less its bias. A bias
-    that was not measured at rest is corrected, if it is larger than that of a calibrated gyro. One that was
-    measured is not, because the radii of wheels may differ: it is as unsure as the difference.
+    ``gyro`` is the rate that the gyro reads less its bias [rad/s]. A bias that was not measured at rest is
+    corrected, if it is larger than that of a calibrated gyro. One that was measured is not, because the radii
+    of wheels may differ: it is as unsure as the difference.
     """
     state, turning = estimate.state, estimate.turning
     variance = float(axis @ state.covariance[GYRO_BIAS, GYRO_BIAS] @ axis)
     corrected_by_wheels = yaw_rate(state, gyro + apart, sigma * sigma, axis, estimate.rate)
+    apart, sigma, noise = difference
     if not estimate.was_at_rest and variance > _UNKNOWN_BIAS * _UNKNOWN_BIAS:
         if abs(apart) < _APART * math.hypot(sigma, _USUAL_BIAS):
-            usual = min(_USUAL_BIAS**2 + max(0.0, apart * apart - sigma * sigma), 0.9 * variance)
-            # A measurement of what is known already, with the noise that leads to this variance.
-            noise = 1.0 / (1.0 / usual - 1.0 / variance)
-            measurement = yaw_rate(state, gyro, noise, axis, estimate.rate)
-            return _moved(estimate._replace(turning=Turning()), updated(state, measurement))
+            # What noise hides, the wheels do not confirm.
+            usual = _USUAL_BIAS**2 + noise * noise + max(0.0, apart * apart - sigma * sigma)
+            if usual < 0.9 * variance:
+                # A measurement of what is known already, with the noise that leads to this variance.
+                known = 1.0 / (1.0 / usual - 1.0 / variance)
+                measurement = yaw_rate(state, gyro, known, axis, estimate.rate)
+                return _moved(estimate._replace(turning=Turning()), updated(state, measurement))
+            if sigma * sigma > _TELLING**2 * variance:
+                return estimate
         estimate = estimate._replace(turning=Turning(), biased_at=estimate.stamp)
         return _moved(estimate, updated(state, corrected_by_wheels))
     if abs(apart) < _APART * math.sqrt(variance + sigma * sigma):
