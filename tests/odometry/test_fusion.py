@@ -30,6 +30,7 @@ from zstate.odometry.invariant_filter import (
     ImuNoise,
     Measurement,
     initial_state,
+    plain_covariance,
     white_noise,
 )
 from zstate.odometry.rotations import rotation_exp
@@ -279,9 +280,16 @@ def test_the_scale_and_the_bias_of_a_gyro_are_errors_of_the_yaw_that_do_not_aver
     assert added == pytest.approx((scale * rate * 2.0) ** 2 + (shift * 2.0) ** 2)
 
 
-def compared(apart: float, bias_sigma: float, *, was_at_rest: bool) -> Estimate:
-    """The estimate after ten seconds straight on, in which wheels turned by ``apart`` more than the gyro."""
+def compared(
+    apart: float, bias_sigma: float, *, was_at_rest: bool, x: float = 0.0, speed: float = 0.0
+) -> Estimate:
+    """The estimate after ten seconds straight on, in which wheels turned by ``apart`` more than the gyro.
+
+    The base is at ``x`` [m] then and has ``speed`` along it [m/s].
+    """
     estimate = sampled(at_rest(sigma=bias_sigma), 2)
+    place, velocity = np.array([x, 0.0, 0.0]), np.array([speed, 0.0, 0.0])
+    estimate = estimate._replace(state=estimate.state._replace(position=place, velocity=velocity))
     turning = Turning(10.0, apart, 0.0, apart * apart, 0.0, 0.0)
     estimate = estimate._replace(turning=turning, wheels_at=estimate.stamp - 1, was_at_rest=was_at_rest)
     unsure = Measurement(np.zeros(3), np.eye(3, 15), 1e12 * np.eye(3))
@@ -342,6 +350,51 @@ def test_a_measured_bias_that_wheels_contradict_is_as_unsure_as_the_difference_a
     expected[GYRO_BIAS.start + 2] = apart**2
     expected[ROTATION.start + 2] = (apart * 10.0) ** 2
     assert added == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("x", [0.0, 100.0])
+def test_a_yaw_that_wheels_contradict_is_unsure_about_the_middle_of_the_last_ten_seconds_way(x: float):
+    """Wherever the origin is, so that the position does not become sure on a way back to it."""
+    apart, bias_sigma, speed = 0.05, 0.005, 0.5
+    before, found = (
+        plain_covariance(compared(one, bias_sigma, was_at_rest=True, x=x, speed=speed).state)
+        for one in (0.0, apart)
+    )
+    yaw, along, across = ROTATION.start + 2, POSITION.start, POSITION.start + 1
+    added = (found - before)[np.ix_([yaw, along, across], [yaw, along, across])]
+    effects = apart * 10.0 * np.array([1.0, 0.0, speed * 10.0 / 2.0])
+    assert added == pytest.approx(np.outer(effects, effects), abs=1e-6)
+
+
+@pytest.mark.parametrize("phase", [0.0, 1.0, 2.0])
+def test_a_gyro_that_vibrates_as_often_as_wheels_are_read_has_no_bias(phase: float):
+    """Its samples at those instants are all alike; the wheels measure means."""
+    estimate = at_rest(sigma=0.02)
+    unsure = Measurement(np.zeros(3), np.eye(3, 15), 1e12 * np.eye(3))
+    for number in range(2400):
+        stamp = number * SAMPLE
+        rate = 0.06 * math.sin(math.tau * 20.0 * stamp * 1e-9 + phase)
+        estimate, _ = FUSION.after_inertia(estimate, Inertia(stamp, np.array([0.0, 0.0, rate]), UPWARDS))
+        if number % 10 == 0:  # at 20 Hz
+            reading = Reading(
+                stamp,
+                lambda _state, _rate: unsure,
+                is_still=False,
+                angular=np.zeros(3),
+                upright=np.array([0.0, 0.0, 1.0]),
+            )
+            estimate, _ = FUSION.after_reading(estimate, "wheels", reading, None)
+    assert imu_remarks(estimate) == []
+    assert abs(estimate.state.gyro_bias[2]) < 1e-3
+
+
+def test_a_bias_that_a_rest_finds_is_no_contradiction_to_the_wheels_before():
+    estimate = at_rest(sigma=0.02)._replace(turning=Turning(10.0, 0.0, 0.02, 0.0, 0.0004, 0.0), wheels_at=0)
+    for number in range(1, 101):
+        sample = Inertia(number * SAMPLE, np.array([0.0, 0.0, 0.02]), UPWARDS)
+        estimate, _ = FUSION.after_inertia(estimate._replace(wheels_at=sample.stamp), sample)
+    assert estimate.was_at_rest
+    assert estimate.turning == Turning()
 
 
 @pytest.mark.parametrize(("later", "is_told"), [(30 * S - 1, True), (30 * S, False)])

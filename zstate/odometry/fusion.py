@@ -718,7 +718,10 @@ class Fusion:
         if not (is_still and rest.was_still):
             return self._within_bounds(estimate), None
         found, outcome = _gated(estimate, STANDSTILL, zero_velocity(state, gyro, _REST_SPEED, sigma))
-        return found._replace(was_at_rest=estimate.was_at_rest or outcome.fate == "accepted"), outcome
+        if outcome.fate == "accepted" and not estimate.was_at_rest:
+            # The comparison with the wheels is of the bias before.
+            found = found._replace(was_at_rest=True, turning=Turning())
+        return found, outcome
 
     def _within_bounds(self, estimate: Estimate) -> Estimate:
         """The estimate with a velocity that is plausible, if nothing measures it any more."""
@@ -816,10 +819,10 @@ def _with_bias_by_wheels(estimate: Estimate, axis: Floats, gyro: float, differen
     corrected, if it is larger than that of a calibrated gyro. One that was measured is not, because the radii
     of wheels may differ: it is as unsure as the difference.
     """
+    apart, sigma, noise = difference
     state, turning = estimate.state, estimate.turning
     variance = float(axis @ state.covariance[GYRO_BIAS, GYRO_BIAS] @ axis)
     corrected_by_wheels = yaw_rate(state, gyro + apart, sigma * sigma, axis, estimate.rate)
-    apart, sigma, noise = difference
     if not estimate.was_at_rest and variance > _UNKNOWN_BIAS * _UNKNOWN_BIAS:
         if abs(apart) < _APART * math.hypot(sigma, _USUAL_BIAS):
             # What noise hides, the wheels do not confirm.
@@ -837,7 +840,13 @@ def _with_bias_by_wheels(estimate: Estimate, axis: Floats, gyro: float, differen
         return estimate
     covariance = state.covariance.copy()
     covariance[GYRO_BIAS, GYRO_BIAS] += np.outer(axis, axis) * apart**2
-    covariance[_YAW, _YAW] += (apart * min(turning.time_s, COMPARED_S)) ** 2
+    # The base turned by so much more on its way of these seconds, about the middle of it. About the origin of
+    # the world, as the yaw alone would be, the error of the position would vanish on the way back.
+    seconds = min(turning.time_s, COMPARED_S)
+    x, y, _ = (state.position - 0.5 * seconds * state.velocity).tolist()
+    shift = np.zeros(len(covariance))
+    shift[_YAW], shift[_LEVEL] = 1.0, (y, -x)
+    covariance += np.outer(shift, shift) * (apart * seconds) ** 2
     state = state._replace(covariance=covariance)
     estimate = estimate._replace(state=state, turning=Turning(), biased_at=estimate.stamp)
     return estimate if estimate.was_at_rest else _moved(estimate, updated(state, corrected_by_wheels))
