@@ -18,6 +18,8 @@ CHOSEN = [
     (_FUSION, "_VIBRATION_S"),
     ("zstate.odometry.turning", "_STRAIGHT"),
     (_FUSION, "_USUAL_BIAS"),
+    (_FUSION, "_TELLING"),
+    ("zstate.odometry.turning", "_SCALE"),
     ("zstate.odometry.turning", "COMPARED_S"),
     (_FUSION, "_STILL_SPEED"),
     (_FUSION, "_LEAST_SPEED_BOUND"),
