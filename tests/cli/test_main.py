@@ -4,7 +4,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -211,3 +213,37 @@ def test_ctrl_c_during_publishing_prints_the_achieved_rate(spawn: Spawn):
     await_samples()
     interrupted(child)
     assert "commanded 50 Hz, achieved " in child.line()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_ctrl_c_that_is_lost_in_a_function_that_python_calls_ends_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """As in one that Zenoh calls. It is raised again, but not while the command cleans up."""
+    events: list[str] = []
+
+    class Watched:
+        pass
+
+    def command(*_: object, **__: object) -> None:
+        watched = Watched()
+        end = weakref.ref(watched, lambda _: signal.raise_signal(signal.SIGINT))
+        try:
+            del watched  # what ``end`` raises is ignored
+            assert end() is None
+            events.append("lost")
+            while True:
+                threading.Event().wait(0.05)
+        finally:
+            deadline = time.monotonic() + 2 * main._CHECKED_AFTER_S
+            while time.monotonic() < deadline:
+                threading.Event().wait(0.05)
+            events.append("cleaned up")
+
+    monkeypatch.setattr(main.group, "main", command)
+    before = signal.signal(signal.SIGINT, main._end)
+    try:
+        assert main.run([]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert events == ["lost", "cleaned up"]
