@@ -16,6 +16,8 @@ from helpers.processes import ZENOH_CLOSE_S
 from zstate import connect, load_model
 from zstate.cli import main
 from zstate.cli.commands import own_commands
+from zstate.cli.processes import orderly_exit
+from zstate.cli.signals import CHECKED_AFTER_S, SignalExit
 from zstate.model.pinocchio_solver import load_pinocchio
 from zstate.sources import JointStateListener
 
@@ -215,35 +217,53 @@ def test_ctrl_c_during_publishing_prints_the_achieved_rate(spawn: Spawn):
     assert "commanded 50 Hz, achieved " in child.line()
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_ctrl_c_that_is_lost_in_a_function_that_python_calls_ends_the_command(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    """As in one that Zenoh calls. It is raised again, but not while the command cleans up."""
-    events: list[str] = []
+def lose_ctrl_c() -> None:
+    """Ctrl-C in a function that Python calls, and whose exceptions it ignores, as Zenoh does."""
 
     class Watched:
         pass
 
-    def command(*_: object, **__: object) -> None:
-        watched = Watched()
-        end = weakref.ref(watched, lambda _: signal.raise_signal(signal.SIGINT))
-        try:
-            del watched  # what ``end`` raises is ignored
-            assert end() is None
-            events.append("lost")
-            while True:
-                threading.Event().wait(0.05)
-        finally:
-            deadline = time.monotonic() + 2 * main._CHECKED_AFTER_S
-            while time.monotonic() < deadline:
-                threading.Event().wait(0.05)
-            events.append("cleaned up")
+    watched = Watched()
+    end = weakref.ref(watched, lambda _: signal.raise_signal(signal.SIGINT))
+    del watched
+    assert end() is None
 
-    monkeypatch.setattr(main.group, "main", command)
+
+def work_until_interrupted(events: list[str]) -> None:
+    """Lose a Ctrl-C, go on until it is raised again, and clean up for longer than until the next check."""
+    try:
+        lose_ctrl_c()
+        events.append("lost")
+        while True:
+            threading.Event().wait(0.05)
+    finally:
+        deadline = time.monotonic() + 2 * CHECKED_AFTER_S
+        while time.monotonic() < deadline:
+            threading.Event().wait(0.05)
+        events.append("cleaned up")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_ctrl_c_that_is_lost_is_raised_again_but_not_while_the_command_cleans_up(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    events: list[str] = []
+    monkeypatch.setattr(main.group, "main", lambda *_, **__: work_until_interrupted(events))
     before = signal.signal(signal.SIGINT, main._end)
     try:
         assert main.run([]) == 130
     finally:
         signal.signal(signal.SIGINT, before)
+    assert events == ["lost", "cleaned up"]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_lost_ctrl_c_ends_a_block_with_an_orderly_exit_as_well():
+    """That of `zstate drive`, whose driver is stopped in it."""
+    events: list[str] = []
+    with pytest.raises(SignalExit), orderly_exit() as begin_end:
+        try:
+            work_until_interrupted(events)
+        finally:
+            begin_end()
     assert events == ["lost", "cleaned up"]

@@ -6,7 +6,6 @@ misspelled options.
 
 from __future__ import annotations
 
-import _thread
 import gc
 import os
 import re
@@ -14,7 +13,6 @@ import shlex
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import combinations
@@ -26,7 +24,7 @@ import click
 
 from zstate.cli.commands import SECTIONS, load_command, load_other_command, own_commands
 from zstate.cli.output import logs
-from zstate.cli.signals import SignalExit
+from zstate.cli.signals import Ending
 from zstate.errors import ZStateError
 
 if TYPE_CHECKING:
@@ -410,8 +408,9 @@ def run(arguments: Sequence[str]) -> str | int:
     except ZStateError as error:
         text, code = str(error), 1
     except SystemExit as leaving:
-        _ended_by.clear()
         return leaving.code or 0
+    finally:
+        _ending.close()
     logs.write(text, level="error", event="failed")
     return code
 
@@ -430,47 +429,13 @@ def _exit(code: str | int) -> NoReturn:
     sys.exit(code)
 
 
-_CHECKED_AFTER_S = 0.5
-_ended_by: set[int] = set()
-"""The signal that ends the command, until it has."""
+_ending = Ending()
 
 
 def _end(number: int, _: FrameType | None) -> None:
-    """Raise SignalExit in the main thread, again if that was lost; a second signal ends the process at once.
-
-    Zenoh calls functions in the thread that declares something, and Python some of its own: what is raised in
-    one of these goes nowhere.
-    """
-    is_check = False
-
-    def on_second(number: int, _: FrameType | None) -> None:
-        nonlocal is_check
-        if not is_check:
-            os._exit(128 + number)
-        is_check = False
-        if number in _ended_by and not _is_ending():
-            _thread.start_new_thread(check, ())
-            raise SignalExit(128 + number)
-
-    def check() -> None:
-        nonlocal is_check
-        time.sleep(_CHECKED_AFTER_S)
-        if number in _ended_by and signal.getsignal(number) is on_second:
-            is_check = True
-            signal.pthread_kill(main_thread, number)
-
-    main_thread = threading.get_ident()
-    _ended_by.add(number)
-    # An orderly exit takes well under a second.
-    signal.signal(number, on_second)
-    # Not by threading, whose lock the main thread may hold.
-    _thread.start_new_thread(check, ())
-    raise SignalExit(128 + number)
-
-
-def _is_ending() -> bool:
-    """Whether SignalExit is on its way: what it passes, such as a ``finally``, handles it now."""
-    error = sys.exc_info()[1]
-    while error is not None and not isinstance(error, SignalExit):
-        error = error.__context__
-    return error is not None
+    # An orderly exit takes well under a second; a second signal ends it at once.
+    if _ending.is_repeated(number):
+        return
+    if _ending.has_begun:
+        os._exit(128 + number)
+    _ending.begin(number)

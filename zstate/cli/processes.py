@@ -15,7 +15,7 @@ from typing import IO, Generic, TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate.cli.output.logs import text_in
-from zstate.cli.signals import SignalExit
+from zstate.cli.signals import Ending
 from zstate.clock import wait_interruptible
 
 Result = TypeVar("Result")
@@ -100,22 +100,26 @@ def orderly_exit(within_s: float = _PROGRAM_ENDS_WITHIN_S) -> Generator[Callable
     must not go on: from there no signal interrupts it. For the main thread.
     """
     ends_at: float | None = None
+    ending = Ending()
 
     def begin_end() -> None:
         nonlocal ends_at
         ends_at = ends_at or time.monotonic()
+        ending.close()
 
     def on_signal(number: int, _: object) -> None:
+        nonlocal ends_at
         if ends_at is None:
-            begin_end()
-            raise SignalExit(128 + number)
-        if time.monotonic() - ends_at > within_s:
+            ends_at = time.monotonic()
+            ending.begin(number)
+        if not ending.is_repeated(number) and time.monotonic() - ends_at > within_s:
             os._exit(128 + number)
 
     before = {one: signal.signal(one, on_signal) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield begin_end
     finally:
+        ending.close()
         for number, handler in before.items():
             signal.signal(number, handler)
 
