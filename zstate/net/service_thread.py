@@ -44,7 +44,7 @@ class ServiceThread(Closeable):
             self._start()
 
     def wake(self) -> None:
-        """Let the thread end if its session is closed. Whoever uses it calls this at the end of a session."""
+        """Let the thread end if its session is closed. Subscriptions call it when theirs ends."""
         self._calls.put((0.0, lambda: None))
 
     def close(self) -> None:

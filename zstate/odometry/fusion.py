@@ -666,7 +666,7 @@ class Fusion:
     def _with_turn(self, estimate: Estimate, reading: Reading) -> Estimate:
         """The estimate after the yaw rate of wheels, which is compared with that of the gyro.
 
-        Both are means since the reading before: of a gyro that vibrates, a sample says little.
+        Both are means since the previous reading. Single samples of a vibrating gyro vary too much.
         """
         axis, angular, wheels_at = reading.upright, reading.angular, estimate.wheels_at
         vibration = estimate.vibration

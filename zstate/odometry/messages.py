@@ -119,11 +119,6 @@ class Pose(StampedMessage, frozen=True, array_like=True, gc=False):
         check_covariance("a pose", self.covariance, 6)
 
 
-def with_child(pose: Pose, child: str) -> Pose:
-    """The same pose of another frame."""
-    return msgspec.structs.replace(pose, child=child)
-
-
 _Measurement = TypeVar("_Measurement", bound="Imu | Velocity | Pose")
 
 

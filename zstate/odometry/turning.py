@@ -68,7 +68,7 @@ def constant_difference(turning: Turning) -> Difference | None:
     That is the regression of one on the other, with a scale if they turn enough to show it. Rates that do not
     follow a line, as those of wheels that slip, or that have another scale, say nothing: None.
 
-    A steady turn does not tell a constant from a scale, so that the difference is as unsure as the scale. The
+    In a steady turn a constant and a scale look alike, so the difference is as uncertain as the scale. The
     noise of the gyro is as large as stated if it is white; that of vibration, whose integral is bounded, is
     smaller. The scale is between those by both.
     """

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, cast
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.plugins import is_measured, measured_streams
+from zstate.plugins import is_measured
 from zstate.streams import Stream, StreamName
 from zstate.wire.messages import Message, StampedMessage
 from zstate.wire.ros2.streams import ros_streams
@@ -29,11 +29,6 @@ _SCALARS = ("boolean", "integer", "number", "string")
 def carried_as_json(stream: StreamName) -> bool:
     """Whether messages of ``stream`` are recorded and displayed in JSON: measurements without a ROS type."""
     return stream not in ros_streams() and is_measured(stream)
-
-
-def json_streams() -> tuple[StreamName, ...]:
-    """The streams of ``carried_as_json``."""
-    return tuple(name for name in measured_streams() if name not in ros_streams())
 
 
 class JsonType(NamedTuple):

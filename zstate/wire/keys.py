@@ -258,7 +258,7 @@ MOTION = Key[str]("zstate/<robot>/@motion")
 """
 
 ODOMETRY_REQUEST = Key[str, str]("zstate/<robot>/@odometry/<writer>")
-"""A queryable of an odometry node, which starts anew or sets its pose; kept from viewers likewise."""
+"""A queryable of an odometry node, which restarts it or sets its pose; viewers may not query it either."""
 
 
 def stream_key(robot: str, stream: StreamName, writer: str = "") -> str:

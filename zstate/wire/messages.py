@@ -21,6 +21,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 
+from zstate.checks import QUATERNION_TOLERANCE
 from zstate.errors import InvalidInput, MessageError
 from zstate.message import Count, Message, SessionId, Stamp, StampedMessage
 from zstate.plugins import stream_named
@@ -34,7 +35,6 @@ Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
 Level = Literal["ok", "warn", "error", "stale"]
 
 POSE_BYTES = 7 * 8
-_UNIT_TOLERANCE = 1e-3
 _UPPER_TRIANGLES = {size: np.triu_indices(size) for size in (3, 6)}
 _FLOAT64 = np.dtype("<f8")
 _FLOAT32 = np.dtype("<f4")
@@ -165,7 +165,7 @@ class WriterTransforms(TransformSample, frozen=True, array_like=True, gc=False):
 
 
 def edge_of(sample: WriterTransforms) -> WriterTransforms:
-    """The edges of ``sample`` alone, without what a plugin's message says of them besides, as a velocity."""
+    """The edges of ``sample`` and their poses, without further fields that the message of a plugin has."""
     head = (sample.stamp, sample.seq, sample.session, sample.order)
     return WriterTransforms(*head, sample.poses, sample.edges, sample.covariances)
 
@@ -235,9 +235,6 @@ def covariance_matrix(triangle: bytes) -> NDArray[np.float64]:
     matrix, upper = np.empty((size, size)), _UPPER_TRIANGLES[size]
     matrix[upper] = matrix.T[upper] = from_block(triangle)
     return matrix
-
-
-"""The most cells of an occupancy grid."""
 
 
 class ClockMessage(StampedMessage, frozen=True, array_like=True, gc=False):
@@ -338,7 +335,7 @@ def check_limit(what: str, numbers: Sequence[float], limit: float) -> None:
 def check_quaternion(quaternion: Sequence[float]) -> None:
     """Raise InvalidInput unless ``quaternion`` has the length 1."""
     length = sqrt(sum(number * number for number in quaternion))
-    if not abs(length - 1.0) <= _UNIT_TOLERANCE:
+    if not abs(length - 1.0) <= QUATERNION_TOLERANCE:
         raise InvalidInput(f"an orientation is a quaternion of length 1, not {length:.6g}")
 
 
