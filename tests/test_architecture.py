@@ -101,6 +101,7 @@ GUESTS = {
     ("transform.py", "pinocchio"),  # `Transform.se3`, when it is read
     ("view/browser_messages.py", "msgspec"),  # what viser's page sends
     ("view/server.py", "websockets"),  # what viser's server is made of
+    ("web_access.py", "websockets"),  # the end of both servers
     # each reads one kind of file in YAML
     ("cli/up/static_edges.py", "yaml"),
     ("scans/map_metadata.py", "yaml"),

@@ -12,6 +12,7 @@ A browser lets any page on the internet open a websocket to a port of the machin
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import ipaddress
 import secrets
@@ -20,13 +21,17 @@ from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 from urllib.parse import parse_qs, urlsplit
 
 from zstate._util.endpoint import format_host
 from zstate.errors import InvalidInput
 
+if TYPE_CHECKING:
+    from websockets.asyncio.server import Server
+
 _PORTS_TRIED = 100
+_ACCEPT_TURNS = 3
 _HTTP_PORT = 80
 _UNIQUE = ("Host", "Origin", "Upgrade", "Cookie")
 _COOKIE = "zstate_view_"  # and the port, because a host has the same cookies at all its ports
@@ -164,6 +169,25 @@ def listen(host: str, port: int | None, default: int) -> socket.socket:
             return bound
     taken = f"port {port} is taken" if port is not None else f"ports {ports[0]} to {ports[-1]} are taken"
     raise InvalidInput(f"{taken} at {host!r}; name a free one with --port, or 0 for any")
+
+
+async def end_openings(server: Server) -> None:
+    """Accept no more connections, and abort those of clients that have not sent their whole request.
+
+    To be awaited before ``server`` closes: that waits for these clients, for up to 10 s.
+    """
+    from websockets.protocol import State  # noqa: PLC0415  # not for metrics
+
+    # python/cpython#109564: a server that closes in the turn of the event loop in which it has accepted a
+    # connection leaves that open; delete when fixed. Two turns later the server knows it.
+    loop = asyncio.get_running_loop()
+    for listening in server.sockets:
+        loop.remove_reader(listening)
+    for _ in range(_ACCEPT_TURNS):
+        await asyncio.sleep(0)
+    for connection in server.handlers:
+        if connection.protocol.state is State.CONNECTING:
+            connection.transport.abort()
 
 
 def _bind(host: str, port: int) -> socket.socket | None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection
@@ -230,3 +232,12 @@ def test_a_taken_port_and_an_unusable_host_are_refused():
         FoxgloveServer(port=server.port)
     with pytest.raises(InvalidInput, match=r"cannot listen at '192\.0\.2\.1'"):
         FoxgloveServer("192.0.2.1", 0)
+
+
+def test_server_closes_while_a_client_has_sent_nothing():
+    before = set(threading.enumerate())
+    server = FoxgloveServer(port=0)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as silent:
+        server.close()
+        assert set(threading.enumerate()) == before
+        assert silent.recv(1) == b""

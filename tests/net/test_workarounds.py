@@ -6,11 +6,15 @@ test_zenoh_texts.py.
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import inspect
 import json
 import math
 import signal
+import socket
 import sys
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -160,3 +164,25 @@ def test_the_stub_has_a_matching_status_for_a_bool() -> None:
     assert "def matching_status(self) -> bool" in stub
     with zenoh.open(configuration({})) as session:
         assert isinstance(session.declare_publisher("key").matching_status, zenoh.MatchingStatus)
+
+
+async def accept_and_close(turns: int) -> None:
+    """Close a server some turns of the event loop after a client has connected."""
+    server = await asyncio.start_server(lambda reader, writer: writer.close(), "127.0.0.1", 0)
+    with socket.create_connection(server.sockets[0].getsockname()):
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        server.close()
+        await asyncio.sleep(0.01)
+
+
+def test_asyncio_leaves_a_connection_open_that_it_accepts_while_it_closes() -> None:
+    """web_access.end_openings."""
+    unclosed: list[str] = []
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("error", ResourceWarning)
+        patch.setattr(sys, "unraisablehook", lambda raised: unclosed.append(str(raised.exc_value)))
+        for turns in range(6):
+            asyncio.run(accept_and_close(turns))
+            gc.collect()
+    assert any("unclosed transport" in text for text in unclosed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Mapping
@@ -134,6 +135,15 @@ def test_server_closes_while_a_browser_does_not_respond():
         assert vanished.recv(1).startswith(b"H")
         page.close()
         assert vanished.fileno() >= 0, "the browser has not closed its end"
+
+
+def test_server_closes_while_a_browser_has_sent_nothing():
+    before = set(threading.enumerate())
+    page = ViewServer(port=0)
+    with socket.create_connection(("127.0.0.1", page.port), timeout=10.0) as silent:
+        page.close()
+        assert set(threading.enumerate()) == before
+        assert silent.recv(1) == b""
 
 
 def test_taken_port_is_an_error_and_the_default_is_the_next_free_one():

@@ -38,7 +38,7 @@ from websockets.typing import Subprotocol
 from zstate._util.closeable import Closeable
 from zstate.errors import printable
 from zstate.recording.storage import ChannelType
-from zstate.web_access import AccessCheck, is_websocket, listen
+from zstate.web_access import AccessCheck, end_openings, is_websocket, listen
 
 PORT = 8765
 SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
@@ -267,8 +267,9 @@ class FoxgloveServer(Closeable):
             logger=_SILENT,
             close_timeout=_CLOSE_TIMEOUT_S,
             max_size=_MAX_REQUEST_BYTES,
-        ):
+        ) as server:
             await self._end.wait()
+            await end_openings(server)
 
     def _process_request(self, connection: ServerConnection, request: Request) -> Response | None:
         denied = self.access.check(request.path, request.headers)

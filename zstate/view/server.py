@@ -33,7 +33,7 @@ from zstate._util.closeable import Closeable
 from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, LibraryMissing, ZStateError
 from zstate.view.browser_messages import Widget, accept_message
-from zstate.web_access import AccessCheck, is_websocket, listen
+from zstate.web_access import AccessCheck, end_openings, is_websocket, listen
 
 PORT = 8080
 # A browser that has vanished (a suspended laptop, a lost network) does not answer the closing handshake.
@@ -157,7 +157,7 @@ class ViewServer(Closeable):
         ) -> websockets.asyncio.server.serve:
             opened.append(port)
             new_connection: Any = functools.partial(_Connection, self._accept)
-            return original(
+            return _Serve(
                 functools.partial(self._handle, handler),
                 sock=self._socket,
                 process_request=functools.partial(self._process_request, process_request),
@@ -233,6 +233,14 @@ class _Connection(ServerConnection):
             accepted = self._accept(self.remote_address, await super().recv(decode))
             if accepted is not None:
                 return accepted
+
+
+class _Serve(websockets.asyncio.server.serve):
+    """The server that viser opens in a context, with an end that leaves no connection open."""
+
+    async def __aexit__(self, *exception: Any) -> None:
+        await end_openings(self.server)
+        await super().__aexit__(*exception)
 
 
 class _Server(viser.ViserServer):
