@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
 # bench/ is not in the package, so it is imported from the repository. The path is appended: the tests use an
 # installed zstate if there is one.
-ROOT = str(Path(__file__).parents[1])
+TESTS = Path(__file__).parent
+ROOT = str(TESTS.parent)
 if ROOT not in sys.path:
     sys.path.append(ROOT)
 
@@ -58,6 +59,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[LEFT_OUT] = Counter()
+    _collect_elsewhere(config)
     # Collection makes 100,000 objects that stay: searching them for garbage takes a third of its time.
     gc.disable()
     # Processes of tests would inherit what nohup and shells make of a program in the background.
@@ -67,6 +69,15 @@ def pytest_configure(config: pytest.Config) -> None:
     for name, requirement in REQUIREMENTS.items():
         config.addinivalue_line("markers", f"{name}: runs with --system; {requirement.install}")
     config.addinivalue_line("markers", "system: has one of those markers")
+
+
+def _collect_elsewhere(config: pytest.Config) -> None:
+    """Let each worker of ``-n`` begin with other tests: what one of them has compiled, the others read."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "")
+    if config.args == config.getini("testpaths") and worker:
+        places = sorted(str(path) for path in TESTS.iterdir() if path.is_dir() or path.match("test_*.py"))
+        first = len(places) * int(worker.removeprefix("gw")) // config.workerinput["workercount"]
+        config.args[:] = places[first:] + places[:first]
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
@@ -104,7 +115,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     reasons = {item: reason for item in items if (reason := reason_to_leave_out(item))}
     config.stash[LEFT_OUT].update(reasons.values())
     config.hook.pytest_deselected(items=list(reasons))
-    items[:] = [item for item in items if item not in reasons]
+    items[:] = sorted((item for item in items if item not in reasons), key=lambda item: item.path)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -30,6 +30,7 @@ from zstate import (
 from zstate.clock import SystemClock
 from zstate.fleet.acl import AclRoles, access_control
 from zstate.fleet.router_config import RouterConfig
+from zstate.net import streams
 from zstate.net.security.credentials import Credentials
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.transform_publisher import TransformPublisher
@@ -267,12 +268,14 @@ def router(
 
 
 def reader(session: Session, robot: str = "*", follow: str = "joint_states", busy_ms: float = 0.0) -> None:
-    """Listens to robots; with ``busy_ms`` each insert blocks the process for that long.
+    """Listens to robots; with ``busy_ms`` each insert blocks the process for that long, and few samples wait.
 
     Replies to the queries of ``ReaderQueries`` about the arm, as ``odometry NAME`` about the odometry, and as
     ``joints NAME``, ``shoulder NAME`` and ``elbow NAME`` about ``JointsMotion``, all of it and of one joint.
     """
     # Merged readings are of one instant, some of their positions up to the age limit older.
+    if busy_ms:
+        streams.CAPACITY = 64
     tolerance = 1e-9 if follow == "joint_states" else sum(map(abs, JointsMotion.RATES)) * MAX_AGE_S * REACH
     with (
         join(session) as opened,
