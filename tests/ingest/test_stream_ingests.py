@@ -161,6 +161,7 @@ def test_all_writers_of_1000_robots_go_on_after_the_tokens_of_all_were_away(make
 
 @READERS
 @pytest.mark.parametrize("attacked", ["another robot", "the same robot"])
+@pytest.mark.long
 def test_strangers_push_out_no_writer_whose_token_is_away(make: type[Reader], attacked: str):
     reader = make()
     reader.joined("rb", 1)

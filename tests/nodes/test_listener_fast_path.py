@@ -311,6 +311,7 @@ def test_any_messages_give_the_same_buffer_counts_and_events(sessions, robot, fo
     )
 
 
+@pytest.mark.long
 def test_any_joint_states_of_ros_give_the_same_buffer_counts_and_events(sessions, monkeypatch):
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     key = get_wire("ros2").expression("r1", "joint_states")

@@ -118,6 +118,7 @@ def test_the_rate_of_a_twist_has_the_noise_of_one_sample():
     np.testing.assert_allclose(variances, 5e-3**2 * 200 + 0.01**2, rtol=0.01)
 
 
+@pytest.mark.long
 def test_the_order_of_arrival_does_not_matter_nor_when_states_are_read():
     _, calls = calls_of(1, 4.0)
     in_order, shuffled = estimator(tilted_mount()), estimator(tilted_mount())
@@ -473,6 +474,7 @@ def test_poses_bound_the_drift_of_wheels():
     assert health_of(base, "mocap").accepted == 80
 
 
+@pytest.mark.long
 def test_of_two_headings_that_disagree_the_worse_one_is_named():
     """A base that turns by 0.5 rad/s, and two compasses, of which one has a hard iron of 0.5 rad."""
     base, random = estimator(), np.random.default_rng(3)

@@ -405,11 +405,13 @@ def test_a_fault_leaves_the_estimate_inside_its_claim_or_is_named(name: str, lon
     assert findings(fault, played(fault)) == []
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.long
 def test_a_base_without_faults_has_no_sentence(seed: int):
     assert played(FAULTS["none"], seed).sentences == {}
 
 
+@pytest.mark.long
 def test_stamps_that_go_back_begin_anew():
     """A recording that is played in a loop: each source goes back by 30 s, all the same."""
     drive = Drive(30.0, ROUND, ROUND_TURNS)

@@ -129,6 +129,7 @@ def test_a_grid_has_the_bytes_of_rosbags(one: OccupancyGrid):
     assert [decoded("map", payload) for payload in (theirs, turned, theirs + b"\x07\0\0")] == [one] * 3
 
 
+@pytest.mark.long
 def test_a_grid_of_4096_x_4096_cells_has_an_allowed_size():
     assert len(encoded(grid(4096, 4096, frame="f" * 1024))) <= stream_named("map").max_bytes
 

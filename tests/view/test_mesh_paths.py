@@ -81,6 +81,7 @@ def outside(package: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return secret
 
 
+@pytest.mark.long
 def test_received_description_gets_no_file_outside_packages_and_no_hint_that_it_exists(outside):
     private, package = outside.parent, outside.parents[1] / "src" / "repository" / "arm"
 

@@ -160,7 +160,8 @@ def test_sigma_that_would_fit_is_that_of_the_sensor(tmp_path: Path):
     assert fitting == pytest.approx([factor * 0.2 * FLOW_SIGMA, factor, factor], rel=0.05)
 
 
-@pytest.mark.parametrize("stream", ["pose/mocap", pytest.param("odometry/laser", marks=pytest.mark.long)])
+@pytest.mark.parametrize("stream", ["pose/mocap", "odometry/laser"])
+@pytest.mark.long
 def test_reference_gives_ate_error_at_the_end_and_nees(tmp_path: Path, stream: str):
     path = str(recorded(tmp_path / "r.mcap"))
     name = ReferenceName(*stream.split("/"), sigma=MOCAP_SIGMA)

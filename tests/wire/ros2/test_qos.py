@@ -86,6 +86,7 @@ def test_a_depth_that_contradicts_the_history_is_refused(history: str, depth: in
 
 
 @given(qos=QOS)
+@pytest.mark.long
 def test_a_recording_names_the_same_qos_to_rosbags(qos: Qos):
     forever = QosTime(9223372036, 854775807)
     theirs = RosbagQos(
