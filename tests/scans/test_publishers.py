@@ -289,6 +289,7 @@ def test_large_map_reaches_early_and_late_readers_in_another_process(spawn, wire
 
 
 @pytest.mark.processes
+@pytest.mark.long
 @pytest.mark.parametrize("wire", ["native", "ros2"])
 def test_large_map_reaches_early_and_late_readers_through_a_router(spawn, free_port: int, wire: str):
     endpoint = f"tcp/127.0.0.1:{free_port}"
