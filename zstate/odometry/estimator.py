@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, TypeAlias
@@ -59,6 +60,7 @@ from zstate.odometry.measurements import (
     pose,
     yaw_curvature,
 )
+from zstate.odometry.measurements import position as measured_position
 from zstate.odometry.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_RATE, MAX_SPEED
 from zstate.odometry.placement import Placement, is_finite, last_pose, placed
 from zstate.odometry.stamp_order import Held, StampOrder
@@ -179,6 +181,8 @@ class BaseEstimator:
         initial_pose: Transform | None = None,
     ) -> None:
         self.odom, self.base = odom, base
+        self._is_continuous = True
+        self._follower: BaseEstimator | None = None
         self.imu_frame = imu
         self.history_s = check_duration("history_s", history_s)
         self._history_ns = round(history_s * 1e9)
@@ -213,6 +217,7 @@ class BaseEstimator:
         self._rotations: list[tuple[int, dict[str, float]]] = []
         """Readings of the wheels, by stamp."""
         self._sources: dict[str, SourceRecord] = {}
+        self._follower = None
         self._restarts: dict[str, tuple[int, str]] = {}
         """By source, when and why it made the estimate start anew."""
         self._placements = 0
@@ -230,6 +235,40 @@ class BaseEstimator:
             self._initial_pose = odom_from_base
         self._begin()
         self.epoch += 1
+
+    def follower(self, odom: str) -> BaseEstimator:
+        """Another estimator with all that this one knows, in the world ``odom``, whose pose may jump.
+
+        It gets all further events of this one, but for poses in this one's ``odom``, placements and new
+        starts. Its states have the estimated pose, where those of this one have the continuous one. The last
+        follower is the only one.
+        """
+        other = copy(self)
+        other.odom, other._is_continuous = odom, False
+        other._log = [copy(event) for event in self._log]
+        other._order = self._order.copied()
+        other._rotations, other._mounts = list(self._rotations), dict(self._mounts)
+        other._sources, other._restarts = deepcopy(self._sources), dict(self._restarts)
+        self._follower, other._follower = other, None
+        return other
+
+    def position(
+        self, stamp: int, position: ArrayLike, covariance: ArrayLike, *, source: str, frame: str
+    ) -> None:
+        """The position of the origin of ``frame`` in ``odom`` at ``stamp`` [m], (3,), as of an antenna.
+
+        ``covariance`` (3, 3) is that of errors that are independent of those of other readings. Raises
+        InvalidInput and UnknownFrame as ``pose``.
+        """
+        measured = checked_vector(position, source, "position", MAX_DISTANCE)
+        noise = checked_noise(None, covariance, 3, source)
+        mount = self._mount(frame)
+
+        def measure(state: FilterState, _: Floats) -> Measurement:
+            return measured_position(state, measured, noise, mount)
+
+        reading = Reading(check_stamp(stamp), measure, is_position=True)
+        self._offer(_Event(source, reading, (*measured.tolist(), *noise.diagonal().tolist())))
 
     def set_pose(self, odom_from_base: Transform) -> None:
         """Place the base now: x, y, z and yaw of ``odom_from_base``, as of the newest event.
@@ -294,10 +333,13 @@ class BaseEstimator:
             )
         stamp = check_stamp(stamp)
         self._mount(frame or self.base)  # raises here, where the mistake is made
-        insert = partial(
-            self._insert_velocity, stamp, measured, frame, source, scale, has_rate=rate is not None
+        self._offer_reading(
+            source,
+            stamp,
+            lambda base: base._insert_velocity(
+                stamp, measured, frame, source, scale, has_rate=rate is not None
+            ),
         )
-        self._offer_reading(source, stamp, insert)
 
     def joints(
         self,
@@ -320,9 +362,10 @@ class BaseEstimator:
                 "BaseEstimator"
             )
         stamp = check_stamp(stamp)
-        if self._wheels is not None:
-            found = check_wheel_positions(self._wheels, positions)
-            self._offer_reading(WHEELS, stamp, partial(self._insert_rotations, self._wheels, stamp, found))
+        wheels = self._wheels
+        if wheels is not None:
+            found = check_wheel_positions(wheels, positions)
+            self._offer_reading(WHEELS, stamp, lambda base: base._insert_rotations(wheels, stamp, found))
         if self._legs is not None:
             numbers = [float(positions.get(name, math.nan)) for name in self._legs.joint_names]
             steps = Steps(stamp, self._legs.feet(positions), velocities, efforts)
@@ -371,7 +414,8 @@ class BaseEstimator:
             return pose(state, matrix, noise, mount)
 
         reading = Reading(check_stamp(stamp), measure, is_position=True)
-        self._offer(_Event(source, reading, (*odom_from_base.pose7.tolist(), *noise.diagonal().tolist())))
+        numbers = (*odom_from_base.pose7.tolist(), *noise.diagonal().tolist())
+        self._offer(_Event(source, reading, numbers), is_shared=False)
 
     def heading(self, stamp: int, yaw: float, sigma: float, *, source: str, frame: str | None = None) -> None:
         """The yaw of ``frame``, by default the base, at ``stamp`` [rad], with a standard deviation.
@@ -508,11 +552,20 @@ class BaseEstimator:
             self._sources[source] = SourceRecord()
         return self._sources[source]
 
-    def _offer(self, event: _Event) -> None:
-        self._offer_reading(event.source, event.reading.stamp, partial(self._insert, event))
+    def _offer(self, event: _Event, *, is_shared: bool = True) -> None:
+        self._offer_reading(
+            event.source, event.reading.stamp, lambda base: base._insert(copy(event)), is_shared=is_shared
+        )
 
-    def _offer_reading(self, source: str, stamp: int, insert: Callable[[], None]) -> None:
-        """Insert a reading, unless it is of another time than the present."""
+    def _offer_reading(
+        self, source: str, stamp: int, insert: Callable[[BaseEstimator], None], *, is_shared: bool = True
+    ) -> None:
+        """Insert a reading, here and in the follower, unless it is of another time than the present."""
+        self._offer_here(source, stamp, partial(insert, self))
+        if self._follower is not None and is_shared:
+            self._follower._offer_reading(source, stamp, insert)
+
+    def _offer_here(self, source: str, stamp: int, insert: Callable[[], None]) -> None:
         record, newest = self._record(source), self._order.newest
         place = self._order.place(source, stamp)
         if place == "present" or newest is None:
@@ -786,10 +839,11 @@ class BaseEstimator:
 
     def _state_of(self, estimate: Estimate) -> BaseState:
         settled = self._fusion.settled(estimate)
-        _, pose_covariance = frame_pose(settled.state, self._imu_from_base)
+        matrix, pose_covariance = frame_pose(settled.state, self._imu_from_base)
         pose_covariance[:2, :2] += yaw_curvature(pose_covariance)
-        matrix, corrected = odom_pose(estimate, self._imu_from_base)
-        pose_covariance += np.outer(corrected, corrected)
+        if self._is_continuous:
+            matrix, corrected = odom_pose(estimate, self._imu_from_base)
+            pose_covariance += np.outer(corrected, corrected)
         density = COASTING_RATE_DENSITY if estimate.is_coasting else self._noise.gyro
         variance = density * density / estimate.sampled_s
         if estimate.vibration is not None:

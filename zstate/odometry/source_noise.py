@@ -72,3 +72,27 @@ def _check_sigma(name: str, sigma: Sigma | None) -> None:
         raise InvalidInput(
             f"{name} is a standard deviation above zero, or three for x, y and z; got {sigma!r}"
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FixNoise:
+    """The noise of the fixes of a GPS receiver.
+
+    ``sigma`` [m] are standard deviations of a position, horizontal and vertical; None if messages have them,
+    as covariances. ``floor`` [m], likewise, are the least that is believed: receivers with corrections (RTK)
+    state millimetres. ``correlated_s`` [s] is for how long the errors of fixes wander before they are others.
+    Raises InvalidInput unless all are finite and above zero.
+    """
+
+    sigma: tuple[float, float] | None = None
+    floor: tuple[float, float] = (0.02, 0.05)
+    correlated_s: float = 20.0
+
+    def __post_init__(self) -> None:
+        for name, values in (
+            ("sigma", self.sigma),
+            ("floor", self.floor),
+            ("correlated_s", (self.correlated_s,)),
+        ):
+            if values is not None and not all(0.0 < value < math.inf for value in values):
+                raise InvalidInput(f"{name} of a GPS receiver is finite and above zero; got {values!r}")

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from copy import copy
 from typing import Literal, NamedTuple, TypeAlias
 
 JUMP_NS = 1_000_000_000
@@ -78,6 +79,12 @@ class StampOrder:
         self._reference = reference
         self._history_ns, self._jump_ns = history_ns, max(history_ns, JUMP_NS)
         self._runs: dict[str, _Run] = {}
+
+    def copied(self) -> StampOrder:
+        """The same present time, without readings that wait: these are inserted where they were read."""
+        other = copy(self)
+        other._runs = {}
+        return other
 
     def place(self, source: str, stamp: int) -> Place:
         """Where a reading of ``source`` is; if that is the present, it may become the newest one."""

@@ -1,0 +1,495 @@
+"""MapEstimator: where a robot is in a map, from its odometry and fixes of GPS receivers.
+
+Two estimators fuse the same events. That of the odometry knows no fix, so its pose stays continuous. That of
+the map begins as a copy of it, as soon as the yaw of the odometry in the map is known, and takes the fixes as
+positions of the antenna. map -> odom is the difference of both at one stamp (REP 105), so it may jump.
+
+- The yaw is found by the way driven (``map_alignment.py``), from any heading, at rest or in motion. Before
+  its standard deviation is below 0.3 rad there is no pose in the map: a filter would not find back from a
+  yaw that is wrong by more.
+- Errors of a fix wander: they are correlated over ``FixNoise.correlated_s``. A filter takes errors as
+  independent, so the variance of each fix is multiplied by (1 + a) / (1 - a), a = exp(-dt / correlated_s)
+  with dt the time since the last one. The mean of many is then as uncertain as it is.
+- A fix is refused if it is further than the 99.9 % gate from where the base is in the map; if it jumps from
+  the last one, less the way driven, by more than a fix is uncertain; or if over half a minute the fixes leave
+  the way by wheels and gyro. Fixes that are refused, but agree with each other and the way for 20 m or for
+  twice ``correlated_s``, are believed: the pose in the map moves there, and velocity and biases stay.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import insort
+from collections import deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.checks import Floats, real_numbers
+from zstate.clock import check_stamp
+from zstate.errors import InPast, InvalidInput, LookupFailed, NoData
+from zstate.odometry.estimator import BaseEstimator, BaseState
+from zstate.odometry.geodesy import Datum, check_place
+from zstate.odometry.health import SourceHealth, chi_square_quantile
+from zstate.odometry.map_alignment import Fixes, MapAlignment, align_in_map, turn
+from zstate.odometry.rotations import skew
+from zstate.odometry.source_noise import FixNoise
+from zstate.transform import Transform
+
+_MOST_YAW_SIGMA = 0.3
+"""[rad] From there on, a filter is consistent."""
+_MOST_SIGMA = 100.0
+"""[m] A fix that is more uncertain says nothing of the place of a robot."""
+_MOST_ALIGNED = 60
+"""So many fixes align the map; if there are more, every second one is left out."""
+_ALIGNED_APART_M, _ALIGNED_APART_S = 0.5, 5.0
+"""Fixes that align it are so far from each other, or so long after each other."""
+_MOST_WAITING = _MOST_KEPT = 1000
+_LEVEL = 0.01
+"""[rad] Roll and pitch are those of the odometry."""
+
+_GATE = 0.999
+_WAY = 0.02
+"""Of a way by wheels, its error is about this part: ``VelocityNoise.scale``."""
+_WANDER_S, _WANDER_SIGMAS = (25.0, 40.0), 5.0
+"""No honest fixes leave the way by so many standard deviations in such a time."""
+_UNPROVEN = 4.0
+"""By how much the variance of fixes is larger than stated, before it was seen: stated are good conditions."""
+_EXCESS_S, _MOST_EXCESS, _LEAST_EXCESS = 60.0, 25.0, 1.0
+"""It is averaged for so long, and has these limits."""
+_BELIEVED_WAY, _BELIEVED_COUNT = 20.0, 10
+"""Of fixes that were refused: [m], and how many they are at least."""
+_TOLD_NS = 30_000_000_000
+_UNKNOWN_HEIGHT = 1e4
+"""[m] The standard deviation of a height that was not measured."""
+_HEIGHT_FACTOR = 10.0
+"""Of a height whose stated noise is that of the position: no satellite is below the horizon."""
+
+
+class MapState(NamedTuple):
+    """``map_from_base`` and ``map_from_odom`` at ``stamp`` [ns].
+
+    ``covariance`` (6, 6) is that of ``map_from_base``, as of ``Transform.covariance``. ``map_from_odom``
+    turns about the vertical only, as gravity shows roll and pitch of both; it has no covariance, as the error
+    of ``map_from_base`` is not the sum of its own and that of the odometry.
+    """
+
+    stamp: int
+    map_from_base: Transform
+    map_from_odom: Transform
+    covariance: Floats
+
+
+class _Fix(NamedTuple):
+    """A fix in the plane of the datum [m], (3,), with its variances [m^2], (3,)."""
+
+    stamp: int
+    there: Floats
+    variances: Floats
+    has_height: bool
+
+
+class _Passed(NamedTuple):
+    """A fix, the antenna in odom at its stamp [m], (3,), and the state of the odometry then."""
+
+    fix: _Fix
+    here: Floats
+    state: BaseState
+
+
+class _Turn(NamedTuple):
+    """From odom to the map: the rotation in the plane, (2, 2), and the variance of its angle [rad^2]."""
+
+    rotation: Floats
+    variance: float
+
+
+@dataclass(slots=True)
+class _Receiver:
+    """What is kept of one receiver, with its antenna at ``lever`` in the base [m], (3,)."""
+
+    frame: str
+    lever: Floats
+    noise: FixNoise
+    waiting: list[_Fix] = field(default_factory=list[_Fix])
+    """Newer than the odometry, by stamp."""
+    aligning: list[_Passed] = field(default_factory=list[_Passed])
+    """Those that align the map."""
+    taken: deque[_Passed] = field(default_factory=lambda: deque[_Passed](maxlen=_MOST_KEPT))
+    """The last ones that were fused."""
+    refused: list[_Passed] = field(default_factory=list[_Passed])
+    """Those since then that were not, and agree with each other."""
+    excess: float = _UNPROVEN
+    """By how much the variance of fixes is larger than stated."""
+    accepted_count: int = 0
+    refused_count: int = 0
+    told: tuple[int, str] = (0, "")
+    """When a fix was last refused, and why."""
+
+
+class MapEstimator:
+    """Where the base of ``odometry`` is in ``map``, by fixes; ``datum`` is the origin of the map.
+
+    The odometry gets its events as before, and this its fixes. Without a ``datum``, the first fix is one.
+    ``buffer`` has the mounts of the antennas, as of ``BaseEstimator``. If the odometry starts anew, so does
+    the map, around the same datum. Not safe for several threads at once.
+    """
+
+    def __init__(
+        self, odometry: BaseEstimator, *, map: str, buffer: TransformBuffer, datum: Datum | None = None
+    ) -> None:
+        self.odometry, self.map, self.datum = odometry, map, datum
+        self._buffer = buffer
+        self._receivers: dict[str, _Receiver] = {}
+        self._in_map: BaseEstimator | None = None
+        self._since = 0
+        """When the map began [ns]."""
+        self._epoch = odometry.epoch
+
+    def fix(
+        self,
+        stamp: int,
+        latitude: float,
+        longitude: float,
+        altitude: float | None = None,
+        *,
+        covariance: ArrayLike | None = None,
+        frame: str,
+        source: str = "gps",
+        noise: FixNoise = FixNoise(),  # noqa: B008 - frozen
+    ) -> None:
+        """The position of an antenna, the origin of ``frame``, at ``stamp`` [ns].
+
+        ``latitude`` and ``longitude`` [deg] and ``altitude`` [m], None if it is not known, are those of
+        WGS84. ``covariance`` (3, 3) [m^2] is that of east, north, up. ``noise`` takes precedence over it.
+        Fixes may come late, as the events of the odometry. Raises InvalidInput, which names the source, for
+        what is no place on the Earth, for (0, 0), which receivers without a fix send, and for an unknown
+        noise; UnknownFrame for the frame.
+        """
+        stamp = check_stamp(stamp)
+        receiver = self._receiver(source, frame, noise)
+        try:
+            check_place(latitude, longitude, altitude or 0.0)
+        except InvalidInput as error:
+            raise InvalidInput(f"a fix of source {source!r}: {error}") from None
+        if latitude == 0.0 and longitude == 0.0:
+            raise InvalidInput(
+                f"a fix of source {source!r} at latitude 0 and longitude 0: receivers send that without a fix"
+            )
+        variances = self._variances(source, covariance, noise)
+        if self.datum is None:
+            if variances[0] > _MOST_SIGMA**2:
+                sigma = math.sqrt(variances[0])
+                self._refuse(receiver, stamp, f"uncertain by {sigma:.3g} m, and so no datum of a map")
+                return
+            self.datum = Datum(latitude, longitude, altitude or 0.0)
+        there = self.datum.enu(latitude, longitude, self.datum.altitude if altitude is None else altitude)
+        insort(
+            receiver.waiting, _Fix(stamp, there, variances, altitude is not None), key=lambda one: one.stamp
+        )
+        del receiver.waiting[:-_MOST_WAITING]
+        self._use_waiting()
+
+    def state(self, at: int | None = None) -> MapState:
+        """The state at the stamp ``at`` [ns]; by default at the newest event.
+
+        Before the yaw in the map is known, raises NoData, with what is missing; otherwise as
+        ``BaseEstimator.state``.
+        """
+        self._use_waiting()
+        if self._in_map is None:
+            error = NoData(self.map, self.odometry.base, edge=(self.map, self.odometry.odom), requested=at)
+            error.note = self._missing()
+            raise error
+        if at is not None and at < self._since:
+            raise InPast(
+                self.map,
+                self.odometry.base,
+                edge=(self.map, self.odometry.odom),
+                requested=check_stamp(at),
+                oldest=self._since,
+                newest=self.odometry.newest,
+            )
+        there = self._in_map.state(at)
+        here = self.odometry.state(there.stamp)
+        yaw = there.odom_from_base.rpy[2] - here.odom_from_base.rpy[2]
+        rotation = np.eye(3)
+        rotation[:2, :2] = turn(yaw)
+        shift = there.odom_from_base.translation - rotation @ here.odom_from_base.translation
+        half = 0.5 * yaw
+        pose7 = (*shift.tolist(), 0.0, 0.0, math.sin(half), math.cos(half))
+        map_from_odom = Transform.from_pose7(self.map, self.odometry.odom, pose7, there.stamp)
+        return MapState(there.stamp, there.odom_from_base, map_from_odom, there.covariance.pose)
+
+    def health(self) -> tuple[SourceHealth, ...]:
+        """The health of each receiver, by name."""
+        self._use_waiting()
+        newest = self.odometry.newest
+        return tuple(
+            self._health(name, receiver, newest) for name, receiver in sorted(self._receivers.items())
+        )
+
+    def _receiver(self, source: str, frame: str, noise: FixNoise) -> _Receiver:
+        found = self._receivers.get(source)
+        if found is None:
+            base_from_antenna = self._buffer.lookup(self.odometry.base, frame)
+            if base_from_antenna.stamp is not None:
+                raise InvalidInput(f"the antenna {frame!r} moves on the robot; fixes need a fixed mount")
+            lever = base_from_antenna.translation
+            found = self._receivers[source] = _Receiver(frame, lever, noise)
+        if (frame, noise) != (found.frame, found.noise):
+            raise InvalidInput(
+                f"source {source!r} has an antenna at {found.frame!r} and one noise; give another receiver "
+                "another name"
+            )
+        return found
+
+    def _variances(self, source: str, covariance: ArrayLike | None, noise: FixNoise) -> Floats:
+        """Of x, y and z [m^2], (3,)."""
+        if noise.sigma is not None:
+            across, up = noise.sigma
+        else:
+            matrix = real_numbers(0.0 if covariance is None else covariance, f"the covariance of {source!r}")
+            if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or matrix.diagonal().min() <= 0.0:
+                raise InvalidInput(
+                    f"fixes of source {source!r} have no covariance (3, 3) with variances above zero: state "
+                    "their noise, as FixNoise(sigma=(1.5, 5.0)) [m]"
+                )
+            across = math.sqrt(float(np.linalg.eigvalsh(matrix[:2, :2])[1]))
+            up = math.sqrt(float(matrix[2, 2]))
+            up = up if up > across else _HEIGHT_FACTOR * across
+        least_across, least_up = noise.floor
+        across, up = max(across, least_across), max(up, least_up)
+        return np.square((across, across, up))
+
+    def _use_waiting(self) -> None:
+        """Use the fixes that the odometry has come up to."""
+        if self.odometry.epoch != self._epoch:
+            self._epoch, self._in_map = self.odometry.epoch, None
+            for receiver in self._receivers.values():
+                receiver.aligning, receiver.refused = [], []
+                receiver.taken.clear()
+        for name, receiver in self._receivers.items():
+            while receiver.waiting and receiver.waiting[0].stamp <= self.odometry.newest:
+                try:
+                    here = self.odometry.state(receiver.waiting[0].stamp)
+                except NoData:
+                    break  # not aligned yet
+                except LookupFailed:
+                    fix = receiver.waiting.pop(0)
+                    self._refuse(receiver, fix.stamp, "too late; raise history_s")
+                    continue
+                passed = _Passed(receiver.waiting.pop(0), _point(here.odom_from_base, receiver.lever), here)
+                if self._in_map is None:
+                    self._align(receiver, passed)
+                else:
+                    self._fuse(self._in_map, name, receiver, passed)
+
+    def _align(self, receiver: _Receiver, passed: _Passed) -> None:
+        kept = receiver.aligning
+        if kept and not _is_apart(kept[-1], passed):
+            return
+        kept.append(passed)
+        if len(kept) > _MOST_ALIGNED:
+            del kept[1:-1:2]
+        alignment = self._alignment(receiver)
+        now = self.odometry.state()
+        grown = np.maximum(now.covariance.pose.diagonal() - kept[0].state.covariance.pose.diagonal(), 0.0)
+        if alignment.yaw_variance + grown[5] > _MOST_YAW_SIGMA**2:
+            return
+        base = now.odom_from_base
+        known = np.diag((*grown[:3], _LEVEL**2, _LEVEL**2, grown[5]))
+        known[np.ix_((0, 1, 5), (0, 1, 5))] += alignment.covariance(base.translation[:2])
+        heights = [one.fix.there[2] - one.here[2] for one in kept if one.fix.has_height]
+        variance = max(one.fix.variances[2] for one in kept) if heights else _UNKNOWN_HEIGHT**2
+        known[2, 2] += variance
+        height = float(np.mean(heights)) if heights else 0.0
+        place = (*alignment.place(base.translation[:2]).tolist(), float(base.translation[2]) + height)
+        rotation = (0.0, 0.0, base.rpy[2] + alignment.yaw)
+        self._in_map, self._since = self.odometry.follower(self.map), now.stamp
+        self._in_map.set_pose(
+            Transform.from_rpy(self.map, self.odometry.base, place, rotation).with_covariance(known)
+        )
+        receiver.taken.extend(kept[-1:])
+
+    def _alignment(self, receiver: _Receiver) -> MapAlignment:
+        kept = receiver.aligning
+        fixes = Fixes(
+            np.array([(one.fix.stamp - kept[0].fix.stamp) * 1e-9 for one in kept]),
+            np.array([one.fix.there[:2] for one in kept]),
+            np.array([one.here[:2] for one in kept]),
+            receiver.excess * np.array([one.fix.variances[0] for one in kept]),
+        )
+        return align_in_map(fixes, receiver.noise.correlated_s)
+
+    def _fuse(self, in_map: BaseEstimator, name: str, receiver: _Receiver, passed: _Passed) -> None:
+        fix = passed.fix
+        if fix.stamp < self._since:
+            return
+        there = in_map.state(fix.stamp)
+        antenna = _point(there.odom_from_base, receiver.lever)
+        yaw = there.odom_from_base.rpy[2] - passed.state.odom_from_base.rpy[2]
+        map_from_odom = _Turn(turn(yaw), float(there.covariance.pose[5, 5]))
+        covariance = _point_covariance(there, receiver.lever)[:2, :2]
+        covariance = covariance + receiver.excess * np.diag(fix.variances[:2])
+        reason = _reason(receiver, passed, antenna, covariance, map_from_odom)
+        if reason:
+            self._refuse(receiver, fix.stamp, reason)
+            run = receiver.refused
+            if run and not _agree(run[0], passed, map_from_odom):
+                run.clear()
+            run.append(passed)
+            if not _is_believed(run, receiver.noise):
+                return
+            away = float(np.hypot(*(fix.there - antenna)[:2]))
+            newest = in_map.state()
+            known = newest.covariance.pose + np.diag((away**2, away**2, 0.0, 0.0, 0.0, 0.0))
+            in_map.set_pose(newest.odom_from_base.with_covariance(known))
+        factor = _correlation_factor(receiver, fix)
+        if factor is None:
+            return  # the same fix again
+        measured, noise = fix.there.copy(), fix.variances * (factor * receiver.excess)
+        if not fix.has_height:
+            measured[2], noise[2] = antenna[2], _UNKNOWN_HEIGHT**2
+        in_map.position(fix.stamp, measured, np.diag(noise), source=name, frame=receiver.frame)
+        receiver.accepted_count += 1
+        receiver.refused.clear()
+        receiver.excess = _excess_after(receiver, passed, map_from_odom)
+        receiver.taken.append(passed)
+
+    def _refuse(self, receiver: _Receiver, stamp: int, reason: str) -> None:
+        receiver.refused_count += 1
+        receiver.told = (stamp, reason)
+
+    def _missing(self) -> str:
+        if not any(receiver.aligning for receiver in self._receivers.values()):
+            return "no fix yet at a known pose of the odometry"
+        sigma = min(
+            self._alignment(receiver).yaw_variance
+            for receiver in self._receivers.values()
+            if receiver.aligning
+        )
+        if sigma > math.pi**2:
+            return "the yaw of the odometry in the map is not known; drive some metres"
+        degrees = math.degrees(math.sqrt(sigma))
+        return f"the yaw of the odometry in the map is known to {degrees:.0f} degrees; drive on, to 17"
+
+    def _health(self, name: str, receiver: _Receiver, newest: int) -> SourceHealth:
+        stamps = [one.fix.stamp for one in receiver.taken]
+        span = max(stamps) - min(stamps) if stamps else 0
+        rate = (len(stamps) - 1) / (span * 1e-9) if span else 0.0
+        age_s = (newest - max(stamps)) * 1e-9 if stamps else math.inf
+        at, reason = receiver.told
+        found = list[str]()
+        if self._in_map is None:
+            found.append(self._missing())
+        if reason and newest - at < _TOLD_NS:
+            found.append(f"{receiver.refused_count} fixes refused, the last one as it is {reason}")
+        sentence = f"{name}: {'; '.join(found)}" if found else ""
+        return SourceHealth(
+            name,
+            rate,
+            age_s,
+            math.nan,
+            (math.nan, math.nan),
+            0,
+            receiver.accepted_count,
+            receiver.refused_count,
+            0,
+            0,
+            sentence,
+        )
+
+
+def _point(world_from_base: Transform, lever: Floats) -> Floats:
+    return world_from_base.translation + world_from_base.matrix[:3, :3] @ lever
+
+
+def _point_covariance(state: BaseState, lever: Floats) -> Floats:
+    """That of the antenna in the world [m^2], (3, 3)."""
+    jacobian = np.hstack((np.eye(3), -skew(state.odom_from_base.matrix[:3, :3] @ lever)))
+    return jacobian @ state.covariance.pose @ jacobian.T
+
+
+def _is_apart(last: _Passed, passed: _Passed) -> bool:
+    way = float(np.hypot(*(passed.here - last.here)[:2]))
+    return way >= _ALIGNED_APART_M or passed.fix.stamp - last.fix.stamp >= _ALIGNED_APART_S * 1e9
+
+
+def _difference(first: _Passed, second: _Passed, map_from_odom: _Turn) -> tuple[float, float]:
+    """By how much the way between two fixes is not that by wheels and gyro [m], and the variance of that.
+
+    The variance is of both fixes, and of the way.
+    """
+    way = (second.here - first.here)[:2]
+    apart = (second.fix.there - first.fix.there)[:2] - map_from_odom.rotation @ way
+    of_way = (_WAY**2 + map_from_odom.variance) * float(way @ way)
+    variance = first.fix.variances[0] + second.fix.variances[0] + of_way
+    return float(np.hypot(*apart)), variance
+
+
+def _reason(
+    receiver: _Receiver, passed: _Passed, antenna: Floats, covariance: Floats, map_from_odom: _Turn
+) -> str:
+    """Why a fix is refused; empty if it is not."""
+    gate = chi_square_quantile(_GATE, 2)
+    apart = (passed.fix.there - antenna)[:2]
+    if float(apart @ np.linalg.solve(covariance, apart)) > gate:
+        return f"{np.hypot(*apart):.1f} m from where wheels, gyro and earlier fixes lead"
+    if not receiver.taken:
+        return ""
+    elapsed_s = (passed.fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9
+    if elapsed_s < receiver.noise.correlated_s:
+        jump, variance = _difference(receiver.taken[-1], passed, map_from_odom)
+        if jump * jump > gate * 0.5 * receiver.excess * variance:
+            return f"{jump:.1f} m from the one before, but for the way by wheels and gyro"
+    for earlier in receiver.taken:
+        elapsed_s = (passed.fix.stamp - earlier.fix.stamp) * 1e-9
+        if _WANDER_S[0] <= elapsed_s <= _WANDER_S[1]:
+            wander, variance = _difference(earlier, passed, map_from_odom)
+            if wander > _WANDER_SIGMAS * math.sqrt(_UNPROVEN * variance):
+                return f"{wander:.1f} m off the way by wheels and gyro since one {elapsed_s:.0f} s before"
+            break
+    return ""
+
+
+def _excess_after(receiver: _Receiver, passed: _Passed, map_from_odom: _Turn) -> float:
+    """By how much the variance of fixes is larger than stated, by the change of their errors in some time."""
+    tau_s = receiver.noise.correlated_s
+    for earlier in reversed(receiver.taken):
+        elapsed_s = (passed.fix.stamp - earlier.fix.stamp) * 1e-9
+        if elapsed_s >= tau_s:
+            break
+    else:
+        return receiver.excess
+    wander, variance = _difference(earlier, passed, map_from_odom)
+    seen = min(wander * wander / (2.0 * variance * (1.0 - math.exp(-elapsed_s / tau_s))), _MOST_EXCESS)
+    share = 1.0 - math.exp(-(passed.fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9 / _EXCESS_S)
+    return max(receiver.excess + share * (seen - receiver.excess), _LEAST_EXCESS)
+
+
+def _agree(first: _Passed, second: _Passed, map_from_odom: _Turn) -> bool:
+    apart, variance = _difference(first, second, map_from_odom)
+    return apart * apart <= chi_square_quantile(_GATE, 2) * variance
+
+
+def _is_believed(run: list[_Passed], noise: FixNoise) -> bool:
+    """Whether fixes that were refused, and agree, are right after all."""
+    way = float(np.hypot(*(run[-1].here - run[0].here)[:2]))
+    elapsed_s = (run[-1].fix.stamp - run[0].fix.stamp) * 1e-9
+    return len(run) >= _BELIEVED_COUNT and (way >= _BELIEVED_WAY or elapsed_s >= 2.0 * noise.correlated_s)
+
+
+def _correlation_factor(receiver: _Receiver, fix: _Fix) -> float | None:
+    """By how much the variance of a fix counts more, as its error is that of the last one.
+
+    None for the same fix again.
+    """
+    if not receiver.taken:
+        return 1.0
+    elapsed_s = abs(fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9
+    kept = math.exp(-elapsed_s / receiver.noise.correlated_s)
+    return None if kept == 1.0 else (1.0 + kept) / (1.0 - kept)
