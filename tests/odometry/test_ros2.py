@@ -323,6 +323,20 @@ def test_a_velocity_is_the_same_after_ros(
 
 
 @given(
+    st.none() | st.tuples(st.floats(-90, 90), st.floats(-180, 180), st.none() | st.floats(-1e8, 1e8)),
+    st.sampled_from([-2, -1, 0, 1, 2]),
+    st.integers(0, 65535),
+    st.integers(0, 3),
+)
+def test_a_fix_is_the_same_after_ros(position: Any, status: int, service: int, kind: int):
+    if position is None:
+        status, kind = min(status, -1), 0
+    covariance = triangle(symmetric(3)) if kind else None
+    fix = Fix(*HEAD, "gps", *(position or [None] * 3), status, service, covariance, kind)
+    assert decoded("fix", encoded(fix)) == fix
+
+
+@given(
     st.binary(max_size=400), st.sampled_from(["imu", "velocity", "pose", "fix", "odometry"]), st.booleans()
 )
 def test_arbitrary_bytes_raise_only_message_error(data: bytes, stream: Any, has_header: bool):
