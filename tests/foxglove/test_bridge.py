@@ -30,7 +30,7 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.stream_publisher import StreamPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.odometry import OdometryPublisher
+from zstate.odometry import FixPublisher, OdometryPublisher
 from zstate.recording.recorder import Recorder
 from zstate.se3 import to_matrix
 from zstate.sources import SineSource
@@ -165,6 +165,7 @@ def test_messages_have_the_bytes_of_a_recording(sessions, serve, tmp_path: Path)
         robot = opened.enter_context(StatePublisher(writer, RRBOT, "r1"))
         wheels = opened.enter_context(OdometryPublisher(writer, "r1", "wheels"))
         tracker = opened.enter_context(TransformPublisher(writer, "r1", "tracker"))
+        gps = opened.enter_context(FixPublisher(writer, "r1", "gps"))
         client = opened.enter_context(FoxgloveClient(serve("r1").url))
         recorder = opened.enter_context(Recorder(reader, path, ["r1"]))
 
@@ -176,11 +177,12 @@ def test_messages_have_the_bytes_of_a_recording(sessions, serve, tmp_path: Path)
             )
             ball = Transform("world", "ball", place, UPRIGHT).with_covariance(np.eye(6))
             tracker.publish([ball], stamp)
+            gps.publish(47.5, 8.0 + k, None, stamp, covariance=np.eye(3))
 
         def received(number: int, *topics: str) -> bool:
             return all(len(client.frames.get(topic, ())) == number for topic in topics)
 
-        client.subscribe(*TOPICS, "/wheels")
+        client.subscribe(*TOPICS, "/wheels", "/gps")
         until(lambda: Counter(one.stream for one in discover_readers(writer, 0.3))["transforms"] == 2)
         publish(0)
         client.until(lambda: received(3, "/tf"))
@@ -188,9 +190,9 @@ def test_messages_have_the_bytes_of_a_recording(sessions, serve, tmp_path: Path)
         client.drain()
         for k in range(1, 10):
             publish(k)
-        client.until(lambda: received(30, "/tf") and received(10, "/wheels", "/joint_states"))
+        client.until(lambda: received(30, "/tf") and received(10, "/wheels", "/gps", "/joint_states"))
         client.until(lambda: received(9, "/pose_with_covariance/ball"))
-        for topic in (*TOPICS, "/wheels"):
+        for topic in (*TOPICS, "/wheels", "/gps"):
             client.unsubscribe(topic)
         client.drain()
         publish(10)  # covariances are received without /tf

@@ -25,6 +25,7 @@ from zstate.net.subscription import Received, subscribe
 from zstate.odometry import (
     BaseEstimator,
     DiffDrive,
+    FixPublisher,
     ImuNoise,
     ImuPublisher,
     OdometryNode,
@@ -34,7 +35,7 @@ from zstate.odometry import (
     VelocityNoise,
     VelocityPublisher,
 )
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
 from zstate.odometry.node import pose_covariance, velocity_covariance
 from zstate.odometry.requests import request_odometry
 from zstate.odometry.simulated_rover import SimulatedRover
@@ -284,6 +285,7 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
     readings: list[tuple[str, Imu]] = []
     velocities: list[tuple[str, Velocity]] = []
     poses: list[tuple[str, Pose]] = []
+    fixes: list[tuple[str, Fix]] = []
     base = Transform("map", "base", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     with (
         SensorListener(
@@ -292,12 +294,14 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
             on_imu=lambda sensor, imu: readings.append((sensor, imu)),
             on_velocity=lambda sensor, velocity: velocities.append((sensor, velocity)),
             on_pose=lambda sensor, pose: poses.append((sensor, pose)),
+            on_fix=lambda sensor, fix: fixes.append((sensor, fix)),
             wire=wire,
         ) as listener,
         ImuPublisher(writer, "r1", "chest", wire, frame="imu_link") as chest,
         ImuPublisher(writer, "r1", "head", wire) as head,
         VelocityPublisher(writer, "r1", "flow", wire) as flow,
         PosePublisher(writer, "r1", "mocap", wire) as mocap,
+        FixPublisher(writer, "r1", "gps", wire) as gps,
     ):
 
         def publish() -> bool:
@@ -305,12 +309,14 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
             head.publish([2, 0, 0], [0, 0, 9.81])
             flow.publish([3, 0, 0])
             mocap.publish(base)
-            return len({sensor for sensor, _ in readings}) == 2 and bool(velocities and poses)
+            gps.publish(47.5, 8.25)
+            return len({sensor for sensor, _ in readings}) == 2 and bool(velocities and poses and fixes)
 
         until(publish)
         frames = {sensor: imu.frame for sensor, imu in readings}
         assert frames == {"chest": "r1/imu_link", "head": "r1/head"}
         assert {(sensor, one.frame) for sensor, one in velocities} == {("flow", "r1/flow")}
+        assert {(sensor, one.frame, one.latitude) for sensor, one in fixes} == {("gps", "r1/gps", 47.5)}
         child = {"native": "r1/base", "ros2": ""}[wire]  # ROS does not name it
         assert {(sensor, one.parent, one.child) for sensor, one in poses} == {("mocap", "r1/map", child)}
         assert listener.refused == {}

@@ -1,4 +1,4 @@
-"""Publishers of IMUs, velocities and odometry, read back from the network."""
+"""Publishers of IMUs, velocities, fixes and odometry, read back from the network."""
 
 from __future__ import annotations
 
@@ -19,8 +19,14 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+from zstate.odometry import (
+    FixPublisher,
+    ImuPublisher,
+    OdometryPublisher,
+    PosePublisher,
+    VelocityPublisher,
+)
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
 from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.messages import Message, covariance_matrix, covariances_of, from_block
@@ -104,6 +110,54 @@ def test_pose_arrives_as_it_was_published(sessions):
     assert known.covariance is not None
     assert covariance_matrix(known.covariance).tolist() == POSE_COVARIANCE.tolist()
     assert (poses[-1].stamp, from_block(poses[-1].pose)[0]) == (7, 2.0)
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_fix_arrives_as_it_was_published_and_so_does_that_there_is_none(sessions, wire: str):
+    writer, reader = sessions
+    fixes = Messages(reader, "fix", wire)
+    covariance = np.array([[1.0, 0.5, 0.0], [0.5, 2.0, 0.25], [0.0, 0.25, 9.0]])
+    with FixPublisher(writer, "r1", "gps", [wire], frame="mast", clock=ManualClock(7)) as publisher:
+        known = fixes.first(
+            lambda: publisher.publish(
+                *(47.5, -8.25, 450.0, 5),
+                **{"covariance": covariance, "covariance_type": 1, "status": 2, "service": 9},
+            )
+        )
+        publisher.publish(47.5, -8.25, covariance=covariance)
+        publisher.publish(None, None, status=-1)
+        until(lambda: fixes[-1].status == -1)
+    assert isinstance(known, Fix)
+    assert (known.stamp, known.frame) == (5, "mast")
+    assert (known.latitude, known.longitude, known.altitude) == (47.5, -8.25, 450.0)
+    assert (known.status, known.service, known.covariance_type) == (2, 9, 1)
+    assert known.covariance is not None
+    assert covariance_matrix(known.covariance).tolist() == covariance.tolist()
+    level, none = fixes[-2:]
+    assert (level.stamp, level.altitude, level.status, level.covariance_type) == (7, None, 0, 3)
+    assert (none.latitude, none.longitude, none.covariance, none.covariance_type) == (None, None, None, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "text"),
+    [
+        ((4730.5, 8.0), {}, "latitudes are within 90 degrees"),
+        ((None, None), {}, r"the status is -1 \(no fix\)"),
+        (([47.0], 8.0), {}, r"latitude is one number; got shape \(1,\)"),
+        (("47", 8.0), {}, "latitude must be real numbers, not text"),
+        ((47.0, 8.0), {"covariance": np.ones(3)}, r"covariance has shape \(3, 3\); got \(3,\)"),
+        ((47.0, 8.0), {"covariance": np.eye(3), "covariance_type": 0}, "got 0 with one"),
+        ((47.0, 8.0), {"status": 4}, "got 4"),
+    ],
+)
+def test_wrong_fix_is_refused_and_counted(
+    sessions, arguments: tuple[Any, ...], options: dict[str, Any], text: str
+):
+    with FixPublisher(sessions[0], "r1") as publisher:
+        with pytest.raises(InvalidInput, match=text):
+            publisher.publish(*arguments, **options)
+        assert (publisher.sensor, publisher.frame) == ("fix", "fix")
+        assert (publisher.stats.sent, publisher.stats.refused) == (0, 1)
 
 
 @pytest.mark.parametrize(

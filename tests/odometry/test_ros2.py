@@ -1,4 +1,4 @@
-"""IMUs, velocities and odometry as ROS 2 messages; rosbags is the independent encoder."""
+"""IMUs, velocities, fixes and odometry as ROS 2 messages; rosbags is the independent encoder."""
 
 from __future__ import annotations
 
@@ -13,14 +13,20 @@ from mcap_ros2._dynamic import generate_dynamic
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import MAX_RATE, MAX_SPEED, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import MAX_RATE, MAX_SPEED, Fix, Imu, Odometry, Pose, Velocity
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import Message, from_block, order_digest, to_block
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
-from zstate.wire.ros2.types import IMU, ODOMETRY, POSE_WITH_COVARIANCE, TWIST_WITH_COVARIANCE
+from zstate.wire.ros2.types import (
+    IMU,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    POSE_WITH_COVARIANCE,
+    TWIST_WITH_COVARIANCE,
+)
 
 STAMP = 1_700_000_000_123_456_789
 PLAIN, PREFIXED = FrameNames(Ros2Options(), "r1"), FrameNames(Ros2Options(frame_prefix="r1/"), "r1")
@@ -80,6 +86,20 @@ def rosbags_pose(covariance: Any, rotation: Any = POSE[3:], frame: str = "map") 
     return rosbags_cdr(POSE_WITH_COVARIANCE.name, header(frame), rosbags_pose_part(covariance, rotation))
 
 
+def rosbags_fix(
+    position: Any,
+    covariance: Any,
+    kind: int = 3,
+    status: int = 0,
+    service: int = 0,
+    **options: bool,
+) -> bytes:
+    state = STORE.types["sensor_msgs/msg/NavSatStatus"](status, service)
+    matrix = np.array(covariance, dtype=float).ravel()
+    fields = (header("gps"), state, *map(float, position), matrix, kind)
+    return rosbags_cdr(NAV_SAT_FIX.name, *fields, **options)
+
+
 def rosbags_odometry(
     pose_covariance: Any, twist_covariance: Any, parent: str = "odom", **options: bool
 ) -> bytes:
@@ -106,6 +126,7 @@ NONE, ABSENT = np.zeros((3, 3)), [-1.0, *[0.0] * 8]
 NAN3 = [np.nan] * 3
 LINEAR_ONLY = np.full((6, 6), np.nan)
 LINEAR_ONLY[:3, :3] = symmetric(3)
+PLACE = (47.5, -8.25, 450.0)
 ODOMETRY_HEAD = (*HEAD, order_digest(EDGE), to_block(POSE), EDGE)
 
 CASES = [
@@ -142,6 +163,24 @@ CASES = [
         rosbags_pose(symmetric(6)),
     ),
     ("pose", Pose(*HEAD, "map", "", to_block(POSE)), rosbags_pose(np.zeros((6, 6)))),
+    ("fix", Fix(*HEAD, "gps", *PLACE), rosbags_fix(PLACE, NONE, 0)),
+    *(
+        (
+            "fix",
+            Fix(*HEAD, "gps", *PLACE, 2, 0x8009, triangle(symmetric(3)), kind),
+            rosbags_fix(PLACE, symmetric(3), kind, 2, 0x8009),
+        )
+        for kind in (1, 2, 3)
+    ),
+    # without an altitude, without a fix, and without a position
+    (
+        "fix",
+        Fix(*HEAD, "gps", *PLACE[:2], None, 0, 1, triangle(symmetric(3)), 1),
+        rosbags_fix([*PLACE[:2], np.nan], symmetric(3), 1, 0, 1),
+    ),
+    ("fix", Fix(*HEAD, "gps", *PLACE, -1, 1), rosbags_fix(PLACE, NONE, 0, -1, 1)),
+    ("fix", Fix(*HEAD, "gps", None, None, status=-1), rosbags_fix(NAN3, NONE, 0, -1)),
+    ("fix", Fix(*HEAD, "gps", None, None, status=-2), rosbags_fix(NAN3, NONE, 0, -2)),
     (
         "odometry",
         Odometry(*ODOMETRY_HEAD, None, to_block(TWIST), None),
@@ -160,6 +199,8 @@ def test_messages_of_big_endian_machines_are_read_too():
     covariances = symmetric(6), symmetric(6, 50)
     turned = rosbags_odometry(*covariances, little_endian=False)
     assert decoded("odometry", turned) == decoded("odometry", rosbags_odometry(*covariances))
+    fix = PLACE, symmetric(3), 3, -1, 0x8009
+    assert decoded("fix", rosbags_fix(*fix, little_endian=False)) == decoded("fix", rosbags_fix(*fix))
 
 
 def test_mcap_ros2_support_decodes_measurements():
@@ -175,12 +216,34 @@ def test_mcap_ros2_support_decodes_measurements():
     assert (theirs.header.frame_id, theirs.child_frame_id) == ("odom", "base")
     assert (theirs.pose.pose.orientation.w, theirs.twist.twist.angular.x) == (0.8, 0.4)
     assert list(theirs.twist.covariance) == symmetric(6, 50).ravel().tolist()
+    fix = Fix(*HEAD, "gps", *PLACE, -1, 9, triangle(symmetric(3)), 2)
+    theirs = generate_dynamic(NAV_SAT_FIX.name, NAV_SAT_FIX.definition)[NAV_SAT_FIX.name](encoded(fix))
+    assert (theirs.status.status, theirs.status.service, theirs.longitude) == (-1, 9, -8.25)
+    assert list(theirs.position_covariance) == symmetric(3).ravel().tolist()
+    assert theirs.position_covariance_type == 2
 
 
 def test_orientation_of_zeros_is_none():
     # what an uninitialised geometry_msgs/Quaternion of ROS 1 has; it is no rotation
     reading = decoded("imu", rosbags_imu([0, 0, 0, 0], [symmetric(3), NONE, NONE]))
     assert reading.orientation is reading.orientation_covariance is None
+
+
+NAN_DIAGONAL = np.diag(NAN3)
+
+
+@pytest.mark.parametrize(
+    ("covariance", "kind"), [(symmetric(3), 0), (NONE, 3), (NAN_DIAGONAL, 3), (np.diag([1, 1, np.nan]), 2)]
+)
+def test_covariance_of_a_fix_of_type_0_of_zeros_or_with_nan_is_not_known(covariance: Any, kind: int):
+    fix = decoded("fix", rosbags_fix(PLACE, covariance, kind))
+    assert (fix.latitude, fix.covariance, fix.covariance_type) == (PLACE[0], None, 0)
+
+
+def test_nothing_but_status_and_service_is_taken_from_a_fix_without_a_position():
+    for position in ([np.nan, 8.0, 450.0], [47.0, np.inf, 450.0]):
+        fix = decoded("fix", rosbags_fix(position, -symmetric(3), 3, -1, 9))
+        assert fix == Fix(*HEAD, "gps", None, None, status=-1, service=9)
 
 
 @pytest.mark.parametrize(
@@ -202,6 +265,14 @@ def test_orientation_of_zeros_is_none():
         ("velocity", rosbags_velocity([*NAN3, *NAN3], LINEAR_ONLY), "malformed", "finite numbers"),
         ("pose", rosbags_pose(symmetric(6), [0, 0, 0, 0]), "malformed", "length 1, not 0"),
         ("pose", rosbags_pose(-symmetric(6)), "malformed", "variances of a pose are not negative"),
+        ("fix", rosbags_fix(NAN3, NONE, 0), "malformed", "a fix of status 0 .* the status is -1"),
+        ("fix", rosbags_fix([91.0, 8.0, 0.0], NONE, 0), "malformed", "latitudes are within 90"),
+        ("fix", rosbags_fix([47.0, 8.0, np.inf], NONE, 0), "malformed", "an altitude of finite"),
+        ("fix", rosbags_fix(PLACE, NONE, 0, 3), "malformed", "status of a fix .* got 3"),
+        ("fix", rosbags_fix(PLACE, symmetric(3), 4), "malformed", "type of a covariance .* got 4"),
+        ("fix", rosbags_fix(PLACE, np.triu(symmetric(3))), "malformed", "symmetric and finite"),
+        ("fix", rosbags_fix(PLACE, -symmetric(3)), "malformed", "variances of a fix are not negative"),
+        ("fix", rosbags_fix(PLACE, NONE, 0)[:-1], "truncated", "1 more are expected"),
         ("odometry", rosbags_odometry(symmetric(6) * np.inf, symmetric(6)), "malformed", "finite"),
     ],
 )
@@ -251,7 +322,23 @@ def test_a_velocity_is_the_same_after_ros(
     assert decoded("velocity", encoded(velocity)) == velocity
 
 
-@given(st.binary(max_size=400), st.sampled_from(["imu", "velocity", "pose", "odometry"]), st.booleans())
+@given(
+    st.none() | st.tuples(st.floats(-90, 90), st.floats(-180, 180), st.none() | st.floats(-1e8, 1e8)),
+    st.sampled_from([-2, -1, 0, 1, 2]),
+    st.integers(0, 65535),
+    st.integers(0, 3),
+)
+def test_a_fix_is_the_same_after_ros(position: Any, status: int, service: int, kind: int):
+    if position is None:
+        status, kind = min(status, -1), 0
+    covariance = triangle(symmetric(3)) if kind else None
+    fix = Fix(*HEAD, "gps", *(position or [None] * 3), status, service, covariance, kind)
+    assert decoded("fix", encoded(fix)) == fix
+
+
+@given(
+    st.binary(max_size=400), st.sampled_from(["imu", "velocity", "pose", "fix", "odometry"]), st.booleans()
+)
 def test_arbitrary_bytes_raise_only_message_error(data: bytes, stream: Any, has_header: bool):
     payload = b"\x00\x01\x00\x00" + data if has_header else data
     try:

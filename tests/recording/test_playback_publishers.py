@@ -24,7 +24,13 @@ from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+from zstate.odometry import (
+    FixPublisher,
+    ImuPublisher,
+    OdometryPublisher,
+    PosePublisher,
+    VelocityPublisher,
+)
 from zstate.odometry.messages import Odometry
 from zstate.recording.decode import DecodedRecording
 from zstate.recording.player import Player
@@ -48,10 +54,10 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
 
 SCAN_STREAMS = ("scan", "map")
-ODOMETRY_STREAMS = ("imu", "velocity", "pose", "odometry")
+ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "odometry")
 
 COUNT = 20
-SENSORS = ("imu/chest", "velocity/flow", "pose/mocap", "odometry/wheels")
+SENSORS = ("imu/chest", "velocity/flow", "pose/mocap", "fix/gps", "odometry/wheels")
 CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
 
 
@@ -398,7 +404,7 @@ def test_an_active_sensor_is_not_replayed(sessions, scanned: Path):
 
 @pytest.fixture
 def driven(sessions, tmp_path: Path) -> Path:
-    """A cart with an IMU, a velocity, poses and odometry, recorded from the native wire."""
+    """A cart with an IMU, a velocity, poses, fixes and odometry, recorded from the native wire."""
     writer, reader = sessions
     path = tmp_path / "driven.mcap"
     with (
@@ -406,6 +412,7 @@ def driven(sessions, tmp_path: Path) -> Path:
         VelocityPublisher(writer, "cart", "flow") as velocity,
         OdometryPublisher(writer, "cart", "wheels") as odometry,
         PosePublisher(writer, "cart", "mocap") as mocap,
+        FixPublisher(writer, "cart", "gps") as gps,
         Recorder(reader, path, ["cart"]) as recorder,
     ):
         wait_for_stream_readers(writer, "cart", *SENSORS)
@@ -416,7 +423,11 @@ def driven(sessions, tmp_path: Path) -> Path:
             base = Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1]).with_covariance(np.eye(6) * (n + 1))
             odometry.publish(base, [n, 0, 0], [0, 0, 0], stamp)
             mocap.publish(base, stamp)
-        until(lambda: measured(recorder) == 4 * COUNT)
+            if n % 2:
+                gps.publish(47.5, n, 450.0, stamp, covariance=np.eye(3) * (n + 1), status=2, service=9)
+            else:
+                gps.publish(None, None, None, stamp, status=-1)
+        until(lambda: measured(recorder) == len(SENSORS) * COUNT)
     return path
 
 
@@ -444,9 +455,9 @@ def test_sensors_and_odometry_are_replayed_as_they_were_recorded(sessions, drive
         wait_for_stream_readers(writer, "cart", *SENSORS)
         with Player(writer, driven) as player:
             report = player.run()
-        until(lambda: measured(recorder) == 4 * COUNT)
+        until(lambda: measured(recorder) == len(SENSORS) * COUNT)
         found = listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=DEADLINE_S)
-    assert (report.samples, report.refused) == (4 * COUNT, {})
+    assert (report.samples, report.refused) == (len(SENSORS) * COUNT, {})
     assert messages(again) == messages(driven)
     assert found.translation[0] == 5.0
     assert found.covariance == pytest.approx(np.eye(6) * 6)
@@ -462,7 +473,7 @@ def test_odometry_is_replayed_to_ros_with_its_edge_on_tf(sessions, driven: Path)
     ):
         for stream, name in (("odometry", "wheels"), ("tf", "")):
             wait_for_reader(writer, RmwKeys(Ros2Options()).key("cart", stream, name))
-        assert player.run().samples == 5 * COUNT
+        assert player.run().samples == (len(SENSORS) + 1) * COUNT
         assert (
             listener.buffer.wait("odom", "base", START + 50 * MS, timeout_s=DEADLINE_S).translation[0] == 5.0
         )

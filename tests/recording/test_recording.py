@@ -24,7 +24,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from zstate import Recording, UnknownFrame
 from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
-from zstate.odometry.messages import Imu, Pose
+from zstate.odometry.messages import Fix, Imu, Pose
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
 from zstate.wire.joint_order import SampleLayout
@@ -32,7 +32,7 @@ from zstate.wire.messages import to_block, to_float32_block
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
-from zstate.wire.ros2.types import IMU, LASER_SCAN, OCCUPANCY_GRID, POSE_WITH_COVARIANCE
+from zstate.wire.ros2.types import IMU, LASER_SCAN, NAV_SAT_FIX, OCCUPANCY_GRID, POSE_WITH_COVARIANCE
 
 
 def test_repr_has_duration_and_robots(tmp_path: Path):
@@ -294,12 +294,21 @@ def test_sensors_of_a_bag_are_those_of_its_robots_whatever_their_namespace(tmp_p
         bag.joints(START, {"wheel": 1.0}, "/r1/joint_states")
         for topic in ("/imu/data", "/r1/imu/data"):
             bag.write(topic, START, STORE.deserialize_cdr(encoder.encode(reading), IMU.name), IMU.name)
+        for place in ((47.5, 8.0, None, 0), (None, None, None, -1)):
+            data = encoder.encode(Fix(START, 0, 1, "antenna", *place))
+            message = STORE.deserialize_cdr(data, NAV_SAT_FIX.name)
+            bag.write("/r1/gps/fix", START, message, NAV_SAT_FIX.name)
     with Recording(tmp_path / "bag") as recording:
         assert recording.robots == ("r1", "ros")
         (of_r1,) = recording.imu("r1", "imu_data")
         (of_all,) = recording.imu("ros", "imu_data")
+        fixes = list(recording.fixes("r1", "gps_fix"))
     assert (of_r1.frame, of_all.frame) == ("r1/imu_link", "ros/imu_link")
     assert of_r1.gyro == reading.gyro
+    assert [(one.frame, one.latitude, one.altitude, one.status) for one in fixes] == [
+        ("r1/antenna", 47.5, None, 0),
+        ("r1/antenna", None, None, -1),
+    ]
 
 
 def test_covariances_of_edges_in_a_converted_recording_are_no_poses(tmp_path: Path):

@@ -39,7 +39,7 @@ KINDS: dict[str, type[Message]] = {
     kind.__name__: kind for kind in (*MESSAGE_TYPES, *(row.type for row in all_streams()))
 }
 FORMATS = {"f64[]": "d", "f32[]": "f", "i8[]": "b"}
-INTEGERS = ("stamp", "session", "uint", "ns")
+INTEGERS = ("stamp", "session", "uint", "int", "ns")
 
 
 def rows_of(text: str) -> list[list[str]]:

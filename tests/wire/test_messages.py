@@ -7,7 +7,7 @@ import pytest
 
 from zstate.driving.messages import DriverState, JointTrajectory, with_short_texts
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity, with_full_names
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity, with_full_names
 from zstate.plugins import stream_named
 from zstate.scans.messages import LaserScan, OccupancyGrid, cells_of
 from zstate.wire.messages import (
@@ -166,6 +166,11 @@ def pose(**changed: Any) -> Pose:
     return Pose(**{**fields, "pose": to_block([1, 2, 3, 0, 0, 0, 1]), **changed})
 
 
+def fix(**changed: Any) -> Fix:
+    fields: dict[str, Any] = {"stamp": 5, "seq": 0, "session": 1, "frame": "gps"}
+    return Fix(**{**fields, "latitude": 47.5, "longitude": 8.25, "altitude": 450.0, **changed})
+
+
 def odometry(**changed: Any) -> Odometry:
     edge = (("odom", "base"),)
     fields: dict[str, Any] = {
@@ -199,6 +204,25 @@ def odometry(**changed: Any) -> Odometry:
         (pose, {"pose": bytes(56)}, "length 1, not 0"),
         (pose, {"pose": to_block([np.nan, 0, 0, 0, 0, 0, 1])}, "a pose of finite numbers"),
         (pose, {"covariance": to_block([-1.0, *range(20)])}, "variances of a pose are not negative"),
+        (fix, {"frame": ""}, "1 to 1024 characters, not 0"),
+        (fix, {"latitude": np.nan}, "a latitude and a longitude of finite numbers .* not nan, 8.25"),
+        (fix, {"longitude": -np.inf}, "not 47.5, -inf"),
+        (fix, {"altitude": np.nan}, "an altitude of finite numbers .* not nan"),
+        # 47 degrees 30 minutes as NMEA has them
+        (fix, {"latitude": 4730.0}, "got 4730.0 and 8.25: give degrees with decimals, not .* of NMEA"),
+        (fix, {"latitude": None}, "a latitude and a longitude; got None and 8.25"),
+        (fix, {"longitude": None, "status": -1}, "a latitude and a longitude; got 47.5 and None"),
+        (fix, {"latitude": None, "longitude": None}, "a fix of status 0 has .* the status is -1"),
+        (fix, {"latitude": None, "longitude": None, "status": -1}, "an altitude .* need a latitude"),
+        (fix, {"status": 3}, "-1 .no fix.*; got 3"),
+        (fix, {"status": -3}, "-1 .no fix.*; got -3"),
+        (fix, {"service": -1}, "16 bits, 0 to 65535; got -1"),
+        (fix, {"service": 65536}, "16 bits, 0 to 65535; got 65536"),
+        (fix, {"covariance": bytes(40), "covariance_type": 3}, "of 6 numbers take 48 bytes, not 40"),
+        (fix, {"covariance": to_block([1, 0, 0, -2, 0, 3]), "covariance_type": 3}, "variances of a fix"),
+        (fix, {"covariance": bytes(48)}, "got 0 with one"),
+        (fix, {"covariance": bytes(48), "covariance_type": 4}, "got 4 with one"),
+        (fix, {"covariance_type": 3}, "got 3 without one"),
         (odometry, {"edges": None}, "odometry has one edge"),
         (odometry, {"poses": bytes(112)}, "1 edges need as many poses, not 2"),
         (odometry, {"covariances": bytes(168 * 2)}, "21 numbers of covariance each"),
@@ -235,6 +259,20 @@ def test_a_number_of_a_measurement_that_no_sensor_has_is_refused(
             make(**{field: to_block([*(1.000001 * numbers), *others])})
 
 
+@pytest.mark.parametrize(("field", "most"), [("latitude", 90.0), ("longitude", 180.0), ("altitude", 1e8)])
+def test_a_position_on_the_earth_is_within_its_limits(field: str, most: float):
+    for number in (most, -most):
+        assert getattr(fix(**{field: number}), field) == number
+        with pytest.raises(InvalidInput, match=r"within 90 degrees|at most 1e\+08"):
+            fix(**{field: np.nextafter(number, 2 * number)})
+
+
+def test_a_receiver_without_a_fix_is_a_message_with_or_without_a_position():
+    for status in (-2, -1):
+        assert fix(status=status).latitude == 47.5
+        assert fix(status=status, latitude=None, longitude=None, altitude=None).latitude is None
+
+
 @pytest.mark.parametrize(
     ("length", "is_unit"), [(0.9991, True), (1.0009, True), (0.9989, False), (1.0011, False)]
 )
@@ -253,11 +291,13 @@ def test_messages_of_sensors_and_odometry_fit_the_limit_of_their_streams():
     frame, six = "\U0001f916" * 1024, bytes(21 * 8)
     edge = ((frame, frame),)
     largest = odometry(edges=edge, order=order_digest(edge), covariances=six, twist_covariance=six)
-    assert max(len(encode(one)) for one in (imu(frame=frame), largest)) <= stream_named("odometry").max_bytes
+    of_sensors = imu(frame=frame), fix(frame=frame, covariance=bytes(48), covariance_type=3)
+    assert max(len(encode(one)) for one in (*of_sensors, largest)) <= stream_named("odometry").max_bytes
 
 
 def test_frames_of_a_measurement_get_their_full_names():
     assert with_full_names(imu(), "r1").frame == "r1/imu"
+    assert with_full_names(fix(), "r1").frame == "r1/gps"
     placed = with_full_names(pose(parent="hall/map"), "r1")
     assert (placed.parent, placed.child) == ("hall/map", "r1/base")
     assert with_full_names(pose(child=""), "r1").child == ""  # of the base

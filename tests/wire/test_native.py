@@ -20,7 +20,7 @@ from zstate.driving.messages import (
     Stop,
 )
 from zstate.errors import MessageError
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
 from zstate.plugins import all_streams
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.streams import LATCHED_BYTES, StreamName
@@ -235,6 +235,20 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + fixstr("base")
         + bin8(struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1))
         + bin8(struct.pack("<21d", *range(21))),
+    ),
+    "fix": (
+        Fix(STAMP, 300, 2**63 + 5, "gps", 47.5, -8.25, None, 1, 9, to_block(range(6)), 2),
+        header(11)[:-10]
+        + fixstr("gps")
+        + b"".join(b"\xcb" + struct.pack(">d", number) for number in (47.5, -8.25))
+        + NIL
+        + b"\x01\x09"
+        + bin8(struct.pack("<6d", *range(6)))
+        + b"\x02",
+    ),
+    "fix without a position": (
+        Fix(STAMP, 300, 2**63 + 5, "gps", None, None, status=-1),
+        header(11)[:-10] + fixstr("gps") + NIL * 3 + b"\xff\x00" + NIL + b"\x00",
     ),
     "odometry": (
         Odometry(

@@ -30,7 +30,13 @@ from zstate import (
     load_model,
 )
 from zstate.net.session import Session
-from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+from zstate.odometry import (
+    FixPublisher,
+    ImuPublisher,
+    OdometryPublisher,
+    PosePublisher,
+    VelocityPublisher,
+)
 from zstate.wire.native import encoding_of
 
 NETWORK = json.loads(Path(__file__).with_name("golden").joinpath("network.json").read_text())
@@ -105,13 +111,14 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
         if wire == "native":
             odometry = opened.enter_context(TransformPublisher(writer, "r1", "odometry", program="driver"))
             odometry.publish([Transform("odom", "world", (1.0, 0.0, 0.0), UPRIGHT)])
-        wheels, imu, flow, mocap = (
+        wheels, imu, flow, mocap, gps = (
             opened.enter_context(kind(writer, "r1", name, (wire,), program="driver"))
             for kind, name in (
                 (OdometryPublisher, "odom"),
                 (ImuPublisher, "chest"),
                 (VelocityPublisher, "flow"),
                 (PosePublisher, "mocap"),
+                (FixPublisher, "gps"),
             )
         )
 
@@ -122,6 +129,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
             imu.publish([0, 0, 0], [0, 0, 9.81])
             flow.publish([0, 0, 0])
             mocap.publish(Transform("map", "odom", (1.0, 0.0, 0.0), UPRIGHT))
+            gps.publish(47.5, 8.25)
 
         with repeated(publish):
             yield

@@ -11,7 +11,13 @@ if TYPE_CHECKING:
     from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
     from zstate.odometry.map_correction import MapCorrection
     from zstate.odometry.node import OdometryNode, SensorListener
-    from zstate.odometry.publishers import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+    from zstate.odometry.publishers import (
+        FixPublisher,
+        ImuPublisher,
+        OdometryPublisher,
+        PosePublisher,
+        VelocityPublisher,
+    )
     from zstate.odometry.requests import request_odometry
     from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
     from zstate.odometry.source_noise import PoseNoise, VelocityNoise
@@ -24,6 +30,7 @@ __all__ = [
     "BaseState",
     "BaseTwist",
     "DiffDrive",
+    "FixPublisher",
     "ForceThresholds",
     "ImuNoise",
     "ImuPublisher",
@@ -55,6 +62,7 @@ _HOMES = {
     "BaseState": "estimator",
     "BaseTwist": "estimator",
     "DiffDrive": "wheels",
+    "FixPublisher": "publishers",
     "ForceThresholds": "legs",
     "ImuNoise": "invariant_filter",
     "ImuPublisher": "publishers",

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
 from zstate.wire.keys import full_name
 from zstate.wire.messages import covariance_matrix, from_block
 
@@ -44,6 +44,26 @@ def pose_document(message: Pose, robot: str) -> dict[str, Any]:
     return document | _sigmas([("pose", message.covariance)])
 
 
+_STATUS = {-2: "unknown", -1: "no fix", 0: "fix", 1: "fix with SBAS", 2: "fix with GBAS"}
+
+
+def fix_document(message: Fix, robot: str) -> dict[str, Any]:
+    """A fix of ``robot``: stamp [ns], status, degrees, altitude and sigmas [m]; NaN is not known."""
+    numbers = {
+        name: np.nan if value is None else value
+        for name, value in (
+            ("latitude", message.latitude),
+            ("longitude", message.longitude),
+            ("altitude", message.altitude),
+        )
+    }
+    sigmas = [np.nan] * 3
+    if message.covariance is not None:
+        sigmas = np.sqrt(np.diag(covariance_matrix(message.covariance))).tolist()
+    document = {**_head(message, robot), "status": _STATUS[message.status], **numbers}
+    return document | dict(zip(("sigma_east", "sigma_north", "sigma_up"), sigmas, strict=True))
+
+
 def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
     """Odometry of ``robot``: stamp [ns], frames, pose [m], velocities [m/s, rad/s], and sigmas if known."""
     ((parent, child),) = message.edges or (("", ""),)
@@ -61,7 +81,7 @@ def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
     return document | _sigmas([("pose", message.covariances), ("twist", message.twist_covariance)])
 
 
-def _head(message: Imu | Velocity, robot: str) -> dict[str, Any]:
+def _head(message: Imu | Velocity | Fix, robot: str) -> dict[str, Any]:
     return {"stamp": message.stamp, "seq": message.seq, "frame": full_name(robot, message.frame)}
 
 

@@ -12,6 +12,7 @@ from zstate.wire.keys import full_name
 from zstate.wire.messages import (
     WriterTransforms,
     check_covariance,
+    check_finite,
     check_frame,
     check_limit,
     check_quaternion,
@@ -119,7 +120,77 @@ class Pose(StampedMessage, frozen=True, array_like=True, gc=False):
         check_covariance("a pose", self.covariance, 6)
 
 
-_Measurement = TypeVar("_Measurement", bound="Imu | Velocity | Pose")
+class Fix(StampedMessage, frozen=True, array_like=True, gc=False):
+    """What a satellite receiver knows of the place of its antenna on the Earth: sensor_msgs/NavSatFix.
+
+    ``frame`` is the antenna, named as in edges. ``latitude`` and ``longitude`` [deg], north and east
+    positive, and ``altitude`` [m] above the ellipsoid, not above the sea, are those of WGS84; ``altitude`` is
+    None if it is not known. ``status`` is -2 if that is not known, -1 for no fix, 0 for a fix, and 1 or 2 for
+    one with augmentation, satellite- or ground-based. Below 0 the position may be None; if it is not, it is
+    one that the receiver does not vouch for. ``service`` has a bit for each system in use, as
+    sensor_msgs/NavSatStatus has, and is 0 if that is not known.
+
+    ``covariance`` [m^2] is a block of the upper triangle in the axes east, north, up at the antenna, 6
+    numbers, or None if it is not known. ``covariance_type`` says where it is from: 1 for an approximation, as
+    from the dilution of precision, 2 if only its diagonal is known, 3 for all of it, and 0 if it is None.
+    """
+
+    frame: str
+    latitude: float | None
+    longitude: float | None
+    altitude: float | None = None
+    status: int = 0
+    service: int = 0
+    covariance: bytes | None = None
+    covariance_type: int = 0
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
+        if self.status not in (-2, -1, 0, 1, 2):
+            raise InvalidInput(
+                "the status of a fix is -2 (not known), -1 (no fix), 0 (fix), 1 or 2 (with augmentation), as "
+                f"in sensor_msgs/NavSatStatus; got {self.status}"
+            )
+        if not 0 <= self.service < 2**16:
+            raise InvalidInput(f"the service of a fix has 16 bits, 0 to 65535; got {self.service}")
+        if self.latitude is None or self.longitude is None:
+            self._check_unplaced()
+        else:
+            check_finite("a latitude and a longitude", self.latitude, self.longitude)
+            if abs(self.latitude) > 90.0 or abs(self.longitude) > 180.0:
+                raise InvalidInput(
+                    "latitudes are within 90 degrees and longitudes within 180 of zero; got "
+                    f"{self.latitude} and {self.longitude}: give degrees with decimals, not the degrees and "
+                    "minutes of NMEA"
+                )
+        if self.altitude is not None:
+            check_finite("an altitude", self.altitude)
+            check_limit("altitudes", (self.altitude,), MAX_DISTANCE)
+        check_covariance("a fix", self.covariance, 3)
+        known = (0,) if self.covariance is None else (1, 2, 3)
+        if self.covariance_type not in known:
+            raise InvalidInput(
+                "the type of a covariance is 1 (approximated), 2 (diagonal known) or 3 (known), and 0 "
+                f"without a covariance; got {self.covariance_type} "
+                f"{'without' if self.covariance is None else 'with'} one"
+            )
+
+    def _check_unplaced(self) -> None:
+        """Raise InvalidInput unless nothing but the position is missing, and the status says so."""
+        if self.latitude is not None or self.longitude is not None:
+            raise InvalidInput(
+                f"a position has a latitude and a longitude; got {self.latitude} and {self.longitude}"
+            )
+        if self.status >= 0:
+            raise InvalidInput(
+                f"a fix of status {self.status} has a latitude and a longitude; without them the status is "
+                "-1 (no fix)"
+            )
+        if self.altitude is not None or self.covariance is not None:
+            raise InvalidInput("an altitude and a covariance need a latitude and a longitude")
+
+
+_Measurement = TypeVar("_Measurement", bound="Imu | Velocity | Pose | Fix")
 
 
 def with_full_names(message: _Measurement, robot: str) -> _Measurement:

@@ -30,7 +30,7 @@ from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
-from zstate.odometry.messages import Imu, Pose, Velocity, with_full_names
+from zstate.odometry.messages import Fix, Imu, Pose, Velocity, with_full_names
 from zstate.odometry.publishers import OdometryPublisher
 from zstate.odometry.requests import apply_request
 from zstate.odometry.source_noise import PoseNoise, VelocityNoise
@@ -143,14 +143,14 @@ def _by_name_if_known(
 
 
 class SensorListener(Closeable):
-    """Calls ``on_imu``, ``on_velocity`` or ``on_pose`` with the sensor's name and each message of a robot.
+    """Calls ``on_imu``, ``on_velocity``, ``on_pose`` or ``on_fix`` for each message of a robot.
 
-    The frames of a message have their full names; the child of a pose is empty for the base of the robot.
-    Each callback has a thread of its own, and gets the messages in the order of their arrival; a stream
-    without a callback is not subscribed. If a callback is slow, the oldest messages are lost. ``refused``
-    counts, by reason, messages that cannot be used, those that a callback refuses by raising InvalidInput,
-    and its other exceptions, which do not end the thread; the first of each reason is also logged. A context
-    manager.
+    The arguments are the sensor's name and the message, whose frames have their full names; the child of a
+    pose is empty for the base of the robot. Each callback has a thread of its own, and gets the messages in
+    the order of their arrival; a stream without a callback is not subscribed. If a callback is slow, the
+    oldest messages are lost. ``refused`` counts, by reason, messages that cannot be used, those that a
+    callback refuses by raising InvalidInput, and its other exceptions, which do not end the thread; the first
+    of each reason is also logged. A context manager.
     """
 
     def __init__(
@@ -161,6 +161,7 @@ class SensorListener(Closeable):
         on_imu: Callable[[str, Imu], object] | None = None,
         on_velocity: Callable[[str, Velocity], object] | None = None,
         on_pose: Callable[[str, Pose], object] | None = None,
+        on_fix: Callable[[str, Fix], object] | None = None,
         wire: str = "native",
     ) -> None:
         self.robot = check_robot(robot)
@@ -174,6 +175,8 @@ class SensorListener(Closeable):
             callbacks["velocity"] = on_velocity
         if on_pose is not None:
             callbacks["pose"] = on_pose
+        if on_fix is not None:
+            callbacks["fix"] = on_fix
         with ExitStack() as opening:
             for stream, callback in callbacks.items():
                 on_messages = partial(self._on_messages, callback)
@@ -190,7 +193,7 @@ class SensorListener(Closeable):
 
     def _on_messages(self, callback: Callable[[str, Any], object], received: list[Received]) -> None:
         for robot, key, message in received:
-            assert isinstance(message, Imu | Velocity | Pose)
+            assert isinstance(message, Imu | Velocity | Pose | Fix)
             try:
                 callback(self._wire.edge_writer_name(key) or "", with_full_names(message, robot))
             except InvalidInput as error:

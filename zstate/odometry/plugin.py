@@ -32,6 +32,15 @@ POSE = Stream(
     ros="zstate.odometry.ros2:POSE_STREAM",
     document="zstate.odometry.documents:pose_document",
 )
+FIX = Stream(
+    "fix",
+    f"{_MESSAGES}:Fix",
+    summary="position of a satellite receiver's antenna on the Earth",
+    named=True,
+    start="start the program of the receiver, with its zstate.odometry.FixPublisher",
+    ros="zstate.odometry.ros2:FIX_STREAM",
+    document="zstate.odometry.documents:fix_document",
+)
 ODOMETRY = Stream(
     "odometry",
     f"{_MESSAGES}:Odometry",
@@ -45,7 +54,7 @@ ODOMETRY = Stream(
 
 PLUGIN = Plugin(
     "odometry",
-    streams=(IMU, VELOCITY, POSE, ODOMETRY),
+    streams=(IMU, VELOCITY, POSE, FIX, ODOMETRY),
     commands={
         "odometry": Command(
             "zstate.odometry.cli.odometry:odometry_command",

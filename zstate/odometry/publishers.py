@@ -1,8 +1,9 @@
-"""Publishers of inertial measurements, of velocities and poses, and of odometry."""
+"""Publishers of inertial measurements, of velocities, poses and fixes, and of odometry."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import index
 
 from numpy.typing import ArrayLike
 
@@ -12,7 +13,7 @@ from zstate.errors import InvalidInput
 from zstate.net.session import Session
 from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
 from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
 from zstate.wire.keys import full_name
 from zstate.wire.messages import to_block
@@ -158,6 +159,63 @@ class PosePublisher(MeasurementPublisher):
             self._send(Pose(stamp, 0, 0, parent, child, pose, triangle))
 
 
+class FixPublisher(MeasurementPublisher):
+    """Publishes the positions of one satellite receiver (GPS, GNSS) of a robot on the Earth.
+
+    A position is that of the antenna, the origin of ``frame``. Sensors, frames, writers and threads are those
+    of ``ImuPublisher``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        sensor: str = "fix",
+        wires: str | Sequence[str] = ("native",),
+        *,
+        frame: str | None = None,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        self.frame = sensor if frame is None else frame
+        full_name(robot, self.frame)
+        super().__init__(session, robot, "fix", sensor, wires=wires, clock=clock, program=program)
+
+    def publish(
+        self,
+        latitude: float | None,
+        longitude: float | None,
+        altitude: float | None = None,
+        stamp: int | None = None,
+        *,
+        covariance: ArrayLike | None = None,
+        covariance_type: int = 3,
+        status: int = 0,
+        service: int = 0,
+    ) -> None:
+        """Publish one fix, or that there is none, at ``stamp`` [ns], the time of the fix; default: now.
+
+        ``latitude`` and ``longitude`` [deg] are those of WGS84, north and east positive, and ``altitude`` [m]
+        is above its ellipsoid: add the separation of the geoid to a height above the sea; leave it out if it
+        is not known. ``covariance`` [m^2] is (3, 3) in the axes east, north, up; leave it out if it is not
+        known. ``covariance_type`` is 1 for an approximation, as from the dilution of precision, 2 if only the
+        diagonal is known. ``status`` and ``service`` are those of sensor_msgs/NavSatStatus: status 1 or 2 for
+        a fix with satellite- or ground-based augmentation, and ``publish(None, None, status=-1)`` without a
+        fix. Raises as ``ImuPublisher.publish``.
+        """
+        with self._refusals:
+            stamp = self._clock.now() if stamp is None else check_stamp(stamp)
+            position = _number(latitude, "latitude"), _number(longitude, "longitude")
+            triangle = _covariance(covariance, "covariance", 3)
+            self._send(
+                Fix(
+                    *(stamp, 0, 0, self.frame, *position, _number(altitude, "altitude")),
+                    *(index(status), index(service)),
+                    *(triangle, 0 if triangle is None else index(covariance_type)),
+                )
+            )
+
+
 class OdometryPublisher(EdgePublisher):
     """Publishes where the base of a robot is, and how fast it moves: the edge odom -> base_link and a twist.
 
@@ -220,6 +278,16 @@ def _numbers(values: ArrayLike, name: str, count: int) -> bytes:
             f"{name} takes {count} numbers, (x, y, z{', w' * (count == 4)}); got shape {array.shape}"
         )
     return to_block(array)
+
+
+def _number(value: float | None, name: str) -> float | None:
+    """One number, None if it is not known."""
+    if value is None:
+        return None
+    array = real_numbers(value, name)
+    if array.shape:
+        raise InvalidInput(f"{name} is one number; got shape {array.shape}")
+    return float(array)
 
 
 def _covariance(values: ArrayLike | None, name: str, size: int) -> bytes | None:

@@ -1,22 +1,32 @@
-"""IMUs, velocities, poses and odometry as ROS 2 messages.
+"""IMUs, velocities, poses, fixes and odometry as ROS 2 messages.
 
 ROS has matrices where zstate has upper triangles or None. A covariance of zeros is not known
 (sensor_msgs/Imu), and so is what a first number of -1 precedes: an IMU without orientation, or one that
-measures no angular velocities or no accelerations. An angular velocity that was not measured is NaN here.
+measures no angular velocities or no accelerations. An angular velocity that was not measured is NaN here,
+and so are the altitude and the position that a fix does not have.
 """
 
 from __future__ import annotations
 
+import struct
+from math import isfinite, isnan, nan
+
 import numpy as np
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
 from zstate.wire.messages import covariance_matrix, from_block, order_digest, to_block
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.streams import RosStream
 from zstate.wire.ros2.topics import FrameNames
-from zstate.wire.ros2.types import IMU, ODOMETRY, POSE_WITH_COVARIANCE, TWIST_WITH_COVARIANCE
+from zstate.wire.ros2.types import (
+    IMU,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    POSE_WITH_COVARIANCE,
+    TWIST_WITH_COVARIANCE,
+)
 
 _IDENTITY = to_block([0.0, 0.0, 0.0, 1.0])
 _ABSENT = to_block([-1.0, *[0.0] * 8])
@@ -125,6 +135,45 @@ def decode_pose(payload: bytes, session: int, seq: int, names: FrameNames) -> Po
         raise reader.malformed(str(error)) from None
 
 
+def encode_fix(fix: Fix, names: FrameNames) -> bytes:
+    """The sensor_msgs/NavSatFix of a fix; raises as ``encode_imu``."""
+    position = (fix.latitude, fix.longitude, fix.altitude)
+    writer = CdrWriter()
+    writer.stamp(fix.stamp)
+    writer.text(names.to_ros(fix.frame))
+    writer.numbers(struct.pack("<b", fix.status), 1)
+    writer.numbers(struct.pack("<H", fix.service), 2)
+    writer.numbers(to_block([nan if number is None else number for number in position]))
+    writer.numbers(_matrix(fix.covariance, 3))
+    writer.numbers(struct.pack("<B", fix.covariance_type), 1)
+    return writer.payload()
+
+
+def decode_fix(payload: bytes, session: int, seq: int, names: FrameNames) -> Fix:
+    """The fix in a sensor_msgs/NavSatFix; raises as ``decode_velocity``.
+
+    Its covariance is not known as well if a driver has put NaN into it, whatever its type says.
+    """
+    reader = CdrReader(payload, NAV_SAT_FIX.name)
+    stamp, frame = reader.stamp(), names.to_zstate(reader.text())
+    (status,), (service,) = (
+        struct.unpack("<b", reader.numbers(1, 1)),
+        struct.unpack("<H", reader.numbers(1, 2)),
+    )
+    latitude, longitude, altitude = from_block(reader.numbers(3)).tolist()
+    covariance, (covariance_type,) = reader.numbers(9), reader.numbers(1, 1)
+    head = (stamp, seq, session, frame)
+    try:
+        if not (isfinite(latitude) and isfinite(longitude)):
+            return Fix(*head, None, None, None, status, service)
+        is_known = covariance_type != 0 and not np.isnan(from_block(covariance)).any()
+        triangle = _triangle(covariance, 3) if is_known else None
+        position = latitude, longitude, None if isnan(altitude) else altitude
+        return Fix(*head, *position, status, service, triangle, 0 if triangle is None else covariance_type)
+    except InvalidInput as error:
+        raise reader.malformed(str(error)) from None
+
+
 def encode_odometry(odometry: Odometry, names: FrameNames) -> bytes:
     """The nav_msgs/Odometry of a sample; raises as ``encode_imu``."""
     assert odometry.edges is not None
@@ -190,6 +239,9 @@ POSE_STREAM = RosStream(
     uncarried="child",
     is_named=True,
     is_of_sensor=True,
+)
+FIX_STREAM = RosStream(
+    NAV_SAT_FIX, _QOS, encode=encode_fix, decode=decode_fix, is_named=True, is_of_sensor=True
 )
 ODOMETRY_STREAM = RosStream(
     ODOMETRY, _QOS, encode=encode_odometry, decode=decode_odometry, is_named=True, is_of_sensor=True

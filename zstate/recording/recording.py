@@ -71,7 +71,7 @@ from zstate.wire.messages import (
 
 if TYPE_CHECKING:
     from zstate.driving.messages import DriverState, JointCommand, Stop
-    from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+    from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
     from zstate.scans.grid import Grid
     from zstate.scans.messages import LaserScan, OccupancyGrid
     from zstate.scans.scan import Scan
@@ -249,6 +249,10 @@ class Recording(Closeable):
         """The measured poses of ``robot``, likewise. The child is empty for its base, as in ROS."""
         return self._measurements("pose", robot, sensor)
 
+    def fixes(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Fix]:
+        """The fixes of the satellite receivers of ``robot``, likewise, also those without a position."""
+        return self._measurements("fix", robot, sensor)
+
     def odometry(self, robot: str | None = None, writer: str | None = None) -> Iterator[Odometry]:
         """The odometry of ``robot``, by default of all robots, or of one ``writer``, likewise.
 
@@ -266,7 +270,7 @@ class Recording(Closeable):
         for writer, message, _ in self._messages(robot, stream, refusals.count):
             if sensor in (None, writer.edge_writer):
                 try:
-                    yield with_full_names(cast("Imu | Velocity | Pose", message), writer.robot)
+                    yield with_full_names(cast("Imu | Velocity | Pose | Fix", message), writer.robot)
                 except InvalidInput as error:
                     refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
 

@@ -28,7 +28,13 @@ from helpers.robots import SampleCollector, wait_for_reader
 
 from zstate import Transform, connect
 from zstate.cli.output.joint_state_text import ChangeFilter
-from zstate.odometry import ImuPublisher, OdometryPublisher, PosePublisher, VelocityPublisher
+from zstate.odometry import (
+    FixPublisher,
+    ImuPublisher,
+    OdometryPublisher,
+    PosePublisher,
+    VelocityPublisher,
+)
 
 FLOATING = """
 <robot name="drone">
@@ -260,6 +266,13 @@ def test_a_topic_of_ros_leads_to_its_wire(command: str):
             },
         ),
         ("imu", {"frame": "r1/chest", "gyro": [0.0, 0.0, 0.25], "accel": [0.0, 0.0, 9.81]}),
+        (
+            "fix",
+            {
+                **{"frame": "r1/gps", "status": "fix", "latitude": 47.5, "longitude": 8.25, "altitude": None},
+                **{"sigma_east": 1.0, "sigma_north": 2.0, "sigma_up": 3.0},
+            },
+        ),
         ("velocity", {"frame": "r1/flow", "linear": [0.5, 0.0, 0.0], "velocity_sigma": [2.0, 2.0, 2.0]}),
     ],
 )
@@ -272,6 +285,7 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
         ImuPublisher(session, "r1", frame="chest") as imu,
         VelocityPublisher(session, "r1", "flow") as velocity,
         PosePublisher(session, "r1", "mocap") as mocap,
+        FixPublisher(session, "r1", "gps") as gps,
     ):
 
         def publish() -> None:
@@ -279,6 +293,7 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
             imu.publish([0, 0, 0.25], [0, 0, 9.81])
             velocity.publish([0.5, 0, 0], covariance=np.eye(3) * 4)
             mocap.publish(base)
+            gps.publish(47.5, 8.25, covariance=variances[:3, :3])
 
         with repeated(publish):
             document = json.loads(run_cli("echo", "r1", "--stream", stream, "--once", "--json").stdout)
@@ -287,8 +302,22 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
     assert {name: value for name, value in document.items() if name not in ("stamp", "seq")} == expected
     assert rate["rate_hz"] > 1.0
     names = {writer["stream"]: writer["names"] for writer in listed[0]["writers"]}
-    assert names == {"odometry": ["odometry"], "imu": ["imu"], "velocity": ["flow"], "pose": ["mocap"]}
+    assert names == {
+        **{"odometry": ["odometry"], "imu": ["imu"], "velocity": ["flow"], "pose": ["mocap"]},
+        "fix": ["gps"],
+    }
     assert all(writer["rate_hz"] for writer in listed[0]["writers"])
+
+
+def test_receiver_without_a_fix_says_so_in_a_row_of_the_same_columns():
+    with (
+        connect() as session,
+        FixPublisher(session, "r1", "gps") as gps,
+        repeated(lambda: gps.publish(None, None, status=-1)),
+    ):
+        names, row = run_cli("echo", "r1", "--stream", "fix", "--once", "--csv").stdout.splitlines()
+    assert names == ("stamp,seq,frame,status,latitude,longitude,altitude,sigma_east,sigma_north,sigma_up")
+    assert row.split(",")[2:] == ["r1/gps", "no fix", *["nan"] * 6]
 
 
 def test_sensor_that_is_not_published_is_explained():

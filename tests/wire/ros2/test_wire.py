@@ -205,6 +205,7 @@ STREAMS = st.sampled_from(
         "imu",
         "velocity",
         "pose",
+        "fix",
         "odometry",
         "clock",
     ]

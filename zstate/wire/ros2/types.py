@@ -105,10 +105,21 @@ _FIELDS: dict[str, Fields] = {
         ("geometry_msgs/Vector3", "linear_acceleration"),
         ("float64[9]", "linear_acceleration_covariance"),
     ),
+    "sensor_msgs/NavSatStatus": (("int8", "status"), ("uint16", "service")),
+    "sensor_msgs/NavSatFix": (
+        ("std_msgs/Header", "header"),
+        ("sensor_msgs/NavSatStatus", "status"),
+        *(("float64", name) for name in ("latitude", "longitude", "altitude")),
+        ("float64[9]", "position_covariance"),
+        ("uint8", "position_covariance_type"),
+    ),
 }
 # The numbers of type_description_interfaces/FieldType.
 _NESTED, _ARRAY, _UNBOUNDED_SEQUENCE = 1, 48, 144
-_PRIMITIVES = {"int8": 2, "int32": 6, "uint32": 7, "float32": 10, "float64": 11, "byte": 16, "string": 17}
+_PRIMITIVES = {
+    **{"int8": 2, "uint8": 3, "uint16": 5, "int32": 6, "uint32": 7},
+    **{"float32": 10, "float64": 11, "byte": 16, "string": 17},
+}
 
 _SEPARATOR = "=" * 80
 
@@ -189,3 +200,4 @@ POSE_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/PoseWithCovarianceStam
 TWIST_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/TwistWithCovarianceStamped")
 ODOMETRY = RosType.from_fields("nav_msgs/Odometry")
 IMU = RosType.from_fields("sensor_msgs/Imu")
+NAV_SAT_FIX = RosType.from_fields("sensor_msgs/NavSatFix")
