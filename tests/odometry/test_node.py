@@ -24,10 +24,13 @@ from zstate.net.status_monitor import StatusMonitor
 from zstate.net.subscription import Received, subscribe
 from zstate.odometry import (
     BaseEstimator,
+    Datum,
     DiffDrive,
+    FixNoise,
     FixPublisher,
     ImuNoise,
     ImuPublisher,
+    MapEstimator,
     OdometryNode,
     PoseNoise,
     PosePublisher,
@@ -85,6 +88,7 @@ class Rover:
 
 @contextmanager
 def rover_with_odometry(
+    datum: Datum | None = None,
     **options: object,
 ) -> Generator[tuple[Rover, OdometryNode, TransformListener, Session]]:
     """A rover, its node in another session, and a listener in a third one."""
@@ -102,10 +106,46 @@ def rover_with_odometry(
             imu_noise=NOISE,
             wheels=DiffDrive("left_wheel_joint", "right_wheel_joint", 0.08, 0.32),
         )
+        if datum is not None:
+            options["in_map"] = MapEstimator(base, map="r1/map", buffer=mounts, datum=datum)
         node = opened.enter_context(OdometryNode(estimating, "r1", base, has_joints=True, **options))  # pyright: ignore[reportArgumentType]
         listener = opened.enter_context(TransformListener(reading, "r1"))
         listener.buffer.wait(ODOM, BASE, timeout_s=DEADLINE_S)
         yield rover, node, listener, reading
+
+
+@pytest.mark.long
+def test_fixes_place_the_odometry_in_the_map_and_the_pose_there_has_a_covariance():
+    """The rover starts 3 m east and 2 m north of the datum, and heads north."""
+    datum = Datum(48.1, 11.5, 560.0)
+    received: list[Pose] = []
+    with rover_with_odometry(fixes={"gps": FixNoise()}, datum=datum) as (rover, node, listener, session):
+        with (
+            FixPublisher(session, "r1", "gps", frame="base_footprint") as gps,
+            SensorListener(session, "r1", on_pose=lambda _, message: received.append(message)),
+        ):
+            rover.truth.drive((4.0, 5.0))
+
+            def is_in_map() -> bool:
+                x, y, _ = rover.truth.pose
+                place = datum.geodetic((3.0 - y, 2.0 + x, 0.0))
+                gps.publish(*place, covariance=np.diag((0.02, 0.02, 0.05)) ** 2)
+                return bool(received)
+
+            until(is_in_map)
+            rover.truth.drive((0.0, 0.0))
+        at_rest = time.time_ns() + 1_000_000_000  # 20 time constants of the wheels
+        until(lambda: listener.buffer.latest("r1/map", BASE) >= at_rest)
+        map_from_base, pose = listener.buffer.lookup("r1/map", BASE), received[-1]
+        x, y, yaw = rover.truth.pose
+        assert map_from_base.translation[:2] == pytest.approx([3.0 - y, 2.0 + x], abs=0.5)
+        assert math.remainder(map_from_base.rpy[2] - yaw - math.pi / 2, math.tau) == pytest.approx(
+            0.0, abs=0.6
+        )
+        assert (pose.parent, pose.child) == ("r1/map", BASE)
+        assert pose.covariance is not None
+        (health,) = [one for one in node.health() if one.name == "gps"]
+        assert (health.sentence, health.rejected) == ("", 0)
 
 
 @pytest.mark.long

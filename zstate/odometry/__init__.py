@@ -6,10 +6,12 @@ from zstate._util.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from zstate.odometry.estimator import BaseCovariance, BaseEstimator, BaseState, BaseTwist
+    from zstate.odometry.geodesy import Datum
     from zstate.odometry.health import SourceHealth
     from zstate.odometry.invariant_filter import ImuNoise
     from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
     from zstate.odometry.map_correction import MapCorrection
+    from zstate.odometry.map_estimator import MapEstimator, MapState
     from zstate.odometry.node import OdometryNode, SensorListener
     from zstate.odometry.publishers import (
         FixPublisher,
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     )
     from zstate.odometry.requests import request_odometry
     from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
-    from zstate.odometry.source_noise import PoseNoise, VelocityNoise
+    from zstate.odometry.source_noise import FixNoise, PoseNoise, VelocityNoise
     from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
 __all__ = [
@@ -29,7 +31,9 @@ __all__ = [
     "BaseEstimator",
     "BaseState",
     "BaseTwist",
+    "Datum",
     "DiffDrive",
+    "FixNoise",
     "FixPublisher",
     "ForceThresholds",
     "ImuNoise",
@@ -37,6 +41,8 @@ __all__ = [
     "LegNoise",
     "Legs",
     "MapCorrection",
+    "MapEstimator",
+    "MapState",
     "Mecanum",
     "OdometryNode",
     "OdometryPublisher",
@@ -61,7 +67,9 @@ _HOMES = {
     "BaseEstimator": "estimator",
     "BaseState": "estimator",
     "BaseTwist": "estimator",
+    "Datum": "geodesy",
     "DiffDrive": "wheels",
+    "FixNoise": "source_noise",
     "FixPublisher": "publishers",
     "ForceThresholds": "legs",
     "ImuNoise": "invariant_filter",
@@ -69,6 +77,8 @@ _HOMES = {
     "LegNoise": "legs",
     "Legs": "legs",
     "MapCorrection": "map_correction",
+    "MapEstimator": "map_estimator",
+    "MapState": "map_estimator",
     "Mecanum": "wheels",
     "OdometryNode": "node",
     "OdometryPublisher": "publishers",

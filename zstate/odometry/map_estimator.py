@@ -36,7 +36,7 @@ from zstate.odometry.geodesy import Datum, check_place
 from zstate.odometry.health import SourceHealth, chi_square_quantile
 from zstate.odometry.map_alignment import Fixes, MapAlignment, align_in_map, turn
 from zstate.odometry.rotations import skew
-from zstate.odometry.source_noise import FixNoise
+from zstate.odometry.source_noise import HEIGHT_FACTOR, FixNoise
 from zstate.transform import Transform
 
 _MOST_YAW_SIGMA = 0.3
@@ -65,8 +65,6 @@ _BELIEVED_WAY, _BELIEVED_COUNT = 20.0, 10
 _TOLD_NS = 30_000_000_000
 _UNKNOWN_HEIGHT = 1e4
 """[m] The standard deviation of a height that was not measured."""
-_HEIGHT_FACTOR = 10.0
-"""Of a height whose stated noise is that of the position: no satellite is below the horizon."""
 
 
 class MapState(NamedTuple):
@@ -171,6 +169,9 @@ class MapEstimator:
         """
         stamp = check_stamp(stamp)
         receiver = self._receiver(source, frame, noise)
+        if stamp < self.odometry.newest - round(self.odometry.history_s * 1e9):
+            self._refuse(receiver, stamp, "too late; raise history_s")
+            return
         try:
             check_place(latitude, longitude, altitude or 0.0)
         except InvalidInput as error:
@@ -249,8 +250,8 @@ class MapEstimator:
 
     def _variances(self, source: str, covariance: ArrayLike | None, noise: FixNoise) -> Floats:
         """Of x, y and z [m^2], (3,)."""
-        if noise.sigma is not None:
-            across, up = noise.sigma
+        if noise.sigmas is not None:
+            across, up = noise.sigmas
         else:
             matrix = real_numbers(0.0 if covariance is None else covariance, f"the covariance of {source!r}")
             if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or matrix.diagonal().min() <= 0.0:
@@ -260,8 +261,8 @@ class MapEstimator:
                 )
             across = math.sqrt(float(np.linalg.eigvalsh(matrix[:2, :2])[1]))
             up = math.sqrt(float(matrix[2, 2]))
-            up = up if up > across else _HEIGHT_FACTOR * across
-        least_across, least_up = noise.floor
+            up = up if up > across else HEIGHT_FACTOR * across
+        least_across, least_up = noise.floors
         across, up = max(across, least_across), max(up, least_up)
         return np.square((across, across, up))
 
@@ -279,8 +280,7 @@ class MapEstimator:
                 except NoData:
                     break  # not aligned yet
                 except LookupFailed:
-                    fix = receiver.waiting.pop(0)
-                    self._refuse(receiver, fix.stamp, "too late; raise history_s")
+                    del receiver.waiting[0]  # from before the odometry began
                     continue
                 passed = _Passed(receiver.waiting.pop(0), _point(here.odom_from_base, receiver.lever), here)
                 if self._in_map is None:

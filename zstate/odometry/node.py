@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,12 +28,14 @@ from zstate.net.presence import announce_reader
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
+from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
+from zstate.odometry.map_estimator import MapEstimator
 from zstate.odometry.messages import Fix, Imu, Pose, Velocity, with_full_names
-from zstate.odometry.publishers import OdometryPublisher
+from zstate.odometry.publishers import OdometryPublisher, PosePublisher
 from zstate.odometry.requests import apply_request
-from zstate.odometry.source_noise import PoseNoise, VelocityNoise
+from zstate.odometry.source_noise import FixNoise, PoseNoise, VelocityNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.streams import StreamName
 from zstate.transform import Transform
@@ -46,6 +48,9 @@ _SILENT_NS = 100_000_000
 
 _AHEAD_NS = 500_000_000
 """Clocks of one robot differ by less, and the way of a reading takes more than none."""
+
+MAP_WRITER = "map"
+"""The name under which map -> odom and the pose in the map are published."""
 
 _LONG_AGO = -(2**63)
 
@@ -117,6 +122,26 @@ def add_pose(base: BaseEstimator, sensor: str, noise: PoseNoise, message: Pose) 
     """Pass one measured pose of ``sensor`` to ``base``. Raises InvalidInput if its noise is not known."""
     measured = Transform.from_pose7(message.parent, message.child or base.base, from_block(message.pose))
     base.pose(message.stamp, measured, pose_covariance(sensor, message, noise), source=sensor)
+
+
+def add_fix(in_map: MapEstimator, sensor: str, noise: FixNoise, message: Fix) -> None:
+    """Pass one fix of ``sensor`` to ``in_map``.
+
+    Raises InvalidInput for a message without a fix, and if its noise is not known.
+    """
+    latitude, longitude = message.latitude, message.longitude
+    if message.status < 0 or latitude is None or longitude is None:
+        raise InvalidInput(f"the receiver {sensor!r} has no fix: its status is {message.status}")
+    in_map.fix(
+        message.stamp,
+        latitude,
+        longitude,
+        message.altitude,
+        covariance=None if message.covariance is None else covariance_matrix(message.covariance),
+        frame=message.frame,
+        source=sensor,
+        noise=noise,
+    )
 
 
 def add_joints(base: BaseEstimator, model: RobotModel, reading: JointReading) -> None:
@@ -212,6 +237,21 @@ def _failure(error: Exception, place: str) -> tuple[str, str]:
     return f"failed with {kind}", f"{place}: {kind}: {error}"
 
 
+class _MapPublishers(NamedTuple):
+    """Of map -> odom, and of the pose of the base in the map."""
+
+    edge: TransformPublisher
+    pose: PosePublisher
+
+    @classmethod
+    def open(cls, opening: ExitStack, session: Session, robot: str, program: str) -> _MapPublishers:
+        """Open both in ``opening``. Raises SecondWriter."""
+        return cls(
+            opening.enter_context(TransformPublisher(session, robot, MAP_WRITER, program=program)),
+            opening.enter_context(PosePublisher(session, robot, MAP_WRITER, program=program)),
+        )
+
+
 class OdometryNode(Closeable):
     """Feeds ``base`` with the sensors of ``robot``, and publishes its odometry as ``writer``.
 
@@ -220,6 +260,11 @@ class OdometryNode(Closeable):
     Each reading of the IMU publishes the state at its stamp, at most ``rate_hz`` of them a second. If the IMU
     is silent for 0.1 s, readings of the other sources do; if all are silent, nothing is published. The
     sentences of ``base.health()`` are the warning in the status of the writer.
+
+    ``in_map`` gets the fixes of the receivers ``fixes``, and has ``base`` as its odometry. As soon as it
+    knows the pose in the map, the writer ``map`` publishes map -> odom at the stamps of the odometry, so that
+    ``lookup("map", "base_link")`` is exact there, and the stream ``pose/map`` has the pose of the base in the
+    map with its covariance. (That of such a lookup would add the covariance of the odometry.)
 
     Readings that are stamped more than 0.5 s after the time of ``clock`` are refused; without ``clock``, the
     clock of this host, or none if that of the buffer of ``base`` is simulated. If time goes back, the node
@@ -238,6 +283,8 @@ class OdometryNode(Closeable):
         imu: str = "imu",
         velocities: Mapping[str, VelocityNoise] = MappingProxyType({}),
         poses: Mapping[str, PoseNoise] = MappingProxyType({}),
+        fixes: Mapping[str, FixNoise] = MappingProxyType({}),
+        in_map: MapEstimator | None = None,
         has_joints: bool = False,
         writer: str = "odometry",
         rate_hz: float | None = None,
@@ -250,6 +297,7 @@ class OdometryNode(Closeable):
         self.has_failed = fork_safe(threading.Event())
         self._refusals = Refusals("joint states")
         self._imu, self._velocities, self._poses = imu, dict(velocities), dict(poses)
+        self._fixes, self._in_map = dict(fixes), in_map
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._restart()
@@ -257,6 +305,9 @@ class OdometryNode(Closeable):
         with ExitStack() as opening:
             self._publisher = opening.enter_context(
                 OdometryPublisher(session, robot, writer, program=program)
+            )
+            self._map_publishers = (
+                None if in_map is None else _MapPublishers.open(opening, session, robot, program)
             )
             request_key = ODOMETRY_REQUEST.key(robot, self._publisher.writer)
             opening.enter_context(Queryable(session, request_key, self._on_request, is_exact=True))
@@ -270,6 +321,7 @@ class OdometryNode(Closeable):
                     on_imu=self._on_imu,
                     on_velocity=self._on_velocity if velocities else None,
                     on_pose=self._on_pose if poses else None,
+                    on_fix=self._on_fix if fixes else None,
                 )
             )
             self._opened = opening.pop_all()
@@ -296,7 +348,11 @@ class OdometryNode(Closeable):
     def health(self) -> tuple[SourceHealth, ...]:
         """That of each source, with a sentence where something is wrong."""
         with self._lock:
-            return self.base.health()
+            return self._health()
+
+    def _health(self) -> tuple[SourceHealth, ...]:
+        in_map = () if self._in_map is None else self._in_map.health()
+        return (*self.base.health(), *in_map)
 
     def state(self) -> BaseState:
         """The newest state. Raises NoData before the first alignment."""
@@ -345,6 +401,12 @@ class OdometryNode(Closeable):
                 self._check_stamp(message.stamp)
                 add_pose(self.base, sensor, self._poses[sensor], message)
                 self._publish_without_imu(message.stamp)
+
+    def _on_fix(self, sensor: str, message: Fix) -> None:
+        if sensor in self._fixes and self._in_map is not None:
+            with self._lock:
+                self._check_stamp(message.stamp)
+                add_fix(self._in_map, sensor, self._fixes[sensor], message)
 
     def _on_joints(self, reading: JointReading) -> None:
         if self._joints is None:  # a reading during its opening
@@ -409,16 +471,28 @@ class OdometryNode(Closeable):
             self._publisher.publish(
                 state.odom_from_base, linear, angular, state.stamp, twist_covariance=state.covariance.twist
             )
+            self._publish_in_map(state.stamp)
         except Closed:
             pass
         except SecondWriter as error:
             self.failure = error
             self.has_failed.set()
 
+    def _publish_in_map(self, stamp: int) -> None:
+        if self._in_map is None or self._map_publishers is None:
+            return
+        try:
+            state = self._in_map.state(stamp)
+        except (NoData, InPast):  # not aligned yet, or not then
+            return
+        edge, pose = self._map_publishers
+        edge.publish([state.map_from_odom], stamp)
+        pose.publish(state.map_from_base.with_covariance(state.covariance), stamp)
+
     def _assess(self, stamp: int) -> None:
         if stamp - self._assessed >= _HEALTH_NS:
             self._assessed = stamp
-            sentences = {one.name: one.sentence for one in self.base.health() if one.sentence}
+            sentences = {one.name: one.sentence for one in self._health() if one.sentence}
             self._publisher.warning = "; ".join(sentences.values())
             for name, sentence in sentences.items():
                 if stamp - self._logged.get(name, _LONG_AGO) > _LOGGED_NS:

@@ -1,4 +1,4 @@
-"""What a user states of the noise of a source of velocities or poses; it takes precedence over messages."""
+"""What a user states of the noise of velocities, poses or fixes; it takes precedence over messages."""
 
 from __future__ import annotations
 
@@ -10,6 +10,13 @@ from zstate.errors import InvalidInput
 
 Sigma: TypeAlias = float | tuple[float, float, float]
 """Standard deviations of x, y and z; one number is that of each."""
+
+FixSigma: TypeAlias = float | tuple[float, float]
+"""Standard deviations of a fix, horizontal and vertical; of one number the vertical one is ten times."""
+
+
+HEIGHT_FACTOR = 10.0
+"""Of a height by satellites, all of which are above: it is less sure than the position."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,23 +83,34 @@ def _check_sigma(name: str, sigma: Sigma | None) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixNoise:
-    """The noise of the fixes of a GPS receiver.
+    """The noise of the fixes of a satellite receiver.
 
-    ``sigma`` [m] are standard deviations of a position, horizontal and vertical; None if messages have them,
-    as covariances. ``floor`` [m], likewise, are the least that is believed: receivers with corrections (RTK)
-    state millimetres. ``correlated_s`` [s] is for how long the errors of fixes wander before they are others.
-    Raises InvalidInput unless all are finite and above zero.
+    ``sigma`` [m] are standard deviations of a position; None if messages have them, as covariances. ``floor``
+    [m] are the least that is believed: receivers with corrections (RTK) state millimetres. ``correlated_s``
+    [s] is for how long the errors of fixes wander before they are others. Raises InvalidInput unless all are
+    finite and above zero.
     """
 
-    sigma: tuple[float, float] | None = None
-    floor: tuple[float, float] = (0.02, 0.05)
+    sigma: FixSigma | None = None
+    floor: FixSigma = (0.02, 0.05)
     correlated_s: float = 20.0
 
     def __post_init__(self) -> None:
-        for name, values in (
-            ("sigma", self.sigma),
-            ("floor", self.floor),
-            ("correlated_s", (self.correlated_s,)),
-        ):
-            if values is not None and not all(0.0 < value < math.inf for value in values):
-                raise InvalidInput(f"{name} of a GPS receiver is finite and above zero; got {values!r}")
+        given = {"sigma": self.sigma, "floor": self.floor, "correlated_s": self.correlated_s}
+        for name, values in given.items():
+            if values is not None and not all(0.0 < value < math.inf for value in _two(values)):
+                raise InvalidInput(f"{name} of a satellite receiver is above zero and finite; got {values!r}")
+
+    @property
+    def sigmas(self) -> tuple[float, float] | None:
+        """Horizontal and vertical [m]; None if messages have them."""
+        return None if self.sigma is None else _two(self.sigma)
+
+    @property
+    def floors(self) -> tuple[float, float]:
+        """Horizontal and vertical [m]."""
+        return _two(self.floor)
+
+
+def _two(sigma: FixSigma) -> tuple[float, float]:
+    return sigma if isinstance(sigma, tuple) else (sigma, HEIGHT_FACTOR * sigma)

@@ -19,7 +19,9 @@ from zstate.errors import InvalidInput
 from zstate.model.kinematics import Kinematics
 from zstate.odometry import (
     BaseEstimator,
+    Datum,
     DiffDrive,
+    FixNoise,
     ImuNoise,
     PoseNoise,
     SimulatedRover,
@@ -35,7 +37,7 @@ from zstate.odometry.cli.replay import (
     sigma_factor,
 )
 from zstate.odometry.cli.settings_file import OdometrySettings
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
 from zstate.odometry.simulated_rover import ImuReading
 from zstate.sources.square_drive import WheelPair
 from zstate.wire.messages import order_digest, to_block
@@ -52,6 +54,7 @@ FLOW_SIGMA, MOCAP_SIGMA = 0.04, 0.02
 FLOW_DELAY_MS, JOINT_DELAY_MS = 60, 0
 MAP_FROM_ODOM = 3.0, -2.0, 2.0
 """x y [m] and yaw [rad]."""
+DATUM = Datum(48.1, 11.5, 560.0)
 
 
 class Drive(NamedTuple):
@@ -112,6 +115,7 @@ def recorded(path: Path, *, covariance: float = 0.0) -> Path:
             flow = Velocity(late, 0, 3, "base_footprint", to_block([speed, 0.0, 0.0]), None, upper)
             write("r1", flow, late, "flow")
         upper = to_block(covariance * np.eye(6)[np.triu_indices(6)])
+        fix_upper = to_block(MOCAP_SIGMA**2 * np.diag((1.0, 1.0, 4.0))[np.triu_indices(3)])
         for stamp, (x, y, yaw) in drive().poses[::5]:
             map_x, map_y, turn = in_map(
                 x + random.gauss(0.0, MOCAP_SIGMA), y + random.gauss(0.0, MOCAP_SIGMA), yaw
@@ -122,6 +126,10 @@ def recorded(path: Path, *, covariance: float = 0.0) -> Path:
             twist = to_block([0.0] * 6)
             other = Odometry(stamp, 0, 5, order_digest(edges), placed, edges, None, twist)
             write("r1", other, stamp, "laser")
+            latitude, longitude, altitude = DATUM.geodetic((map_x, map_y, 0.0))
+            fix = Fix(stamp, 0, 6, "base_footprint", latitude, longitude, altitude, 0, 0, fix_upper, 2)
+            write("r1", fix, stamp, "gps")
+        write("r1", Fix(stamp, 0, 6, "base_footprint", None, None, status=-1), stamp, "gps")
     return path
 
 
@@ -182,6 +190,26 @@ def test_reference_gives_ate_error_at_the_end_and_nees(tmp_path: Path, stream: s
         rf"against \d+ readings of {stream}: ATE 0.\d+ m, error at the end 0.\d+ m, .* % of", text
     )
     assert re.search(r"error at the end \d.\d sigma .*; NEES of x y \d.\d\d \(2 is right", text)
+
+
+@pytest.mark.long
+def test_fixes_of_a_receiver_give_the_end_of_the_drive_in_the_map_and_on_the_earth(tmp_path: Path):
+    datum = (DATUM.latitude, DATUM.longitude, DATUM.altitude)
+    settings = replace(SETTINGS, fix={"gps": FixNoise()}, datum=datum)
+    replayed = replay(str(recorded(tmp_path / "r.mcap", covariance=MOCAP_SIGMA**2)), "r1", settings)
+    state = replayed.in_map
+    assert state is not None
+    x, y, yaw = in_map(*drive().poses[-1][1])
+    errors = (state.map_from_base.translation - (x, y, 0.0))[:2]
+    assert errors @ np.linalg.solve(state.covariance[:2, :2], errors) < 12.0
+    assert math.remainder(state.map_from_base.rpy[2] - yaw, math.tau) ** 2 < 12.0 * state.covariance[5, 5]
+    (line,) = [
+        line for line in report_lines(replayed) if line.startswith("in 'r1/map', x east and y north of")
+    ]
+    latitude, longitude, _ = DATUM.geodetic(state.map_from_base.translation)
+    assert line.endswith(f"{latitude:.7f} {longitude:.7f}")
+    (gps,) = [one for one in replayed.health if one.name == "gps"]
+    assert (gps.accepted > 20, gps.rejected) == (True, 0)
 
 
 @pytest.mark.long

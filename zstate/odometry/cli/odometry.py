@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
-    from zstate.odometry import DiffDrive, OdometryNode, PoseNoise, VelocityNoise
+    from zstate.odometry import DiffDrive, FixNoise, OdometryNode, PoseNoise, VelocityNoise
     from zstate.odometry.cli.reference import ReferenceName
     from zstate.odometry.cli.settings_file import LegSettings, OdometrySettings, PlanarPose
-    from zstate.odometry.messages import Imu, Pose, Velocity
+    from zstate.odometry.messages import Fix, Imu, Pose, Velocity
 
-    SensorMessage = Imu | Velocity | Pose
+    SensorMessage = Imu | Velocity | Pose | Fix
 
 
 def _parse_diff_drive(text: str) -> DiffDrive:
@@ -54,6 +54,12 @@ def _parse_pose(text: str) -> tuple[str, PoseNoise]:
     return parse_pose(text)
 
 
+def _parse_fix(text: str) -> tuple[str, FixNoise]:
+    from zstate.odometry.cli.settings_file import parse_fix
+
+    return parse_fix(text)
+
+
 def _parse_reference(text: str) -> ReferenceName:
     from zstate.odometry.cli.reference import parse_reference
 
@@ -67,8 +73,8 @@ def _parse_plot(file: str) -> Path:
 
 
 _OF_ESTIMATES = (
-    *("imu", "velocities", "poses", "diff_drive", "feet", "file", "odom", "base", "initial_pose"),
-    *("rate", "replay", "reference", "plot", "seconds"),
+    *("imu", "velocities", "poses", "fixes", "map_frame", "datum", "diff_drive", "feet", "file"),
+    *("odom", "base", "initial_pose", "rate", "replay", "reference", "plot", "seconds"),
 )
 """Parameters of the command that a request to a running odometry has no use for."""
 
@@ -93,6 +99,23 @@ _OF_ESTIMATES = (
     multiple=True,
     help="A further stream of measured poses in the frame of the odometry. Its noise is that of its "
     "messages, or sigma and sigma_deg. Repeatable.",
+)
+@click.option(
+    "--fix",
+    "fixes",
+    metavar="SENSOR[:sigma=M]",
+    type=options.Checked("SENSOR", _parse_fix),
+    multiple=True,
+    help="A satellite receiver, which places the odometry in a map, x east and y north. Its noise is that of "
+    "its messages, or sigma. Repeatable.",
+)
+@click.option("--map", "map_frame", metavar="FRAME", help="The frame of that map; default: map.")
+@click.option(
+    "--datum",
+    type=float,
+    nargs=3,
+    metavar="LAT LON ALT",
+    help="Its origin [degrees, metres above the ellipsoid]; default: the first fix.",
 )
 @click.option(
     "--diff-drive",
@@ -164,6 +187,9 @@ def odometry_command(
     imu: str | None,
     velocities: tuple[tuple[str, VelocityNoise], ...],
     poses: tuple[tuple[str, PoseNoise], ...],
+    fixes: tuple[tuple[str, FixNoise], ...],
+    map_frame: str | None,
+    datum: tuple[float, float, float] | None,
     diff_drive: DiffDrive | None,
     feet: LegSettings | None,
     file: str | None,
@@ -196,6 +222,7 @@ def odometry_command(
     zstate odometry go2 --feet FL_foot,FR_foot,RL_foot,RR_foot
     zstate odometry r1 --file r1.toml
     zstate odometry r1 --velocity wheels:sigma=0.05                # [m/s]; messages without covariance
+    zstate odometry r1 --diff-drive ... --fix gps                  # and map -> odom, by GPS
     zstate odometry r1 --file r1.toml --replay run.mcap --plot run.png
     zstate odometry r1 --file r1.toml --replay run.mcap --reference pose/mocap
     zstate odometry r1 --set-pose 2 1 90                           # the base of the one that runs
@@ -215,6 +242,9 @@ def odometry_command(
         "imu": imu,
         "velocity": dict(velocities) or None,
         "pose": dict(poses) or None,
+        "fix": dict(fixes) or None,
+        "map": map_frame,
+        "datum": datum,
         "odom": odom,
         "base": base,
         "initial_pose": initial_pose,
@@ -274,14 +304,17 @@ def _publish(
     with ExitStack() as opened:
         listener = opened.enter_context(TransformListener(session, robot))
         base, imu_frame, model = _wait_for_sensors(session, robot, settings, listener)
+        estimator = settings.estimator(robot, base, imu_frame, listener.buffer, model)
         node = opened.enter_context(
             OdometryNode(
                 session,
                 robot,
-                settings.estimator(robot, base, imu_frame, listener.buffer, model),
+                estimator,
                 imu=settings.imu,
                 velocities=settings.velocity,
                 poses=settings.pose,
+                fixes=settings.fix,
+                in_map=settings.map_estimator(robot, estimator, listener.buffer),
                 has_joints=settings.has_joints,
                 writer=writer,
                 rate_hz=rate_hz,
@@ -317,9 +350,14 @@ def _wait_for_sensors(
 
     waiter = ConditionWaiter()
     models: dict[str, RobotModel] = {}
-    heard: dict[str, dict[str, SensorMessage]] = {"imu": {}, "velocity": {}, "pose": {}}
+    heard: dict[str, dict[str, SensorMessage]] = {"imu": {}, "velocity": {}, "pose": {}, "fix": {}}
     """The first message of each sensor, by stream."""
-    needed = {"imu": (settings.imu,), "velocity": (*settings.velocity,), "pose": (*settings.pose,)}
+    needed = {
+        "imu": (settings.imu,),
+        "velocity": (*settings.velocity,),
+        "pose": (*settings.pose,),
+        "fix": (*settings.fix,),
+    }
 
     def base() -> str:
         return settings.base or models[robot].root
@@ -345,7 +383,8 @@ def _wait_for_sensors(
         if robot not in models and settings.base is None:
             return f"the model of {robot!r} has no publisher; start it, or give --base"
         try:
-            listener.buffer.lookup(full_name(robot, base()), imu_frame())
+            for frame in (imu_frame(), *(cast("Fix", heard["fix"][one]).frame for one in settings.fix)):
+                listener.buffer.lookup(full_name(robot, base()), frame)
         except LookupFailed as missing:
             return str(missing)
         return ""
@@ -363,6 +402,7 @@ def _wait_for_sensors(
             on_imu=partial(on_message, "imu"),
             on_velocity=partial(on_message, "velocity") if settings.velocity else None,
             on_pose=partial(on_message, "pose") if settings.pose else None,
+            on_fix=partial(on_message, "fix") if settings.fix else None,
         ),
         DescriptionSubscriber(session, robot, on_description),
     ):
@@ -378,7 +418,12 @@ def _sources_text(settings: OdometrySettings) -> str:
     wheels = ["its wheels"] if settings.wheels is not None else []
     feet = ["its feet"] if settings.legs is not None else []
     return ", ".join(
-        [f"its IMU {settings.imu!r}", *wheels, *feet, *map(repr, (*settings.velocity, *settings.pose))]
+        [
+            f"its IMU {settings.imu!r}",
+            *wheels,
+            *feet,
+            *map(repr, (*settings.velocity, *settings.pose, *settings.fix)),
+        ]
     )
 
 

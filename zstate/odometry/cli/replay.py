@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from operator import itemgetter
@@ -20,15 +21,24 @@ from zstate.cli.output.text_layout import Table
 from zstate.errors import InvalidInput, LookupFailed, NoData, UnknownFrame
 from zstate.model.joint_history import JointHistory
 from zstate.model.urdf import parse_urdf
-from zstate.odometry import BaseEstimator, BaseState, SourceHealth
+from zstate.odometry import (
+    BaseEstimator,
+    BaseState,
+    Datum,
+    FixNoise,
+    MapEstimator,
+    MapState,
+    SourceHealth,
+)
 from zstate.odometry.cli.delay import Delay, Motions
 from zstate.odometry.cli.reference import Comparison, Path, ReferenceName, compared, reference_path
 from zstate.odometry.cli.settings_file import OdometrySettings, others_text
 from zstate.odometry.estimator import WHEELS
 from zstate.odometry.fusion import STANDSTILL
 from zstate.odometry.health import WINDOW
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
 from zstate.odometry.node import (
+    add_fix,
     add_imu,
     add_pose,
     add_velocity,
@@ -45,7 +55,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Stamped = TypeVar("Stamped", Imu, Velocity, Pose, Odometry)
+Stamped = TypeVar("Stamped", Imu, Velocity, Pose, Fix, Odometry)
 
 _HEALTH_NS = 500_000_000
 """Interval of the points of the NIS."""
@@ -86,7 +96,8 @@ class ReplayedOdometry:
     ``health`` is the last one, ``nis`` by source the points of those in between: seconds since the first
     state, mean NIS, and its band from low to high. ``delays`` are those of sources whose stamps the motion
     determines, ``sigmas`` the medians of the standard deviations of velocities and poses: x y z [m/s], or x y
-    z [m] and the rotation [rad].
+    z [m] and the rotation [rad]. ``in_map`` is the last state in the map with the origin ``datum``, if fixes
+    gave one.
     """
 
     base: str
@@ -98,6 +109,8 @@ class ReplayedOdometry:
     delays: dict[str, Delay] = field(default_factory=dict[str, Delay])
     sigmas: dict[str, Floats] = field(default_factory=dict[str, Floats])
     reference: Comparison | None = None
+    in_map: MapState | None = None
+    datum: Datum | None = None
 
     @property
     def positions(self) -> Floats:
@@ -135,6 +148,7 @@ def replay(
         readings = sensors.imu(settings.imu)
         velocities = {name: sensors.velocities(name) for name in settings.velocity}
         poses = {name: sensors.poses(name) for name in settings.pose}
+        fixes = {name: sensors.fixes(name) for name in settings.fix}
         joints = recording.joint_states(robot) if settings.has_joints else None
         truth = None if reference is None else sensors.reference(reference)
     base = settings.base or (None if model is None else model.root)
@@ -142,6 +156,7 @@ def replay(
         raise InvalidInput(f"{path} has no model of {robot!r}, whose root would be the base; give --base")
     try:
         estimator = settings.estimator(robot, base, readings[0].frame, mounts, model)
+        in_map = settings.map_estimator(robot, estimator, mounts)
     except LookupFailed as failure:
         is_empty = isinstance(failure, UnknownFrame) and not failure.frame_count
         raise InvalidInput(
@@ -165,12 +180,20 @@ def replay(
         events += [(one.stamp, False, partial(add, message=one)) for one in known]
         sigmas[name] = _median_sigmas(pose_covariance(name, one, noise) for one in known)
         delays[name] = motions.delay(motions.of_poses(known), None)
+    if in_map is not None:
+        events += [
+            (one.stamp, False, partial(_add_fix, in_map=in_map, sensor=name, noise=noise, message=one))
+            for name, noise in settings.fix.items()
+            for one in fixes[name]
+        ]
     if joints is not None:
         events += [
             (stamp, False, partial(_add_joints, joints=joints, row=row))
             for row, stamp in enumerate(joints.stamps.tolist())
         ]
-    replayed = _run(estimator, base, sorted(events, key=itemgetter(0)))  # checks the joints of the wheels
+    replayed = _run(
+        estimator, in_map, base, sorted(events, key=itemgetter(0))
+    )  # checks the joints of the wheels
     if joints is not None and settings.wheels is not None:
         delays[WHEELS] = motions.delay(*motions.of_wheels(settings.wheels, joints))
     replayed.sigmas = sigmas
@@ -180,7 +203,7 @@ def replay(
     return replayed
 
 
-def _stamp(message: Imu | Velocity | Pose | Odometry) -> int:
+def _stamp(message: Imu | Velocity | Pose | Fix | Odometry) -> int:
     return message.stamp
 
 
@@ -201,6 +224,9 @@ class _RecordedSensors:
 
     def poses(self, sensor: str) -> list[Pose]:
         return self._some("pose", sensor, self._recording.poses(self._robot, sensor))
+
+    def fixes(self, sensor: str) -> list[Fix]:
+        return self._some("fix", sensor, self._recording.fixes(self._robot, sensor))
 
     def reference(self, name: ReferenceName) -> Sequence[Pose | Odometry]:
         if name.stream == "pose":
@@ -260,7 +286,16 @@ def _by_name_if_known(names: Sequence[str], block: Floats | None, row: int) -> d
     return dict(zip(names, block[row].tolist(), strict=True))
 
 
-def _run(base: BaseEstimator, frame: str, events: Sequence[Event]) -> ReplayedOdometry:
+def _add_fix(base: BaseEstimator, in_map: MapEstimator, sensor: str, noise: FixNoise, message: Fix) -> None:
+    """Pass a fix to ``in_map``, which follows ``base``; messages without a fix are none."""
+    assert in_map.odometry is base
+    if message.status >= 0:
+        add_fix(in_map, sensor, noise, message)
+
+
+def _run(
+    base: BaseEstimator, in_map: MapEstimator | None, frame: str, events: Sequence[Event]
+) -> ReplayedOdometry:
     replayed = ReplayedOdometry(frame)
     due = 0
     for stamp, is_imu, add in events:
@@ -278,6 +313,11 @@ def _run(base: BaseEstimator, frame: str, events: Sequence[Event]) -> ReplayedOd
                 if one.dimension:
                     replayed.nis.setdefault(one.name, []).append((second, one.nis_mean, *one.nis_band))
     replayed.health = base.health()
+    if in_map is not None:
+        replayed.health += in_map.health()
+        replayed.datum = in_map.datum
+        with suppress(NoData):
+            replayed.in_map = in_map.state()
     return replayed
 
 
@@ -297,10 +337,27 @@ def report_lines(replayed: ReplayedOdometry) -> Iterator[str]:
         f"x {x:.3f} m (sigma {sigmas[0]:.3f}), y {y:.3f} m ({sigmas[1]:.3f}), z {z:.3f} m ({sigmas[2]:.3f}), "
         f"yaw {math.degrees(last.odom_from_base.rpy[2]):.1f} deg ({math.degrees(sigmas[5]):.1f})"
     )
+    yield from _map_lines(replayed)
     drift = float(np.hypot(sigmas[0], sigmas[1]))
     yield f"drift by its own claim: {drift:.3f} m{_part_text(drift, replayed.way_m)}"
     if replayed.reference is not None:
         yield from _reference_lines(replayed.reference, replayed.way_m)
+
+
+def _map_lines(replayed: ReplayedOdometry) -> Iterator[str]:
+    """Where the base ends in the map and on the Earth."""
+    state, datum = replayed.in_map, replayed.datum
+    if state is None or datum is None:
+        return
+    x, y, z = state.map_from_base.translation.tolist()
+    sigmas = np.sqrt(np.diag(state.covariance))
+    latitude, longitude, _ = datum.geodetic((x, y, z))
+    yield (
+        f"in {state.map_from_base.target!r}, x east and y north of {datum.latitude:.7f} "
+        f"{datum.longitude:.7f}, it ends at x {x:.2f} m (sigma {sigmas[0]:.2f}), y {y:.2f} m "
+        f"({sigmas[1]:.2f}), yaw {math.degrees(state.map_from_base.rpy[2]):.1f} deg "
+        f"({math.degrees(sigmas[5]):.1f}): {latitude:.7f} {longitude:.7f}"
+    )
 
 
 def source_table(replayed: ReplayedOdometry) -> Table:

@@ -22,11 +22,14 @@ from zstate.model.robot import RobotModel
 from zstate.odometry import (
     Ackermann,
     BaseEstimator,
+    Datum,
     DiffDrive,
+    FixNoise,
     ForceThresholds,
     ImuNoise,
     LegNoise,
     Legs,
+    MapEstimator,
     Mecanum,
     PoseNoise,
     SpeedThresholds,
@@ -43,7 +46,7 @@ DEFAULT_SPEEDS = SpeedThresholds(touchdown=0.1, liftoff=0.2)
 """Those of the feet of walking robots without another setting."""
 
 T = TypeVar("T")
-Noise = TypeVar("Noise", VelocityNoise, PoseNoise)
+Noise = TypeVar("Noise", VelocityNoise, PoseNoise, FixNoise)
 PlanarPose = tuple[float, float, float]
 """x, y [m] and yaw [degrees] in the frame of the odometry."""
 
@@ -78,14 +81,19 @@ class LegSettings:
 class OdometrySettings:
     """The sensors, frames and noise of one robot.
 
-    ``velocity`` and ``pose`` are further sensors by name, with what is stated of their noise. ``base`` None
-    is the root of the model. Without an ``initial_pose`` the base starts at the origin, once it is aligned at
-    rest. Raises InvalidInput for names that no sensor can have, and for wheels of several kinds.
+    ``velocity``, ``pose`` and ``fix`` are further sensors by name, with what is stated of their noise. Fixes
+    place the odometry in the frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and
+    an altitude [m]; by default it is the first fix. ``base`` None is the root of the model. Without an
+    ``initial_pose`` the base starts at the origin, once it is aligned at rest. Raises InvalidInput for names
+    that no sensor can have, for wheels of several kinds, and for a datum that is no place on the Earth.
     """
 
     imu: str = "imu"
     velocity: dict[str, VelocityNoise] = field(default_factory=dict[str, VelocityNoise])
     pose: dict[str, PoseNoise] = field(default_factory=dict[str, PoseNoise])
+    fix: dict[str, FixNoise] = field(default_factory=dict[str, FixNoise])
+    map: str = "map"
+    datum: tuple[float, float, float] | None = None
     odom: str = "odom"
     base: str | None = None
     initial_pose: PlanarPose | None = None
@@ -97,11 +105,13 @@ class OdometrySettings:
     legs: LegSettings | None = None
 
     def __post_init__(self) -> None:
-        for sensor in (self.imu, *self.velocity, *self.pose):
+        for sensor in (self.imu, *self.velocity, *self.pose, *self.fix):
             check_writer(sensor)
         kinds = [kind for kind in ("diff_drive", "ackermann", "mecanum") if getattr(self, kind) is not None]
         if len(kinds) > 1:
             raise InvalidInput(f"a robot has wheels of one kind, not of {' and '.join(kinds)}")
+        if self.datum is not None:
+            Datum(*self.datum)  # raises here
 
     @property
     def wheels(self) -> Wheels | None:
@@ -139,6 +149,15 @@ class OdometrySettings:
             initial_pose=start,
         )
 
+    def map_estimator(
+        self, robot: str, odometry: BaseEstimator, buffer: TransformBuffer
+    ) -> MapEstimator | None:
+        """What places ``odometry`` in the map by fixes; None without receivers."""
+        if not self.fix:
+            return None
+        datum = None if self.datum is None else Datum(*self.datum)
+        return MapEstimator(odometry, map=full_name(robot, self.map), buffer=buffer, datum=datum)
+
 
 def planar_transform(odom: str, base: str, pose: PlanarPose) -> Transform:
     """The pose of ``base`` in ``odom``, on the floor and upright."""
@@ -149,7 +168,7 @@ def planar_transform(odom: str, base: str, pose: PlanarPose) -> Transform:
 def read_settings(path: str) -> OdometrySettings:
     """The settings in a TOML file. Raises ConfigError, with the line, for unknown and unusable keys."""
     file = TomlFile(Path(path))
-    for kind, noise in (("velocity", VelocityNoise), ("pose", PoseNoise)):
+    for kind, noise in (("velocity", VelocityNoise), ("pose", PoseNoise), ("fix", FixNoise)):
         for sensor, table in _table(file.tables.get(kind)).items():
             _converted(table, noise, file, f"{kind}.{sensor}")  # msgspec does not name keys of mappings
     return _converted(file.tables, OdometrySettings, file, "")
@@ -204,6 +223,11 @@ def parse_velocity(text: str) -> tuple[str, VelocityNoise]:
 def parse_pose(text: str) -> tuple[str, PoseNoise]:
     """``SENSOR[:sigma=M,sigma_deg=DEG]``, likewise."""
     return _parse_source(text, PoseNoise)
+
+
+def parse_fix(text: str) -> tuple[str, FixNoise]:
+    """``SENSOR[:sigma=M,floor=M,correlated_s=S]``, likewise."""
+    return _parse_source(text, FixNoise)
 
 
 def _parse_source(text: str, kind: Callable[..., Noise]) -> tuple[str, Noise]:
