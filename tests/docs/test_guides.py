@@ -64,8 +64,9 @@ def test_sentences_in_the_guide_of_odometry_are_those_of_the_code() -> None:
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     ]
-    table = GUIDES["odometry"].partition("| sentence |")[2].partition("\n\n")[0]
-    quoted = re.findall(r"`([^`]*)`", "".join(f"{row.split(' | ')[0]}\n" for row in table.splitlines()[2:]))
+    tables = [text.partition("\n\n")[0] for text in GUIDES["odometry"].split("| sentence |")[1:]]
+    rows = [row for table in tables for row in table.splitlines()[2:]]
+    quoted = re.findall(r"`([^`]*)`", "".join(f"{row.split(' | ')[0]}\n" for row in rows))
     assert len(quoted) > 20
     for sentence in quoted:
         split = re.split(r"\d[\d.]*(?: s\b| readings?)?|'\w+'|\.\.\.|[,;:]", sentence)
