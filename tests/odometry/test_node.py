@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
 
+import msgspec
 import numpy as np
 import pytest
 from helpers.processes import DEADLINE_S, until
@@ -28,6 +29,7 @@ from zstate.odometry import (
     DiffDrive,
     FixNoise,
     FixPublisher,
+    HeadingNoise,
     ImuNoise,
     ImuPublisher,
     MapEstimator,
@@ -39,7 +41,7 @@ from zstate.odometry import (
     VelocityPublisher,
 )
 from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
-from zstate.odometry.node import pose_covariance, velocity_covariance
+from zstate.odometry.node import add_heading, heading_sigma, pose_covariance, velocity_covariance
 from zstate.odometry.requests import request_odometry
 from zstate.odometry.simulated_rover import SimulatedRover
 from zstate.rate import Rate
@@ -125,11 +127,15 @@ def test_fixes_place_the_odometry_in_the_map_and_the_pose_there_has_a_covariance
             SensorListener(session, "r1", on_pose=lambda _, message: received.append(message)),
         ):
             rover.truth.drive((4.0, 5.0))
+            due = 0
 
             def is_in_map() -> bool:
-                x, y, _ = rover.truth.pose
-                place = datum.geodetic((3.0 - y, 2.0 + x, 0.0))
-                gps.publish(*place, covariance=np.diag((0.02, 0.02, 0.05)) ** 2)
+                nonlocal due
+                if rover.ticks >= due:
+                    due = rover.ticks + 20
+                    x, y, _ = rover.truth.pose
+                    place = datum.geodetic((3.0 - y, 2.0 + x, 0.0))
+                    gps.publish(*place, covariance=np.diag((0.02, 0.02, 0.05)) ** 2)
                 return bool(received)
 
             until(is_in_map)
@@ -168,6 +174,36 @@ def test_odometry_follows_the_truth_and_is_a_moving_edge_with_a_covariance():
 def _distance(rover: Rover, listener: TransformListener) -> float:
     x, y, _ = listener.buffer.lookup(ODOM, BASE).translation.tolist()
     return math.hypot(x - rover.truth.pose.x, y - rover.truth.pose.y)
+
+
+def test_heading_of_an_imu_is_the_yaw_of_its_frame_and_needs_a_stated_noise():
+    base = Recorder()
+    half = 0.5 * 0.7
+    orientation = to_block([0.0, 0.0, math.sin(half), math.cos(half)])
+    message = Imu(STAMP, 0, 1, IMU, to_block([0.0] * 3), to_block([0.0] * 3), orientation)
+    add_heading(base, "imu", HeadingNoise(sigma_deg=2.0), message)  # pyright: ignore[reportArgumentType]
+    ((stamp, yaw, sigma, options),) = base.headings
+    assert (stamp, options) == (STAMP, {"source": "imu heading", "frame": IMU})
+    assert (yaw, sigma) == pytest.approx((0.7, math.radians(2.0)))
+    covariance = to_block(np.diag((1.0, 1.0, 0.04))[np.triu_indices(3)])
+    stated = msgspec.structs.replace(message, orientation_covariance=covariance)
+    assert heading_sigma("imu", stated, HeadingNoise()) == pytest.approx(0.2)
+    with pytest.raises(
+        InvalidInput, match="have no covariance: state their noise by `--heading imu:sigma_deg=5`"
+    ):
+        heading_sigma("imu", message, HeadingNoise())
+    with pytest.raises(InvalidInput, match="the IMU 'imu' sends no orientation"):
+        heading_sigma("imu", msgspec.structs.replace(message, orientation=None), HeadingNoise())
+
+
+class Recorder:
+    """In place of an estimator: its calls of ``heading``."""
+
+    def __init__(self) -> None:
+        self.headings: list[tuple[int, float, float, dict[str, str]]] = []
+
+    def heading(self, stamp: int, yaw: float, sigma: float, **options: str) -> None:
+        self.headings.append((stamp, yaw, sigma, options))
 
 
 def test_wheels_ahead_of_the_imu_do_not_move_the_state_beyond_its_last_reading(sessions):

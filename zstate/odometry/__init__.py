@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     )
     from zstate.odometry.requests import request_odometry
     from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
-    from zstate.odometry.source_noise import FixNoise, PoseNoise, VelocityNoise
+    from zstate.odometry.source_noise import FixNoise, HeadingNoise, PoseNoise, VelocityNoise
     from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "FixNoise",
     "FixPublisher",
     "ForceThresholds",
+    "HeadingNoise",
     "ImuNoise",
     "ImuPublisher",
     "LegNoise",
@@ -72,6 +73,7 @@ _HOMES = {
     "FixNoise": "source_noise",
     "FixPublisher": "publishers",
     "ForceThresholds": "legs",
+    "HeadingNoise": "source_noise",
     "ImuNoise": "invariant_filter",
     "ImuPublisher": "publishers",
     "LegNoise": "legs",

@@ -6,6 +6,7 @@ The functions that pass a message to an estimator also serve recordings.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +36,7 @@ from zstate.odometry.map_estimator import MapEstimator
 from zstate.odometry.messages import Fix, Imu, Pose, Velocity, with_full_names
 from zstate.odometry.publishers import OdometryPublisher, PosePublisher
 from zstate.odometry.requests import apply_request
-from zstate.odometry.source_noise import FixNoise, PoseNoise, VelocityNoise
+from zstate.odometry.source_noise import FixNoise, HeadingNoise, PoseNoise, VelocityNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.streams import StreamName
 from zstate.transform import Transform
@@ -101,6 +102,25 @@ def pose_covariance(sensor: str, message: Pose, noise: PoseNoise) -> Floats:
     return covariance
 
 
+def heading_sigma(sensor: str, message: Imu, noise: HeadingNoise) -> float:
+    """The standard deviation of the yaw of an orientation [rad]: by ``noise``, else of the message.
+
+    Raises InvalidInput for a message without an orientation, and as ``velocity_covariance``.
+    """
+    if message.orientation is None:
+        raise InvalidInput(f"the IMU {sensor!r} sends no orientation, and so no heading")
+    if noise.sigma_deg is not None:
+        return math.radians(noise.sigma_deg)
+    known = message.orientation_covariance
+    covariance = None if known is None else covariance_matrix(known)
+    if covariance is None or not covariance[2, 2] > 0.0:
+        raise InvalidInput(
+            f"orientations of {sensor!r} have {_unknown(covariance)}: state their noise by `--heading "
+            f"{sensor}:sigma_deg=5`, or sigma_deg = 5.0 [degrees] in [heading.{sensor}] of the settings"
+        )
+    return math.sqrt(float(covariance[2, 2]))
+
+
 def _unknown(covariance: Floats | None) -> str:
     return "no covariance" if covariance is None else "a covariance with variances that are not above zero"
 
@@ -116,6 +136,18 @@ def add_velocity(base: BaseEstimator, sensor: str, noise: VelocityNoise, message
         scale=noise.scale,
         source=sensor,
     )
+
+
+def add_heading(base: BaseEstimator, sensor: str, noise: HeadingNoise, message: Imu) -> None:
+    """Pass the yaw of the orientation of an IMU to ``base``, as a source of its own beside its rates.
+
+    Raises InvalidInput as ``heading_sigma``.
+    """
+    sigma = heading_sigma(sensor, message, noise)
+    assert message.orientation is not None
+    x, y, z, w = from_block(message.orientation).tolist()
+    yaw = math.atan2(2.0 * (x * y + z * w), 1.0 - 2.0 * (y * y + z * z))
+    base.heading(message.stamp, yaw, sigma, source=f"{sensor} heading", frame=message.frame)
 
 
 def add_pose(base: BaseEstimator, sensor: str, noise: PoseNoise, message: Pose) -> None:
@@ -255,8 +287,9 @@ class _MapPublishers(NamedTuple):
 class OdometryNode(Closeable):
     """Feeds ``base`` with the sensors of ``robot``, and publishes its odometry as ``writer``.
 
-    ``base`` gets the readings of the IMU ``imu``, of the sensors ``velocities`` and ``poses``, each with what
-    is stated of its noise, and with ``has_joints`` the joint states, from the threads of their subscriptions.
+    ``base`` gets the readings of the IMU ``imu``, of the sensors ``velocities`` and ``poses``, and the yaw of
+    the orientations of the IMUs ``headings``, each with what is stated of its noise, and with ``has_joints``
+    the joint states, from the threads of their subscriptions.
     Each reading of the IMU publishes the state at its stamp, at most ``rate_hz`` of them a second. If the IMU
     is silent for 0.1 s, readings of the other sources do; if all are silent, nothing is published. The
     sentences of ``base.health()`` are the warning in the status of the writer.
@@ -283,6 +316,7 @@ class OdometryNode(Closeable):
         imu: str = "imu",
         velocities: Mapping[str, VelocityNoise] = MappingProxyType({}),
         poses: Mapping[str, PoseNoise] = MappingProxyType({}),
+        headings: Mapping[str, HeadingNoise] = MappingProxyType({}),
         fixes: Mapping[str, FixNoise] = MappingProxyType({}),
         in_map: MapEstimator | None = None,
         has_joints: bool = False,
@@ -297,6 +331,7 @@ class OdometryNode(Closeable):
         self.has_failed = fork_safe(threading.Event())
         self._refusals = Refusals("joint states")
         self._imu, self._velocities, self._poses = imu, dict(velocities), dict(poses)
+        self._headings = dict(headings)
         self._fixes, self._in_map = dict(fixes), in_map
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
@@ -376,17 +411,21 @@ class OdometryNode(Closeable):
     # In the threads of the subscriptions
 
     def _on_imu(self, sensor: str, message: Imu) -> None:
-        if sensor != self._imu:
-            return
         with self._lock:
-            self._check_stamp(message.stamp)
-            add_imu(self.base, message)
-            self._check_epoch()
-            is_present = message.stamp <= self.base.newest
-            if is_present:
-                self._imu_stamp = max(self._imu_stamp, message.stamp)
-                # Not the newest of all data: wheels may be ahead, and what the IMU did since is not known.
-                self._publish(message.stamp, at=self._imu_stamp)
+            if sensor in (self._imu, *self._headings):
+                self._check_stamp(message.stamp)
+            if sensor == self._imu:
+                self._add_imu(message)
+            if sensor in self._headings:
+                add_heading(self.base, sensor, self._headings[sensor], message)
+
+    def _add_imu(self, message: Imu) -> None:
+        add_imu(self.base, message)
+        self._check_epoch()
+        if message.stamp <= self.base.newest:  # else it is of another time
+            self._imu_stamp = max(self._imu_stamp, message.stamp)
+            # Not the newest of all data: wheels may be ahead, and what the IMU did since is not known.
+            self._publish(message.stamp, at=self._imu_stamp)
 
     def _on_velocity(self, sensor: str, message: Velocity) -> None:
         if sensor in self._velocities:

@@ -1,4 +1,4 @@
-"""What a user states of the noise of velocities, poses or fixes; it takes precedence over messages."""
+"""What a user states of the noise of a source; it takes precedence over messages."""
 
 from __future__ import annotations
 
@@ -79,6 +79,20 @@ def _check_sigma(name: str, sigma: Sigma | None) -> None:
         raise InvalidInput(
             f"{name} is a standard deviation above zero, or three for x, y and z; got {sigma!r}"
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeadingNoise:
+    """The noise of headings, as of the orientation of an IMU with a compass; one setting for a sensor.
+
+    ``sigma_deg`` [degrees] is that of errors that do not average out; None if messages have it, as a
+    covariance. Raises InvalidInput unless it is finite and above zero.
+    """
+
+    sigma_deg: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_sigma("sigma_deg", self.sigma_deg)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,6 +22,7 @@ from zstate.odometry import (
     Datum,
     DiffDrive,
     FixNoise,
+    HeadingNoise,
     ImuNoise,
     PoseNoise,
     SimulatedRover,
@@ -105,7 +106,8 @@ def recorded(path: Path, *, covariance: float = 0.0) -> Path:
         write = builder.encoder.write_message
         builder.describe("r1", MODEL)
         for one in drive().imu:
-            message = Imu(one.stamp, 0, 2, "imu_link", to_block(one.gyro), to_block(one.accel))
+            orientation = to_block([0.0, 0.0, 0.0, 1.0])  # a compass that always shows the same
+            message = Imu(one.stamp, 0, 2, "imu_link", to_block(one.gyro), to_block(one.accel), orientation)
             write("r1", message, one.stamp, "imu")
         for stamp, positions in drive().joints:
             builder.joints("r1", stamp + JOINT_DELAY_MS * MS, positions, model=MODEL)
@@ -190,6 +192,17 @@ def test_reference_gives_ate_error_at_the_end_and_nees(tmp_path: Path, stream: s
         rf"against \d+ readings of {stream}: ATE 0.\d+ m, error at the end 0.\d+ m, .* % of", text
     )
     assert re.search(r"error at the end \d.\d sigma .*; NEES of x y \d.\d\d \(2 is right", text)
+
+
+@pytest.mark.long
+def test_compass_that_lies_is_a_source_with_a_sentence_and_does_not_turn_the_odometry(tmp_path: Path):
+    path = str(recorded(tmp_path / "r.mcap"))
+    without = replay(path, "r1", SETTINGS)
+    replayed = replay(path, "r1", replace(SETTINGS, heading={"imu": HeadingNoise(sigma_deg=2.0)}))
+    (compass,) = [one for one in replayed.health if one.name == "imu heading"]
+    assert "against the gyro" in compass.sentence
+    yaws = [one.states[-1].odom_from_base.rpy[2] for one in (without, replayed)]
+    assert math.remainder(yaws[1] - yaws[0], math.tau) == pytest.approx(0.0, abs=0.1)
 
 
 @pytest.mark.long

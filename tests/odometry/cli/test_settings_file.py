@@ -10,7 +10,9 @@ from zstate.errors import ConfigError, InvalidInput
 from zstate.odometry import (
     Ackermann,
     DiffDrive,
+    FixNoise,
     ForceThresholds,
+    HeadingNoise,
     ImuNoise,
     LegNoise,
     PoseNoise,
@@ -23,6 +25,8 @@ from zstate.odometry.cli.settings_file import (
     OdometrySettings,
     parse_diff_drive,
     parse_feet,
+    parse_fix,
+    parse_heading,
     parse_pose,
     parse_velocity,
     read_settings,
@@ -163,6 +167,25 @@ def test_noise_of_a_source_is_stated_on_the_command_line():
     assert parse_pose("mocap:sigma=0.01,sigma_deg=1")[1].sigmas == pytest.approx(
         (0.01,) * 3 + (0.0174533,) * 3
     )
+    assert parse_heading("imu:sigma_deg=5") == ("imu", HeadingNoise(sigma_deg=5.0))
+    assert parse_fix("gps") == ("gps", FixNoise())
+    assert parse_fix("gps:sigma=1.5,correlated_s=30")[1] == FixNoise(sigma=1.5, correlated_s=30.0)
+    assert FixNoise(sigma=1.5).sigmas == (1.5, 15.0)
+
+
+def test_file_has_receivers_and_the_origin_of_their_map(tmp_path: Path):
+    text = 'map = "site/map"\ndatum = [48.1, 11.5, 560.0]\n' + ROVER
+    text += "[fix.gps]\nsigma = [1.5, 4.0]\n[heading.imu]\nsigma_deg = 5.0\n"
+    settings = read_settings(written(tmp_path, text))
+    assert (settings.map, settings.datum) == ("site/map", (48.1, 11.5, 560.0))
+    assert settings.fix == {"gps": FixNoise(sigma=(1.5, 4.0))}
+    assert settings.heading == {"imu": HeadingNoise(sigma_deg=5.0)}
+    with pytest.raises(ConfigError, match="a place has a latitude of -90 to 90"):
+        read_settings(written(tmp_path, text.replace("48.1", "98.1")))
+    with pytest.raises(
+        ConfigError, match=r"rover.toml:\d+: fix.gps: sigma of a satellite receiver is above zero"
+    ):
+        read_settings(written(tmp_path, text.replace("4.0]", "0.0]")))
 
 
 @pytest.mark.parametrize(

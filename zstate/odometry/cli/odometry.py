@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
-    from zstate.odometry import DiffDrive, FixNoise, OdometryNode, PoseNoise, VelocityNoise
+    from zstate.odometry import DiffDrive, FixNoise, HeadingNoise, OdometryNode, PoseNoise, VelocityNoise
     from zstate.odometry.cli.reference import ReferenceName
     from zstate.odometry.cli.settings_file import LegSettings, OdometrySettings, PlanarPose
     from zstate.odometry.messages import Fix, Imu, Pose, Velocity
@@ -54,6 +54,12 @@ def _parse_pose(text: str) -> tuple[str, PoseNoise]:
     return parse_pose(text)
 
 
+def _parse_heading(text: str) -> tuple[str, HeadingNoise]:
+    from zstate.odometry.cli.settings_file import parse_heading
+
+    return parse_heading(text)
+
+
 def _parse_fix(text: str) -> tuple[str, FixNoise]:
     from zstate.odometry.cli.settings_file import parse_fix
 
@@ -73,8 +79,8 @@ def _parse_plot(file: str) -> Path:
 
 
 _OF_ESTIMATES = (
-    *("imu", "velocities", "poses", "fixes", "map_frame", "datum", "diff_drive", "feet", "file"),
-    *("odom", "base", "initial_pose", "rate", "replay", "reference", "plot", "seconds"),
+    *("imu", "velocities", "poses", "headings", "fixes", "map_frame", "datum", "diff_drive", "feet"),
+    *("file", "odom", "base", "initial_pose", "rate", "replay", "reference", "plot", "seconds"),
 )
 """Parameters of the command that a request to a running odometry has no use for."""
 
@@ -99,6 +105,15 @@ _OF_ESTIMATES = (
     multiple=True,
     help="A further stream of measured poses in the frame of the odometry. Its noise is that of its "
     "messages, or sigma and sigma_deg. Repeatable.",
+)
+@click.option(
+    "--heading",
+    "headings",
+    metavar="SENSOR[:sigma_deg=DEG]",
+    type=options.Checked("SENSOR", _parse_heading),
+    multiple=True,
+    help="An IMU whose orientation shows the yaw, as by a compass. Its noise is that of its messages, or "
+    "sigma_deg. Repeatable.",
 )
 @click.option(
     "--fix",
@@ -187,6 +202,7 @@ def odometry_command(
     imu: str | None,
     velocities: tuple[tuple[str, VelocityNoise], ...],
     poses: tuple[tuple[str, PoseNoise], ...],
+    headings: tuple[tuple[str, HeadingNoise], ...],
     fixes: tuple[tuple[str, FixNoise], ...],
     map_frame: str | None,
     datum: tuple[float, float, float] | None,
@@ -242,6 +258,7 @@ def odometry_command(
         "imu": imu,
         "velocity": dict(velocities) or None,
         "pose": dict(poses) or None,
+        "heading": dict(headings) or None,
         "fix": dict(fixes) or None,
         "map": map_frame,
         "datum": datum,
@@ -313,6 +330,7 @@ def _publish(
                 imu=settings.imu,
                 velocities=settings.velocity,
                 poses=settings.pose,
+                headings=settings.heading,
                 fixes=settings.fix,
                 in_map=settings.map_estimator(robot, estimator, listener.buffer),
                 has_joints=settings.has_joints,
@@ -344,7 +362,7 @@ def _wait_for_sensors(
     from zstate.odometry import SensorListener
     from zstate.odometry.cli.settings_file import others_text
     from zstate.odometry.messages import Imu
-    from zstate.odometry.node import pose_covariance, velocity_covariance
+    from zstate.odometry.node import heading_sigma, pose_covariance, velocity_covariance
     from zstate.sources.joint_state_listener import DescriptionSubscriber
     from zstate.wire.keys import full_name
 
@@ -353,7 +371,7 @@ def _wait_for_sensors(
     heard: dict[str, dict[str, SensorMessage]] = {"imu": {}, "velocity": {}, "pose": {}, "fix": {}}
     """The first message of each sensor, by stream."""
     needed = {
-        "imu": (settings.imu,),
+        "imu": (settings.imu, *settings.heading),
         "velocity": (*settings.velocity,),
         "pose": (*settings.pose,),
         "fix": (*settings.fix,),
@@ -383,7 +401,8 @@ def _wait_for_sensors(
         if robot not in models and settings.base is None:
             return f"the model of {robot!r} has no publisher; start it, or give --base"
         try:
-            for frame in (imu_frame(), *(cast("Fix", heard["fix"][one]).frame for one in settings.fix)):
+            frames = [cast("Imu", heard["imu"][one]).frame for one in needed["imu"]]
+            for frame in (*frames, *(cast("Fix", heard["fix"][one]).frame for one in settings.fix)):
                 listener.buffer.lookup(full_name(robot, base()), frame)
         except LookupFailed as missing:
             return str(missing)
@@ -411,6 +430,8 @@ def _wait_for_sensors(
         velocity_covariance(sensor, cast("Velocity", heard["velocity"][sensor]), noise)
     for sensor, noise in settings.pose.items():
         pose_covariance(sensor, cast("Pose", heard["pose"][sensor]), noise)
+    for sensor, noise in settings.heading.items():
+        heading_sigma(sensor, cast("Imu", heard["imu"][sensor]), noise)
     return base(), imu_frame(), models.get(robot)
 
 
@@ -422,7 +443,9 @@ def _sources_text(settings: OdometrySettings) -> str:
             f"its IMU {settings.imu!r}",
             *wheels,
             *feet,
-            *map(repr, (*settings.velocity, *settings.pose, *settings.fix)),
+            *map(repr, (*settings.velocity, *settings.pose)),
+            *(f"the heading of {name!r}" for name in settings.heading),
+            *map(repr, settings.fix),
         ]
     )
 

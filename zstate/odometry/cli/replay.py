@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -39,6 +39,7 @@ from zstate.odometry.health import WINDOW
 from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
 from zstate.odometry.node import (
     add_fix,
+    add_heading,
     add_imu,
     add_pose,
     add_velocity,
@@ -148,6 +149,7 @@ def replay(
         readings = sensors.imu(settings.imu)
         velocities = {name: sensors.velocities(name) for name in settings.velocity}
         poses = {name: sensors.poses(name) for name in settings.pose}
+        headings = {name: sensors.imu(name) for name in settings.heading}
         fixes = {name: sensors.fixes(name) for name in settings.fix}
         joints = recording.joint_states(robot) if settings.has_joints else None
         truth = None if reference is None else sensors.reference(reference)
@@ -180,12 +182,13 @@ def replay(
         events += [(one.stamp, False, partial(add, message=one)) for one in known]
         sigmas[name] = _median_sigmas(pose_covariance(name, one, noise) for one in known)
         delays[name] = motions.delay(motions.of_poses(known), None)
+    events += [
+        (one.stamp, False, partial(add_heading, sensor=name, noise=noise, message=one))
+        for name, noise in settings.heading.items()
+        for one in headings[name]
+    ]
     if in_map is not None:
-        events += [
-            (one.stamp, False, partial(_add_fix, in_map=in_map, sensor=name, noise=noise, message=one))
-            for name, noise in settings.fix.items()
-            for one in fixes[name]
-        ]
+        events += _fix_events(in_map, settings, fixes)
     if joints is not None:
         events += [
             (stamp, False, partial(_add_joints, joints=joints, row=row))
@@ -286,11 +289,18 @@ def _by_name_if_known(names: Sequence[str], block: Floats | None, row: int) -> d
     return dict(zip(names, block[row].tolist(), strict=True))
 
 
-def _add_fix(base: BaseEstimator, in_map: MapEstimator, sensor: str, noise: FixNoise, message: Fix) -> None:
-    """Pass a fix to ``in_map``, which follows ``base``; messages without a fix are none."""
-    assert in_map.odometry is base
-    if message.status >= 0:
+def _fix_events(
+    in_map: MapEstimator, settings: OdometrySettings, fixes: Mapping[str, Sequence[Fix]]
+) -> Iterator[Event]:
+    """Each fix as an event of the odometry of ``in_map``; messages without a fix are none."""
+
+    def add(_: BaseEstimator, sensor: str, noise: FixNoise, message: Fix) -> None:
         add_fix(in_map, sensor, noise, message)
+
+    for name, noise in settings.fix.items():
+        for one in fixes[name]:
+            if one.status >= 0:
+                yield one.stamp, False, partial(add, sensor=name, noise=noise, message=one)
 
 
 def _run(

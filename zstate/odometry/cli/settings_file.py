@@ -26,6 +26,7 @@ from zstate.odometry import (
     DiffDrive,
     FixNoise,
     ForceThresholds,
+    HeadingNoise,
     ImuNoise,
     LegNoise,
     Legs,
@@ -46,7 +47,7 @@ DEFAULT_SPEEDS = SpeedThresholds(touchdown=0.1, liftoff=0.2)
 """Those of the feet of walking robots without another setting."""
 
 T = TypeVar("T")
-Noise = TypeVar("Noise", VelocityNoise, PoseNoise, FixNoise)
+Noise = TypeVar("Noise", VelocityNoise, PoseNoise, HeadingNoise, FixNoise)
 PlanarPose = tuple[float, float, float]
 """x, y [m] and yaw [degrees] in the frame of the odometry."""
 
@@ -81,16 +82,18 @@ class LegSettings:
 class OdometrySettings:
     """The sensors, frames and noise of one robot.
 
-    ``velocity``, ``pose`` and ``fix`` are further sensors by name, with what is stated of their noise. Fixes
-    place the odometry in the frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and
-    an altitude [m]; by default it is the first fix. ``base`` None is the root of the model. Without an
-    ``initial_pose`` the base starts at the origin, once it is aligned at rest. Raises InvalidInput for names
-    that no sensor can have, for wheels of several kinds, and for a datum that is no place on the Earth.
+    ``velocity``, ``pose``, ``heading`` and ``fix`` are further sensors by name, with what is stated of their
+    noise; those of ``heading`` are IMUs whose orientation shows the yaw. Fixes place the odometry in the
+    frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an altitude [m]; by
+    default it is the first fix. ``base`` None is the root of the model. Without an ``initial_pose`` the base
+    starts at the origin, once it is aligned at rest. Raises InvalidInput for names that no sensor can have,
+    for wheels of several kinds, and for a datum that is no place on the Earth.
     """
 
     imu: str = "imu"
     velocity: dict[str, VelocityNoise] = field(default_factory=dict[str, VelocityNoise])
     pose: dict[str, PoseNoise] = field(default_factory=dict[str, PoseNoise])
+    heading: dict[str, HeadingNoise] = field(default_factory=dict[str, HeadingNoise])
     fix: dict[str, FixNoise] = field(default_factory=dict[str, FixNoise])
     map: str = "map"
     datum: tuple[float, float, float] | None = None
@@ -105,7 +108,7 @@ class OdometrySettings:
     legs: LegSettings | None = None
 
     def __post_init__(self) -> None:
-        for sensor in (self.imu, *self.velocity, *self.pose, *self.fix):
+        for sensor in (self.imu, *self.velocity, *self.pose, *self.heading, *self.fix):
             check_writer(sensor)
         kinds = [kind for kind in ("diff_drive", "ackermann", "mecanum") if getattr(self, kind) is not None]
         if len(kinds) > 1:
@@ -168,7 +171,8 @@ def planar_transform(odom: str, base: str, pose: PlanarPose) -> Transform:
 def read_settings(path: str) -> OdometrySettings:
     """The settings in a TOML file. Raises ConfigError, with the line, for unknown and unusable keys."""
     file = TomlFile(Path(path))
-    for kind, noise in (("velocity", VelocityNoise), ("pose", PoseNoise), ("fix", FixNoise)):
+    kinds = {"velocity": VelocityNoise, "pose": PoseNoise, "heading": HeadingNoise, "fix": FixNoise}
+    for kind, noise in kinds.items():
         for sensor, table in _table(file.tables.get(kind)).items():
             _converted(table, noise, file, f"{kind}.{sensor}")  # msgspec does not name keys of mappings
     return _converted(file.tables, OdometrySettings, file, "")
@@ -223,6 +227,11 @@ def parse_velocity(text: str) -> tuple[str, VelocityNoise]:
 def parse_pose(text: str) -> tuple[str, PoseNoise]:
     """``SENSOR[:sigma=M,sigma_deg=DEG]``, likewise."""
     return _parse_source(text, PoseNoise)
+
+
+def parse_heading(text: str) -> tuple[str, HeadingNoise]:
+    """``SENSOR[:sigma_deg=DEG]``, likewise."""
+    return _parse_source(text, HeadingNoise)
 
 
 def parse_fix(text: str) -> tuple[str, FixNoise]:
