@@ -101,9 +101,10 @@ def test_a_query_that_a_queryable_never_finishes_ends_with_its_timeout(sessions:
     queryable = theirs.zenoh.declare_queryable("zstate/r1/silent", kept)
     until(lambda: list(query(ours.zenoh, "zstate/r1/silent", 0.1)) or queryable.handler.try_recv())
     began = time.monotonic()
-    (reply,) = query(ours.zenoh, "zstate/r1/silent", 0.2)
-    assert reply.err is not None
-    assert reply.err.payload.to_string() == "Timeout"
+    errors = [
+        reply.err and reply.err.payload.to_string() for reply in query(ours.zenoh, "zstate/r1/silent", 0.2)
+    ]
+    assert set(errors) == {"Timeout"}
     assert time.monotonic() - began >= 0.2
 
 

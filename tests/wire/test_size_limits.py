@@ -75,7 +75,9 @@ def test_too_large_messages_are_counted_and_later_ones_are_inserted(sessions):
     writer, reader = sessions
     with (
         KeyPublisher(writer, "zstate/r2/joint_states", encoding_of(JointState)) as stranger,
-        LatchedPublisher(writer, "zstate/r1/tf_static/mount", encoding_of(StaticTransforms)) as mount,
+        LatchedPublisher(
+            writer, "zstate/r1/tf_static/mount", encoding_of(StaticTransforms), is_large=True
+        ) as mount,
         TransformListener(reader) as listener,
         StatePublisher(writer, RRBOT, "r1") as publisher,
     ):
