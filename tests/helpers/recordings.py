@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +18,9 @@ from helpers.plaza import aligned_error, best_turn
 
 from zstate import InFuture, InPast, NoData, Transform
 from zstate.odometry import BaseEstimator, DiffDrive
+from zstate.odometry.geodesy import Datum
 from zstate.odometry.invariant_filter import Floats
+from zstate.odometry.map_estimator import MapEstimator, MapState
 
 FOLDER = Path(__file__).parents[1] / "odometry/data"
 WHEELS = DiffDrive("left", "right", radius=0.165, track=0.55)
@@ -28,6 +31,9 @@ JACKAL_MOUNT = Transform("base_link", "imu_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.
 HUSKY_REST_S = 236.7
 VELOCITY_VARIANCE, COMPASS_SIGMA = 0.001, 0.035
 """[m^2/s^2], [rad]: what the messages state."""
+
+HUSKY_DATUM = Datum(42.375812, -71.14739467)
+"""The first fix of the Husky."""
 
 Change = Callable[[list[Call]], list[Call]]
 
@@ -96,6 +102,83 @@ def calls_of(
         for t, yaw in recording.compass.tolist():
             calls.append(Call(t, "heading", (yaw, COMPASS_SIGMA), {"source": "compass"}))
     return sorted((call for call in calls if call.t >= start), key=lambda call: call.t)
+
+
+def fix_calls(
+    recording: Recording,
+    *,
+    start: float = 0.0,
+    end: float = math.inf,
+    angle: float = 0.0,
+    shift: Callable[[float], tuple[float, float]] = lambda _: (0.0, 0.0),
+) -> list[Call]:
+    """Calls of a MapEstimator from ``start`` to ``end`` [s], without heights, which the recording has not.
+
+    The fixes are turned about the datum by ``angle`` [rad], and moved by ``shift`` [m] at their times [s].
+    """
+    calls = list[Call]()
+    for t, x, y, variance in recording.gps.tolist():
+        if start <= t < end:
+            east, north = _turn(angle) @ (x, y) + shift(t)
+            latitude, longitude, _ = HUSKY_DATUM.geodetic((east, north, 0.0))
+            options = {"covariance": variance * np.eye(3), "frame": "base_link"}
+            calls.append(Call(t, "fix", (latitude, longitude), options))
+    return calls
+
+
+class MapTrack(NamedTuple):
+    """What a MapEstimator made of a recording: its states, and sentences of its health with their times [s].
+
+    ``t`` [s], ``places`` x, y, yaw in the map, (N, 3), their ``covariances``, (N, 3, 3).
+    """
+
+    t: Floats
+    places: Floats
+    covariances: Floats
+    states: list[MapState]
+    sentences: dict[str, float]
+    estimator: MapEstimator
+
+    def at(self, t: float) -> int:
+        """The row of the first state at or after ``t`` [s]."""
+        return int(np.searchsorted(self.t, t))
+
+    def first_told(self, text: str, since: float = 0.0) -> float:
+        """When a sentence with ``text`` was first read after ``since`` [s]; infinite if it was not."""
+        times = (t for sentence, t in self.sentences.items() if text in sentence and t >= since)
+        return min(times, default=math.inf)
+
+
+def new_map_estimator(base: BaseEstimator, datum: Datum | None = HUSKY_DATUM) -> MapEstimator:
+    """An estimator of a map, with the mounts that ``base`` knows."""
+    return MapEstimator(base, map="map", buffer=base._buffer, datum=datum)
+
+
+def played_in_map(recording: Recording, calls: Sequence[Call], times: Floats) -> MapTrack:
+    """Feed ``calls``, also of fixes, in their order; states at ``times`` [s] are read 0.4 s after them."""
+    base = new_estimator(recording.mount)
+    estimator = new_map_estimator(base)
+    states, sentences, due = list[MapState](), dict[str, float](), 0
+    for call in calls:
+        to = estimator if call.kind == "fix" else base
+        getattr(to, call.kind)(recording.stamp(call.t), *call.values, **call.options)
+        while call.kind != "fix" and due < len(times) and times[due] <= call.t - 0.4:
+            due += 1
+            with suppress(NoData, InPast):
+                states.append(estimator.state(recording.stamp(times[due - 1])))
+            for source in estimator.health():
+                if source.sentence:
+                    sentences.setdefault(source.sentence, call.t)
+    places = [(*one.map_from_base.translation[:2].tolist(), one.map_from_base.rpy[2]) for one in states]
+    rows = np.ix_((0, 1, 5), (0, 1, 5))
+    return MapTrack(
+        np.array([(one.stamp - recording.start) * 1e-9 for one in states]),
+        np.array(places),
+        np.array([one.covariance[rows] for one in states]),
+        states,
+        sentences,
+        estimator,
+    )
 
 
 def dead_reckoned(recording: Recording, *, start: float = 0.0) -> tuple[Floats, Floats]:

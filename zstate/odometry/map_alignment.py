@@ -3,10 +3,10 @@
 One position shows no yaw, and the way between two shows it the better the longer it is, in any direction,
 also in reverse and in curves. The errors of a GPS receiver are not independent: they wander for tens of
 seconds (atmosphere, multipath), so the mean of many fixes is hardly better than one. With C their covariance,
-W = C^-1 - C^-1 1 1^T C^-1 / (1^T C^-1 1) weighs positions about their mean, and
-S = sum W_jk z_j q_k^T of map positions z and odometry positions q has all that they tell of the yaw: its
-posterior is a von Mises distribution about atan2(S_10 - S_01, S_00 + S_11) with the concentration
-hypot(S_10 - S_01, S_00 + S_11) (Mardia and Jupp, "Directional Statistics", 2000, for the distribution).
+and map positions z and odometry positions q about their means, which C^-1 weighs,
+S = sum (C^-1)_jk z_j q_k^T has all that they tell of the yaw: its posterior is a von Mises distribution about
+atan2(S_10 - S_01, S_00 + S_11) with the concentration hypot(S_10 - S_01, S_00 + S_11) (Mardia and Jupp,
+"Directional Statistics", 2000, for the distribution).
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from zstate.checks import Floats
 
 _WHITE = 0.1
 """The part of the standard deviation of a fix that differs from one to the next. It keeps C regular."""
+_SCALE = 0.1
+"""By this part, a way by wheels may be too long or too short: that does not change the yaw."""
 
 
 class Fixes(NamedTuple):
@@ -36,7 +38,8 @@ class MapAlignment(NamedTuple):
     """A point of odom is at ``there + R(yaw) (point - here)`` in the map, with ``here`` the mean of the way.
 
     ``yaw_variance`` [rad^2] is infinite if the way shows no yaw; ``variance`` [m^2] is that of ``there`` in
-    each axis. Both errors are independent.
+    each axis. Both errors are independent. ``misfit`` is the sum of squares of what is left between both
+    ways, normalised: chi-square with ``freedom`` degrees of freedom, or less, as a part of the way is free.
     """
 
     yaw: float
@@ -44,6 +47,8 @@ class MapAlignment(NamedTuple):
     there: Floats
     here: Floats
     variance: float
+    misfit: float
+    freedom: int
 
     def place(self, point: Floats) -> Floats:
         """A point of odom, (2,), in the map."""
@@ -68,12 +73,18 @@ def align_in_map(fixes: Fixes, correlated_s: float) -> MapAlignment:
     information = float(ones.sum())
     weights = ones / information
     mean_there, mean_here = weights @ there, weights @ here
-    centred = inverse - np.outer(ones, ones) / information
-    s = there.T @ centred @ here
+    z, q = there - mean_there, here - mean_here
+    s = z.T @ inverse @ q
     along, across = float(s[0, 0] + s[1, 1]), float(s[1, 0] - s[0, 1])
     concentration = math.hypot(along, across)
     yaw_variance = 1.0 / concentration if concentration > 0.0 else math.inf
-    return MapAlignment(math.atan2(across, along), yaw_variance, mean_there, mean_here, 1.0 / information)
+    yaw = math.atan2(across, along)
+    left: Floats = z - np.dot(q, turn(yaw).T)
+    errors: Floats = covariance + _SCALE**2 * np.dot(q, q.T)
+    misfit = float(np.einsum("ni,nm,mi", left, np.linalg.inv(errors), left))
+    return MapAlignment(
+        yaw, yaw_variance, mean_there, mean_here, 1.0 / information, misfit, max(2 * len(t) - 3, 0)
+    )
 
 
 def turn(yaw: float) -> Floats:

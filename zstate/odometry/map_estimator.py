@@ -12,8 +12,11 @@ positions of the antenna. map -> odom is the difference of both at one stamp (RE
   with dt the time since the last one. The mean of many is then as uncertain as it is.
 - A fix is refused if it is further than the 99.9 % gate from where the base is in the map; if it jumps from
   the last one, less the way driven, by more than a fix is uncertain; or if over half a minute the fixes leave
-  the way by wheels and gyro. Fixes that are refused, but agree with each other and the way for 20 m or for
-  twice ``correlated_s``, are believed: the pose in the map moves there, and velocity and biases stay.
+  the way by wheels and gyro, with the yaw in the map from before: a drift takes that with it. After a drift,
+  all are refused.
+- Fixes that are refused, but agree with each other and the way for ``correlated_s`` and 20 m, or for twice
+  that time, are believed: the pose in the map moves there, and velocity and biases stay.
+- A drift across the way is as an error of the yaw: if the yaw is not known well, it is followed for a while.
 """
 
 from __future__ import annotations
@@ -27,13 +30,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from zstate._util.format import format_duration
 from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import Floats, real_numbers
 from zstate.clock import check_stamp
 from zstate.errors import InPast, InvalidInput, LookupFailed, NoData
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.geodesy import Datum, check_place
-from zstate.odometry.health import SourceHealth, chi_square_quantile
+from zstate.odometry.health import WINDOW, SourceHealth, chi_square_quantile
 from zstate.odometry.map_alignment import Fixes, MapAlignment, align_in_map, turn
 from zstate.odometry.rotations import skew
 from zstate.odometry.source_noise import HEIGHT_FACTOR, FixNoise
@@ -41,6 +45,8 @@ from zstate.transform import Transform
 
 _MOST_YAW_SIGMA = 0.3
 """[rad] From there on, a filter is consistent."""
+_MOST_YAW_GROWN = 0.15
+"""[rad] The odometry loses its yaw: fixes from before it lost so much do not align the map any more."""
 _MOST_SIGMA = 100.0
 """[m] A fix that is more uncertain says nothing of the place of a robot."""
 _MOST_ALIGNED = 60
@@ -48,21 +54,25 @@ _MOST_ALIGNED = 60
 _ALIGNED_APART_M, _ALIGNED_APART_S = 0.5, 5.0
 """Fixes that align it are so far from each other, or so long after each other."""
 _MOST_WAITING = _MOST_KEPT = 1000
+_KEPT_APART = 1.0 / 200.0
+"""Of the time over which fixes are compared, those that are kept are apart by this part."""
 _LEVEL = 0.01
 """[rad] Roll and pitch are those of the odometry."""
 
 _GATE = 0.999
 _WAY = 0.02
-"""Of a way by wheels, its error is about this part: ``VelocityNoise.scale``."""
-_WANDER_S, _WANDER_SIGMAS = (25.0, 40.0), 5.0
-"""No honest fixes leave the way by so many standard deviations in such a time."""
+"""Of the length of a way by wheels, its error is about this part: ``VelocityNoise.scale``."""
+_WANDER_S = (25.0, 40.0)
+"""Over such a time, fixes that are honest do not leave the way by more than the gate."""
 _UNPROVEN = 4.0
 """By how much the variance of fixes is larger than stated, before it was seen: stated are good conditions."""
 _EXCESS_S, _MOST_EXCESS, _LEAST_EXCESS = 60.0, 25.0, 1.0
 """It is averaged for so long, and has these limits."""
-_BELIEVED_WAY, _BELIEVED_COUNT = 20.0, 10
-"""Of fixes that were refused: [m], and how many they are at least."""
+_BELIEVED_WAY, _BELIEVED_COUNT, _BELIEVED_GATE = 20.0, 10, 0.95
+"""Of fixes that were refused: [m], how many they are at least, and how well they agree. By a wider gate, and
+in less time, a drift of 0.5 m/s would agree with a way whose yaw is uncertain."""
 _TOLD_NS = 30_000_000_000
+_AHEAD_NS = 1_000_000_000
 _UNKNOWN_HEIGHT = 1e4
 """[m] The standard deviation of a height that was not measured."""
 
@@ -90,19 +100,28 @@ class _Fix(NamedTuple):
     has_height: bool
 
 
-class _Passed(NamedTuple):
-    """A fix, the antenna in odom at its stamp [m], (3,), and the state of the odometry then."""
-
-    fix: _Fix
-    here: Floats
-    state: BaseState
-
-
 class _Turn(NamedTuple):
     """From odom to the map: the rotation in the plane, (2, 2), and the variance of its angle [rad^2]."""
 
     rotation: Floats
     variance: float
+
+
+_UNKNOWN_TURN = _Turn(np.eye(2), math.pi**2)
+
+
+class _Passed(NamedTuple):
+    """A fix, and what was at its stamp.
+
+    ``here`` is the antenna in odom [m], (3,), ``way`` the length of its path until then [m], ``state`` that
+    of the odometry.
+    """
+
+    fix: _Fix
+    here: Floats
+    way: float
+    state: BaseState
+    map_from_odom: _Turn
 
 
 @dataclass(slots=True)
@@ -112,8 +131,12 @@ class _Receiver:
     frame: str
     lever: Floats
     noise: FixNoise
+    stamps: deque[int] = field(default_factory=lambda: deque[int](maxlen=WINDOW))
+    """Of the last fixes, in the order of arrival."""
     waiting: list[_Fix] = field(default_factory=list[_Fix])
     """Newer than the odometry, by stamp."""
+    last: _Passed | None = None
+    """The last one of all."""
     aligning: list[_Passed] = field(default_factory=list[_Passed])
     """Those that align the map."""
     taken: deque[_Passed] = field(default_factory=lambda: deque[_Passed](maxlen=_MOST_KEPT))
@@ -122,6 +145,8 @@ class _Receiver:
     """Those since then that were not, and agree with each other."""
     excess: float = _UNPROVEN
     """By how much the variance of fixes is larger than stated."""
+    is_doubted: bool = False
+    """They have left the way, as a drift does; then they are taken again once they are believed."""
     accepted_count: int = 0
     refused_count: int = 0
     told: tuple[int, str] = (0, "")
@@ -132,8 +157,8 @@ class MapEstimator:
     """Where the base of ``odometry`` is in ``map``, by fixes; ``datum`` is the origin of the map.
 
     The odometry gets its events as before, and this its fixes. Without a ``datum``, the first fix is one.
-    ``buffer`` has the mounts of the antennas, as of ``BaseEstimator``. If the odometry starts anew, so does
-    the map, around the same datum. Not safe for several threads at once.
+    ``buffer``, that of the odometry, has the mounts of the antennas, which must be static. If the odometry
+    starts anew, so does the map, around the same datum. Not safe for several threads at once.
     """
 
     def __init__(
@@ -145,6 +170,8 @@ class MapEstimator:
         self._in_map: BaseEstimator | None = None
         self._since = 0
         """When the map began [ns]."""
+        self._unaligned = 0
+        """Until then the odometry had no pose [ns]."""
         self._epoch = odometry.epoch
 
     def fix(
@@ -163,15 +190,15 @@ class MapEstimator:
 
         ``latitude`` and ``longitude`` [deg] and ``altitude`` [m], None if it is not known, are those of
         WGS84. ``covariance`` (3, 3) [m^2] is that of east, north, up. ``noise`` takes precedence over it.
-        Fixes may come late, as the events of the odometry. Raises InvalidInput, which names the source, for
+        Fixes may come late, as the events of the odometry. One that is newer than they are is used by the
+        first call of any method after the odometry has come up to it, which must not be ``history_s`` later.
+        Raises InvalidInput, which names the source, for
         what is no place on the Earth, for (0, 0), which receivers without a fix send, and for an unknown
         noise; UnknownFrame for the frame.
         """
         stamp = check_stamp(stamp)
+        self._begin_if_odometry_has()
         receiver = self._receiver(source, frame, noise)
-        if stamp < self.odometry.newest - round(self.odometry.history_s * 1e9):
-            self._refuse(receiver, stamp, "too late; raise history_s")
-            return
         try:
             check_place(latitude, longitude, altitude or 0.0)
         except InvalidInput as error:
@@ -181,13 +208,14 @@ class MapEstimator:
                 f"a fix of source {source!r} at latitude 0 and longitude 0: receivers send that without a fix"
             )
         variances = self._variances(source, covariance, noise)
+        if variances[0] > _MOST_SIGMA**2:
+            self._refuse(receiver, stamp, f"uncertain by {math.sqrt(variances[0]):.3g} m")
+            self._use_waiting()
+            return
         if self.datum is None:
-            if variances[0] > _MOST_SIGMA**2:
-                sigma = math.sqrt(variances[0])
-                self._refuse(receiver, stamp, f"uncertain by {sigma:.3g} m, and so no datum of a map")
-                return
             self.datum = Datum(latitude, longitude, altitude or 0.0)
         there = self.datum.enu(latitude, longitude, self.datum.altitude if altitude is None else altitude)
+        receiver.stamps.append(stamp)
         insort(
             receiver.waiting, _Fix(stamp, there, variances, altitude is not None), key=lambda one: one.stamp
         )
@@ -266,27 +294,40 @@ class MapEstimator:
         across, up = max(across, least_across), max(up, least_up)
         return np.square((across, across, up))
 
+    def _begin_if_odometry_has(self) -> None:
+        """Forget fixes of another time, and the map, but for its datum, if the odometry started anew."""
+        if self.odometry.epoch == self._epoch:
+            return
+        self._epoch, self._in_map, self._unaligned = self.odometry.epoch, None, 0
+        for receiver in self._receivers.values():
+            for kept in (receiver.waiting, receiver.aligning, receiver.taken, receiver.refused):
+                kept.clear()
+            receiver.stamps.clear()
+            receiver.last, receiver.is_doubted, receiver.told = None, False, (0, "")
+
     def _use_waiting(self) -> None:
         """Use the fixes that the odometry has come up to."""
-        if self.odometry.epoch != self._epoch:
-            self._epoch, self._in_map = self.odometry.epoch, None
-            for receiver in self._receivers.values():
-                receiver.aligning, receiver.refused = [], []
-                receiver.taken.clear()
+        self._begin_if_odometry_has()
+        newest = self.odometry.newest
         for name, receiver in self._receivers.items():
-            while receiver.waiting and receiver.waiting[0].stamp <= self.odometry.newest:
+            while receiver.waiting and receiver.waiting[0].stamp <= newest:
+                stamp = receiver.waiting[0].stamp
                 try:
-                    here = self.odometry.state(receiver.waiting[0].stamp)
+                    here = self.odometry.state(stamp)
+                    there = None if self._in_map is None else self._in_map.state(max(stamp, self._since))
                 except NoData:
-                    break  # not aligned yet
+                    self._unaligned = newest
+                    break
                 except LookupFailed:
-                    del receiver.waiting[0]  # from before the odometry began
+                    del receiver.waiting[0]
+                    if stamp > self._unaligned:
+                        self._refuse(receiver, stamp, "too late; raise history_s")
                     continue
-                passed = _Passed(receiver.waiting.pop(0), _point(here.odom_from_base, receiver.lever), here)
-                if self._in_map is None:
+                passed = _passed(receiver, receiver.waiting.pop(0), here, there)
+                if there is None:
                     self._align(receiver, passed)
-                else:
-                    self._fuse(self._in_map, name, receiver, passed)
+                elif stamp >= self._since:
+                    self._fuse(there, name, receiver, passed)
 
     def _align(self, receiver: _Receiver, passed: _Passed) -> None:
         kept = receiver.aligning
@@ -295,13 +336,21 @@ class MapEstimator:
         kept.append(passed)
         if len(kept) > _MOST_ALIGNED:
             del kept[1:-1:2]
-        alignment = self._alignment(receiver)
         now = self.odometry.state()
-        grown = np.maximum(now.covariance.pose.diagonal() - kept[0].state.covariance.pose.diagonal(), 0.0)
+        while _grown(kept, now)[5] > _MOST_YAW_GROWN**2:
+            del kept[0]
+        alignment = self._alignment(receiver)
+        if alignment.misfit > chi_square_quantile(_GATE, max(alignment.freedom, 1)):
+            self._refuse(receiver, passed.fix.stamp, "not where wheels and gyro lead from earlier ones")
+            del kept[:-1]
+            return
+        grown = _grown(kept, now)
         if alignment.yaw_variance + grown[5] > _MOST_YAW_SIGMA**2:
             return
         base = now.odom_from_base
-        known = np.diag((*grown[:3], _LEVEL**2, _LEVEL**2, grown[5]))
+        known = np.diag((0.0, 0.0, grown[2], _LEVEL**2, _LEVEL**2, grown[5]))
+        turned = _Turn(turn(alignment.yaw), alignment.yaw_variance)
+        known[:2, :2] = turned.rotation @ np.diag(grown[:2]) @ turned.rotation.T
         known[np.ix_((0, 1, 5), (0, 1, 5))] += alignment.covariance(base.translation[:2])
         heights = [one.fix.there[2] - one.here[2] for one in kept if one.fix.has_height]
         variance = max(one.fix.variances[2] for one in kept) if heights else _UNKNOWN_HEIGHT**2
@@ -313,7 +362,7 @@ class MapEstimator:
         self._in_map.set_pose(
             Transform.from_rpy(self.map, self.odometry.base, place, rotation).with_covariance(known)
         )
-        receiver.taken.extend(kept[-1:])
+        receiver.taken.append(passed._replace(map_from_odom=turned))
 
     def _alignment(self, receiver: _Receiver) -> MapAlignment:
         kept = receiver.aligning
@@ -325,39 +374,60 @@ class MapEstimator:
         )
         return align_in_map(fixes, receiver.noise.correlated_s)
 
-    def _fuse(self, in_map: BaseEstimator, name: str, receiver: _Receiver, passed: _Passed) -> None:
-        fix = passed.fix
-        if fix.stamp < self._since:
+    def _fuse(self, there: BaseState, name: str, receiver: _Receiver, passed: _Passed) -> None:
+        """Fuse a fix, or refuse it; ``there`` is the state in the map at its stamp."""
+        fix, in_map = passed.fix, self._in_map
+        assert in_map is not None
+        if _is_known(receiver, fix):
             return
-        there = in_map.state(fix.stamp)
         antenna = _point(there.odom_from_base, receiver.lever)
-        yaw = there.odom_from_base.rpy[2] - passed.state.odom_from_base.rpy[2]
-        map_from_odom = _Turn(turn(yaw), float(there.covariance.pose[5, 5]))
         covariance = _point_covariance(there, receiver.lever)[:2, :2]
         covariance = covariance + receiver.excess * np.diag(fix.variances[:2])
-        reason = _reason(receiver, passed, antenna, covariance, map_from_odom)
+        reason = _reason(receiver, passed, antenna, covariance)
         if reason:
             self._refuse(receiver, fix.stamp, reason)
             run = receiver.refused
-            if run and not _agree(run[0], passed, map_from_odom):
+            if run and not _agree(run[0], passed):
                 run.clear()
             run.append(passed)
-            if not _is_believed(run, receiver.noise):
-                return
-            away = float(np.hypot(*(fix.there - antenna)[:2]))
-            newest = in_map.state()
-            known = newest.covariance.pose + np.diag((away**2, away**2, 0.0, 0.0, 0.0, 0.0))
-            in_map.set_pose(newest.odom_from_base.with_covariance(known))
+            del run[1 : 1 - _BELIEVED_COUNT]
+            if _is_believed(run, receiver.noise):
+                self._believe(in_map, receiver, passed, fix.there - antenna)
+            return
         factor = _correlation_factor(receiver, fix)
-        if factor is None:
-            return  # the same fix again
         measured, noise = fix.there.copy(), fix.variances * (factor * receiver.excess)
         if not fix.has_height:
             measured[2], noise[2] = antenna[2], _UNKNOWN_HEIGHT**2
         in_map.position(fix.stamp, measured, np.diag(noise), source=name, frame=receiver.frame)
         receiver.accepted_count += 1
         receiver.refused.clear()
-        receiver.excess = _excess_after(receiver, passed, map_from_odom)
+        taken = receiver.taken
+        if taken and fix.stamp < taken[-1].fix.stamp:
+            return  # later ones are compared with the last one
+        receiver.excess = _excess_after(receiver, passed)
+        apart_ns = _KEPT_APART * 1e9 * max(_WANDER_S[1], receiver.noise.correlated_s)
+        if len(taken) > 1 and taken[-1].fix.stamp - taken[-2].fix.stamp < apart_ns:
+            taken.pop()
+        taken.append(passed)
+
+    def _believe(self, in_map: BaseEstimator, receiver: _Receiver, passed: _Passed, away: Floats) -> None:
+        """Move the base in the map by ``away`` [m], (3,), in the plane: to where fixes agree that it is.
+
+        It is placed at the newest stamp, so a position at the stamp of the fix would be of no effect.
+        """
+        newest = in_map.state()
+        pose, known = newest.odom_from_base, newest.covariance.pose.copy()
+        receiver.excess = max(receiver.excess, _UNPROVEN)
+        known[:2, :2] += receiver.excess * np.diag(passed.fix.variances[:2])
+        place = pose.translation + np.array((*away[:2], 0.0))
+        moved = Transform.from_pose7(
+            self.map, self.odometry.base, (*place.tolist(), *pose.pose7[3:].tolist())
+        )
+        in_map.set_pose(moved.with_covariance(known))
+        receiver.accepted_count += 1
+        receiver.refused.clear()
+        receiver.is_doubted = False
+        receiver.taken.clear()  # the jump from earlier ones is no error of those to come
         receiver.taken.append(passed)
 
     def _refuse(self, receiver: _Receiver, stamp: int, reason: str) -> None:
@@ -367,18 +437,22 @@ class MapEstimator:
     def _missing(self) -> str:
         if not any(receiver.aligning for receiver in self._receivers.values()):
             return "no fix yet at a known pose of the odometry"
-        sigma = min(
+        variance = min(
             self._alignment(receiver).yaw_variance
+            + float(_grown(receiver.aligning, receiver.aligning[-1].state)[5])
             for receiver in self._receivers.values()
             if receiver.aligning
         )
-        if sigma > math.pi**2:
+        if variance > math.pi**2:
             return "the yaw of the odometry in the map is not known; drive some metres"
-        degrees = math.degrees(math.sqrt(sigma))
-        return f"the yaw of the odometry in the map is known to {degrees:.0f} degrees; drive on, to 17"
+        degrees, least = (math.degrees(angle) for angle in (math.sqrt(variance), _MOST_YAW_SIGMA))
+        return (
+            f"the yaw of the odometry in the map is known to {degrees:.1f} degrees; drive on, until it is "
+            f"known to {least:.1f}"
+        )
 
     def _health(self, name: str, receiver: _Receiver, newest: int) -> SourceHealth:
-        stamps = [one.fix.stamp for one in receiver.taken]
+        stamps = receiver.stamps
         span = max(stamps) - min(stamps) if stamps else 0
         rate = (len(stamps) - 1) / (span * 1e-9) if span else 0.0
         age_s = (newest - max(stamps)) * 1e-9 if stamps else math.inf
@@ -388,6 +462,12 @@ class MapEstimator:
             found.append(self._missing())
         if reason and newest - at < _TOLD_NS:
             found.append(f"{receiver.refused_count} fixes refused, the last one as it is {reason}")
+        if newest and stamps and max(stamps) - newest > _AHEAD_NS:
+            ahead = format_duration(max(stamps) - newest)
+            found.append(
+                f"its last fix is stamped {ahead} after the newest event of the odometry and waits for it: "
+                "one of the two clocks is wrong, or the odometry has no more events"
+            )
         sentence = f"{name}: {'; '.join(found)}" if found else ""
         return SourceHealth(
             name,
@@ -414,49 +494,86 @@ def _point_covariance(state: BaseState, lever: Floats) -> Floats:
     return jacobian @ state.covariance.pose @ jacobian.T
 
 
+def _passed(receiver: _Receiver, fix: _Fix, odom: BaseState, in_map: BaseState | None) -> _Passed:
+    """A fix with the states at its stamp."""
+    here, last = _point(odom.odom_from_base, receiver.lever), receiver.last
+    way = 0.0 if last is None else last.way + float(np.hypot(*(here - last.here)[:2]))
+    receiver.last = _Passed(fix, here, way, odom, _turn_between(odom, in_map))
+    return receiver.last
+
+
+def _turn_between(odom: BaseState, in_map: BaseState | None) -> _Turn:
+    """That from odom to the map, by states at one stamp."""
+    if in_map is None:
+        return _UNKNOWN_TURN
+    yaw = in_map.odom_from_base.rpy[2] - odom.odom_from_base.rpy[2]
+    return _Turn(turn(yaw), float(in_map.covariance.pose[5, 5]))
+
+
+def _grown(kept: list[_Passed], now: BaseState) -> Floats:
+    """By how much the variances of the pose in odom have grown since the first of the fixes, (6,)."""
+    return np.maximum(now.covariance.pose.diagonal() - kept[0].state.covariance.pose.diagonal(), 0.0)
+
+
+def _is_known(receiver: _Receiver, fix: _Fix) -> bool:
+    """Whether it is the same fix again, as after a reconnection."""
+    same = (one.fix.stamp for one in reversed(receiver.taken) if one.fix.stamp <= fix.stamp)
+    return next(same, None) == fix.stamp
+
+
 def _is_apart(last: _Passed, passed: _Passed) -> bool:
     way = float(np.hypot(*(passed.here - last.here)[:2]))
     return way >= _ALIGNED_APART_M or passed.fix.stamp - last.fix.stamp >= _ALIGNED_APART_S * 1e9
 
 
-def _difference(first: _Passed, second: _Passed, map_from_odom: _Turn) -> tuple[float, float]:
-    """By how much the way between two fixes is not that by wheels and gyro [m], and the variance of that.
+def _difference(first: _Passed, second: _Passed, excess: float = 1.0) -> tuple[Floats, Floats]:
+    """By how much the way between two fixes is not that by wheels and gyro [m], (2,), and its covariance.
 
-    The variance is of both fixes, and of the way.
+    The covariance is of both fixes, with ``excess`` times their variances, and of the way. The yaw in the map
+    is that at the first one: fixes that drift away take the yaw with them, and agree with a later one.
     """
-    way = (second.here - first.here)[:2]
-    apart = (second.fix.there - first.fix.there)[:2] - map_from_odom.rotation @ way
-    of_way = (_WAY**2 + map_from_odom.variance) * float(way @ way)
-    variance = first.fix.variances[0] + second.fix.variances[0] + of_way
-    return float(np.hypot(*apart)), variance
+    rotation, variance = first.map_from_odom
+    variance += max(float(second.state.covariance.pose[5, 5] - first.state.covariance.pose[5, 5]), 0.0)
+    way = rotation @ (second.here - first.here)[:2]
+    apart = (second.fix.there - first.fix.there)[:2] - way
+    across = np.array((-way[1], way[0]))
+    of_way = (_WAY * (second.way - first.way)) ** 2
+    of_each = excess * (first.fix.variances[0] + second.fix.variances[0]) + of_way
+    return apart, of_each * np.eye(2) + variance * np.outer(across, across)
 
 
-def _reason(
-    receiver: _Receiver, passed: _Passed, antenna: Floats, covariance: Floats, map_from_odom: _Turn
-) -> str:
-    """Why a fix is refused; empty if it is not."""
+def _square(apart: Floats, covariance: Floats) -> float:
+    """The square of the Mahalanobis distance."""
+    return float(apart @ np.linalg.solve(covariance, apart))
+
+
+def _reason(receiver: _Receiver, passed: _Passed, antenna: Floats, covariance: Floats) -> str:
+    """Why a fix is refused, empty if it is not; a receiver that leaves the way is doubted from then on."""
     gate = chi_square_quantile(_GATE, 2)
     apart = (passed.fix.there - antenna)[:2]
-    if float(apart @ np.linalg.solve(covariance, apart)) > gate:
+    if _square(apart, covariance) > gate:
         return f"{np.hypot(*apart):.1f} m from where wheels, gyro and earlier fixes lead"
     if not receiver.taken:
         return ""
     elapsed_s = (passed.fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9
-    if elapsed_s < receiver.noise.correlated_s:
-        jump, variance = _difference(receiver.taken[-1], passed, map_from_odom)
-        if jump * jump > gate * 0.5 * receiver.excess * variance:
-            return f"{jump:.1f} m from the one before, but for the way by wheels and gyro"
+    share = 0.5 if elapsed_s < receiver.noise.correlated_s else 1.0  # errors of neighbours are alike
+    jump, covariance = _difference(receiver.taken[-1], passed, receiver.excess)
+    if _square(jump, covariance) > share * gate:
+        return f"{np.hypot(*jump):.1f} m from the one before, but for the way by wheels and gyro"
     for earlier in receiver.taken:
         elapsed_s = (passed.fix.stamp - earlier.fix.stamp) * 1e-9
         if _WANDER_S[0] <= elapsed_s <= _WANDER_S[1]:
-            wander, variance = _difference(earlier, passed, map_from_odom)
-            if wander > _WANDER_SIGMAS * math.sqrt(_UNPROVEN * variance):
-                return f"{wander:.1f} m off the way by wheels and gyro since one {elapsed_s:.0f} s before"
+            wander, covariance = _difference(earlier, passed, _UNPROVEN)
+            if _square(wander, covariance) > gate:
+                off, receiver.is_doubted = np.hypot(*wander), True
+                return f"{off:.1f} m off the way by wheels and gyro since one {elapsed_s:.0f} s before"
             break
+    if receiver.is_doubted:
+        return "not along the way by wheels and gyro for long enough, since they have left it"
     return ""
 
 
-def _excess_after(receiver: _Receiver, passed: _Passed, map_from_odom: _Turn) -> float:
+def _excess_after(receiver: _Receiver, passed: _Passed) -> float:
     """By how much the variance of fixes is larger than stated, by the change of their errors in some time."""
     tau_s = receiver.noise.correlated_s
     for earlier in reversed(receiver.taken):
@@ -465,31 +582,29 @@ def _excess_after(receiver: _Receiver, passed: _Passed, map_from_odom: _Turn) ->
             break
     else:
         return receiver.excess
-    wander, variance = _difference(earlier, passed, map_from_odom)
-    seen = min(wander * wander / (2.0 * variance * (1.0 - math.exp(-elapsed_s / tau_s))), _MOST_EXCESS)
+    square = _square(*_difference(earlier, passed))
+    seen = min(square / (2.0 * (1.0 - math.exp(-elapsed_s / tau_s))), _MOST_EXCESS)
     share = 1.0 - math.exp(-(passed.fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9 / _EXCESS_S)
     return max(receiver.excess + share * (seen - receiver.excess), _LEAST_EXCESS)
 
 
-def _agree(first: _Passed, second: _Passed, map_from_odom: _Turn) -> bool:
-    apart, variance = _difference(first, second, map_from_odom)
-    return apart * apart <= chi_square_quantile(_GATE, 2) * variance
+def _agree(first: _Passed, second: _Passed) -> bool:
+    square = _square(*_difference(first, second))
+    return square <= chi_square_quantile(_BELIEVED_GATE, 2)
 
 
 def _is_believed(run: list[_Passed], noise: FixNoise) -> bool:
     """Whether fixes that were refused, and agree, are right after all."""
     way = float(np.hypot(*(run[-1].here - run[0].here)[:2]))
     elapsed_s = (run[-1].fix.stamp - run[0].fix.stamp) * 1e-9
-    return len(run) >= _BELIEVED_COUNT and (way >= _BELIEVED_WAY or elapsed_s >= 2.0 * noise.correlated_s)
+    least_s = noise.correlated_s if way >= _BELIEVED_WAY else 2.0 * noise.correlated_s
+    return len(run) >= _BELIEVED_COUNT and elapsed_s >= least_s
 
 
-def _correlation_factor(receiver: _Receiver, fix: _Fix) -> float | None:
-    """By how much the variance of a fix counts more, as its error is that of the last one.
-
-    None for the same fix again.
-    """
+def _correlation_factor(receiver: _Receiver, fix: _Fix) -> float:
+    """By how much the variance of a fix counts more, as its error is that of the last one."""
     if not receiver.taken:
         return 1.0
     elapsed_s = abs(fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9
     kept = math.exp(-elapsed_s / receiver.noise.correlated_s)
-    return None if kept == 1.0 else (1.0 + kept) / (1.0 - kept)
+    return (1.0 + kept) / (1.0 - kept)
