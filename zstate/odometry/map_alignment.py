@@ -4,7 +4,7 @@ One position shows no yaw, and the way between two shows it the better the longe
 also in reverse and in curves. The errors of a GPS receiver are not independent: they wander for tens of
 seconds (atmosphere, multipath), so the mean of many fixes is hardly better than one. With C their covariance,
 and map positions z and odometry positions q about their means, which C^-1 weighs,
-S = sum (C^-1)_jk z_j q_k^T has all that they tell of the yaw: its posterior is a von Mises distribution about
+S = sum (C^-1)_jk z_j q_k^T determines the yaw: its posterior is a von Mises distribution about
 atan2(S_10 - S_01, S_00 + S_11) with the concentration hypot(S_10 - S_01, S_00 + S_11) (Mardia and Jupp,
 "Directional Statistics", 2000, for the distribution).
 """

@@ -48,7 +48,7 @@ _MOST_YAW_SIGMA = 0.3
 _MOST_YAW_GROWN = 0.15
 """[rad] The odometry loses its yaw: fixes from before it lost so much do not align the map any more."""
 _MOST_SIGMA = 100.0
-"""[m] A fix that is more uncertain says nothing of the place of a robot."""
+"""[m] A fix that is more uncertain is of no use for a robot."""
 _MOST_ALIGNED = 60
 """So many fixes align the map; if there are more, every second one is left out."""
 _ALIGNED_APART_M, _ALIGNED_APART_S = 0.5, 5.0
@@ -71,7 +71,7 @@ _EXCESS_S, _MOST_EXCESS, _LEAST_EXCESS = 60.0, 25.0, 1.0
 _BELIEVED_WAY, _BELIEVED_COUNT, _BELIEVED_GATE = 20.0, 10, 0.95
 """Of fixes that were refused: [m], how many they are at least, and how well they agree. By a wider gate, and
 in less time, a drift of 0.5 m/s would agree with a way whose yaw is uncertain."""
-_TOLD_NS = 30_000_000_000
+_REPORTED_NS = 30_000_000_000
 _AHEAD_NS = 1_000_000_000
 _UNKNOWN_HEIGHT = 1e4
 """[m] The standard deviation of a height that was not measured."""
@@ -149,7 +149,7 @@ class _Receiver:
     """They have left the way, as a drift does; then they are taken again once they are believed."""
     accepted_count: int = 0
     refused_count: int = 0
-    told: tuple[int, str] = (0, "")
+    last_refusal: tuple[int, str] = (0, "")
     """When a fix was last refused, and why."""
 
 
@@ -158,7 +158,7 @@ class MapEstimator:
 
     The odometry gets its events as before, and this its fixes. Without a ``datum``, the first fix is one.
     ``buffer``, that of the odometry, has the mounts of the antennas, which must be static. If the odometry
-    starts anew, so does the map, around the same datum. Not safe for several threads at once.
+    restarts, so does the map, around the same datum. Not safe for several threads at once.
     """
 
     def __init__(
@@ -192,9 +192,8 @@ class MapEstimator:
         WGS84. ``covariance`` (3, 3) [m^2] is that of east, north, up. ``noise`` takes precedence over it.
         Fixes may come late, as the events of the odometry. One that is newer than they are is used by the
         first call of any method after the odometry has come up to it, which must not be ``history_s`` later.
-        Raises InvalidInput, which names the source, for
-        what is no place on the Earth, for (0, 0), which receivers without a fix send, and for an unknown
-        noise; UnknownFrame for the frame.
+        Raises InvalidInput, which names the source, for what is no place on the Earth, for (0, 0), which
+        receivers without a fix send, and for an unknown noise; UnknownFrame for the frame.
         """
         stamp = check_stamp(stamp)
         self._begin_if_odometry_has()
@@ -295,7 +294,7 @@ class MapEstimator:
         return np.square((across, across, up))
 
     def _begin_if_odometry_has(self) -> None:
-        """Forget fixes of another time, and the map, but for its datum, if the odometry started anew."""
+        """Forget fixes of another time, and the map, but for its datum, if the odometry was restarted."""
         if self.odometry.epoch == self._epoch:
             return
         self._epoch, self._in_map, self._unaligned = self.odometry.epoch, None, 0
@@ -303,7 +302,7 @@ class MapEstimator:
             for kept in (receiver.waiting, receiver.aligning, receiver.taken, receiver.refused):
                 kept.clear()
             receiver.stamps.clear()
-            receiver.last, receiver.is_doubted, receiver.told = None, False, (0, "")
+            receiver.last, receiver.is_doubted, receiver.last_refusal = None, False, (0, "")
 
     def _use_waiting(self) -> None:
         """Use the fixes that the odometry has come up to."""
@@ -383,7 +382,12 @@ class MapEstimator:
         antenna = _point(there.odom_from_base, receiver.lever)
         covariance = _point_covariance(there, receiver.lever)[:2, :2]
         covariance = covariance + receiver.excess * np.diag(fix.variances[:2])
-        reason = _reason(receiver, passed, antenna, covariance)
+        reason = _contradiction(receiver, passed, antenna, covariance)
+        if not reason:
+            reason = _drift(receiver, passed)
+            receiver.is_doubted = receiver.is_doubted or bool(reason)
+        if not reason and receiver.is_doubted:
+            reason = "not along the way by wheels and gyro for long enough, since they have left it"
         if reason:
             self._refuse(receiver, fix.stamp, reason)
             run = receiver.refused
@@ -432,7 +436,7 @@ class MapEstimator:
 
     def _refuse(self, receiver: _Receiver, stamp: int, reason: str) -> None:
         receiver.refused_count += 1
-        receiver.told = (stamp, reason)
+        receiver.last_refusal = (stamp, reason)
 
     def _missing(self) -> str:
         if not any(receiver.aligning for receiver in self._receivers.values()):
@@ -456,11 +460,11 @@ class MapEstimator:
         span = max(stamps) - min(stamps) if stamps else 0
         rate = (len(stamps) - 1) / (span * 1e-9) if span else 0.0
         age_s = (newest - max(stamps)) * 1e-9 if stamps else math.inf
-        at, reason = receiver.told
+        at, reason = receiver.last_refusal
         found = list[str]()
         if self._in_map is None:
             found.append(self._missing())
-        if reason and newest - at < _TOLD_NS:
+        if reason and newest - at < _REPORTED_NS:
             found.append(f"{receiver.refused_count} fixes refused, the last one as it is {reason}")
         if newest and stamps and max(stamps) - newest > _AHEAD_NS:
             ahead = format_duration(max(stamps) - newest)
@@ -547,8 +551,8 @@ def _square(apart: Floats, covariance: Floats) -> float:
     return float(apart @ np.linalg.solve(covariance, apart))
 
 
-def _reason(receiver: _Receiver, passed: _Passed, antenna: Floats, covariance: Floats) -> str:
-    """Why a fix is refused, empty if it is not; a receiver that leaves the way is doubted from then on."""
+def _contradiction(receiver: _Receiver, passed: _Passed, antenna: Floats, covariance: Floats) -> str:
+    """By what a fix contradicts the pose in the map, or the fix before; empty if it does not."""
     gate = chi_square_quantile(_GATE, 2)
     apart = (passed.fix.there - antenna)[:2]
     if _square(apart, covariance) > gate:
@@ -560,16 +564,19 @@ def _reason(receiver: _Receiver, passed: _Passed, antenna: Floats, covariance: F
     jump, covariance = _difference(receiver.taken[-1], passed, receiver.excess)
     if _square(jump, covariance) > share * gate:
         return f"{np.hypot(*jump):.1f} m from the one before, but for the way by wheels and gyro"
+    return ""
+
+
+def _drift(receiver: _Receiver, passed: _Passed) -> str:
+    """By how much fixes have left the way in half a minute; empty if no more than honest ones do."""
     for earlier in receiver.taken:
         elapsed_s = (passed.fix.stamp - earlier.fix.stamp) * 1e-9
         if _WANDER_S[0] <= elapsed_s <= _WANDER_S[1]:
             wander, covariance = _difference(earlier, passed, _UNPROVEN)
-            if _square(wander, covariance) > gate:
-                off, receiver.is_doubted = np.hypot(*wander), True
+            if _square(wander, covariance) > chi_square_quantile(_GATE, 2):
+                off = np.hypot(*wander)
                 return f"{off:.1f} m off the way by wheels and gyro since one {elapsed_s:.0f} s before"
             break
-    if receiver.is_doubted:
-        return "not along the way by wheels and gyro for long enough, since they have left it"
     return ""
 
 
