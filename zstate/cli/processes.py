@@ -169,7 +169,8 @@ class ChildProcess(Closeable):
             threading.Thread(target=self._read, args=output, name=f"zstate {name}", daemon=True)
             for output in ((self._process.stdout, False), (self._process.stderr, True))
         ]
-        for thread in (*self._readers, threading.Thread(target=self._follow, daemon=True)):
+        self._follower = threading.Thread(target=self._follow, daemon=True)
+        for thread in (*self._readers, self._follower):
             thread.start()
 
     @property
@@ -188,12 +189,17 @@ class ChildProcess(Closeable):
             self._signal(signal.SIGINT if self._is_program else signal.SIGTERM)
 
     def wait(self, deadline: float) -> None:
-        """Wait for its exit; kill it after ``deadline`` (monotonic), a user's program or driver 3 s later."""
+        """Wait for its exit and its last lines.
+
+        It is killed after ``deadline`` (monotonic), a user's program or driver 3 s later.
+        """
         try:
             self._process.wait(max(0.0, deadline - time.monotonic()) + self._later_s)
         except subprocess.TimeoutExpired:
             self._signal(signal.SIGKILL)
             self._process.wait()
+        if threading.current_thread() is not self._follower:
+            self._follower.join(END_WITHIN_S)
 
     def _signal(self, number: signal.Signals) -> None:
         with suppress(ProcessLookupError):
