@@ -235,13 +235,13 @@ def test_a_second_commander_is_refused_with_the_name_of_the_first(sessions):
 
 def test_commands_of_another_session_are_refused_while_the_first_are_valid(sessions):
     driver = RecordingDriver()
-    with running(sessions[0], driver) as host, Commander(sessions[1], "arm") as arm:
+    with running(sessions[0], driver, ttl_s=10.0) as host, Commander(sessions[1], "arm") as arm:
         arm.wait_for_driver()
         with raw_commands(sessions) as put:
-            send_until(arm, {"elbow": 0.1}, lambda: host.state == "active")
+            until(lambda: arm.send({"elbow": 0.1}, ttl_s=10.0) or host.state == "active")
 
             def both() -> bool:
-                arm.send({"elbow": 0.1})
+                arm.send({"elbow": 0.1}, ttl_s=10.0)
                 put(command(elbow=-1.0))
                 return host.report().refused.get("second commander", 0) > 0
 
