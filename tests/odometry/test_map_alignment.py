@@ -165,3 +165,17 @@ def test_wheels_that_measure_a_way_too_long_fit_as_the_yaw_does_not_change():
         alignment = align_in_map(Fixes(t, there, 1.1 * here, variances), TAU_S)
         assert alignment.yaw == pytest.approx(aligned(start).yaw, abs=1e-9)
         assert alignment.misfit < chi_square_quantile(0.999, alignment.freedom)
+
+
+def test_the_yaw_is_known_to_17_degrees_after_4_5_metres_with_fixes_that_state_a_metre():
+    """As the guide says; stated variances count four times before they were seen."""
+    x = np.arange(0.0, 10.0, 0.5)
+    way = np.column_stack((x, np.zeros_like(x)))
+    sigmas = {
+        x[size - 1]: align_in_map(
+            Fixes(x[:size], way[:size], way[:size], np.full(size, 4.0)), 20.0
+        ).yaw_variance
+        ** 0.5
+        for size in range(2, len(x))
+    }
+    assert min(length for length, sigma in sigmas.items() if sigma < 0.3) == 4.5
