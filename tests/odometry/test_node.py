@@ -41,8 +41,14 @@ from zstate.odometry import (
     VelocityPublisher,
 )
 from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
-from zstate.odometry.node import add_heading, heading_sigma, pose_covariance, velocity_covariance
 from zstate.odometry.requests import request_odometry
+from zstate.odometry.sensors import (
+    Estimators,
+    add_heading,
+    heading_covariance,
+    pose_covariance,
+    velocity_covariance,
+)
 from zstate.odometry.simulated_rover import SimulatedRover
 from zstate.rate import Rate
 from zstate.sources.square_drive import WheelPair
@@ -121,10 +127,10 @@ def test_fixes_place_the_odometry_in_the_map_and_the_pose_there_has_a_covariance
     """The rover starts 3 m east and 2 m north of the datum, and heads north."""
     datum = Datum(48.1, 11.5, 560.0)
     received: list[Pose] = []
-    with rover_with_odometry(fixes={"gps": FixNoise()}, datum=datum) as (rover, node, listener, session):
+    with rover_with_odometry(sensors=[("gps", FixNoise())], datum=datum) as (rover, node, listener, session):
         with (
             FixPublisher(session, "r1", "gps", frame="base_footprint") as gps,
-            SensorListener(session, "r1", on_pose=lambda _, message: received.append(message)),
+            SensorListener(session, "r1", {"pose": lambda _, message: received.append(message)}),
         ):
             rover.truth.drive((4.0, 5.0))
             due = 0
@@ -181,19 +187,19 @@ def test_heading_of_an_imu_is_the_yaw_of_its_frame_and_needs_a_stated_noise():
     half = 0.5 * 0.7
     orientation = to_block([0.0, 0.0, math.sin(half), math.cos(half)])
     message = Imu(STAMP, 0, 1, IMU, to_block([0.0] * 3), to_block([0.0] * 3), orientation)
-    add_heading(base, "imu", HeadingNoise(sigma_deg=2.0), message)  # pyright: ignore[reportArgumentType]
+    add_heading(Estimators(base), "imu", HeadingNoise(sigma_deg=2.0), message)  # pyright: ignore[reportArgumentType]
     ((stamp, yaw, sigma, options),) = base.headings
     assert (stamp, options) == (STAMP, {"source": "imu heading", "frame": IMU})
     assert (yaw, sigma) == pytest.approx((0.7, math.radians(2.0)))
     covariance = to_block(np.diag((1.0, 1.0, 0.04))[np.triu_indices(3)])
     stated = msgspec.structs.replace(message, orientation_covariance=covariance)
-    assert heading_sigma("imu", stated, HeadingNoise()) == pytest.approx(0.2)
+    assert heading_covariance("imu", HeadingNoise(), stated) == pytest.approx(0.04)
     with pytest.raises(
         InvalidInput, match="have no covariance: state their noise by `--heading imu:sigma_deg=5`"
     ):
-        heading_sigma("imu", message, HeadingNoise())
+        heading_covariance("imu", HeadingNoise(), message)
     with pytest.raises(InvalidInput, match="the IMU 'imu' sends no orientation"):
-        heading_sigma("imu", msgspec.structs.replace(message, orientation=None), HeadingNoise())
+        heading_covariance("imu", HeadingNoise(), msgspec.structs.replace(message, orientation=None))
 
 
 class Recorder:
@@ -279,7 +285,7 @@ def test_rate_limits_the_samples_of_a_faster_imu(sessions):
 @pytest.mark.long
 def test_sentences_on_the_sources_are_in_the_status_of_the_writer_and_logged_once(caplog):
     with (
-        rover_with_odometry(velocities={"flow": VelocityNoise()}) as (_, _, _, session),
+        rover_with_odometry(sensors=[("flow", VelocityNoise())]) as (_, _, _, session),
         StatusMonitor(session, "r1") as statuses,
         VelocityPublisher(session, "r1", "flow", frame="base_footprint") as flow,
     ):
@@ -296,7 +302,7 @@ def test_sentences_on_the_sources_are_in_the_status_of_the_writer_and_logged_onc
 
 def test_velocities_without_covariance_are_refused_and_counted():
     with (
-        rover_with_odometry(velocities={"flow": VelocityNoise()}) as (_, node, _, session),
+        rover_with_odometry(sensors=[("flow", VelocityNoise())]) as (_, node, _, session),
         VelocityPublisher(session, "r1", "flow", frame="base_footprint") as flow,
     ):
 
@@ -307,33 +313,38 @@ def test_velocities_without_covariance_are_refused_and_counted():
         until(refused)
 
 
+def test_a_listener_to_a_stream_of_no_sensor_is_told_those_that_there_are(sessions):
+    with pytest.raises(InvalidInput, match=r"'velocities' is no stream of sensors: .*velocity"):
+        SensorListener(sessions[1], "r1", {"velocities": print})
+
+
 @pytest.mark.parametrize("covariance", [None, np.zeros((3, 3)), np.diag([0.01, 0.0, 0.0])])
 def test_noise_that_is_stated_is_in_place_of_that_of_messages(covariance: np.ndarray | None):
     triangle = None if covariance is None else to_block(covariance[np.triu_indices(3)])
     message = Velocity(1, 0, 1, "base", to_block([1.0, 0.0, 0.0]), None, triangle)
-    stated = velocity_covariance("flow", message, VelocityNoise(sigma=(0.1, 0.2, 0.3)))
+    stated = velocity_covariance("flow", VelocityNoise(sigma=(0.1, 0.2, 0.3)), message)
     assert np.diag(stated) == pytest.approx([0.01, 0.04, 0.09])
     why = r"velocities of 'flow' have .*: state their noise by `--velocity flow:sigma=0.05`, or sigma = 0.05"
     with pytest.raises(InvalidInput, match=why):
-        velocity_covariance("flow", message, VelocityNoise())
+        velocity_covariance("flow", VelocityNoise(), message)
 
 
 def test_poses_have_the_noise_of_their_messages_or_the_stated_one():
     placed = to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     known = Pose(1, 0, 1, "odom", "", placed, to_block(np.eye(6)[np.triu_indices(6)]))
-    assert np.array_equal(pose_covariance("mocap", known, PoseNoise()), np.eye(6))
+    assert np.array_equal(pose_covariance("mocap", PoseNoise(), known), np.eye(6))
     stated = PoseNoise(sigma=0.1, sigma_deg=(1.0, 1.0, 2.0))
-    assert np.sqrt(np.diag(pose_covariance("mocap", known, stated))) == pytest.approx(
+    assert np.sqrt(np.diag(pose_covariance("mocap", stated, known))) == pytest.approx(
         [0.1, 0.1, 0.1, math.radians(1.0), math.radians(1.0), math.radians(2.0)]
     )
     with pytest.raises(InvalidInput, match=r"poses of 'mocap' have no covariance: .* in \[pose.mocap\]"):
-        pose_covariance("mocap", Pose(1, 0, 1, "odom", "", placed), PoseNoise())
+        pose_covariance("mocap", PoseNoise(), Pose(1, 0, 1, "odom", "", placed))
 
 
 @pytest.mark.long
 def test_measured_poses_place_the_base():
     with (
-        rover_with_odometry(poses={"mocap": PoseNoise()}) as (_, node, listener, session),
+        rover_with_odometry(sensors=[("mocap", PoseNoise())]) as (_, node, listener, session),
         PosePublisher(session, "r1", "mocap") as mocap,
     ):
         measured = Transform(ODOM, BASE, [0.02, 0.0, 0.0], [0, 0, 0, 1]).with_covariance(1e-6 * np.eye(6))
@@ -367,10 +378,12 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
         SensorListener(
             reader,
             "r1",
-            on_imu=lambda sensor, imu: readings.append((sensor, imu)),
-            on_velocity=lambda sensor, velocity: velocities.append((sensor, velocity)),
-            on_pose=lambda sensor, pose: poses.append((sensor, pose)),
-            on_fix=lambda sensor, fix: fixes.append((sensor, fix)),
+            {
+                "imu": lambda sensor, imu: readings.append((sensor, imu)),
+                "velocity": lambda sensor, velocity: velocities.append((sensor, velocity)),
+                "pose": lambda sensor, pose: poses.append((sensor, pose)),
+                "fix": lambda sensor, fix: fixes.append((sensor, fix)),
+            },
             wire=wire,
         ) as listener,
         ImuPublisher(writer, "r1", "chest", wire, frame="imu_link") as chest,
@@ -404,7 +417,7 @@ def test_message_that_a_callback_refuses_is_counted(sessions):
     def refuse(sensor: str, _: Imu) -> None:
         raise InvalidInput(f"{sensor} is not wanted")
 
-    with SensorListener(reader, "r1", on_imu=refuse) as listener, ImuPublisher(writer, "r1") as imu:
+    with SensorListener(reader, "r1", {"imu": refuse}) as listener, ImuPublisher(writer, "r1") as imu:
         until(lambda: imu.publish([0, 0, 0], [0, 0, 9.81]) or listener.refused)
         assert set(listener.refused) == {"refused"}
 
@@ -458,13 +471,13 @@ def test_a_stamp_is_of_the_future_from_half_a_second_after_the_time_of_the_clock
 def test_readings_of_other_sources_are_published_once_the_imu_is_silent_for_more_than_a_tenth_of_a_second(
     sessions, silent_ns: int, count: int
 ):
-    flow_noise = {"flow": VelocityNoise(sigma=(0.1, 0.1, 0.1))}
+    flow = [("flow", VelocityNoise(sigma=(0.1, 0.1, 0.1)))]
     with (
-        imu_to_node(sessions, clock=ManualClock(STAMP), velocities=flow_noise) as (imu, node),
-        VelocityPublisher(sessions[0], "r1", "flow", frame="base_footprint") as flow,
+        imu_to_node(sessions, clock=ManualClock(STAMP), sensors=flow) as (imu, node),
+        VelocityPublisher(sessions[0], "r1", "flow", frame="base_footprint") as publisher,
     ):
         until(lambda: imu.publish([0, 0, 0], [0, 0, 9.80665], STAMP) or node.published)
-        until(lambda: flow.publish([0, 0, 0], stamp=STAMP + silent_ns) or node.base.newest > STAMP)
+        until(lambda: publisher.publish([0, 0, 0], stamp=STAMP + silent_ns) or node.base.newest > STAMP)
         node.health()  # after that reading
         assert node.published == count
 
@@ -499,7 +512,7 @@ def test_exceptions_of_a_callback_are_counted_and_the_next_messages_arrive(sessi
         calls.append(message.stamp)
         raise ZeroDivisionError(sensor)
 
-    with SensorListener(reader, "r1", on_imu=fail) as listener, ImuPublisher(writer, "r1") as imu:
+    with SensorListener(reader, "r1", {"imu": fail}) as listener, ImuPublisher(writer, "r1") as imu:
         until(lambda: imu.publish([0, 0, 0], [0, 0, 9.81]) or len(calls) > 2)
         until(lambda: listener.refused.get("failed with ZeroDivisionError", 0) > 2)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import msgspec
 
@@ -190,7 +190,11 @@ class Fix(StampedMessage, frozen=True, array_like=True, gc=False):
             raise InvalidInput("an altitude and a covariance need a latitude and a longitude")
 
 
-_Measurement = TypeVar("_Measurement", bound="Imu | Velocity | Pose | Fix")
+SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix
+SENSOR_STREAMS = ("imu", "velocity", "pose", "fix")
+"""The streams of these messages."""
+
+_Measurement = TypeVar("_Measurement", bound=SensorMessage)
 
 
 def with_full_names(message: _Measurement, robot: str) -> _Measurement:
@@ -199,3 +203,8 @@ def with_full_names(message: _Measurement, robot: str) -> _Measurement:
         parent, child = full_name(robot, message.parent), message.child and full_name(robot, message.child)
         return msgspec.structs.replace(message, parent=parent, child=child)
     return msgspec.structs.replace(message, frame=full_name(robot, message.frame))
+
+
+def frame_of(message: SensorMessage) -> str:
+    """The frame that was measured; empty for a pose of the base of the robot."""
+    return message.child if isinstance(message, Pose) else message.frame

@@ -1,25 +1,21 @@
 """From the streams of a robot to its odometry: SensorListener, and OdometryNode.
 
-The functions that pass a message to an estimator also serve recordings.
+``add_joints`` also serves recordings; ``sensors.py`` has the functions for messages of sensors.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from types import MappingProxyType
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
-from zstate._util.format import format_duration
+from zstate._util.format import did_you_mean, format_duration
 from zstate._util.refusals import Refusals
 from zstate.checks import Floats
 from zstate.clock import SYSTEM, Clock
@@ -33,15 +29,15 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
 from zstate.odometry.map_estimator import MapEstimator
-from zstate.odometry.messages import Fix, Imu, Pose, Velocity, with_full_names
+from zstate.odometry.messages import SENSOR_STREAMS, Imu, SensorMessage, with_full_names
 from zstate.odometry.publishers import OdometryPublisher, PosePublisher
 from zstate.odometry.requests import apply_request
-from zstate.odometry.source_noise import FixNoise, HeadingNoise, PoseNoise, VelocityNoise
+from zstate.odometry.sensors import Estimators, add_imu, sensor
+from zstate.odometry.source_noise import SensorNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.keys import ODOMETRY_REQUEST, check_robot, shortened
-from zstate.wire.messages import covariance_matrix, from_block
 from zstate.wire.registry import get_wire
 
 _SILENT_NS = 100_000_000
@@ -62,118 +58,6 @@ _LOGGED_NS = 60_000_000_000
 
 _HEALTH_NS = 500_000_000
 """The interval at which the health of the sources is assessed, by stamps."""
-
-
-def add_imu(base: BaseEstimator, message: Imu) -> None:
-    """Pass one reading to ``base``."""
-    base.imu(message.stamp, from_block(message.gyro), from_block(message.accel))
-
-
-def velocity_covariance(sensor: str, message: Velocity, noise: VelocityNoise) -> Floats:
-    """That of the linear velocity [m^2/s^2], (3, 3): by ``noise``, else of the message.
-
-    Raises InvalidInput if neither states it: a driver that does not know variances sends zero or -1.
-    """
-    if noise.sigmas is not None:
-        return np.diag(np.square(noise.sigmas))
-    covariance = None if message.covariance is None else covariance_matrix(message.covariance)[:3, :3]
-    if covariance is None or not (np.diag(covariance) > 0.0).all():
-        raise InvalidInput(
-            f"velocities of {sensor!r} have {_unknown(covariance)}: state their noise by `--velocity "
-            f"{sensor}:sigma=0.05`, or sigma = 0.05 [m/s] in [velocity.{sensor}] of the settings"
-        )
-    return covariance
-
-
-def pose_covariance(sensor: str, message: Pose, noise: PoseNoise) -> Floats:
-    """That of a pose, (6, 6), as of ``Transform.covariance``: by ``noise``, else of the message.
-
-    Raises InvalidInput as ``velocity_covariance``.
-    """
-    if noise.sigmas is not None:
-        return np.diag(np.square(noise.sigmas))
-    covariance = None if message.covariance is None else covariance_matrix(message.covariance)
-    if covariance is None or not (np.diag(covariance) > 0.0).all():
-        raise InvalidInput(
-            f"poses of {sensor!r} have {_unknown(covariance)}: state their noise by `--pose "
-            f"{sensor}:sigma=0.02,sigma_deg=1`, or sigma = 0.02 [m] and sigma_deg = 1.0 [degrees] in "
-            f"[pose.{sensor}] of the settings"
-        )
-    return covariance
-
-
-def heading_sigma(sensor: str, message: Imu, noise: HeadingNoise) -> float:
-    """The standard deviation of the yaw of an orientation [rad]: by ``noise``, else of the message.
-
-    Raises InvalidInput for a message without an orientation, and as ``velocity_covariance``.
-    """
-    if message.orientation is None:
-        raise InvalidInput(f"the IMU {sensor!r} sends no orientation, and so no heading")
-    if noise.sigma_deg is not None:
-        return math.radians(noise.sigma_deg)
-    known = message.orientation_covariance
-    covariance = None if known is None else covariance_matrix(known)
-    if covariance is None or not covariance[2, 2] > 0.0:
-        raise InvalidInput(
-            f"orientations of {sensor!r} have {_unknown(covariance)}: state their noise by `--heading "
-            f"{sensor}:sigma_deg=5`, or sigma_deg = 5.0 [degrees] in [heading.{sensor}] of the settings"
-        )
-    return math.sqrt(float(covariance[2, 2]))
-
-
-def _unknown(covariance: Floats | None) -> str:
-    return "no covariance" if covariance is None else "a covariance with variances that are not above zero"
-
-
-def add_velocity(base: BaseEstimator, sensor: str, noise: VelocityNoise, message: Velocity) -> None:
-    """Pass one measurement of ``sensor`` to ``base``. Raises InvalidInput if its noise is not known."""
-    base.velocity(
-        message.stamp,
-        from_block(message.linear),
-        covariance=velocity_covariance(sensor, message, noise),
-        angular=None if message.angular is None else from_block(message.angular),
-        frame=message.frame,
-        scale=noise.scale,
-        source=sensor,
-    )
-
-
-def add_heading(base: BaseEstimator, sensor: str, noise: HeadingNoise, message: Imu) -> None:
-    """Pass the yaw of the orientation of an IMU to ``base``, as a source of its own beside its rates.
-
-    Raises InvalidInput as ``heading_sigma``.
-    """
-    sigma = heading_sigma(sensor, message, noise)
-    assert message.orientation is not None
-    x, y, z, w = from_block(message.orientation).tolist()
-    yaw = math.atan2(2.0 * (x * y + z * w), 1.0 - 2.0 * (y * y + z * z))
-    base.heading(message.stamp, yaw, sigma, source=f"{sensor} heading", frame=message.frame)
-
-
-def add_pose(base: BaseEstimator, sensor: str, noise: PoseNoise, message: Pose) -> None:
-    """Pass one measured pose of ``sensor`` to ``base``. Raises InvalidInput if its noise is not known."""
-    measured = Transform.from_pose7(message.parent, message.child or base.base, from_block(message.pose))
-    base.pose(message.stamp, measured, pose_covariance(sensor, message, noise), source=sensor)
-
-
-def add_fix(in_map: MapEstimator, sensor: str, noise: FixNoise, message: Fix) -> None:
-    """Pass one fix of ``sensor`` to ``in_map``.
-
-    Raises InvalidInput for a message without a fix, and if its noise is not known.
-    """
-    latitude, longitude = message.latitude, message.longitude
-    if message.status < 0 or latitude is None or longitude is None:
-        raise InvalidInput(f"the receiver {sensor!r} has no fix: its status is {message.status}")
-    in_map.fix(
-        message.stamp,
-        latitude,
-        longitude,
-        message.altitude,
-        covariance=None if message.covariance is None else covariance_matrix(message.covariance),
-        frame=message.frame,
-        source=sensor,
-        noise=noise,
-    )
 
 
 def add_joints(base: BaseEstimator, model: RobotModel, reading: JointReading) -> None:
@@ -200,40 +84,33 @@ def _by_name_if_known(
 
 
 class SensorListener(Closeable):
-    """Calls ``on_imu``, ``on_velocity``, ``on_pose`` or ``on_fix`` for each message of a robot.
+    """Calls ``callbacks[stream](sensor, message)`` for each message of the sensors of a robot, as of "imu".
 
     The arguments are the sensor's name and the message, whose frames have their full names; the child of a
     pose is empty for the base of the robot. Each callback has a thread of its own, and gets the messages in
     the order of their arrival; a stream without a callback is not subscribed. If a callback is slow, the
     oldest messages are lost. ``refused`` counts, by reason, messages that cannot be used, those that a
     callback refuses by raising InvalidInput, and its other exceptions, which do not end the thread; the first
-    of each reason is also logged. A context manager.
+    of each reason is also logged. Raises InvalidInput for other streams. A context manager.
     """
 
     def __init__(
         self,
         session: Session,
         robot: str,
+        callbacks: Mapping[StreamName, Callable[[str, Any], object]],
         *,
-        on_imu: Callable[[str, Imu], object] | None = None,
-        on_velocity: Callable[[str, Velocity], object] | None = None,
-        on_pose: Callable[[str, Pose], object] | None = None,
-        on_fix: Callable[[str, Fix], object] | None = None,
         wire: str = "native",
     ) -> None:
         self.robot = check_robot(robot)
         self._wire = get_wire(wire)
         self._refusals = Refusals("measurement")
         self.refused: dict[str, int] = self._refusals.counts
-        callbacks: dict[StreamName, Callable[..., object]] = {}
-        if on_imu is not None:
-            callbacks["imu"] = on_imu
-        if on_velocity is not None:
-            callbacks["velocity"] = on_velocity
-        if on_pose is not None:
-            callbacks["pose"] = on_pose
-        if on_fix is not None:
-            callbacks["fix"] = on_fix
+        if unknown := [stream for stream in callbacks if stream not in SENSOR_STREAMS]:
+            known = ", ".join(SENSOR_STREAMS)
+            raise InvalidInput(
+                f"{unknown[0]!r} is no stream of sensors: {known}{did_you_mean(unknown[0], SENSOR_STREAMS)}"
+            )
         with ExitStack() as opening:
             for stream, callback in callbacks.items():
                 on_messages = partial(self._on_messages, callback)
@@ -250,9 +127,8 @@ class SensorListener(Closeable):
 
     def _on_messages(self, callback: Callable[[str, Any], object], received: list[Received]) -> None:
         for robot, key, message in received:
-            assert isinstance(message, Imu | Velocity | Pose | Fix)
             try:
-                callback(self._wire.edge_writer_name(key) or "", with_full_names(message, robot))
+                callback(self._wire.edge_writer_name(key) or "", with_full_names(message, robot))  # pyright: ignore[reportArgumentType] - of a stream of sensors
             except InvalidInput as error:
                 self._refusals.count("refused", f"{shortened(key)}: {error}")
             except Exception as error:  # the next message may be good
@@ -287,14 +163,14 @@ class _MapPublishers(NamedTuple):
 class OdometryNode(Closeable):
     """Feeds ``base`` with the sensors of ``robot``, and publishes its odometry as ``writer``.
 
-    ``base`` gets the readings of the IMU ``imu``, of the sensors ``velocities`` and ``poses``, and the yaw of
-    the orientations of the IMUs ``headings``, each with what is stated of its noise, and with ``has_joints``
-    the joint states, from the threads of their subscriptions.
+    ``base`` gets the readings of the IMU ``imu`` and of the further ``sensors``, each by its name and with
+    what is stated of its noise, whose class tells the kind: ``[("wheels", VelocityNoise(sigma=0.05))]``; and
+    with ``has_joints`` the joint states, from the threads of their subscriptions.
     Each reading of the IMU publishes the state at its stamp, at most ``rate_hz`` of them a second. If the IMU
     is silent for 0.1 s, readings of the other sources do; if all are silent, nothing is published. The
     sentences of ``base.health()`` are the warning in the status of the writer.
 
-    ``in_map`` gets the fixes of the receivers ``fixes``, and has ``base`` as its odometry. As soon as it
+    ``in_map`` gets the fixes of satellite receivers, and has ``base`` as its odometry. As soon as it
     knows the pose in the map, the writer ``map`` publishes map -> odom at the stamps of the odometry, so that
     ``lookup("map", "base_link")`` is exact there, and the stream ``pose/map`` has the pose of the base in the
     map with its covariance. (That of such a lookup would add the covariance of the odometry.)
@@ -314,10 +190,7 @@ class OdometryNode(Closeable):
         base: BaseEstimator,
         *,
         imu: str = "imu",
-        velocities: Mapping[str, VelocityNoise] = MappingProxyType({}),
-        poses: Mapping[str, PoseNoise] = MappingProxyType({}),
-        headings: Mapping[str, HeadingNoise] = MappingProxyType({}),
-        fixes: Mapping[str, FixNoise] = MappingProxyType({}),
+        sensors: Iterable[tuple[str, SensorNoise]] = (),
         in_map: MapEstimator | None = None,
         has_joints: bool = False,
         writer: str = "odometry",
@@ -330,9 +203,9 @@ class OdometryNode(Closeable):
         self.failure: Exception | None = None
         self.has_failed = fork_safe(threading.Event())
         self._refusals = Refusals("joint states")
-        self._imu, self._velocities, self._poses = imu, dict(velocities), dict(poses)
-        self._headings = dict(headings)
-        self._fixes, self._in_map = dict(fixes), in_map
+        self._imu, self._in_map = imu, in_map
+        self._estimators = Estimators(base, in_map)
+        self._sensors = tuple(sensor(name, noise) for name, noise in sensors)
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._restart()
@@ -349,14 +222,14 @@ class OdometryNode(Closeable):
             if has_joints:
                 joints = JointStateListener(session, robot, on_reading=self._on_joints)
                 self._joints = opening.enter_context(joints)
-            self._sensors = opening.enter_context(
+            self._listener = opening.enter_context(
                 SensorListener(
                     session,
                     robot,
-                    on_imu=self._on_imu,
-                    on_velocity=self._on_velocity if velocities else None,
-                    on_pose=self._on_pose if poses else None,
-                    on_fix=self._on_fix if fixes else None,
+                    {
+                        stream: partial(self._on_message, stream)
+                        for stream in ("imu", *(one.kind.stream for one in self._sensors))
+                    },
                 )
             )
             self._opened = opening.pop_all()
@@ -373,7 +246,7 @@ class OdometryNode(Closeable):
     @property
     def refused(self) -> dict[str, int]:
         """Counts of messages that could not be used, by reason; the first of each is also logged."""
-        return dict(Counter(self._sensors.refused) + self._refusals.counts)
+        return dict(Counter(self._listener.refused) + self._refusals.counts)
 
     @property
     def published(self) -> int:
@@ -410,14 +283,19 @@ class OdometryNode(Closeable):
 
     # In the threads of the subscriptions
 
-    def _on_imu(self, sensor: str, message: Imu) -> None:
+    def _on_message(self, stream: StreamName, name: str, message: SensorMessage) -> None:
+        is_imu = (stream, name) == ("imu", self._imu)
+        sensors = [one for one in self._sensors if (one.kind.stream, one.name) == (stream, name)]
+        if not is_imu and not sensors:
+            return
         with self._lock:
-            if sensor in (self._imu, *self._headings):
-                self._check_stamp(message.stamp)
-            if sensor == self._imu:
+            self._check_stamp(message.stamp)
+            if is_imu:
+                assert isinstance(message, Imu)
                 self._add_imu(message)
-            if sensor in self._headings:
-                add_heading(self.base, sensor, self._headings[sensor], message)
+            for one in sensors:
+                one.add(self._estimators, message)
+                self._publish_without_imu(message.stamp)
 
     def _add_imu(self, message: Imu) -> None:
         add_imu(self.base, message)
@@ -426,26 +304,6 @@ class OdometryNode(Closeable):
             self._imu_stamp = max(self._imu_stamp, message.stamp)
             # Not the newest of all data: wheels may be ahead, and what the IMU did since is not known.
             self._publish(message.stamp, at=self._imu_stamp)
-
-    def _on_velocity(self, sensor: str, message: Velocity) -> None:
-        if sensor in self._velocities:
-            with self._lock:
-                self._check_stamp(message.stamp)
-                add_velocity(self.base, sensor, self._velocities[sensor], message)
-                self._publish_without_imu(message.stamp)
-
-    def _on_pose(self, sensor: str, message: Pose) -> None:
-        if sensor in self._poses:
-            with self._lock:
-                self._check_stamp(message.stamp)
-                add_pose(self.base, sensor, self._poses[sensor], message)
-                self._publish_without_imu(message.stamp)
-
-    def _on_fix(self, sensor: str, message: Fix) -> None:
-        if sensor in self._fixes and self._in_map is not None:
-            with self._lock:
-                self._check_stamp(message.stamp)
-                add_fix(self._in_map, sensor, self._fixes[sensor], message)
 
     def _on_joints(self, reading: JointReading) -> None:
         if self._joints is None:  # a reading during its opening

@@ -128,3 +128,7 @@ class FixNoise:
 
 def _two(sigma: FixSigma) -> tuple[float, float]:
     return sigma if isinstance(sigma, tuple) else (sigma, HEIGHT_FACTOR * sigma)
+
+
+SensorNoise: TypeAlias = VelocityNoise | PoseNoise | HeadingNoise | FixNoise
+"""What is stated of a sensor: the class says of which kind it is."""

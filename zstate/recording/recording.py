@@ -71,7 +71,7 @@ from zstate.wire.messages import (
 
 if TYPE_CHECKING:
     from zstate.driving.messages import DriverState, JointCommand, Stop
-    from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+    from zstate.odometry.messages import Fix, Imu, Odometry, Pose, SensorMessage, Velocity
     from zstate.scans.grid import Grid
     from zstate.scans.messages import LaserScan, OccupancyGrid
     from zstate.scans.scan import Scan
@@ -239,19 +239,19 @@ class Recording(Closeable):
         Messages that cannot be used are left out; the first of each reason is logged. Raises InvalidInput
         for a robot that is not in the recording.
         """
-        return self._measurements("imu", robot, sensor)
+        return self.sensor_messages("imu", robot, sensor)
 
     def velocities(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Velocity]:
         """The measured velocities of ``robot``, likewise."""
-        return self._measurements("velocity", robot, sensor)
+        return self.sensor_messages("velocity", robot, sensor)
 
     def poses(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Pose]:
         """The measured poses of ``robot``, likewise. The child is empty for its base, as in ROS."""
-        return self._measurements("pose", robot, sensor)
+        return self.sensor_messages("pose", robot, sensor)
 
     def fixes(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Fix]:
         """The fixes of the satellite receivers of ``robot``, likewise, also those without a position."""
-        return self._measurements("fix", robot, sensor)
+        return self.sensor_messages("fix", robot, sensor)
 
     def odometry(self, robot: str | None = None, writer: str | None = None) -> Iterator[Odometry]:
         """The odometry of ``robot``, by default of all robots, or of one ``writer``, likewise.
@@ -263,14 +263,17 @@ class Recording(Closeable):
             if writer in (None, recorded.edge_writer):
                 yield cast("Odometry", message)
 
-    def _measurements(self, stream: StreamName, robot: str | None, sensor: str | None) -> Iterator[Any]:
+    def sensor_messages(
+        self, stream: StreamName, robot: str | None = None, sensor: str | None = None
+    ) -> Iterator[Any]:
+        """The messages of ``stream``, one of those that ``SensorListener`` takes, as those of ``imu``."""
         from zstate.odometry.messages import with_full_names  # noqa: PLC0415 - odometry is a plugin
 
         refusals = Refusals(f"recorded {stream}")
         for writer, message, _ in self._messages(robot, stream, refusals.count):
             if sensor in (None, writer.edge_writer):
                 try:
-                    yield with_full_names(cast("Imu | Velocity | Pose | Fix", message), writer.robot)
+                    yield with_full_names(cast("SensorMessage", message), writer.robot)
                 except InvalidInput as error:
                     refusals.count("malformed", f"{writer.edge_writer!r} of {writer.robot!r}: {error}")
 

@@ -260,7 +260,7 @@ def test_odometry_whose_driver_has_ended_names_the_streams_that_it_waits_for():
         connect() as session,
         OdometryPublisher(session, "cart", "odometry", program="odometry") as odometry,
         TransformListener(session, "cart"),
-        SensorListener(session, "cart", on_imu=lambda *_: None),
+        SensorListener(session, "cart", {"imu": lambda *_: None}),
         JointStateListener(session, "cart"),
         repeated(lambda: odometry.publish(edge, [0, 0, 0], [0, 0, 0])),
     ):

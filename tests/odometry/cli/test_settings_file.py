@@ -25,10 +25,7 @@ from zstate.odometry.cli.settings_file import (
     OdometrySettings,
     parse_diff_drive,
     parse_feet,
-    parse_fix,
-    parse_heading,
-    parse_pose,
-    parse_velocity,
+    parse_sensor,
     read_settings,
 )
 
@@ -162,14 +159,17 @@ def test_robot_has_wheels_of_one_kind(tmp_path: Path):
 
 
 def test_noise_of_a_source_is_stated_on_the_command_line():
-    assert parse_velocity("wheels") == ("wheels", VelocityNoise())
-    assert parse_velocity("wheels:sigma=0.05, scale=0") == ("wheels", VelocityNoise(sigma=0.05, scale=0.0))
-    assert parse_pose("mocap:sigma=0.01,sigma_deg=1")[1].sigmas == pytest.approx(
+    assert parse_sensor("velocity", "wheels") == ("wheels", VelocityNoise())
+    assert parse_sensor("velocity", "wheels:sigma=0.05, scale=0") == (
+        "wheels",
+        VelocityNoise(sigma=0.05, scale=0.0),
+    )
+    assert parse_sensor("pose", "mocap:sigma=0.01,sigma_deg=1")[1].sigmas == pytest.approx(
         (0.01,) * 3 + (0.0174533,) * 3
     )
-    assert parse_heading("imu:sigma_deg=5") == ("imu", HeadingNoise(sigma_deg=5.0))
-    assert parse_fix("gps") == ("gps", FixNoise())
-    assert parse_fix("gps:sigma=1.5,correlated_s=30")[1] == FixNoise(sigma=1.5, correlated_s=30.0)
+    assert parse_sensor("heading", "imu:sigma_deg=5") == ("imu", HeadingNoise(sigma_deg=5.0))
+    assert parse_sensor("fix", "gps") == ("gps", FixNoise())
+    assert parse_sensor("fix", "gps:sigma=1.5,correlated_s=30")[1] == FixNoise(sigma=1.5, correlated_s=30.0)
     assert FixNoise(sigma=1.5).sigmas == (1.5, 15.0)
 
 
@@ -205,7 +205,7 @@ def test_file_has_receivers_and_the_origin_of_their_map(tmp_path: Path):
 )
 def test_unusable_noise_of_a_source_is_refused(text: str, error: str):
     with pytest.raises(InvalidInput, match=error):
-        parse_velocity(text)
+        parse_sensor("velocity", text)
 
 
 def test_initial_pose_is_where_the_base_starts():

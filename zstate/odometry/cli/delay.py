@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from zstate.checks import Floats
 from zstate.model.joint_history import JointHistory
 from zstate.odometry import Wheels
 from zstate.odometry.messages import Imu, Pose, Velocity
+from zstate.streams import StreamName
 from zstate.wire.messages import StampedMessage, from_block
 
 _REACH_S, _STEP_S = 0.5, 0.01
@@ -70,6 +71,12 @@ class Motions:
             for blocks in ([one.gyro for one in readings], [one.accel for one in readings])
         )
         self._yaw, self._speed = _integrated(seconds, gyro[:, 2]), _integrated(seconds, accel[:, 0])
+
+    def delay_of(self, stream: StreamName, messages: Sequence[Any]) -> Delay | None:
+        """That of a sensor whose messages show a yaw or a speed; None for one of another stream."""
+        if stream == "velocity":
+            return self.delay(*self.of_velocities(messages))
+        return self.delay(self.of_poses(messages), None) if stream == "pose" else None
 
     def delay(self, yaw: Series | None, speed: Series | None) -> Delay | None:
         """That of a source with this yaw and this speed, where it has them."""

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import click
 from click.core import ParameterSource
@@ -17,17 +17,17 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import LookupFailed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
-    from zstate.odometry import DiffDrive, FixNoise, HeadingNoise, OdometryNode, PoseNoise, VelocityNoise
+    from zstate.odometry import DiffDrive, OdometryNode
     from zstate.odometry.cli.reference import ReferenceName
     from zstate.odometry.cli.settings_file import LegSettings, OdometrySettings, PlanarPose
-    from zstate.odometry.messages import Fix, Imu, Pose, Velocity
-
-    SensorMessage = Imu | Velocity | Pose | Fix
+    from zstate.odometry.messages import SensorMessage
+    from zstate.odometry.source_noise import SensorNoise
+    from zstate.streams import StreamName
 
 
 def _parse_diff_drive(text: str) -> DiffDrive:
@@ -42,28 +42,23 @@ def _parse_feet(text: str) -> LegSettings:
     return parse_feet(text)
 
 
-def _parse_velocity(text: str) -> tuple[str, VelocityNoise]:
-    from zstate.odometry.cli.settings_file import parse_velocity
+def _parse_sensor(kind: str, text: str) -> tuple[str, SensorNoise]:
+    from zstate.odometry.cli.settings_file import parse_sensor
 
-    return parse_velocity(text)
-
-
-def _parse_pose(text: str) -> tuple[str, PoseNoise]:
-    from zstate.odometry.cli.settings_file import parse_pose
-
-    return parse_pose(text)
+    return parse_sensor(kind, text)
 
 
-def _parse_heading(text: str) -> tuple[str, HeadingNoise]:
-    from zstate.odometry.cli.settings_file import parse_heading
-
-    return parse_heading(text)
-
-
-def _parse_fix(text: str) -> tuple[str, FixNoise]:
-    from zstate.odometry.cli.settings_file import parse_fix
-
-    return parse_fix(text)
+def _sensor_option(
+    kind: str, stated: str, help_text: str
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """``--kind SENSOR[:...]``, repeatable: further sensors, of whose noise ``stated`` may be stated."""
+    return click.option(
+        f"--{kind}",
+        metavar=f"SENSOR[:{stated}]",
+        type=options.Checked("SENSOR", partial(_parse_sensor, kind)),
+        multiple=True,
+        help=f"{help_text} Repeatable.",
+    )
 
 
 def _parse_reference(text: str) -> ReferenceName:
@@ -78,51 +73,36 @@ def _parse_plot(file: str) -> Path:
     return plot_file(file)
 
 
-_OF_ESTIMATES = (
-    *("imu", "velocities", "poses", "headings", "fixes", "map_frame", "datum", "diff_drive", "feet"),
-    *("file", "odom", "base", "initial_pose", "rate", "replay", "reference", "plot", "seconds"),
-)
-"""Parameters of the command that a request to a running odometry has no use for."""
+_OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
+"""The parameters of the command that a request to a running odometry has a use for."""
 
 
 @click.command("odometry")
 @click.argument("robot")
 @click.option("--imu", metavar="SENSOR", help="The IMU: a stream of ROBOT; default: imu.")
-@click.option(
-    "--velocity",
-    "velocities",
-    metavar="SENSOR[:sigma=M/S,scale=PART]",
-    type=options.Checked("SENSOR", _parse_velocity),
-    multiple=True,
-    help="A further stream of measured velocities. Its noise is that of its messages, or the standard "
-    "deviation sigma; scale is that of a constant relative error. Repeatable.",
+@_sensor_option(
+    "velocity",
+    "sigma=M/S,scale=PART",
+    "A further stream of measured velocities. Its noise is that of its messages, or the standard deviation "
+    "sigma; scale is that of a constant relative error.",
 )
-@click.option(
-    "--pose",
-    "poses",
-    metavar="SENSOR[:sigma=M,sigma_deg=DEG]",
-    type=options.Checked("SENSOR", _parse_pose),
-    multiple=True,
-    help="A further stream of measured poses in the frame of the odometry. Its noise is that of its "
-    "messages, or sigma and sigma_deg. Repeatable.",
+@_sensor_option(
+    "pose",
+    "sigma=M,sigma_deg=DEG",
+    "A further stream of measured poses in the frame of the odometry. Its noise is that of its messages, or "
+    "sigma and sigma_deg.",
 )
-@click.option(
-    "--heading",
-    "headings",
-    metavar="SENSOR[:sigma_deg=DEG]",
-    type=options.Checked("SENSOR", _parse_heading),
-    multiple=True,
-    help="An IMU whose orientation shows the yaw, as by a compass. Its noise is that of its messages, or "
-    "sigma_deg. Repeatable.",
+@_sensor_option(
+    "heading",
+    "sigma_deg=DEG",
+    "An IMU whose orientation shows the yaw, as by a compass. Its noise is that of its messages, or "
+    "sigma_deg.",
 )
-@click.option(
-    "--fix",
-    "fixes",
-    metavar="SENSOR[:sigma=M]",
-    type=options.Checked("SENSOR", _parse_fix),
-    multiple=True,
-    help="A satellite receiver, which places the odometry in a map, x east and y north. Its noise is that of "
-    "its messages, or sigma. Repeatable.",
+@_sensor_option(
+    "fix",
+    "sigma=M",
+    "A satellite receiver, which places the odometry in a map, x east and y north. Its noise is that of its "
+    "messages, or sigma.",
 )
 @click.option("--map", "map_frame", metavar="FRAME", help="The frame of that map; default: map.")
 @click.option(
@@ -200,10 +180,6 @@ def odometry_command(
     *,
     robot: str,
     imu: str | None,
-    velocities: tuple[tuple[str, VelocityNoise], ...],
-    poses: tuple[tuple[str, PoseNoise], ...],
-    headings: tuple[tuple[str, HeadingNoise], ...],
-    fixes: tuple[tuple[str, FixNoise], ...],
     map_frame: str | None,
     datum: tuple[float, float, float] | None,
     diff_drive: DiffDrive | None,
@@ -221,6 +197,7 @@ def odometry_command(
     plot: Path | None,
     seconds: float | None,
     network: SessionOptions,
+    **sensors: tuple[tuple[str, SensorNoise], ...],
 ) -> None:
     """Publish where the base of ROBOT is: odom -> base, from its IMU, its joints and its velocities.
 
@@ -256,10 +233,7 @@ def odometry_command(
     settings = OdometrySettings() if file is None else read_settings(file)
     given = {
         "imu": imu,
-        "velocity": dict(velocities) or None,
-        "pose": dict(poses) or None,
-        "heading": dict(headings) or None,
-        "fix": dict(fixes) or None,
+        **{kind: dict(given) or None for kind, given in sensors.items()},
         "map": map_frame,
         "datum": datum,
         "odom": odom,
@@ -270,7 +244,7 @@ def odometry_command(
     settings = replace(settings, **{key: value for key, value in given.items() if value is not None})
     if diff_drive is not None:
         settings = replace(settings, diff_drive=diff_drive, ackermann=None, mecanum=None)
-    if not (settings.has_joints or settings.velocity or settings.pose):
+    if not settings.has_joints and not any(one.kind.is_enough for one in settings.sensors):
         raise click.UsageError(
             "an IMU alone drifts by metres in seconds; add --diff-drive, --feet, --velocity, --pose or --file"
         )
@@ -285,7 +259,7 @@ def _check_request(context: click.Context) -> None:
     """Refuse options of the odometry itself next to a request to one that runs."""
     for one in context.command.params:
         name = one.name or ""
-        if name in _OF_ESTIMATES and context.get_parameter_source(name) == ParameterSource.COMMANDLINE:
+        if name not in _OF_REQUESTS and context.get_parameter_source(name) == ParameterSource.COMMANDLINE:
             raise click.UsageError(
                 f"--reset and --set-pose go to an odometry that runs; {one.opts[0]} is not for it"
             )
@@ -328,10 +302,7 @@ def _publish(
                 robot,
                 estimator,
                 imu=settings.imu,
-                velocities=settings.velocity,
-                poses=settings.pose,
-                headings=settings.heading,
-                fixes=settings.fix,
+                sensors=[(one.name, one.noise) for one in settings.sensors],
                 in_map=settings.map_estimator(robot, estimator, listener.buffer),
                 has_joints=settings.has_joints,
                 writer=writer,
@@ -361,28 +332,23 @@ def _wait_for_sensors(
     from zstate.cli.waiting import ConditionWaiter
     from zstate.odometry import SensorListener
     from zstate.odometry.cli.settings_file import others_text
-    from zstate.odometry.messages import Imu
-    from zstate.odometry.node import heading_sigma, pose_covariance, velocity_covariance
+    from zstate.odometry.messages import frame_of
     from zstate.sources.joint_state_listener import DescriptionSubscriber
     from zstate.wire.keys import full_name
 
     waiter = ConditionWaiter()
     models: dict[str, RobotModel] = {}
-    heard: dict[str, dict[str, SensorMessage]] = {"imu": {}, "velocity": {}, "pose": {}, "fix": {}}
+    needed = [("imu", settings.imu), *((one.kind.stream, one.name) for one in settings.sensors)]
+    """The stream and the name of each sensor."""
+    heard: dict[StreamName, dict[str, SensorMessage]] = {stream: {} for stream, _ in needed}
     """The first message of each sensor, by stream."""
-    needed = {
-        "imu": (settings.imu, *settings.heading),
-        "velocity": (*settings.velocity,),
-        "pose": (*settings.pose,),
-        "fix": (*settings.fix,),
-    }
 
     def base() -> str:
         return settings.base or models[robot].root
 
-    def on_message(stream: str, sensor: str, message: SensorMessage) -> None:
-        if sensor not in heard[stream]:
-            heard[stream][sensor] = message
+    def on_message(stream: StreamName, name: str, message: SensorMessage) -> None:
+        if name not in heard[stream]:
+            heard[stream][name] = message
             waiter.notify()
 
     def on_description(name: str, model: RobotModel) -> None:
@@ -390,49 +356,30 @@ def _wait_for_sensors(
         waiter.notify()
 
     def reason() -> str:
-        for stream, sensors in needed.items():
-            for sensor in sensors:
-                if sensor not in heard[stream]:
-                    return (
-                        f"{robot!r} has no message on {stream}/{sensor}{others_text(sensor, heard[stream])}"
-                    )
+        for stream, name in needed:
+            if name not in heard[stream]:
+                return f"{robot!r} has no message on {stream}/{name}{others_text(name, heard[stream])}"
         if robot not in models and settings.legs is not None:
             return f"the model of {robot!r}, which feet need, has no publisher; start it"
         if robot not in models and settings.base is None:
             return f"the model of {robot!r} has no publisher; start it, or give --base"
         try:
-            frames = [cast("Imu", heard["imu"][one]).frame for one in needed["imu"]]
-            for frame in (*frames, *(cast("Fix", heard["fix"][one]).frame for one in settings.fix)):
-                listener.buffer.lookup(full_name(robot, base()), frame)
+            for stream, name in needed:
+                if frame := frame_of(heard[stream][name]):
+                    listener.buffer.lookup(full_name(robot, base()), frame)
         except LookupFailed as missing:
             return str(missing)
         return ""
 
-    def imu_frame() -> str:
-        message = heard["imu"][settings.imu]
-        assert isinstance(message, Imu)
-        return message.frame
-
     listener.add_observer(waiter.notify)
     with (
-        SensorListener(
-            session,
-            robot,
-            on_imu=partial(on_message, "imu"),
-            on_velocity=partial(on_message, "velocity") if settings.velocity else None,
-            on_pose=partial(on_message, "pose") if settings.pose else None,
-            on_fix=partial(on_message, "fix") if settings.fix else None,
-        ),
+        SensorListener(session, robot, {stream: partial(on_message, stream) for stream in heard}),
         DescriptionSubscriber(session, robot, on_description),
     ):
         waiter.wait_for(lambda: not reason(), None, reason)
-    for sensor, noise in settings.velocity.items():
-        velocity_covariance(sensor, cast("Velocity", heard["velocity"][sensor]), noise)
-    for sensor, noise in settings.pose.items():
-        pose_covariance(sensor, cast("Pose", heard["pose"][sensor]), noise)
-    for sensor, noise in settings.heading.items():
-        heading_sigma(sensor, cast("Imu", heard["imu"][sensor]), noise)
-    return base(), imu_frame(), models.get(robot)
+    for one in settings.sensors:
+        one.covariance(heard[one.kind.stream][one.name])
+    return base(), frame_of(heard["imu"][settings.imu]), models.get(robot)
 
 
 def _sources_text(settings: OdometrySettings) -> str:
@@ -443,9 +390,7 @@ def _sources_text(settings: OdometrySettings) -> str:
             f"its IMU {settings.imu!r}",
             *wheels,
             *feet,
-            *map(repr, (*settings.velocity, *settings.pose)),
-            *(f"the heading of {name!r}" for name in settings.heading),
-            *map(repr, settings.fix),
+            *map(str, settings.sensors),
         ]
     )
 

@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from operator import itemgetter
-from typing import TYPE_CHECKING, TypeVar, cast
+from operator import attrgetter, itemgetter
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -21,42 +21,25 @@ from zstate.cli.output.text_layout import Table
 from zstate.errors import InvalidInput, LookupFailed, NoData, UnknownFrame
 from zstate.model.joint_history import JointHistory
 from zstate.model.urdf import parse_urdf
-from zstate.odometry import (
-    BaseEstimator,
-    BaseState,
-    Datum,
-    FixNoise,
-    MapEstimator,
-    MapState,
-    SourceHealth,
-)
+from zstate.odometry import BaseEstimator, BaseState, Datum, MapState, SourceHealth
 from zstate.odometry.cli.delay import Delay, Motions
 from zstate.odometry.cli.reference import Comparison, Path, ReferenceName, compared, reference_path
 from zstate.odometry.cli.settings_file import OdometrySettings, others_text
 from zstate.odometry.estimator import WHEELS
 from zstate.odometry.fusion import STANDSTILL
 from zstate.odometry.health import WINDOW
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
-from zstate.odometry.node import (
-    add_fix,
-    add_heading,
-    add_imu,
-    add_pose,
-    add_velocity,
-    pose_covariance,
-    velocity_covariance,
-)
+from zstate.odometry.messages import Fix, Odometry, Pose
+from zstate.odometry.sensors import Estimators, add_imu
 from zstate.recording.cli.plot import new_figure
 from zstate.recording.info import recorded_robots
 from zstate.recording.recording import HISTORY_S, Recording
+from zstate.streams import StreamName
 from zstate.wire.keys import full_name
 from zstate.wire.messages import RobotDescription
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Stamped = TypeVar("Stamped", Imu, Velocity, Pose, Fix, Odometry)
 
 _HEALTH_NS = 500_000_000
 """Interval of the points of the NIS."""
@@ -86,8 +69,8 @@ _FEW_LABELS = 1000.0
 _REST_S = 5.0
 """A robot that was at rest at its start was found to stand by then: alignment takes 0.5 s of it."""
 
-Event = tuple[int, bool, Callable[[BaseEstimator], None]]
-"""A stamp, whether it is that of a reading of the IMU, and what passes the data to an estimator."""
+Event = tuple[int, bool, Callable[[], None]]
+"""A stamp, whether it is that of a reading of the IMU, and what passes the data to the estimators."""
 
 
 @dataclass
@@ -145,14 +128,10 @@ def replay(
         for _, message, _ in recording.fill(mounts):
             if isinstance(message, RobotDescription) and model is None:
                 model = parse_urdf(message.urdf, f"the URDF of {robot!r}")
-        sensors = _RecordedSensors(recording, robot)
-        readings = sensors.imu(settings.imu)
-        velocities = {name: sensors.velocities(name) for name in settings.velocity}
-        poses = {name: sensors.poses(name) for name in settings.pose}
-        headings = {name: sensors.imu(name) for name in settings.heading}
-        fixes = {name: sensors.fixes(name) for name in settings.fix}
+        readings = _messages(recording, robot, "imu", settings.imu)
+        recorded = [(one, _messages(recording, robot, one.kind.stream, one.name)) for one in settings.sensors]
         joints = recording.joint_states(robot) if settings.has_joints else None
-        truth = None if reference is None else sensors.reference(reference)
+        truth = None if reference is None else _messages(recording, robot, reference.stream, reference.sensor)
     base = settings.base or (None if model is None else model.root)
     if base is None:
         raise InvalidInput(f"{path} has no model of {robot!r}, whose root would be the base; give --base")
@@ -166,37 +145,23 @@ def replay(
             f"{'it has no model and no static transforms' if is_empty else failure}; record "
             "robot_description or tf_static with them (`zstate info` shows what it has)"
         ) from None
-    events: list[Event] = [(one.stamp, True, partial(add_imu, message=one)) for one in readings]
+    estimators = Estimators(estimator, in_map)
+    events: list[Event] = [(one.stamp, True, partial(add_imu, estimator, one)) for one in readings]
     motions = Motions(mounts, full_name(robot, base), readings)
     sigmas: dict[str, Floats] = {}
     delays: dict[str, Delay | None] = {}
-    for name, noise in settings.velocity.items():
-        known = velocities[name]
-        add = partial(add_velocity, sensor=name, noise=noise)
-        events += [(one.stamp, False, partial(add, message=one)) for one in known]
-        sigmas[name] = _median_sigmas(velocity_covariance(name, one, noise) for one in known)
-        delays[name] = motions.delay(*motions.of_velocities(known))
-    for name, noise in settings.pose.items():
-        known = poses[name]
-        add = partial(add_pose, sensor=name, noise=noise)
-        events += [(one.stamp, False, partial(add, message=one)) for one in known]
-        sigmas[name] = _median_sigmas(pose_covariance(name, one, noise) for one in known)
-        delays[name] = motions.delay(motions.of_poses(known), None)
-    events += [
-        (one.stamp, False, partial(add_heading, sensor=name, noise=noise, message=one))
-        for name, noise in settings.heading.items()
-        for one in headings[name]
-    ]
-    if in_map is not None:
-        events += _fix_events(in_map, settings, fixes)
+    for one, messages in recorded:
+        covariances = [known for message in messages if (known := one.covariance(message)) is not None]
+        if covariances:
+            sigmas[one.name] = np.median([np.sqrt(np.diag(known)) for known in covariances], axis=0)
+        delays[one.name] = motions.delay_of(one.kind.stream, messages)
+        events += [(message.stamp, False, partial(one.add, estimators, message)) for message in messages]
     if joints is not None:
         events += [
-            (stamp, False, partial(_add_joints, joints=joints, row=row))
+            (stamp, False, partial(_add_joints, estimator, joints, row))
             for row, stamp in enumerate(joints.stamps.tolist())
         ]
-    replayed = _run(
-        estimator, in_map, base, sorted(events, key=itemgetter(0))
-    )  # checks the joints of the wheels
+    replayed = _run(estimators, base, sorted(events, key=itemgetter(0)))  # checks the joints of the wheels
     if joints is not None and settings.wheels is not None:
         delays[WHEELS] = motions.delay(*motions.of_wheels(settings.wheels, joints))
     replayed.sigmas = sigmas
@@ -206,51 +171,21 @@ def replay(
     return replayed
 
 
-def _stamp(message: Imu | Velocity | Pose | Fix | Odometry) -> int:
-    return message.stamp
-
-
-class _RecordedSensors:
-    """The messages of one robot by sensor, by their stamps.
+def _messages(recording: Recording, robot: str, stream: StreamName, sensor: str) -> list[Any]:
+    """The messages of one sensor, by their stamps; fixes without a position are none.
 
     Raises InvalidInput, with near misses, for a sensor without any.
     """
-
-    def __init__(self, recording: Recording, robot: str) -> None:
-        self._recording, self._robot = recording, robot
-
-    def imu(self, sensor: str) -> list[Imu]:
-        return self._some("imu", sensor, self._recording.imu(self._robot, sensor))
-
-    def velocities(self, sensor: str) -> list[Velocity]:
-        return self._some("velocity", sensor, self._recording.velocities(self._robot, sensor))
-
-    def poses(self, sensor: str) -> list[Pose]:
-        return self._some("pose", sensor, self._recording.poses(self._robot, sensor))
-
-    def fixes(self, sensor: str) -> list[Fix]:
-        return self._some("fix", sensor, self._recording.fixes(self._robot, sensor))
-
-    def reference(self, name: ReferenceName) -> Sequence[Pose | Odometry]:
-        if name.stream == "pose":
-            return self.poses(name.sensor)
-        return self._some("odometry", name.sensor, self._recording.odometry(self._robot, name.sensor))
-
-    def _some(self, stream: str, sensor: str, messages: Iterator[Stamped]) -> list[Stamped]:
-        found = sorted(messages, key=_stamp)
-        if found:
-            return found
-        recorded = recorded_robots(self._recording.info)
-        streams = [one for robot in recorded if robot.name == self._robot for one in robot.streams]
-        known = {one.writer for one in streams if one.stream == stream and one.count}
-        raise InvalidInput(
-            f"{self._recording.info.path} has no message on {stream}/{sensor} of {self._robot!r}"
-            f"{others_text(sensor, known)}"
-        )
-
-
-def _median_sigmas(covariances: Iterable[Floats]) -> Floats:
-    return np.median([np.sqrt(np.diag(one)) for one in covariances], axis=0)
+    messages = recording.odometry if stream == "odometry" else partial(recording.sensor_messages, stream)
+    found = [one for one in messages(robot, sensor) if not isinstance(one, Fix) or one.status >= 0]
+    if found:
+        return sorted(found, key=attrgetter("stamp"))
+    robots = recorded_robots(recording.info)
+    streams = [one for recorded in robots if recorded.name == robot for one in recorded.streams]
+    known = {one.writer for one in streams if one.stream == stream and one.count}
+    raise InvalidInput(
+        f"{recording.info.path} has no message on {stream}/{sensor} of {robot!r}{others_text(sensor, known)}"
+    )
 
 
 def _against(
@@ -289,27 +224,12 @@ def _by_name_if_known(names: Sequence[str], block: Floats | None, row: int) -> d
     return dict(zip(names, block[row].tolist(), strict=True))
 
 
-def _fix_events(
-    in_map: MapEstimator, settings: OdometrySettings, fixes: Mapping[str, Sequence[Fix]]
-) -> Iterator[Event]:
-    """Each fix as an event of the odometry of ``in_map``; messages without a fix are none."""
-
-    def add(_: BaseEstimator, sensor: str, noise: FixNoise, message: Fix) -> None:
-        add_fix(in_map, sensor, noise, message)
-
-    for name, noise in settings.fix.items():
-        for one in fixes[name]:
-            if one.status >= 0:
-                yield one.stamp, False, partial(add, sensor=name, noise=noise, message=one)
-
-
-def _run(
-    base: BaseEstimator, in_map: MapEstimator | None, frame: str, events: Sequence[Event]
-) -> ReplayedOdometry:
+def _run(estimators: Estimators, frame: str, events: Sequence[Event]) -> ReplayedOdometry:
+    base, in_map = estimators
     replayed = ReplayedOdometry(frame)
     due = 0
     for stamp, is_imu, add in events:
-        add(base)
+        add()
         if not is_imu:
             continue
         try:

@@ -7,7 +7,7 @@ is an example.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -37,6 +37,8 @@ from zstate.odometry import (
     VelocityNoise,
     Wheels,
 )
+from zstate.odometry.sensors import KINDS, Sensor
+from zstate.odometry.source_noise import SensorNoise
 from zstate.transform import Transform
 from zstate.wire.keys import check_writer, full_name
 
@@ -47,7 +49,6 @@ DEFAULT_SPEEDS = SpeedThresholds(touchdown=0.1, liftoff=0.2)
 """Those of the feet of walking robots without another setting."""
 
 T = TypeVar("T")
-Noise = TypeVar("Noise", VelocityNoise, PoseNoise, HeadingNoise, FixNoise)
 PlanarPose = tuple[float, float, float]
 """x, y [m] and yaw [degrees] in the frame of the odometry."""
 
@@ -108,13 +109,22 @@ class OdometrySettings:
     legs: LegSettings | None = None
 
     def __post_init__(self) -> None:
-        for sensor in (self.imu, *self.velocity, *self.pose, *self.heading, *self.fix):
-            check_writer(sensor)
+        for name in (self.imu, *(one.name for one in self.sensors)):
+            check_writer(name)
         kinds = [kind for kind in ("diff_drive", "ackermann", "mecanum") if getattr(self, kind) is not None]
         if len(kinds) > 1:
             raise InvalidInput(f"a robot has wheels of one kind, not of {' and '.join(kinds)}")
         if self.datum is not None:
             Datum(*self.datum)  # raises here
+
+    @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """All but the IMU and the joints."""
+        return tuple(
+            Sensor(kind, name, noise)
+            for kind in KINDS
+            for name, noise in cast("dict[str, SensorNoise]", getattr(self, kind.name)).items()
+        )
 
     @property
     def wheels(self) -> Wheels | None:
@@ -171,10 +181,11 @@ def planar_transform(odom: str, base: str, pose: PlanarPose) -> Transform:
 def read_settings(path: str) -> OdometrySettings:
     """The settings in a TOML file. Raises ConfigError, with the line, for unknown and unusable keys."""
     file = TomlFile(Path(path))
-    kinds = {"velocity": VelocityNoise, "pose": PoseNoise, "heading": HeadingNoise, "fix": FixNoise}
-    for kind, noise in kinds.items():
-        for sensor, table in _table(file.tables.get(kind)).items():
-            _converted(table, noise, file, f"{kind}.{sensor}")  # msgspec does not name keys of mappings
+    for kind in KINDS:
+        for name, table in _table(file.tables.get(kind.name)).items():
+            _converted(
+                table, kind.noise, file, f"{kind.name}.{name}"
+            )  # msgspec does not name keys of mappings
     return _converted(file.tables, OdometrySettings, file, "")
 
 
@@ -219,29 +230,14 @@ def parse_feet(text: str) -> LegSettings:
     return LegSettings(feet=feet)
 
 
-def parse_velocity(text: str) -> tuple[str, VelocityNoise]:
-    """``SENSOR[:sigma=M/S,scale=PART]``: the sensor, and what is stated of its noise. Raises InvalidInput."""
-    return _parse_source(text, VelocityNoise)
+def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
+    """``SENSOR[:sigma=NUMBER,...]``: a sensor of this kind, and what is stated of its noise.
 
-
-def parse_pose(text: str) -> tuple[str, PoseNoise]:
-    """``SENSOR[:sigma=M,sigma_deg=DEG]``, likewise."""
-    return _parse_source(text, PoseNoise)
-
-
-def parse_heading(text: str) -> tuple[str, HeadingNoise]:
-    """``SENSOR[:sigma_deg=DEG]``, likewise."""
-    return _parse_source(text, HeadingNoise)
-
-
-def parse_fix(text: str) -> tuple[str, FixNoise]:
-    """``SENSOR[:sigma=M,floor=M,correlated_s=S]``, likewise."""
-    return _parse_source(text, FixNoise)
-
-
-def _parse_source(text: str, kind: Callable[..., Noise]) -> tuple[str, Noise]:
-    sensor, colon, stated = text.partition(":")
-    known = msgspec.inspect.type_info(kind)
+    Raises InvalidInput.
+    """
+    noise = next(kind.noise for kind in KINDS if kind.name == kind_name)
+    name, colon, stated = text.partition(":")
+    known = msgspec.inspect.type_info(noise)
     assert isinstance(known, msgspec.inspect.DataclassType)
     names = [one.name for one in known.fields]
     values: dict[str, float] = {}
@@ -253,7 +249,7 @@ def _parse_source(text: str, kind: Callable[..., Noise]) -> tuple[str, Noise]:
                 f"{did_you_mean(key, names)}"
             )
         values[key] = _number(key, value)
-    return check_writer(sensor), kind(**values)
+    return check_writer(name), noise(**values)
 
 
 def _number(key: str, value: str, unit: str = "") -> float:
