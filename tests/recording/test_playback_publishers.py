@@ -25,13 +25,15 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import (
+    Datum,
+    DatumPublisher,
     FixPublisher,
     ImuPublisher,
     OdometryPublisher,
     PosePublisher,
     VelocityPublisher,
 )
-from zstate.odometry.messages import Odometry
+from zstate.odometry.messages import MapDatum, Odometry
 from zstate.recording.decode import DecodedRecording
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
@@ -461,6 +463,33 @@ def test_sensors_and_odometry_are_replayed_as_they_were_recorded(sessions, drive
     assert messages(again) == messages(driven)
     assert found.translation[0] == 5.0
     assert found.covariance == pytest.approx(np.eye(6) * 6)
+
+
+def test_the_datum_of_a_map_is_recorded_and_replayed_as_the_latched_value_that_it_is(
+    sessions, tmp_path: Path
+):
+    writer, reader = sessions
+    path, found = tmp_path / "run.mcap", list[MapDatum]()
+    with (
+        DatumPublisher(writer, "cart", "site/map") as publisher,
+        Recorder(reader, path, ["cart"]) as recorder,
+    ):
+        for count, datum in enumerate((Datum(47.5, 8.25, 450.0), Datum(47.5, 8.5, 450.0)), 1):
+            publisher.set(datum)
+            until(lambda count=count: recorder.stats.messages.get(("cart", "datum")) == count)
+
+    def on_messages(received: list[Received]) -> None:
+        for one in received:
+            assert isinstance(one.message, MapDatum)
+            found.append(one.message)
+
+    with (
+        subscribe(reader, get_wire("native"), "cart", "datum", on_messages),
+        Player(writer, path, rate=math.inf) as player,
+    ):
+        player.run()
+        until(lambda: found and found[-1].longitude == 8.5)
+    assert (found[-1].frame, found[-1].datum) == ("site/map", Datum(47.5, 8.5, 450.0))
 
 
 def test_odometry_is_replayed_to_ros_with_its_edge_on_tf(sessions, driven: Path):

@@ -7,7 +7,7 @@ import pytest
 
 from zstate.driving.messages import DriverState, JointTrajectory, with_short_texts
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity, with_full_names
+from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Velocity, with_full_names
 from zstate.plugins import stream_named
 from zstate.scans.messages import LaserScan, OccupancyGrid, cells_of
 from zstate.wire.messages import (
@@ -171,6 +171,11 @@ def fix(**changed: Any) -> Fix:
     return Fix(**{**fields, "latitude": 47.5, "longitude": 8.25, "altitude": 450.0, **changed})
 
 
+def datum(**changed: Any) -> MapDatum:
+    fields: dict[str, Any] = {"stamp": 5, "seq": 0, "session": 1, "frame": "map"}
+    return MapDatum(**{**fields, "latitude": 47.5, "longitude": 8.25, "altitude": 450.0, **changed})
+
+
 def odometry(**changed: Any) -> Odometry:
     edge = (("odom", "base"),)
     fields: dict[str, Any] = {
@@ -214,6 +219,10 @@ def odometry(**changed: Any) -> Odometry:
         (fix, {"longitude": None, "status": -1}, "a latitude and a longitude; got 47.5 and None"),
         (fix, {"latitude": None, "longitude": None}, "a fix of status 0 has .* the status is -1"),
         (fix, {"latitude": None, "longitude": None, "status": -1}, "an altitude .* need a latitude"),
+        (datum, {"frame": ""}, "1 to 1024 characters, not 0"),
+        (datum, {"latitude": 90.1}, "a latitude of -90 to 90 .*; got 90.1, 8.25, 450.0"),
+        (datum, {"longitude": float("nan")}, "got 47.5, nan, 450.0"),
+        (datum, {"altitude": 2e7}, "got 47.5, 8.25, 20000000.0"),
         (fix, {"status": 3}, "-1 .no fix.*; got 3"),
         (fix, {"status": -3}, "-1 .no fix.*; got -3"),
         (fix, {"service": -1}, "16 bits, 0 to 65535; got -1"),

@@ -31,6 +31,8 @@ from zstate import (
 )
 from zstate.net.session import Session
 from zstate.odometry import (
+    Datum,
+    DatumPublisher,
     FixPublisher,
     ImuPublisher,
     OdometryPublisher,
@@ -111,6 +113,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
         if wire == "native":
             odometry = opened.enter_context(TransformPublisher(writer, "r1", "odometry", program="driver"))
             odometry.publish([Transform("odom", "world", (1.0, 0.0, 0.0), UPRIGHT)])
+            opened.enter_context(DatumPublisher(writer, "r1", program="driver")).set(Datum(47.5, 8.25))
         wheels, imu, flow, mocap, gps = (
             opened.enter_context(kind(writer, "r1", name, (wire,), program="driver"))
             for kind, name in (

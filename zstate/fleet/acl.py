@@ -59,15 +59,15 @@ _SECTIONS = ("rules", "subjects", "policies")
 class AclRoles:
     """Roles of identities behind a router, by name: the common name of a certificate, or a user.
 
-    A robot writes and reads its own keys; of other robots it reads their names, their static edges,
-    which it must not contradict, their maps, as those of places, and the states of their drivers; and it
+    A robot writes and reads its own keys; of other robots it reads their names, their static edges, which it
+    must not contradict, their maps, as those of places, their datums, and the states of their drivers; and it
     reads the simulated time. A viewer reads everything and writes nothing but stops of drivers, which every
     identity may send: the joints hold. A commander also commands joints, releases stops, resets and places an
     odometry, and may switch the torque off; an operator does, too, and calls services of ROS; a timekeeper
-    also writes the simulated time. A placer writes only static edges under its own name, and reads those
-    of the robots: it places their roots, as in ``fleet/map -> r1/odom``; readers with ``placers=`` accept
-    such edges from these only. A name may have several roles. ``namespace`` is that of the sessions
-    behind the router, if they have one. ``wires``: "native", and "ros2" with its options, see
+    also writes the simulated time. A placer writes only static edges under its own name, and reads those of
+    the robots: it places their roots, as in ``fleet/map -> r1/odom``; readers with ``placers=`` accept such
+    edges from these only. A name may have several roles. ``namespace`` is that of the sessions behind the
+    router, if they have one. ``wires``: "native", and "ros2" with its options, see
     ``_Ros2Rules``.
     Raises InvalidInput for names that cannot be names of identities.
     """

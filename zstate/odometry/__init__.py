@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from zstate.odometry.map_estimator import MapEstimator, MapState
     from zstate.odometry.node import OdometryNode, SensorListener
     from zstate.odometry.publishers import (
+        DatumPublisher,
         FixPublisher,
         ImuPublisher,
         OdometryPublisher,
@@ -32,6 +33,7 @@ __all__ = [
     "BaseState",
     "BaseTwist",
     "Datum",
+    "DatumPublisher",
     "DiffDrive",
     "FixNoise",
     "FixPublisher",
@@ -69,6 +71,7 @@ _HOMES = {
     "BaseState": "estimator",
     "BaseTwist": "estimator",
     "Datum": "geodesy",
+    "DatumPublisher": "publishers",
     "DiffDrive": "wheels",
     "FixNoise": "source_noise",
     "FixPublisher": "publishers",

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Velocity
 from zstate.wire.keys import full_name
 from zstate.wire.messages import covariance_matrix, from_block
 
@@ -64,6 +64,12 @@ def fix_document(message: Fix, robot: str) -> dict[str, Any]:
     return document | dict(zip(("sigma_east", "sigma_north", "sigma_up"), sigmas, strict=True))
 
 
+def datum_document(message: MapDatum, robot: str) -> dict[str, Any]:
+    """The datum of a map of ``robot``: stamp of its announcement [ns], frame, degrees, altitude [m]."""
+    place = ("latitude", "longitude", "altitude")
+    return {**_head(message, robot), **{name: getattr(message, name) for name in place}}
+
+
 def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
     """Odometry of ``robot``: stamp [ns], frames, pose [m], velocities [m/s, rad/s], and sigmas if known."""
     ((parent, child),) = message.edges or (("", ""),)
@@ -81,7 +87,7 @@ def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
     return document | _sigmas([("pose", message.covariances), ("twist", message.twist_covariance)])
 
 
-def _head(message: Imu | Velocity | Fix, robot: str) -> dict[str, Any]:
+def _head(message: Imu | Velocity | Fix | MapDatum, robot: str) -> dict[str, Any]:
     return {"stamp": message.stamp, "seq": message.seq, "frame": full_name(robot, message.frame)}
 
 

@@ -29,6 +29,10 @@ _MOST_ALTITUDE = 1e7
 """[m] Above the orbits of the satellites, and below the centre of the Earth."""
 
 
+SAME_DATUM_M = 0.01
+"""Datums that are nearer to each other are one that was rounded."""
+
+
 @dataclass(frozen=True, slots=True)
 class Datum:
     """The origin of a map on the Earth: WGS84 latitude and longitude [deg], altitude above the ellipsoid [m].
@@ -50,6 +54,13 @@ class Datum:
             self.latitude, self.longitude, self.altitude
         )
         return self._axes().dot(away)
+
+    def __str__(self) -> str:
+        return f"{self.latitude:.7f} {self.longitude:.7f} {self.altitude:.2f}"
+
+    def distance(self, other: Datum) -> float:
+        """To the origin of ``other`` [m]."""
+        return float(np.linalg.norm(self.enu(other.latitude, other.longitude, other.altitude)))
 
     def geodetic(self, enu: ArrayLike) -> tuple[float, float, float]:
         """Latitude, longitude [deg] and altitude [m] of a point in the plane, (3,) [m].

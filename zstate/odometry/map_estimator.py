@@ -36,7 +36,7 @@ from zstate.checks import Floats, real_numbers
 from zstate.clock import check_stamp
 from zstate.errors import InPast, InvalidInput, LookupFailed, NoData
 from zstate.odometry.estimator import BaseEstimator, BaseState
-from zstate.odometry.geodesy import Datum, check_place
+from zstate.odometry.geodesy import SAME_DATUM_M, Datum, check_place
 from zstate.odometry.health import WINDOW, SourceHealth, chi_square_quantile
 from zstate.odometry.map_alignment import Fixes, MapAlignment, align_in_map, turn
 from zstate.odometry.rotations import skew
@@ -165,6 +165,8 @@ class MapEstimator:
         self, odometry: BaseEstimator, *, map: str, buffer: TransformBuffer, datum: Datum | None = None
     ) -> None:
         self.odometry, self.map, self.datum = odometry, map, datum
+        self.contradiction = ""
+        """What others say against the datum: a part of the health of each receiver."""
         self._buffer = buffer
         self._receivers: dict[str, _Receiver] = {}
         self._in_map: BaseEstimator | None = None
@@ -220,6 +222,20 @@ class MapEstimator:
         )
         del receiver.waiting[:-_MOST_WAITING]
         self._use_waiting()
+
+    def agree(self, datum: Datum, robot: str) -> None:
+        """Take the ``datum`` that ``robot`` has given the same map, if there is none yet.
+
+        Raises InvalidInput, with both and their distance, if there is another one.
+        """
+        if self.datum is None:
+            self.datum = datum
+        away = self.datum.distance(datum)
+        if away > SAME_DATUM_M:
+            raise InvalidInput(
+                f"the datum of {self.map!r} is {self.datum} here and {datum} of {robot!r}, {away:.2f} m away "
+                "(latitude, longitude, altitude): give all robots of a map one --datum"
+            )
 
     def state(self, at: int | None = None) -> MapState:
         """The state at the stamp ``at`` [ns]; by default at the newest event.
@@ -461,7 +477,7 @@ class MapEstimator:
         rate = (len(stamps) - 1) / (span * 1e-9) if span else 0.0
         age_s = (newest - max(stamps)) * 1e-9 if stamps else math.inf
         at, reason = receiver.last_refusal
-        found = list[str]()
+        found = [self.contradiction] if self.contradiction else []
         if self._in_map is None:
             found.append(self._missing())
         if reason and newest - at < _REPORTED_NS:

@@ -8,6 +8,7 @@ import msgspec
 
 from zstate.errors import InvalidInput
 from zstate.message import StampedMessage
+from zstate.odometry.geodesy import Datum, check_place
 from zstate.wire.keys import full_name
 from zstate.wire.messages import (
     WriterTransforms,
@@ -188,6 +189,27 @@ class Fix(StampedMessage, frozen=True, array_like=True, gc=False):
             )
         if self.altitude is not None or self.covariance is not None:
             raise InvalidInput("an altitude and a covariance need a latitude and a longitude")
+
+
+class MapDatum(StampedMessage, frozen=True, array_like=True, gc=False):
+    """The point of the Earth at the origin of the map ``frame``, named as in edges: x is east, y north, z up.
+
+    ``latitude`` and ``longitude`` [deg] and ``altitude`` [m] above the ellipsoid are those of WGS84.
+    """
+
+    frame: str
+    latitude: float
+    longitude: float
+    altitude: float
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
+        check_place(self.latitude, self.longitude, self.altitude)
+
+    @property
+    def datum(self) -> Datum:
+        """The same, with its methods."""
+        return Datum(self.latitude, self.longitude, self.altitude)
 
 
 SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix

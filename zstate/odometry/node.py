@@ -21,23 +21,24 @@ from zstate.checks import Floats
 from zstate.clock import SYSTEM, Clock
 from zstate.errors import Closed, InPast, InvalidInput, NoData, SecondWriter
 from zstate.model.robot import POSITION_COUNTS, RobotModel
+from zstate.net.latched import cached_values
 from zstate.net.presence import announce_reader
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
-from zstate.net.subscription import Received, subscribe
+from zstate.net.subscription import Received, decode_samples, subscribe
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
 from zstate.odometry.map_estimator import MapEstimator
-from zstate.odometry.messages import SENSOR_STREAMS, Imu, SensorMessage, with_full_names
-from zstate.odometry.publishers import OdometryPublisher, PosePublisher
+from zstate.odometry.messages import SENSOR_STREAMS, Imu, MapDatum, SensorMessage, with_full_names
+from zstate.odometry.publishers import DatumPublisher, OdometryPublisher, PosePublisher
 from zstate.odometry.requests import apply_request
 from zstate.odometry.sensors import Estimators, add_imu, sensor
 from zstate.odometry.source_noise import SensorNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.keys import ODOMETRY_REQUEST, check_robot, shortened
+from zstate.wire.keys import ANY, ODOMETRY_REQUEST, check_robot, frame_owner, full_name, shortened
 from zstate.wire.registry import get_wire
 
 _SILENT_NS = 100_000_000
@@ -47,7 +48,10 @@ _AHEAD_NS = 500_000_000
 """Clocks of one robot differ by less, and the way of a reading takes more than none."""
 
 MAP_WRITER = "map"
-"""The name under which map -> odom and the pose in the map are published."""
+"""The name under which map -> odom, the pose in the map and its datum are published."""
+
+_CACHED_WITHIN_S = 2.0
+"""A node waits so long for the datums that other robots have published."""
 
 _LONG_AGO = -(2**63)
 
@@ -146,17 +150,19 @@ def _failure(error: Exception, place: str) -> tuple[str, str]:
 
 
 class _MapPublishers(NamedTuple):
-    """Of map -> odom, and of the pose of the base in the map."""
+    """Of map -> odom, of the pose of the base in the map, and of its datum."""
 
     edge: TransformPublisher
     pose: PosePublisher
+    datum: DatumPublisher
 
     @classmethod
-    def open(cls, opening: ExitStack, session: Session, robot: str, program: str) -> _MapPublishers:
-        """Open both in ``opening``. Raises SecondWriter."""
+    def open(cls, opening: ExitStack, session: Session, robot: str, map: str, program: str) -> _MapPublishers:
+        """Open them in ``opening``. Raises SecondWriter."""
         return cls(
             opening.enter_context(TransformPublisher(session, robot, MAP_WRITER, program=program)),
             opening.enter_context(PosePublisher(session, robot, MAP_WRITER, program=program)),
+            opening.enter_context(DatumPublisher(session, robot, map, writer=MAP_WRITER, program=program)),
         )
 
 
@@ -173,7 +179,10 @@ class OdometryNode(Closeable):
     ``in_map`` gets the fixes of satellite receivers, and has ``base`` as its odometry. As soon as it
     knows the pose in the map, the writer ``map`` publishes map -> odom at the stamps of the odometry, so that
     ``lookup("map", "base_link")`` is exact there, and the stream ``pose/map`` has the pose of the base in the
-    map with its covariance. (That of such a lookup would add the covariance of the odometry.)
+    map with its covariance. (That of such a lookup would add the covariance of the odometry.) The stream
+    ``datum/map`` has the datum, latched. For a map that is no frame of the robot itself, that of other robots
+    is taken, if ``in_map`` has none yet; if it has another one, InvalidInput is raised, or, for one that is
+    published later, a sentence in the health of the receivers says so.
 
     Readings that are stamped more than 0.5 s after the time of ``clock`` are refused; without ``clock``, the
     clock of this host, or none if that of the buffer of ``base`` is simulated. If time goes back, the node
@@ -206,6 +215,8 @@ class OdometryNode(Closeable):
         self._imu, self._in_map = imu, in_map
         self._estimators = Estimators(base, in_map)
         self._sensors = tuple(sensor(name, noise) for name, noise in sensors)
+        self._contradictions: dict[str, str] = {}
+        """Against the datum of the map, by the key of that of another robot."""
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._restart()
@@ -215,8 +226,11 @@ class OdometryNode(Closeable):
                 OdometryPublisher(session, robot, writer, program=program)
             )
             self._map_publishers = (
-                None if in_map is None else _MapPublishers.open(opening, session, robot, program)
+                None if in_map is None else _MapPublishers.open(opening, session, robot, in_map.map, program)
             )
+            if in_map is not None and frame_owner(in_map.map) != robot:
+                self._share_datum(opening, session)
+            self._publish_datum()
             request_key = ODOMETRY_REQUEST.key(robot, self._publisher.writer)
             opening.enter_context(Queryable(session, request_key, self._on_request, is_exact=True))
             if has_joints:
@@ -281,6 +295,34 @@ class OdometryNode(Closeable):
         """Stop. A second call does nothing."""
         self._opened.close()
 
+    def _share_datum(self, opening: ExitStack, session: Session) -> None:
+        """Agree with others on the datum of a map that is not the robot's own. Raises InvalidInput."""
+        wire = get_wire("native")
+        cached = cached_values(session, wire.expression(ANY, "datum"), _CACHED_WITHIN_S)
+        for received in decode_samples(wire, ANY, "datum", tuple(cached), self._refusals.count):
+            self._agree(received)
+        opening.enter_context(
+            subscribe(
+                *(session, wire, ANY, "datum", self._on_datums),
+                on_error=self._refusals.count,
+                on_withdrawn=self._on_datum_withdrawn,
+            )
+        )
+
+    def _agree(self, received: Received) -> None:
+        """Raises InvalidInput if another robot has another datum for the map."""
+        robot, _, message = received
+        assert isinstance(message, MapDatum)
+        assert self._in_map is not None
+        if robot != self._publisher.robot and full_name(robot, message.frame) == self._in_map.map:
+            self._in_map.agree(message.datum, robot)
+
+    def _publish_datum(self) -> None:
+        if self._in_map is not None and self._map_publishers is not None:
+            publisher, datum = self._map_publishers.datum, self._in_map.datum
+            if datum is not None and datum != publisher.datum:
+                publisher.set(datum)
+
     # In the threads of the subscriptions
 
     def _on_message(self, stream: StreamName, name: str, message: SensorMessage) -> None:
@@ -296,6 +338,7 @@ class OdometryNode(Closeable):
             for one in sensors:
                 one.add(self._estimators, message)
                 self._publish_without_imu(message.stamp)
+            self._publish_datum()
 
     def _add_imu(self, message: Imu) -> None:
         add_imu(self.base, message)
@@ -304,6 +347,26 @@ class OdometryNode(Closeable):
             self._imu_stamp = max(self._imu_stamp, message.stamp)
             # Not the newest of all data: wheels may be ahead, and what the IMU did since is not known.
             self._publish(message.stamp, at=self._imu_stamp)
+
+    def _on_datums(self, received: list[Received]) -> None:
+        with self._lock:
+            for one in received:
+                self._contradictions.pop(one.key, None)
+                try:
+                    self._agree(one)
+                except InvalidInput as error:
+                    self._contradictions[one.key] = str(error)
+            self._tell_contradictions()
+            self._publish_datum()
+
+    def _on_datum_withdrawn(self, key: str) -> None:
+        with self._lock:
+            self._contradictions.pop(key, None)
+            self._tell_contradictions()
+
+    def _tell_contradictions(self) -> None:
+        if self._in_map is not None:
+            self._in_map.contradiction = "; ".join(self._contradictions.values())
 
     def _on_joints(self, reading: JointReading) -> None:
         if self._joints is None:  # a reading during its opening
@@ -382,7 +445,7 @@ class OdometryNode(Closeable):
             state = self._in_map.state(stamp)
         except (NoData, InPast):  # not aligned yet, or not then
             return
-        edge, pose = self._map_publishers
+        edge, pose, _ = self._map_publishers
         edge.publish([state.map_from_odom], stamp)
         pose.publish(state.map_from_base.with_covariance(state.covariance), stamp)
 

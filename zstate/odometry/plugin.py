@@ -41,6 +41,15 @@ FIX = Stream(
     ros="zstate.odometry.ros2:FIX_STREAM",
     document="zstate.odometry.documents:fix_document",
 )
+DATUM = Stream(
+    "datum",
+    f"{_MESSAGES}:MapDatum",
+    summary="the place on the Earth of the origin of a map",
+    named=True,
+    latched=True,
+    start="start one: `zstate odometry {robot} --fix SENSOR`",
+    document="zstate.odometry.documents:datum_document",
+)
 ODOMETRY = Stream(
     "odometry",
     f"{_MESSAGES}:Odometry",
@@ -54,7 +63,7 @@ ODOMETRY = Stream(
 
 PLUGIN = Plugin(
     "odometry",
-    streams=(IMU, VELOCITY, POSE, FIX, ODOMETRY),
+    streams=(IMU, VELOCITY, POSE, FIX, DATUM, ODOMETRY),
     commands={
         "odometry": Command(
             "zstate.odometry.cli.odometry:odometry_command",
@@ -62,4 +71,5 @@ PLUGIN = Plugin(
             "Publish where the base of a robot is, from its IMU and its wheels.",
         ),
     },
+    checks="zstate.odometry.cli.checks:DatumChecks",
 )

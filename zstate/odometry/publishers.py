@@ -1,4 +1,4 @@
-"""Publishers of inertial measurements, of velocities, poses and fixes, and of odometry."""
+"""Publishers of the sensors of a moving base, of its odometry, and of the datum of its map."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ from operator import index
 from numpy.typing import ArrayLike
 
 from zstate.checks import real_numbers
-from zstate.clock import Clock, check_stamp
+from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
+from zstate.net.writer import write_all
+from zstate.nodes.robot_writer import RobotWriter
 from zstate.nodes.sample_publisher import MeasurementPublisher
+from zstate.nodes.static_publisher import ValuePublisher
 from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.geodesy import Datum
+from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Velocity
 from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
-from zstate.wire.keys import full_name
+from zstate.wire.keys import check_writer, full_name
 from zstate.wire.messages import to_block
 
 
@@ -214,6 +218,37 @@ class FixPublisher(MeasurementPublisher):
                     *(triangle, 0 if triangle is None else index(covariance_type)),
                 )
             )
+
+
+class DatumPublisher(ValuePublisher):
+    """Publishes where on the Earth the origin of a map is, latched: readers that join later receive it too.
+
+    ``frame`` is the map, whose x is east, y north and z up; a bare name is the robot's own. ``writer``
+    distinguishes maps of one robot. ``close()`` withdraws it. SecondWriter is raised as by ``MapPublisher``.
+    ROS has no message for it. A context manager.
+    """
+
+    def __init__(
+        self, session: Session, robot: str, frame: str = "map", *, writer: str = "map", program: str = ""
+    ) -> None:
+        full_name(robot, frame)
+        self._frame = frame
+        self.datum: Datum | None = None
+        """The one that was published last."""
+        out = RobotWriter(session, robot, ("native",), program)
+        out.title = f"the datum publisher {writer!r}"
+        super().__init__(out, "datum", check_writer(writer))
+
+    def set(self, datum: Datum) -> None:
+        """Publish ``datum`` in place of the last one. Raises Closed."""
+        out = self._out
+        with out.lock:
+            out.check_open()
+            place = datum.latitude, datum.longitude, datum.altitude
+            message = MapDatum(SystemClock().now(), out.seq, out.session_id, self._frame, *place)
+            write_all(self._latched, message)
+            out.seq += 1
+            self.datum = datum
 
 
 class OdometryPublisher(EdgePublisher):

@@ -351,8 +351,8 @@ class LatchedState:
     def __init__(self) -> None:
         self.descriptions: dict[str, DecodedMessage] = {}
         """By robot."""
-        self.maps: dict[tuple[str, str], DecodedMessage] = {}
-        """By robot and name; of a withdrawn one a grid without cells."""
+        self.values: dict[tuple[str, StreamName, str], DecodedMessage] = {}
+        """Maps and so on, by robot, stream and name; of a withdrawn map a grid without cells."""
         self._statics: dict[tuple[str, str], DecodedMessage] = {}
         self._accumulated: dict[RecordedWriter, StaticAccumulator] = {}
 
@@ -378,8 +378,8 @@ class LatchedState:
             before = self._statics.get(key)
             self._statics[key] = decoded
         elif is_value(writer.stream):
-            before = self.maps.get(key := (writer.robot, writer.edge_writer or ""))
-            self.maps[key] = decoded
+            before = self.values.get(key := (writer.robot, writer.stream, writer.edge_writer or ""))
+            self.values[key] = decoded
         else:
             return None
         is_same = before is not None and _latched_value(before.message) == _latched_value(decoded.message)

@@ -199,7 +199,9 @@ class RecordingEncoder:
         cannot grow.
         """
         try:
-            if carried_as_json(stream):
+            if carried_as_json(stream) and is_latched(stream):
+                self._latch(robot, stream, message, log_time, edge_writer or "")
+            elif carried_as_json(stream):
                 with self._lock:
                     self._write_json(robot, stream, message, log_time, edge_writer or "")
             elif isinstance(message, StaticTransforms):
@@ -207,11 +209,11 @@ class RecordingEncoder:
                     key = robot, message.session
                     edges = self._statics.setdefault(key, StaticAccumulator(message.session))
                     message, edge_writer = edges.with_edges(message), f"ros-{message.session}"
-                self._latch(robot, message, log_time, edge_writer)
+                self._latch(robot, "tf_static", message, log_time, edge_writer)
             elif isinstance(message, RobotDescription):
                 self._write_description(robot, message, log_time)
-            elif is_latched(_stream_of(type(message))):
-                self._latch(robot, message, log_time, edge_writer or "")
+            elif is_latched(latched := _stream_of(type(message))):
+                self._latch(robot, latched, message, log_time, edge_writer or "")
             elif (form := recorded_forms().get(_stream_of(type(message)))) is not None:
                 with self._lock:
                     self._write_form(form, robot, message, log_time, edge_writer or "")
@@ -235,13 +237,16 @@ class RecordingEncoder:
     def withdraw(self, robot: str, stream: StreamName, name: str, log_time: int) -> None:
         """Write that the writer ``name`` has withdrawn its static edges (``tf_static``), or its ``map``.
 
-        ROS cannot express this: the messages are a TFMessage without transforms, and a grid without cells.
+        ROS cannot express this: the messages are a TFMessage without transforms, and a grid without cells. A
+        value in JSON is not repeated any more.
         """
         with self._lock:
             key = _latched_key(robot, stream, name)
             channel = self._latched.get(robot, {}).pop(key, None)
             self._map_bytes.pop(key, None)
-            if channel is not None:
+            if channel is not None and carried_as_json(stream):
+                self._writer.unlatch(channel.number, key)
+            elif channel is not None:
                 empty = ros_stream(stream).withdrawn or StaticTransforms(0, (), b"")
                 self._writer.latch(channel.number, key, channel.encode(empty), log_time, log_time)
                 self._writer.unlatch(channel.number, key)
@@ -309,7 +314,7 @@ class RecordingEncoder:
         self._writer.write(channel.number, payload, log_time, max(sample.stamp, 0), sequence=sample.seq)
 
     def _write_description(self, robot: str, description: RobotDescription, log_time: int) -> None:
-        self._latch(robot, description, log_time)
+        self._latch(robot, "robot_description", description, log_time)
         try:
             self._orders_of(robot).add(description, robot)
         except ModelError as error:
@@ -322,11 +327,11 @@ class RecordingEncoder:
     def _latch(
         self,
         robot: str,
+        stream: StreamName,
         message: Message,
         log_time: int,
         edge_writer: str = "",
     ) -> None:
-        stream = _stream_of(type(message))
         key = _latched_key(robot, stream, edge_writer)
         with self._lock:
             latched = self._latched.setdefault(robot, {})
@@ -335,7 +340,7 @@ class RecordingEncoder:
                     f"it has {MAX_LATCHED} latched messages; that of {edge_writer!r} is one more"
                 )
             channel = self._channel(robot, stream, session_of(message), log_time, edge_writer)
-        payload = channel.encode(message)
+        payload = encode_json(message) if carried_as_json(stream) else channel.encode(message)
         with self._lock:
             # The maps of a fleet, with 16 MB each, would be most of a recording if they were repeated.
             once = is_value(stream)

@@ -44,7 +44,7 @@ from zstate.wire.messages import (
 )
 from zstate.wire.protocol import carrier
 from zstate.wire.registry import get_wire
-from zstate.wire.ros2.streams import ros_stream
+from zstate.wire.ros2.streams import ros_streams
 
 EdgeWriter: TypeAlias = tuple[str, str]
 """The robot and the name of a writer of transforms."""
@@ -124,7 +124,7 @@ class PlaybackPublishers(Closeable):
                 robot, stream, name = named
                 publisher = self._open_passthrough(robot, (stream,), name, wires=on_wires)
                 self._named[named] = opening.enter_context(publisher)
-            for decoded in (*latched.descriptions.values(), *latched.statics, *latched.maps.values()):
+            for decoded in (*latched.descriptions.values(), *latched.statics, *latched.values.values()):
                 self._publish_counted(decoded)
             self._opened = opening.pop_all()
 
@@ -506,7 +506,8 @@ class PassthroughPublisher(Closeable):
 
     def set_value(self, stream: StreamName, message: Message, writer: str) -> None:
         """Publish the latched value of ``writer``; one that was withdrawn withdraws the previous one."""
-        is_withdrawn = ros_stream(stream).is_withdrawn
+        carried = ros_streams().get(stream)
+        is_withdrawn = None if carried is None else carried.is_withdrawn
         if is_withdrawn is not None and is_withdrawn(message):
             self._withdraw(stream, writer)
             return
@@ -524,7 +525,9 @@ class PassthroughPublisher(Closeable):
             announced = self._announced(stream, writer)
             with ExitStack() as opening:
                 claim = self._claimed(opening, [announced])
-                opened = [one.open_latched(stream, writer) for one in self._wire_writers]
+                opened = [
+                    one.open_latched(stream, writer) for one in self._wire_writers if one.wire.carries(stream)
+                ]
                 if claim is not None:
                     claim.confirm()
                 self._opened.push(opening.pop_all())

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, cast
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.plugins import is_measured
+from zstate.plugins import is_measured, is_value
 from zstate.streams import Stream, StreamName
 from zstate.wire.messages import Message, StampedMessage
 from zstate.wire.ros2.streams import ros_streams
@@ -28,7 +28,7 @@ _SCALARS = ("boolean", "integer", "number", "string")
 
 def carried_as_json(stream: StreamName) -> bool:
     """Whether messages of ``stream`` are recorded and displayed in JSON: measurements without a ROS type."""
-    return stream not in ros_streams() and is_measured(stream)
+    return stream not in ros_streams() and (is_measured(stream) or is_value(stream))
 
 
 class JsonType(NamedTuple):
