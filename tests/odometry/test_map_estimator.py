@@ -457,6 +457,73 @@ def test_without_altitudes_the_height_in_the_map_is_unknown_and_the_place_is_not
     assert state.map_from_base.translation[2] == pytest.approx(0.0, abs=0.5)  # that of the odometry
 
 
+def raised(fixes: list[Call], begin: float, end: float, metres: float) -> list[Call]:
+    """The same with other altitudes for a while [s]."""
+    return [
+        call._replace(values=(*call.values[:2], call.values[2] + metres * (begin <= call.t < end)))
+        for call in fixes
+    ]
+
+
+@pytest.mark.parametrize("noise", [RTK, FixNoise(sigma=(0.5, 2.0), correlated_s=5.0)], ids=["RTK", "GPS"])
+@pytest.mark.parametrize("metres", [20.0, -20.0])
+def test_a_jump_of_the_altitude_alone_is_refused_and_named_and_its_position_is_used(
+    noise: FixNoise, metres: float
+):
+    fixes = [
+        call._replace(options={**call.options, "noise": noise}) for call in antenna_calls(LEVER, "antenna")
+    ]
+    estimator, at_best = circled(raised(fixes, 20.0, 23.0, metres)), circled(fixes)
+    error, yaw = true_error(estimator)
+    assert abs(error[2]) < 0.2
+    assert np.abs(error[:2] - true_error(at_best)[0][:2]).max() < 0.05
+    assert abs(yaw - true_error(at_best)[1]) < 0.01
+    assert estimator.state().covariance[2, 2] < 2.0 * at_best.state().covariance[2, 2]
+    (health,), (undisturbed_health,) = estimator.health(), at_best.health()
+    assert "gps: 8 heights refused, the last one as it is " in health.sentence
+    assert (health.accepted, health.rejected) == (undisturbed_health.accepted, 0)
+    assert undisturbed_health.sentence == ""
+
+
+def test_during_a_jump_of_the_altitude_the_height_in_the_map_stays():
+    fixes = raised(antenna_calls(LEVER, "antenna"), 20.0, 23.0, 20.0)
+    for end in (20.6, 21.5, 22.9):
+        error, _ = true_error(circled(fixes, end), end - 0.2)
+        assert np.abs(error).max() < 0.15
+
+
+def test_an_altitude_that_has_jumped_for_good_is_believed_and_the_place_stays():
+    estimator = circled(raised(antenna_calls(LEVER, "antenna"), 15.0, CIRCLE_S, 20.0))
+    error, yaw = true_error(estimator)
+    assert error[2] == pytest.approx(20.0, abs=0.3)
+    assert np.abs(error[:2]).max() < 0.1
+    assert abs(yaw) < 0.05
+
+
+def test_an_altitude_that_wanders_as_stated_is_followed_and_never_refused():
+    """As of the ionosphere: 3 m with a period of half a minute, stated as 2 m."""
+    noise = FixNoise(sigma=(0.05, 2.0), correlated_s=5.0)
+    fixes = [
+        call._replace(
+            values=(*call.values[:2], call.values[2] + 3.0 * math.sin(0.2 * call.t)),
+            options={**call.options, "noise": noise},
+        )
+        for call in antenna_calls(LEVER, "antenna")
+    ]
+    estimator = circled(fixes)
+    error, _ = true_error(estimator)
+    assert abs(error[2]) < 3.0
+    assert error[2] ** 2 < 9.0 * estimator.state().covariance[2, 2]
+    (health,) = estimator.health()
+    assert health.sentence == ""
+
+
+def test_a_wrong_altitude_while_the_map_is_aligned_does_not_lift_it():
+    """Of the fixes of the first metres, one is 20 m too high."""
+    error, _ = true_error(circled(raised(antenna_calls(LEVER, "antenna"), 2.5, 2.8, 20.0)))
+    assert np.abs(error).max() < 0.1
+
+
 def test_before_the_yaw_is_known_there_is_no_state_and_the_note_says_what_is_missing():
     fixes = antenna_calls(LEVER, "antenna")
     estimator = circled([], 2.0)

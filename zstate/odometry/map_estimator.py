@@ -16,6 +16,8 @@ positions of the antenna. map -> odom is the difference of both at one stamp (RE
   all are refused.
 - Fixes that are refused, but agree with each other and the way for ``correlated_s`` and 20 m, or for twice
   that time, are believed: the pose in the map moves there, and velocity and biases stay.
+- The height of a fix has gates of its own: one that is refused leaves its position in use. It is believed as
+  fixes are. A slow drift of the height is followed.
 - A drift across the way is as an error of the yaw: if the yaw is not known well, it is followed for a while.
 """
 
@@ -24,8 +26,9 @@ from __future__ import annotations
 import math
 from bisect import insort
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -124,6 +127,51 @@ class _Passed(NamedTuple):
     map_from_odom: _Turn
 
 
+_Square: TypeAlias = Callable[[_Passed, _Passed], float]
+"""By how much two fixes do not agree, but for the way, in units of their variances, squared."""
+
+
+@dataclass(slots=True)
+class _Trust:
+    """What is known of the errors of fixes in the plane, or of their heights."""
+
+    excess: float = _UNPROVEN
+    """By how much their variance is larger than stated."""
+    refused: list[_Passed] = field(default_factory=list[_Passed])
+    """Those since the last one that was fused that were not, and agree with each other."""
+    refused_count: int = 0
+    last_refusal: tuple[int, str] = (0, "")
+    """When one was last refused, and why."""
+
+    def refuse(self, stamp: int, reason: str) -> None:
+        """Count one."""
+        self.refused_count += 1
+        self.last_refusal = (stamp, reason)
+
+    def believes(self, passed: _Passed, square: _Square, dimension: int, noise: FixNoise) -> bool:
+        """Whether ``passed``, which is refused, and those before agree for so long that they are right."""
+        run = self.refused
+        if run and square(run[0], passed) > chi_square_quantile(_BELIEVED_GATE, dimension):
+            run.clear()
+        run.append(passed)
+        del run[1 : 1 - _BELIEVED_COUNT]
+        return _is_believed(run, noise)
+
+    def learn(self, receiver: _Receiver, passed: _Passed, square: _Square, dimension: int) -> None:
+        """Average ``excess``, by the change of the errors in some time; ``passed`` is not taken yet."""
+        tau_s = receiver.noise.correlated_s
+        for earlier in reversed(receiver.taken):
+            elapsed_s = (passed.fix.stamp - earlier.fix.stamp) * 1e-9
+            if elapsed_s >= tau_s and (dimension == 2 or earlier.fix.has_height):
+                break
+        else:
+            return
+        kept = math.exp(-elapsed_s / tau_s)
+        seen = min(square(earlier, passed) / (dimension * (1.0 - kept)), _MOST_EXCESS)
+        share = 1.0 - math.exp(-(passed.fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9 / _EXCESS_S)
+        self.excess = max(self.excess + share * (seen - self.excess), _LEAST_EXCESS)
+
+
 @dataclass(slots=True)
 class _Receiver:
     """What is kept of one receiver, with its antenna at ``lever`` in the base [m], (3,)."""
@@ -141,16 +189,11 @@ class _Receiver:
     """Those that align the map."""
     taken: deque[_Passed] = field(default_factory=lambda: deque[_Passed](maxlen=_MOST_KEPT))
     """The last ones that were fused."""
-    refused: list[_Passed] = field(default_factory=list[_Passed])
-    """Those since then that were not, and agree with each other."""
-    excess: float = _UNPROVEN
-    """By how much the variance of fixes is larger than stated."""
+    plane: _Trust = field(default_factory=_Trust)
+    height: _Trust = field(default_factory=_Trust)
     is_doubted: bool = False
     """They have left the way, as a drift does; then they are taken again once they are believed."""
     accepted_count: int = 0
-    refused_count: int = 0
-    last_refusal: tuple[int, str] = (0, "")
-    """When a fix was last refused, and why."""
 
 
 class MapEstimator:
@@ -210,7 +253,7 @@ class MapEstimator:
             )
         variances = self._variances(source, covariance, noise)
         if variances[0] > _MOST_SIGMA**2:
-            self._refuse(receiver, stamp, f"uncertain by {math.sqrt(variances[0]):.3g} m")
+            receiver.plane.refuse(stamp, f"uncertain by {math.sqrt(variances[0]):.3g} m")
             self._use_waiting()
             return
         if self.datum is None:
@@ -315,10 +358,13 @@ class MapEstimator:
             return
         self._epoch, self._in_map, self._unaligned = self.odometry.epoch, None, 0
         for receiver in self._receivers.values():
-            for kept in (receiver.waiting, receiver.aligning, receiver.taken, receiver.refused):
+            for kept in (receiver.waiting, receiver.aligning, receiver.taken):
                 kept.clear()
+            for trust in (receiver.plane, receiver.height):
+                trust.refused.clear()
+                trust.last_refusal = (0, "")
             receiver.stamps.clear()
-            receiver.last, receiver.is_doubted, receiver.last_refusal = None, False, (0, "")
+            receiver.last, receiver.is_doubted = None, False
 
     def _use_waiting(self) -> None:
         """Use the fixes that the odometry has come up to."""
@@ -336,7 +382,7 @@ class MapEstimator:
                 except LookupFailed:
                     del receiver.waiting[0]
                     if stamp > self._unaligned:
-                        self._refuse(receiver, stamp, "too late; raise history_s")
+                        receiver.plane.refuse(stamp, "too late; raise history_s")
                     continue
                 passed = _passed(receiver, receiver.waiting.pop(0), here, there)
                 if there is None:
@@ -356,7 +402,7 @@ class MapEstimator:
             del kept[0]
         alignment = self._alignment(receiver)
         if alignment.misfit > chi_square_quantile(_GATE, max(alignment.freedom, 1)):
-            self._refuse(receiver, passed.fix.stamp, "not where wheels and gyro lead from earlier ones")
+            receiver.plane.refuse(passed.fix.stamp, "not where wheels and gyro lead from earlier ones")
             del kept[:-1]
             return
         grown = _grown(kept, now)
@@ -368,9 +414,9 @@ class MapEstimator:
         known[:2, :2] = turned.rotation @ np.diag(grown[:2]) @ turned.rotation.T
         known[np.ix_((0, 1, 5), (0, 1, 5))] += alignment.covariance(base.translation[:2])
         heights = [one.fix.there[2] - one.here[2] for one in kept if one.fix.has_height]
-        variance = max(one.fix.variances[2] for one in kept) if heights else _UNKNOWN_HEIGHT**2
-        known[2, 2] += variance
-        height = float(np.mean(heights)) if heights else 0.0
+        variance = receiver.height.excess * max(one.fix.variances[2] for one in kept)
+        known[2, 2] += variance if heights else _UNKNOWN_HEIGHT**2
+        height = float(np.median(heights)) if heights else 0.0
         place = (*alignment.place(base.translation[:2]).tolist(), float(base.translation[2]) + height)
         rotation = (0.0, 0.0, base.rpy[2] + alignment.yaw)
         self._in_map, self._since = self.odometry.follower(self.map), now.stamp
@@ -385,7 +431,7 @@ class MapEstimator:
             np.array([(one.fix.stamp - kept[0].fix.stamp) * 1e-9 for one in kept]),
             np.array([one.fix.there[:2] for one in kept]),
             np.array([one.here[:2] for one in kept]),
-            receiver.excess * np.array([one.fix.variances[0] for one in kept]),
+            receiver.plane.excess * np.array([one.fix.variances[0] for one in kept]),
         )
         return align_in_map(fixes, receiver.noise.correlated_s)
 
@@ -395,64 +441,70 @@ class MapEstimator:
         assert in_map is not None
         if _is_known(receiver, fix):
             return
+        plane, height, noise = receiver.plane, receiver.height, receiver.noise
         antenna = _point(there.odom_from_base, receiver.lever)
-        covariance = _point_covariance(there, receiver.lever)[:2, :2]
-        covariance = covariance + receiver.excess * np.diag(fix.variances[:2])
-        reason = _contradiction(receiver, passed, antenna, covariance)
+        covariance = _point_covariance(there, receiver.lever)
+        away = fix.there - antenna
+        reason = _contradiction(receiver, passed, away, covariance)
         if not reason:
             reason = _drift(receiver, passed)
             receiver.is_doubted = receiver.is_doubted or bool(reason)
         if not reason and receiver.is_doubted:
             reason = "not along the way by wheels and gyro for long enough, since they have left it"
         if reason:
-            self._refuse(receiver, fix.stamp, reason)
-            run = receiver.refused
-            if run and not _agree(run[0], passed):
-                run.clear()
-            run.append(passed)
-            del run[1 : 1 - _BELIEVED_COUNT]
-            if _is_believed(run, receiver.noise):
-                self._believe(in_map, receiver, passed, fix.there - antenna)
+            plane.refuse(fix.stamp, reason)
+            if plane.believes(passed, _square, 2, noise):
+                self._believe(in_map, plane, passed, away * (1.0, 1.0, 0.0))
+                receiver.accepted_count += 1
+                receiver.is_doubted = False
+                receiver.taken.clear()  # the jump from earlier ones is no error of those to come
+                receiver.taken.append(passed)
             return
-        factor = _correlation_factor(receiver, fix)
-        measured, noise = fix.there.copy(), fix.variances * (factor * receiver.excess)
-        if not fix.has_height:
-            measured[2], noise[2] = antenna[2], _UNKNOWN_HEIGHT**2
-        in_map.position(fix.stamp, measured, np.diag(noise), source=name, frame=receiver.frame)
         receiver.accepted_count += 1
-        receiver.refused.clear()
+        plane.refused.clear()
+        reason = _wrong_height(receiver, passed, away[2], covariance[2, 2]) if fix.has_height else ""
+        if reason:
+            height.refuse(fix.stamp, reason)
+            if height.believes(passed, _square_of_heights, 1, noise):
+                self._believe(in_map, height, passed, away * (0.0, 0.0, 1.0))
+                receiver.taken = deque((_without_height(one) for one in receiver.taken), _MOST_KEPT)
+                receiver.taken.append(passed)
+                return
+            passed = _without_height(passed)
+            fix = passed.fix
+        factor = _correlation_factor(receiver, fix)
+        measured, variances = fix.there.copy(), factor * plane.excess * fix.variances
+        variances[2] = factor * height.excess * fix.variances[2]
+        if not fix.has_height:
+            measured[2], variances[2] = antenna[2], _UNKNOWN_HEIGHT**2
+        in_map.position(fix.stamp, measured, np.diag(variances), source=name, frame=receiver.frame)
         taken = receiver.taken
         if taken and fix.stamp < taken[-1].fix.stamp:
             return  # later ones are compared with the last one
-        receiver.excess = _excess_after(receiver, passed)
-        apart_ns = _KEPT_APART * 1e9 * max(_WANDER_S[1], receiver.noise.correlated_s)
+        plane.learn(receiver, passed, _square, 2)
+        if fix.has_height:
+            height.refused.clear()
+            height.learn(receiver, passed, _square_of_heights, 1)
+        apart_ns = _KEPT_APART * 1e9 * max(_WANDER_S[1], noise.correlated_s)
         if len(taken) > 1 and taken[-1].fix.stamp - taken[-2].fix.stamp < apart_ns:
             taken.pop()
         taken.append(passed)
 
-    def _believe(self, in_map: BaseEstimator, receiver: _Receiver, passed: _Passed, away: Floats) -> None:
-        """Move the base in the map by ``away`` [m], (3,), in the plane: to where fixes agree that it is.
+    def _believe(self, in_map: BaseEstimator, trust: _Trust, passed: _Passed, away: Floats) -> None:
+        """Move the base in the map by ``away`` [m], (3,), to where fixes, or heights, agree that it is.
 
         It is placed at the newest stamp, so a position at the stamp of the fix would be of no effect.
         """
         newest = in_map.state()
         pose, known = newest.odom_from_base, newest.covariance.pose.copy()
-        receiver.excess = max(receiver.excess, _UNPROVEN)
-        known[:2, :2] += receiver.excess * np.diag(passed.fix.variances[:2])
-        place = pose.translation + np.array((*away[:2], 0.0))
+        trust.excess = max(trust.excess, _UNPROVEN)
+        known[:3, :3] += trust.excess * np.diag(np.where(away == 0.0, 0.0, passed.fix.variances))
+        place = pose.translation + away
         moved = Transform.from_pose7(
             self.map, self.odometry.base, (*place.tolist(), *pose.pose7[3:].tolist())
         )
         in_map.set_pose(moved.with_covariance(known))
-        receiver.accepted_count += 1
-        receiver.refused.clear()
-        receiver.is_doubted = False
-        receiver.taken.clear()  # the jump from earlier ones is no error of those to come
-        receiver.taken.append(passed)
-
-    def _refuse(self, receiver: _Receiver, stamp: int, reason: str) -> None:
-        receiver.refused_count += 1
-        receiver.last_refusal = (stamp, reason)
+        trust.refused.clear()
 
     def _missing(self) -> str:
         if not any(receiver.aligning for receiver in self._receivers.values()):
@@ -476,12 +528,13 @@ class MapEstimator:
         span = max(stamps) - min(stamps) if stamps else 0
         rate = (len(stamps) - 1) / (span * 1e-9) if span else 0.0
         age_s = (newest - max(stamps)) * 1e-9 if stamps else math.inf
-        at, reason = receiver.last_refusal
         found = [self.contradiction] if self.contradiction else []
         if self._in_map is None:
             found.append(self._missing())
-        if reason and newest - at < _REPORTED_NS:
-            found.append(f"{receiver.refused_count} fixes refused, the last one as it is {reason}")
+        for trust, what in ((receiver.plane, "fixes refused"), (receiver.height, "heights refused")):
+            at, reason = trust.last_refusal
+            if reason and newest - at < _REPORTED_NS:
+                found.append(f"{trust.refused_count} {what}, the last one as it is {reason}")
         if newest and stamps and max(stamps) - newest > _AHEAD_NS:
             ahead = format_duration(max(stamps) - newest)
             found.append(
@@ -497,7 +550,7 @@ class MapEstimator:
             (math.nan, math.nan),
             0,
             receiver.accepted_count,
-            receiver.refused_count,
+            receiver.plane.refused_count,
             0,
             0,
             sentence,
@@ -562,25 +615,62 @@ def _difference(first: _Passed, second: _Passed, excess: float = 1.0) -> tuple[F
     return apart, of_each * np.eye(2) + variance * np.outer(across, across)
 
 
-def _square(apart: Floats, covariance: Floats) -> float:
-    """The square of the Mahalanobis distance."""
+def _mahalanobis(apart: Floats, covariance: Floats) -> float:
+    """The square of the distance."""
     return float(apart @ np.linalg.solve(covariance, apart))
 
 
-def _contradiction(receiver: _Receiver, passed: _Passed, antenna: Floats, covariance: Floats) -> str:
-    """By what a fix contradicts the pose in the map, or the fix before; empty if it does not."""
-    gate = chi_square_quantile(_GATE, 2)
-    apart = (passed.fix.there - antenna)[:2]
-    if _square(apart, covariance) > gate:
-        return f"{np.hypot(*apart):.1f} m from where wheels, gyro and earlier fixes lead"
-    if not receiver.taken:
-        return ""
-    elapsed_s = (passed.fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9
-    share = 0.5 if elapsed_s < receiver.noise.correlated_s else 1.0  # errors of neighbours are alike
-    jump, covariance = _difference(receiver.taken[-1], passed, receiver.excess)
-    if _square(jump, covariance) > share * gate:
-        return f"{np.hypot(*jump):.1f} m from the one before, but for the way by wheels and gyro"
+def _square(first: _Passed, second: _Passed, excess: float = 1.0) -> float:
+    """The square of ``_difference`` in units of its covariance."""
+    return _mahalanobis(*_difference(first, second, excess))
+
+
+def _rise(first: _Passed, second: _Passed) -> float:
+    """By how much the difference of two heights is not that by the odometry [m]."""
+    return float((second.fix.there - first.fix.there)[2] - (second.here - first.here)[2])
+
+
+def _square_of_heights(first: _Passed, second: _Passed, excess: float = 1.0) -> float:
+    """The square of ``_rise`` in units of its variance."""
+    variance = excess * (first.fix.variances[2] + second.fix.variances[2])
+    return _rise(first, second) ** 2 / (variance + (_WAY * (second.way - first.way)) ** 2)
+
+
+def _without_height(passed: _Passed) -> _Passed:
+    return passed._replace(fix=passed.fix._replace(has_height=False))
+
+
+def _contradiction(receiver: _Receiver, passed: _Passed, away: Floats, covariance: Floats) -> str:
+    """By what a fix contradicts the pose in the map, or the fix before; empty if it does not.
+
+    It is ``away`` [m] from where the antenna is with ``covariance``; of both the plane counts.
+    """
+    gate, excess = chi_square_quantile(_GATE, 2), receiver.plane.excess
+    if _mahalanobis(away[:2], covariance[:2, :2] + excess * np.diag(passed.fix.variances[:2])) > gate:
+        return f"{np.hypot(*away[:2]):.1f} m from where wheels, gyro and earlier fixes lead"
+    if receiver.taken:
+        last = receiver.taken[-1]
+        if _square(last, passed, excess) > _share(receiver, last, passed) * gate:
+            jump, _ = _difference(last, passed)
+            return f"{np.hypot(*jump):.1f} m from the one before, but for the way by wheels and gyro"
     return ""
+
+
+def _wrong_height(receiver: _Receiver, passed: _Passed, away: float, variance: float) -> str:
+    """The same of the height of a fix."""
+    gate, excess = chi_square_quantile(_GATE, 1), receiver.height.excess
+    if away**2 > gate * (variance + excess * passed.fix.variances[2]):
+        return f"{abs(away):.1f} m from where earlier ones and the odometry lead"
+    last = next((one for one in reversed(receiver.taken) if one.fix.has_height), None)
+    if last is not None and _square_of_heights(last, passed, excess) > _share(receiver, last, passed) * gate:
+        return f"{abs(_rise(last, passed)):.1f} m from the one before, but for the way by the odometry"
+    return ""
+
+
+def _share(receiver: _Receiver, last: _Passed, passed: _Passed) -> float:
+    """Of the variance of a difference: errors of neighbours are alike."""
+    elapsed_s = (passed.fix.stamp - last.fix.stamp) * 1e-9
+    return 0.5 if elapsed_s < receiver.noise.correlated_s else 1.0
 
 
 def _drift(receiver: _Receiver, passed: _Passed) -> str:
@@ -589,31 +679,11 @@ def _drift(receiver: _Receiver, passed: _Passed) -> str:
         elapsed_s = (passed.fix.stamp - earlier.fix.stamp) * 1e-9
         if _WANDER_S[0] <= elapsed_s <= _WANDER_S[1]:
             wander, covariance = _difference(earlier, passed, _UNPROVEN)
-            if _square(wander, covariance) > chi_square_quantile(_GATE, 2):
+            if _mahalanobis(wander, covariance) > chi_square_quantile(_GATE, 2):
                 off = np.hypot(*wander)
                 return f"{off:.1f} m off the way by wheels and gyro since one {elapsed_s:.0f} s before"
             break
     return ""
-
-
-def _excess_after(receiver: _Receiver, passed: _Passed) -> float:
-    """By how much the variance of fixes is larger than stated, by the change of their errors in some time."""
-    tau_s = receiver.noise.correlated_s
-    for earlier in reversed(receiver.taken):
-        elapsed_s = (passed.fix.stamp - earlier.fix.stamp) * 1e-9
-        if elapsed_s >= tau_s:
-            break
-    else:
-        return receiver.excess
-    square = _square(*_difference(earlier, passed))
-    seen = min(square / (2.0 * (1.0 - math.exp(-elapsed_s / tau_s))), _MOST_EXCESS)
-    share = 1.0 - math.exp(-(passed.fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9 / _EXCESS_S)
-    return max(receiver.excess + share * (seen - receiver.excess), _LEAST_EXCESS)
-
-
-def _agree(first: _Passed, second: _Passed) -> bool:
-    square = _square(*_difference(first, second))
-    return square <= chi_square_quantile(_BELIEVED_GATE, 2)
 
 
 def _is_believed(run: list[_Passed], noise: FixNoise) -> bool:
