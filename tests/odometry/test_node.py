@@ -177,6 +177,18 @@ def test_odometry_follows_the_truth_and_is_a_moving_edge_with_a_covariance():
         assert node.published > 10
 
 
+def test_planar_odometry_is_level_and_has_the_height_that_it_leaves_out_in_its_covariance():
+    with rover_with_odometry(planar=True) as (_, node, listener, _):
+        odom_from_base = listener.buffer.lookup(ODOM, BASE)
+        assert odom_from_base.translation[2] == 0.0
+        assert odom_from_base.pose7[3:5].tolist() == [0.0, 0.0]
+        assert odom_from_base.covariance is not None
+        assert odom_from_base.covariance[2, 2] > 0.0
+        state = node.state()
+        assert state.odom_from_base.translation[2] == state.twist.linear[2] == 0.0
+        assert node.base.state().odom_from_base.pose7[3:5].tolist() != [0.0, 0.0]
+
+
 def _distance(rover: Rover, listener: TransformListener) -> float:
     x, y, _ = listener.buffer.lookup(ODOM, BASE).translation.tolist()
     return math.hypot(x - rover.truth.pose.x, y - rover.truth.pose.y)

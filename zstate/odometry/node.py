@@ -31,6 +31,7 @@ from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
 from zstate.odometry.map_estimator import MapEstimator
 from zstate.odometry.messages import SENSOR_STREAMS, Imu, MapDatum, SensorMessage, with_full_names
+from zstate.odometry.planar import in_plane, map_in_plane
 from zstate.odometry.publishers import DatumPublisher, OdometryPublisher, PosePublisher
 from zstate.odometry.requests import apply_request
 from zstate.odometry.sensors import Estimators, add_imu, sensor
@@ -184,6 +185,8 @@ class OdometryNode(Closeable):
     is taken, if ``in_map`` has none yet; if it has another one, InvalidInput is raised, or, for one that is
     published later, a sentence in the health of the receivers says so.
 
+    ``planar``: z, roll and pitch of what is published, and of ``state``, are zero (``in_plane``).
+
     Readings that are stamped more than 0.5 s after the time of ``clock`` are refused; without ``clock``, the
     clock of this host, or none if that of the buffer of ``base`` is simulated. If time goes back, the node
     publishes from there on, which is a new epoch for listeners. It also obeys ``request_odometry``.
@@ -202,6 +205,7 @@ class OdometryNode(Closeable):
         sensors: Iterable[tuple[str, SensorNoise]] = (),
         in_map: MapEstimator | None = None,
         has_joints: bool = False,
+        planar: bool = False,
         writer: str = "odometry",
         rate_hz: float | None = None,
         program: str = "",
@@ -212,7 +216,7 @@ class OdometryNode(Closeable):
         self.failure: Exception | None = None
         self.has_failed = fork_safe(threading.Event())
         self._refusals = Refusals("joint states")
-        self._imu, self._in_map = imu, in_map
+        self._imu, self._in_map, self._is_planar = imu, in_map, planar
         self._estimators = Estimators(base, in_map)
         self._sensors = tuple(sensor(name, noise) for name, noise in sensors)
         self._contradictions: dict[str, str] = {}
@@ -279,7 +283,11 @@ class OdometryNode(Closeable):
     def state(self) -> BaseState:
         """The newest state. Raises NoData before the first alignment."""
         with self._lock:
-            return self.base.state()
+            return self._state()
+
+    def _state(self, at: int | None = None) -> BaseState:
+        state = self.base.state(at)
+        return in_plane(state) if self._is_planar else state
 
     def reset(self, odom_from_base: Transform | None = None) -> None:
         """Start anew, as ``BaseEstimator.reset``."""
@@ -416,7 +424,7 @@ class OdometryNode(Closeable):
         if stamp < self._due or self.failure is not None:
             return
         try:
-            state = self.base.state(at)
+            state = self._state(at)
         except (NoData, InPast):  # not aligned yet, or at a reading that came too late
             return
         if state.stamp <= self._newest:
@@ -445,6 +453,8 @@ class OdometryNode(Closeable):
             state = self._in_map.state(stamp)
         except (NoData, InPast):  # not aligned yet, or not then
             return
+        if self._is_planar:
+            state = map_in_plane(state)
         edge, pose, _ = self._map_publishers
         edge.publish([state.map_from_odom], stamp)
         pose.publish(state.map_from_base.with_covariance(state.covariance), stamp)

@@ -131,7 +131,7 @@ def test_velocities_without_noise_end_the_command_with_the_key_that_states_it():
 
 
 def test_stated_noise_and_initial_pose_place_the_base_where_it_starts():
-    start = ("--initial-pose", "2", "1", "90")
+    start = ("--initial-pose", "2", "1", "90", "--planar")
     with (
         connect() as session,
         TransformListener(session, "walker") as listener,
@@ -144,6 +144,7 @@ def test_stated_noise_and_initial_pose_place_the_base_where_it_starts():
             *("odometry", "walker", "--velocity", "flow:sigma=0.05", "--base", "base", *start),
         )
     assert [*pose.translation[:2], pose.rpy[2]] == pytest.approx([2.0, 1.0, math.pi / 2], abs=0.05)
+    assert [pose.translation[2], *pose.pose7[3:5]] == [0.0, 0.0, 0.0]  # in the plane
 
 
 @pytest.mark.processes

@@ -221,6 +221,10 @@ def test_fixes_of_a_receiver_give_the_end_of_the_drive_in_the_map_and_on_the_ear
     ]
     latitude, longitude, _ = DATUM.geodetic(state.map_from_base.translation)
     assert line.endswith(f"{latitude:.7f} {longitude:.7f}")
+    level = replay(str(tmp_path / "r.mcap"), "r1", replace(settings, planar=True))
+    assert level.in_map is not None
+    assert level.in_map.map_from_base.translation[:2].tolist() == state.map_from_base.translation[:2].tolist()
+    assert level.in_map.map_from_base.translation[2] == np.abs(level.positions[:, 2]).max() == 0.0
     (gps,) = [one for one in replayed.health if one.name == "gps"]
     assert (gps.accepted > 20, gps.rejected) == (True, 0)
 

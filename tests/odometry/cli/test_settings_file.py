@@ -174,10 +174,10 @@ def test_noise_of_a_source_is_stated_on_the_command_line():
 
 
 def test_file_has_receivers_and_the_origin_of_their_map(tmp_path: Path):
-    text = 'map = "site/map"\ndatum = [48.1, 11.5, 560.0]\n' + ROVER
+    text = 'map = "site/map"\nplanar = true\ndatum = [48.1, 11.5, 560.0]\n' + ROVER
     text += "[fix.gps]\nsigma = [1.5, 4.0]\n[heading.imu]\nsigma_deg = 5.0\n"
     settings = read_settings(written(tmp_path, text))
-    assert (settings.map, settings.datum) == ("site/map", (48.1, 11.5, 560.0))
+    assert (settings.map, settings.datum, settings.planar) == ("site/map", (48.1, 11.5, 560.0), True)
     assert settings.fix == {"gps": FixNoise(sigma=(1.5, 4.0))}
     assert settings.heading == {"imu": HeadingNoise(sigma_deg=5.0)}
     with pytest.raises(ConfigError, match="a place has a latitude of -90 to 90"):

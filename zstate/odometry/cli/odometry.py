@@ -140,6 +140,11 @@ _OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
     help="Where the base starts [m, degrees]; default: at the origin, after a second at rest.",
 )
 @click.option(
+    "--planar",
+    is_flag=True,
+    help="Publish z, roll and pitch of the base as zero, for planners in the plane; gravity still levels.",
+)
+@click.option(
     "--rate", type=options.RATE, help="Publish so often at most; default: with each reading of the IMU."
 )
 @click.option(
@@ -188,6 +193,7 @@ def odometry_command(
     odom: str | None,
     base: str | None,
     initial_pose: PlanarPose | None,
+    planar: bool,
     rate: float | None,
     writer: str,
     reset: bool,
@@ -239,6 +245,7 @@ def odometry_command(
         "odom": odom,
         "base": base,
         "initial_pose": initial_pose,
+        "planar": planar or None,
         "legs": feet,
     }
     settings = replace(settings, **{key: value for key, value in given.items() if value is not None})
@@ -305,6 +312,7 @@ def _publish(
                 sensors=[(one.name, one.noise) for one in settings.sensors],
                 in_map=settings.map_estimator(robot, estimator, listener.buffer),
                 has_joints=settings.has_joints,
+                planar=settings.planar,
                 writer=writer,
                 rate_hz=rate_hz,
             )

@@ -29,6 +29,7 @@ from zstate.odometry.estimator import WHEELS
 from zstate.odometry.fusion import STANDSTILL
 from zstate.odometry.health import WINDOW
 from zstate.odometry.messages import Fix, Odometry, Pose
+from zstate.odometry.planar import in_plane, map_in_plane
 from zstate.odometry.sensors import Estimators, add_imu
 from zstate.recording.cli.plot import new_figure
 from zstate.recording.info import recorded_robots
@@ -162,6 +163,9 @@ def replay(
             for row, stamp in enumerate(joints.stamps.tolist())
         ]
     replayed = _run(estimators, base, sorted(events, key=itemgetter(0)))  # checks the joints of the wheels
+    if settings.planar:
+        replayed.states = list(map(in_plane, replayed.states))
+        replayed.in_map = None if replayed.in_map is None else map_in_plane(replayed.in_map)
     if joints is not None and settings.wheels is not None:
         delays[WHEELS] = motions.delay(*motions.of_wheels(settings.wheels, joints))
     replayed.sigmas = sigmas

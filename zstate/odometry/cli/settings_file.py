@@ -87,7 +87,8 @@ class OdometrySettings:
     noise; those of ``heading`` are IMUs whose orientation shows the yaw. Fixes place the odometry in the
     frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an altitude [m]; by
     default it is the first fix. ``base`` None is the root of the model. Without an ``initial_pose`` the base
-    starts at the origin, once it is aligned at rest. Raises InvalidInput for names that no sensor can have,
+    starts at the origin, once it is aligned at rest. ``planar``: its z, roll and pitch are published as zero.
+    Raises InvalidInput for names that no sensor can have,
     for wheels of several kinds, and for a datum that is no place on the Earth.
     """
 
@@ -101,6 +102,7 @@ class OdometrySettings:
     odom: str = "odom"
     base: str | None = None
     initial_pose: PlanarPose | None = None
+    planar: bool = False
     history_s: float = 1.0
     imu_noise: ImuNoise = MEMS_NOISE
     diff_drive: DiffDrive | None = None
