@@ -36,11 +36,12 @@ from zstate.odometry import (
     OdometryNode,
     PoseNoise,
     PosePublisher,
+    PressurePublisher,
     SensorListener,
     VelocityNoise,
     VelocityPublisher,
 )
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Pressure, Velocity
 from zstate.odometry.requests import request_odometry
 from zstate.odometry.sensors import (
     Estimators,
@@ -385,6 +386,7 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
     velocities: list[tuple[str, Velocity]] = []
     poses: list[tuple[str, Pose]] = []
     fixes: list[tuple[str, Fix]] = []
+    pressures: list[tuple[str, Pressure]] = []
     base = Transform("map", "base", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     with (
         SensorListener(
@@ -395,6 +397,7 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
                 "velocity": lambda sensor, velocity: velocities.append((sensor, velocity)),
                 "pose": lambda sensor, pose: poses.append((sensor, pose)),
                 "fix": lambda sensor, fix: fixes.append((sensor, fix)),
+                "pressure": lambda sensor, pressure: pressures.append((sensor, pressure)),
             },
             wire=wire,
         ) as listener,
@@ -403,6 +406,7 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
         VelocityPublisher(writer, "r1", "flow", wire) as flow,
         PosePublisher(writer, "r1", "mocap", wire) as mocap,
         FixPublisher(writer, "r1", "gps", wire) as gps,
+        PressurePublisher(writer, "r1", "bmp", wire) as barometer,
     ):
 
         def publish() -> bool:
@@ -411,12 +415,17 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
             flow.publish([3, 0, 0])
             mocap.publish(base)
             gps.publish(47.5, 8.25)
-            return len({sensor for sensor, _ in readings}) == 2 and bool(velocities and poses and fixes)
+            barometer.publish(101325.0)
+            others = (velocities, poses, fixes, pressures)
+            return len({sensor for sensor, _ in readings}) == 2 and all(others)
 
         until(publish)
         frames = {sensor: imu.frame for sensor, imu in readings}
         assert frames == {"chest": "r1/imu_link", "head": "r1/head"}
         assert {(sensor, one.frame) for sensor, one in velocities} == {("flow", "r1/flow")}
+        assert {(sensor, one.frame, one.pressure) for sensor, one in pressures} == {
+            ("bmp", "r1/bmp", 101325.0)
+        }
         assert {(sensor, one.frame, one.latitude) for sensor, one in fixes} == {("gps", "r1/gps", 47.5)}
         child = {"native": "r1/base", "ros2": ""}[wire]  # ROS does not name it
         assert {(sensor, one.parent, one.child) for sensor, one in poses} == {("mocap", "r1/map", child)}

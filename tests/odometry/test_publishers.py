@@ -24,9 +24,10 @@ from zstate.odometry import (
     ImuPublisher,
     OdometryPublisher,
     PosePublisher,
+    PressurePublisher,
     VelocityPublisher,
 )
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Pressure, Velocity
 from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.messages import Message, covariance_matrix, covariances_of, from_block
@@ -136,6 +137,23 @@ def test_fix_arrives_as_it_was_published_and_so_does_that_there_is_none(sessions
     level, none = fixes[-2:]
     assert (level.stamp, level.altitude, level.status, level.covariance_type) == (7, None, 0, 3)
     assert (none.latitude, none.longitude, none.covariance, none.covariance_type) == (None, None, None, 0)
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_pressure_arrives_as_it_was_published(sessions, wire: str):
+    writer, reader = sessions
+    pressures = Messages(reader, "pressure", wire)
+    with PressurePublisher(writer, "r1", "bmp", [wire], frame="mast", clock=ManualClock(7)) as publisher:
+        known = pressures.first(lambda: publisher.publish(101325.0, 5, variance=2.25))
+        publisher.publish(9e4)
+        until(lambda: pressures[-1].variance is None)
+        for wrong in (-1.0, float("nan"), [9e4], None):
+            with pytest.raises(InvalidInput, match="pressure"):
+                publisher.publish(wrong)  # pyright: ignore[reportArgumentType]
+        assert publisher.stats.refused == 4
+    assert isinstance(known, Pressure)
+    assert (known.stamp, known.frame, known.pressure, known.variance) == (5, "mast", 101325.0, 2.25)
+    assert (pressures[-1].stamp, pressures[-1].pressure) == (7, 9e4)
 
 
 @pytest.mark.parametrize(

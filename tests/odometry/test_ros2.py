@@ -13,7 +13,7 @@ from mcap_ros2._dynamic import generate_dynamic
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import MAX_RATE, MAX_SPEED, Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import MAX_RATE, MAX_SPEED, Fix, Imu, Odometry, Pose, Pressure, Velocity
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import Message, from_block, order_digest, to_block
 from zstate.wire.ros2.decoder import RosDecoder
@@ -21,6 +21,7 @@ from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
+    FLUID_PRESSURE,
     IMU,
     NAV_SAT_FIX,
     ODOMETRY,
@@ -98,6 +99,10 @@ def rosbags_fix(
     matrix = np.array(covariance, dtype=float).ravel()
     fields = (header("gps"), state, *map(float, position), matrix, kind)
     return rosbags_cdr(NAV_SAT_FIX.name, *fields, **options)
+
+
+def rosbags_pressure(pressure: float, variance: float, **options: bool) -> bytes:
+    return rosbags_cdr(FLUID_PRESSURE.name, header("barometer"), pressure, variance, **options)
 
 
 def rosbags_odometry(
@@ -181,6 +186,8 @@ CASES = [
     ("fix", Fix(*HEAD, "gps", *PLACE, -1, 1), rosbags_fix(PLACE, NONE, 0, -1, 1)),
     ("fix", Fix(*HEAD, "gps", None, None, status=-1), rosbags_fix(NAN3, NONE, 0, -1)),
     ("fix", Fix(*HEAD, "gps", None, None, status=-2), rosbags_fix(NAN3, NONE, 0, -2)),
+    ("pressure", Pressure(*HEAD, "barometer", 101325.0, 2.25), rosbags_pressure(101325.0, 2.25)),
+    ("pressure", Pressure(*HEAD, "barometer", 95000.5), rosbags_pressure(95000.5, 0.0)),
     (
         "odometry",
         Odometry(*ODOMETRY_HEAD, None, to_block(TWIST), None),
@@ -201,6 +208,8 @@ def test_messages_of_big_endian_machines_are_read_too():
     assert decoded("odometry", turned) == decoded("odometry", rosbags_odometry(*covariances))
     fix = PLACE, symmetric(3), 3, -1, 0x8009
     assert decoded("fix", rosbags_fix(*fix, little_endian=False)) == decoded("fix", rosbags_fix(*fix))
+    turned = rosbags_pressure(101325.0, 2.25, little_endian=False)
+    assert decoded("pressure", turned) == Pressure(*HEAD, "barometer", 101325.0, 2.25)
 
 
 def test_mcap_ros2_support_decodes_measurements():
@@ -240,6 +249,10 @@ def test_covariance_of_a_fix_of_type_0_of_zeros_or_with_nan_is_not_known(covaria
     assert (fix.latitude, fix.covariance, fix.covariance_type) == (PLACE[0], None, 0)
 
 
+def test_variance_of_a_pressure_that_is_nan_is_not_known():
+    assert decoded("pressure", rosbags_pressure(9e4, np.nan)) == Pressure(*HEAD, "barometer", 9e4)
+
+
 def test_nothing_but_status_and_service_is_taken_from_a_fix_without_a_position():
     for position in ([np.nan, 8.0, 450.0], [47.0, np.inf, 450.0]):
         fix = decoded("fix", rosbags_fix(position, -symmetric(3), 3, -1, 9))
@@ -273,6 +286,10 @@ def test_nothing_but_status_and_service_is_taken_from_a_fix_without_a_position()
         ("fix", rosbags_fix(PLACE, np.triu(symmetric(3))), "malformed", "symmetric and finite"),
         ("fix", rosbags_fix(PLACE, -symmetric(3)), "malformed", "variances of a fix are not negative"),
         ("fix", rosbags_fix(PLACE, NONE, 0)[:-1], "truncated", "1 more are expected"),
+        ("pressure", rosbags_pressure(0.0, 0.0), "malformed", "above zero and at most 1e[+]09 Pa; got 0.0"),
+        ("pressure", rosbags_pressure(np.nan, 0.0), "malformed", "got nan"),
+        ("pressure", rosbags_pressure(9e4, -1.0), "malformed", "the variance of a pressure is 0 or more"),
+        ("pressure", rosbags_pressure(9e4, 0.0)[:-1], "truncated", "more are expected"),
         ("odometry", rosbags_odometry(symmetric(6) * np.inf, symmetric(6)), "malformed", "finite"),
     ],
 )
@@ -337,7 +354,9 @@ def test_a_fix_is_the_same_after_ros(position: Any, status: int, service: int, k
 
 
 @given(
-    st.binary(max_size=400), st.sampled_from(["imu", "velocity", "pose", "fix", "odometry"]), st.booleans()
+    st.binary(max_size=400),
+    st.sampled_from(["imu", "velocity", "pose", "fix", "pressure", "odometry"]),
+    st.booleans(),
 )
 def test_arbitrary_bytes_raise_only_message_error(data: bytes, stream: Any, has_header: bool):
     payload = b"\x00\x01\x00\x00" + data if has_header else data

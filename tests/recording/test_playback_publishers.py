@@ -31,6 +31,7 @@ from zstate.odometry import (
     ImuPublisher,
     OdometryPublisher,
     PosePublisher,
+    PressurePublisher,
     VelocityPublisher,
 )
 from zstate.odometry.messages import MapDatum, Odometry
@@ -56,10 +57,10 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
 
 SCAN_STREAMS = ("scan", "map")
-ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "odometry")
+ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "pressure", "odometry")
 
 COUNT = 20
-SENSORS = ("imu/chest", "velocity/flow", "pose/mocap", "fix/gps", "odometry/wheels")
+SENSORS = ("imu/chest", "velocity/flow", "pose/mocap", "fix/gps", "pressure/bmp", "odometry/wheels")
 CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
 
 
@@ -415,6 +416,7 @@ def driven(sessions, tmp_path: Path) -> Path:
         OdometryPublisher(writer, "cart", "wheels") as odometry,
         PosePublisher(writer, "cart", "mocap") as mocap,
         FixPublisher(writer, "cart", "gps") as gps,
+        PressurePublisher(writer, "cart", "bmp") as barometer,
         Recorder(reader, path, ["cart"]) as recorder,
     ):
         wait_for_stream_readers(writer, "cart", *SENSORS)
@@ -425,6 +427,7 @@ def driven(sessions, tmp_path: Path) -> Path:
             base = Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1]).with_covariance(np.eye(6) * (n + 1))
             odometry.publish(base, [n, 0, 0], [0, 0, 0], stamp)
             mocap.publish(base, stamp)
+            barometer.publish(101325.0 - n, stamp, variance=2.25 if n % 2 else None)
             if n % 2:
                 gps.publish(47.5, n, 450.0, stamp, covariance=np.eye(3) * (n + 1), status=2, service=9)
             else:

@@ -7,7 +7,7 @@ import pytest
 
 from zstate.driving.messages import DriverState, JointTrajectory, with_short_texts
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Velocity, with_full_names
+from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Pressure, Velocity, with_full_names
 from zstate.plugins import stream_named
 from zstate.scans.messages import LaserScan, OccupancyGrid, cells_of
 from zstate.wire.messages import (
@@ -171,6 +171,11 @@ def fix(**changed: Any) -> Fix:
     return Fix(**{**fields, "latitude": 47.5, "longitude": 8.25, "altitude": 450.0, **changed})
 
 
+def pressure(**changed: Any) -> Pressure:
+    fields: dict[str, Any] = {"stamp": 5, "seq": 0, "session": 1, "frame": "bmp", "pressure": 101325.0}
+    return Pressure(**{**fields, **changed})
+
+
 def datum(**changed: Any) -> MapDatum:
     fields: dict[str, Any] = {"stamp": 5, "seq": 0, "session": 1, "frame": "map"}
     return MapDatum(**{**fields, "latitude": 47.5, "longitude": 8.25, "altitude": 450.0, **changed})
@@ -219,6 +224,12 @@ def odometry(**changed: Any) -> Odometry:
         (fix, {"longitude": None, "status": -1}, "a latitude and a longitude; got 47.5 and None"),
         (fix, {"latitude": None, "longitude": None}, "a fix of status 0 has .* the status is -1"),
         (fix, {"latitude": None, "longitude": None, "status": -1}, "an altitude .* need a latitude"),
+        (pressure, {"frame": ""}, "1 to 1024 characters, not 0"),
+        (pressure, {"pressure": 0.0}, r"above zero and at most 1e\+09 Pa; got 0.0"),
+        (pressure, {"pressure": np.nan}, "got nan"),
+        (pressure, {"pressure": 1.0001e9}, "got 1000100000.0"),
+        (pressure, {"variance": -1.0}, r"0 or more \[Pa\^2\]; got -1.0"),
+        (pressure, {"variance": np.inf}, "got inf"),
         (datum, {"frame": ""}, "1 to 1024 characters, not 0"),
         (datum, {"latitude": 90.1}, "a latitude of -90 to 90 .*; got 90.1, 8.25, 450.0"),
         (datum, {"longitude": float("nan")}, "got 47.5, nan, 450.0"),
@@ -307,6 +318,7 @@ def test_messages_of_sensors_and_odometry_fit_the_limit_of_their_streams():
 def test_frames_of_a_measurement_get_their_full_names():
     assert with_full_names(imu(), "r1").frame == "r1/imu"
     assert with_full_names(fix(), "r1").frame == "r1/gps"
+    assert with_full_names(pressure(), "r1").frame == "r1/bmp"
     placed = with_full_names(pose(parent="hall/map"), "r1")
     assert (placed.parent, placed.child) == ("hall/map", "r1/base")
     assert with_full_names(pose(child=""), "r1").child == ""  # of the base

@@ -20,7 +20,7 @@ from zstate.driving.messages import (
     Stop,
 )
 from zstate.errors import MessageError
-from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Pressure, Velocity
 from zstate.plugins import all_streams
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.streams import LATCHED_BYTES, StreamName
@@ -249,6 +249,12 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     "fix without a position": (
         Fix(STAMP, 300, 2**63 + 5, "gps", None, None, status=-1),
         header(11)[:-10] + fixstr("gps") + NIL * 3 + b"\xff\x00" + NIL + b"\x00",
+    ),
+    "pressure": (
+        Pressure(STAMP, 300, 2**63 + 5, "bmp", 101325.0, 2.25),
+        header(6)[:-10]
+        + fixstr("bmp")
+        + b"".join(b"\xcb" + struct.pack(">d", number) for number in (101325.0, 2.25)),
     ),
     "datum": (
         MapDatum(STAMP, 300, 2**63 + 5, "fleet/map", 47.5, -8.25, 450.0),

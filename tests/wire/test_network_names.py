@@ -37,6 +37,7 @@ from zstate.odometry import (
     ImuPublisher,
     OdometryPublisher,
     PosePublisher,
+    PressurePublisher,
     VelocityPublisher,
 )
 from zstate.wire.native import encoding_of
@@ -114,7 +115,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
             odometry = opened.enter_context(TransformPublisher(writer, "r1", "odometry", program="driver"))
             odometry.publish([Transform("odom", "world", (1.0, 0.0, 0.0), UPRIGHT)])
             opened.enter_context(DatumPublisher(writer, "r1", program="driver")).set(Datum(47.5, 8.25))
-        wheels, imu, flow, mocap, gps = (
+        wheels, imu, flow, mocap, gps, barometer = (
             opened.enter_context(kind(writer, "r1", name, (wire,), program="driver"))
             for kind, name in (
                 (OdometryPublisher, "odom"),
@@ -122,6 +123,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
                 (VelocityPublisher, "flow"),
                 (PosePublisher, "mocap"),
                 (FixPublisher, "gps"),
+                (PressurePublisher, "bmp"),
             )
         )
 
@@ -133,6 +135,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
             flow.publish([0, 0, 0])
             mocap.publish(Transform("map", "odom", (1.0, 0.0, 0.0), UPRIGHT))
             gps.publish(47.5, 8.25)
+            barometer.publish(101325.0)
 
         with repeated(publish):
             yield

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         ImuPublisher,
         OdometryPublisher,
         PosePublisher,
+        PressurePublisher,
         VelocityPublisher,
     )
     from zstate.odometry.requests import request_odometry
@@ -51,6 +52,7 @@ __all__ = [
     "OdometryPublisher",
     "PoseNoise",
     "PosePublisher",
+    "PressurePublisher",
     "SensorListener",
     "SimulatedRover",
     "SimulatedWheels",
@@ -89,6 +91,7 @@ _HOMES = {
     "OdometryPublisher": "publishers",
     "PoseNoise": "source_noise",
     "PosePublisher": "publishers",
+    "PressurePublisher": "publishers",
     "SensorListener": "node",
     "SimulatedRover": "simulated_rover",
     "SimulatedWheels": "simulated_rover",

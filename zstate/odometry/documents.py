@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Pressure, Velocity
 from zstate.wire.keys import full_name
 from zstate.wire.messages import covariance_matrix, from_block
 
@@ -64,6 +65,12 @@ def fix_document(message: Fix, robot: str) -> dict[str, Any]:
     return document | dict(zip(("sigma_east", "sigma_north", "sigma_up"), sigmas, strict=True))
 
 
+def pressure_document(message: Pressure, robot: str) -> dict[str, Any]:
+    """A pressure at a frame of ``robot``: stamp [ns], pressure [Pa], and its sigma if known."""
+    document = {**_head(message, robot), "pressure": message.pressure}
+    return document if message.variance is None else document | {"sigma": math.sqrt(message.variance)}
+
+
 def datum_document(message: MapDatum, robot: str) -> dict[str, Any]:
     """The datum of a map of ``robot``: stamp of its announcement [ns], frame, degrees, altitude [m]."""
     place = ("latitude", "longitude", "altitude")
@@ -87,7 +94,7 @@ def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
     return document | _sigmas([("pose", message.covariances), ("twist", message.twist_covariance)])
 
 
-def _head(message: Imu | Velocity | Fix | MapDatum, robot: str) -> dict[str, Any]:
+def _head(message: Imu | Velocity | Fix | Pressure | MapDatum, robot: str) -> dict[str, Any]:
     return {"stamp": message.stamp, "seq": message.seq, "frame": full_name(robot, message.frame)}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias, TypeVar
 
 import msgspec
@@ -42,6 +43,9 @@ class Odometry(WriterTransforms, frozen=True, array_like=True, gc=False):
 
 MAX_RATE, MAX_ACCELERATION = 1e3, 1e5
 """[rad/s] and [m/s^2]: more in any axis is no reading of a sensor, but a fault of memory or of units."""
+
+MAX_PRESSURE = 1e9
+"""[Pa], likewise: nine times that at the deepest place of the sea."""
 
 MAX_SPEED, MAX_DISTANCE = 1e4, 1e8
 """[m/s] and [m], likewise: above the speed of satellites, and twice the circumference of the Earth."""
@@ -191,6 +195,27 @@ class Fix(StampedMessage, frozen=True, array_like=True, gc=False):
             raise InvalidInput("an altitude and a covariance need a latitude and a longitude")
 
 
+class Pressure(StampedMessage, frozen=True, array_like=True, gc=False):
+    """A reading of a barometer, or of another sensor of the pressure of a fluid: sensor_msgs/FluidPressure.
+
+    ``frame`` is the sensor, named as in edges; ``pressure`` [Pa] is absolute. ``variance`` [Pa^2] is None if
+    it is not known.
+    """
+
+    frame: str
+    pressure: float
+    variance: float | None = None
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
+        if not 0.0 < self.pressure <= MAX_PRESSURE:
+            raise InvalidInput(
+                f"an absolute pressure is above zero and at most {MAX_PRESSURE:g} Pa; got {self.pressure}"
+            )
+        if self.variance is not None and not 0.0 <= self.variance < math.inf:
+            raise InvalidInput(f"the variance of a pressure is 0 or more [Pa^2]; got {self.variance}")
+
+
 class MapDatum(StampedMessage, frozen=True, array_like=True, gc=False):
     """The point of the Earth at the origin of the map ``frame``, named as in edges: x is east, y north, z up.
 
@@ -212,8 +237,8 @@ class MapDatum(StampedMessage, frozen=True, array_like=True, gc=False):
         return Datum(self.latitude, self.longitude, self.altitude)
 
 
-SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix
-SENSOR_STREAMS = ("imu", "velocity", "pose", "fix")
+SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix | Pressure
+SENSOR_STREAMS = ("imu", "velocity", "pose", "fix", "pressure")
 """The streams of these messages."""
 
 _Measurement = TypeVar("_Measurement", bound=SensorMessage)

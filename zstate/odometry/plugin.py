@@ -41,6 +41,15 @@ FIX = Stream(
     ros="zstate.odometry.ros2:FIX_STREAM",
     document="zstate.odometry.documents:fix_document",
 )
+PRESSURE = Stream(
+    "pressure",
+    f"{_MESSAGES}:Pressure",
+    summary="pressure at a barometer",
+    named=True,
+    start="start the program of the barometer, with its zstate.odometry.PressurePublisher",
+    ros="zstate.odometry.ros2:PRESSURE_STREAM",
+    document="zstate.odometry.documents:pressure_document",
+)
 DATUM = Stream(
     "datum",
     f"{_MESSAGES}:MapDatum",
@@ -63,7 +72,7 @@ ODOMETRY = Stream(
 
 PLUGIN = Plugin(
     "odometry",
-    streams=(IMU, VELOCITY, POSE, FIX, DATUM, ODOMETRY),
+    streams=(IMU, VELOCITY, POSE, FIX, PRESSURE, DATUM, ODOMETRY),
     commands={
         "odometry": Command(
             "zstate.odometry.cli.odometry:odometry_command",

@@ -17,7 +17,7 @@ from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.static_publisher import ValuePublisher
 from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
 from zstate.odometry.geodesy import Datum
-from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Pressure, Velocity
 from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
 from zstate.wire.keys import check_writer, full_name
 from zstate.wire.messages import to_block
@@ -218,6 +218,40 @@ class FixPublisher(MeasurementPublisher):
                     *(triangle, 0 if triangle is None else index(covariance_type)),
                 )
             )
+
+
+class PressurePublisher(MeasurementPublisher):
+    """Publishes the readings of one barometer of a robot.
+
+    Sensors, frames, writers and threads are those of ``ImuPublisher``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        sensor: str = "pressure",
+        wires: str | Sequence[str] = ("native",),
+        *,
+        frame: str | None = None,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        self.frame = sensor if frame is None else frame
+        full_name(robot, self.frame)
+        super().__init__(session, robot, "pressure", sensor, wires=wires, clock=clock, program=program)
+
+    def publish(self, pressure: float, stamp: int | None = None, *, variance: float | None = None) -> None:
+        """Publish one absolute ``pressure`` [Pa] at ``stamp`` [ns]; default: now.
+
+        Leave ``variance`` [Pa^2] out if it is not known. Raises as ``ImuPublisher.publish``.
+        """
+        with self._refusals:
+            stamp = self._clock.now() if stamp is None else check_stamp(stamp)
+            reading = _number(pressure, "pressure")
+            if reading is None:
+                raise InvalidInput("a pressure is a number [Pa]; got None")
+            self._send(Pressure(stamp, 0, 0, self.frame, reading, _number(variance, "variance")))
 
 
 class DatumPublisher(ValuePublisher):

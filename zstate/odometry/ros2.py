@@ -1,9 +1,10 @@
-"""IMUs, velocities, poses, fixes and odometry as ROS 2 messages.
+"""IMUs, velocities, poses, fixes, pressures and odometry as ROS 2 messages.
 
 ROS has matrices where zstate has upper triangles or None. A covariance of zeros is not known
-(sensor_msgs/Imu), and so is what a first number of -1 precedes: an IMU without orientation, or one that
-measures no angular velocities or no accelerations. An angular velocity that was not measured is NaN here,
-and so are the altitude and the position that a fix does not have.
+(sensor_msgs/Imu), nor is a variance of zero (sensor_msgs/FluidPressure), and so is what a first number of -1
+precedes: an IMU without orientation, or one that measures no angular velocities or no accelerations. An
+angular velocity that was not measured is NaN here, and so are the altitude and the position that a fix does
+not have.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ from math import isfinite, isnan, nan
 import numpy as np
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Pressure, Velocity
 from zstate.wire.messages import covariance_matrix, from_block, order_digest, to_block
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.streams import RosStream
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
+    FLUID_PRESSURE,
     IMU,
     NAV_SAT_FIX,
     ODOMETRY,
@@ -174,6 +176,30 @@ def decode_fix(payload: bytes, session: int, seq: int, names: FrameNames) -> Fix
         raise reader.malformed(str(error)) from None
 
 
+def encode_pressure(pressure: Pressure, names: FrameNames) -> bytes:
+    """The sensor_msgs/FluidPressure of a reading; raises as ``encode_imu``."""
+    writer = CdrWriter()
+    writer.stamp(pressure.stamp)
+    writer.text(names.to_ros(pressure.frame))
+    writer.numbers(to_block([pressure.pressure, pressure.variance or 0.0]))
+    return writer.payload()
+
+
+def decode_pressure(payload: bytes, session: int, seq: int, names: FrameNames) -> Pressure:
+    """The reading in a sensor_msgs/FluidPressure; raises as ``decode_velocity``.
+
+    Its variance is not known as well if a driver has put NaN into it.
+    """
+    reader = CdrReader(payload, FLUID_PRESSURE.name)
+    stamp, frame = reader.stamp(), names.to_zstate(reader.text())
+    pressure, variance = from_block(reader.numbers(2)).tolist()
+    known = None if variance == 0.0 or isnan(variance) else variance
+    try:
+        return Pressure(stamp, seq, session, frame, pressure, known)
+    except InvalidInput as error:
+        raise reader.malformed(str(error)) from None
+
+
 def encode_odometry(odometry: Odometry, names: FrameNames) -> bytes:
     """The nav_msgs/Odometry of a sample; raises as ``encode_imu``."""
     assert odometry.edges is not None
@@ -242,6 +268,9 @@ POSE_STREAM = RosStream(
 )
 FIX_STREAM = RosStream(
     NAV_SAT_FIX, _QOS, encode=encode_fix, decode=decode_fix, is_named=True, is_of_sensor=True
+)
+PRESSURE_STREAM = RosStream(
+    FLUID_PRESSURE, _QOS, encode=encode_pressure, decode=decode_pressure, is_named=True, is_of_sensor=True
 )
 ODOMETRY_STREAM = RosStream(
     ODOMETRY, _QOS, encode=encode_odometry, decode=decode_odometry, is_named=True, is_of_sensor=True

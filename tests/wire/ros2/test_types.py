@@ -11,6 +11,7 @@ from zstate.wire.ros2.types import (
     CLOCK,
     DIAGNOSTIC_ARRAY,
     FLOAT64_MULTI_ARRAY,
+    FLUID_PRESSURE,
     IMU,
     JOINT_STATE,
     JOINT_TRAJECTORY,
@@ -39,6 +40,7 @@ TYPES = (
     IMU,
     TWIST_WITH_COVARIANCE,
     NAV_SAT_FIX,
+    FLUID_PRESSURE,
     ODOMETRY,
 )
 EACH = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])

@@ -113,6 +113,11 @@ _FIELDS: dict[str, Fields] = {
         ("float64[9]", "position_covariance"),
         ("uint8", "position_covariance_type"),
     ),
+    "sensor_msgs/FluidPressure": (
+        ("std_msgs/Header", "header"),
+        ("float64", "fluid_pressure"),
+        ("float64", "variance"),
+    ),
 }
 # The numbers of type_description_interfaces/FieldType.
 _NESTED, _ARRAY, _UNBOUNDED_SEQUENCE = 1, 48, 144
@@ -200,4 +205,5 @@ POSE_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/PoseWithCovarianceStam
 TWIST_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/TwistWithCovarianceStamped")
 ODOMETRY = RosType.from_fields("nav_msgs/Odometry")
 IMU = RosType.from_fields("sensor_msgs/Imu")
+FLUID_PRESSURE = RosType.from_fields("sensor_msgs/FluidPressure")
 NAV_SAT_FIX = RosType.from_fields("sensor_msgs/NavSatFix")
