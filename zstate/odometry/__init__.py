@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     )
     from zstate.odometry.requests import request_odometry
     from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
-    from zstate.odometry.source_noise import FixNoise, HeadingNoise, PoseNoise, VelocityNoise
+    from zstate.odometry.source_noise import BarometerNoise, FixNoise, HeadingNoise, PoseNoise, VelocityNoise
     from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
 __all__ = [
     "Ackermann",
+    "BarometerNoise",
     "BaseCovariance",
     "BaseEstimator",
     "BaseState",
@@ -68,6 +69,7 @@ __all__ = [
 
 _HOMES = {
     "Ackermann": "wheels",
+    "BarometerNoise": "source_noise",
     "BaseCovariance": "estimator",
     "BaseEstimator": "estimator",
     "BaseState": "estimator",

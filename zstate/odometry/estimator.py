@@ -1,4 +1,4 @@
-"""BaseEstimator: where the base of a robot is, from an IMU, wheels, legs, velocities, poses and headings.
+"""BaseEstimator: where the base of a robot is, from an IMU, wheels, legs, velocities, poses and more.
 
 All events are kept for ``history_s`` in the order of their stamps, each with the estimate after it, which is
 immutable. A late event is sorted in, and the events after it are fused again when a state is next read. So
@@ -39,6 +39,7 @@ from zstate.odometry.fusion import (
     Estimate,
     Fusion,
     Heading,
+    Height,
     Inertia,
     Reading,
     Steps,
@@ -127,7 +128,7 @@ class BaseState:
     is_coasting: bool
 
 
-_Input: TypeAlias = Inertia | Reading | Displacement | Heading | Contacts | Steps | Placement
+_Input: TypeAlias = Inertia | Reading | Displacement | Heading | Height | Contacts | Steps | Placement
 
 
 class _Event:
@@ -434,6 +435,38 @@ class BaseEstimator:
             )
         reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, mount)
         self._offer(_Event(source, reading, (yaw, sigma)))
+
+    def height(
+        self,
+        stamp: int,
+        height: float,
+        sigma: float,
+        *,
+        source: str,
+        frame: str | None = None,
+        wander: float = 0.0,
+        correlated_s: float = 300.0,
+    ) -> None:
+        """The height of ``frame``, by default the base, at ``stamp`` [m], above any level, up positive.
+
+        It is relative to the first one of this source, as the odometry frame has no sea level. ``sigma`` [m]
+        is the standard deviation of each reading, ``wander`` [m] that of an error besides that changes over
+        ``correlated_s`` [s], as by weather. The height will not be known better by it than both together
+        allow, and nothing but the height is corrected. See ``zstate.odometry.fusion``. Raises InvalidInput,
+        which names the source, for NaN, more than 1e8 m, a sigma outside of 1e-9 to 1e9, a wander outside of
+        0 to 1e9, and a time that is not above zero.
+        """
+        mount = self._mount(frame or self.base)
+        is_known = abs(height) <= MAX_DISTANCE and MIN_SIGMA <= sigma <= MAX_SIGMA
+        if not (is_known and 0.0 <= wander <= MAX_SIGMA and 0.0 < correlated_s < math.inf):
+            raise InvalidInput(
+                f"a height of source {source!r} is at most {MAX_DISTANCE:g} m, with a sigma of {MIN_SIGMA:g} "
+                f"to {MAX_SIGMA:g} m and a wander of 0 to {MAX_SIGMA:g} m in a time above zero; got "
+                f"height={height!r}, sigma={sigma!r}, wander={wander!r}, correlated_s={correlated_s!r}"
+            )
+        numbers = float(height), float(sigma) ** 2, float(wander) ** 2, float(correlated_s)
+        self._record(source).has_bounds = True
+        self._offer(_Event(source, Height(check_stamp(stamp), *numbers, mount), numbers))
 
     @property
     def clock(self) -> Clock:
@@ -772,6 +805,8 @@ class BaseEstimator:
                 after, outcome = fusion.after_pause(estimate, reading, following)
             case Heading():
                 after, outcome = fusion.after_heading(estimate, event.source, reading, following)
+            case Height():
+                after, outcome = fusion.after_height(estimate, event.source, reading, following)
             case Reading():
                 after, outcome = fusion.after_reading(estimate, event.source, reading, following)
         return after, outcome

@@ -18,6 +18,10 @@ kept.
   lowered below that of the source, which is the stated one or, if larger, the mean square that its
   innovations have shown for 20 s. A compass that is wrong by tens of degrees loses its weight; one that is
   right still bounds the drift. It may be off by 0.5 rad until it has been read in all directions.
+- A height by a barometer is relative to the first one of its source as well, and its error wanders with the
+  weather. The height is never known better than by what the barometer may have wandered since its first
+  reading, and moves alone: velocity, tilt and biases learn nothing from it. A barometer that is rejected for
+  two seconds, as in a gust, begins anew.
 - The pose of the odometry frame is continuous (REP 105): it is the integral of the predictions. What a
   reading corrects of the place or the yaw remains an ``Offset``, whose square is part of the covariance.
 """
@@ -55,7 +59,7 @@ from zstate.odometry.invariant_filter import (
     with_plain_covariance,
 )
 from zstate.odometry.legs import Foot, Legs, Stance, stance_after, updated_by_feet
-from zstate.odometry.measurements import heading, yaw_rate, zero_velocity
+from zstate.odometry.measurements import heading, height, yaw_rate, zero_velocity
 from zstate.odometry.rotations import rotation_exp, skew
 from zstate.odometry.turning import (
     COMPARED_S,
@@ -135,6 +139,7 @@ _SAMPLED_S, _SAMPLED_GAIN, _SLOWEST_NS = 0.01, 0.05, 350_000_000
 
 _YAW = ROTATION.start + 2
 _LEVEL = slice(POSITION.start, POSITION.start + 2)
+_UP, _UP_OF_CONTACTS = POSITION.start + 2, slice(17, None, 3)
 
 COASTING_RATE_DENSITY, _COASTING_FORCE_DENSITY = 0.1, 1.0
 """Of the rate by wheels [rad/s/sqrt(Hz)], and of unknown accelerations [m/s^2/sqrt(Hz)]."""
@@ -193,6 +198,20 @@ class Heading(NamedTuple):
     imu_from_frame: Floats
 
 
+class Height(NamedTuple):
+    """The height of a frame above an unknown level [m], with its variance [m^2].
+
+    ``wander`` is the variance of an error besides that changes over ``correlated_s`` [s].
+    """
+
+    stamp: int
+    height: float
+    variance: float
+    wander: float
+    correlated_s: float
+    imu_from_frame: Floats
+
+
 class Contacts(NamedTuple):
     """The feet on the ground, as measured."""
 
@@ -235,6 +254,17 @@ class Compass(NamedTuple):
     sectors: dict[int, tuple[int, float]]
 
 
+class Altimeter(NamedTuple):
+    """Of a source of heights, the stamp of its first reading, and what it was more than our height then.
+
+    ``variance`` is that of this difference: of the reading, and of our height.
+    """
+
+    start: int
+    offset: float
+    variance: float
+
+
 class Vibration(NamedTuple):
     """The noise of the samples of the IMU: ``variance`` of gyro and accelerometer in each axis, (6,).
 
@@ -255,7 +285,7 @@ class Offset(NamedTuple):
     """From the estimate to the continuous pose of the IMU: ``rotation @ place + shift``. ``rotation`` (3, 3).
 
     It was last changed at ``stamp``. ``is_followed``: it fades, as poses are measured in the odometry frame;
-    ``is_turned``: its yaw fades, as a compass is right.
+    ``is_turned``: its yaw fades, as a compass is right; ``is_lifted``: its height fades, by a barometer.
     """
 
     rotation: Floats
@@ -263,6 +293,7 @@ class Offset(NamedTuple):
     stamp: int
     is_followed: bool = False
     is_turned: bool = False
+    is_lifted: bool = False
 
 
 class Pause(NamedTuple):
@@ -341,6 +372,7 @@ class Estimate(NamedTuple):
     lost_at: int | None = None
     runs: dict[str, Run] = {}  # noqa: RUF012 - replaced, never written to
     compasses: dict[str, Compass] = {}  # noqa: RUF012 - replaced, never written to
+    altimeters: dict[str, Altimeter] = {}  # noqa: RUF012 - replaced, never written to
 
 
 def started(stamp: int, state: FilterState) -> Estimate:
@@ -487,6 +519,42 @@ class Fusion:
             else:
                 found = _without_yaw_bias(found, estimate.state.rotation[2])
             estimate = _moved(estimate, corrected(estimate.state, measurement, found))
+        return estimate, Outcome("accepted", nis, 1)
+
+    def after_height(
+        self, before: Estimate, source: str, reading: Height, following: Inertia | None
+    ) -> tuple[Estimate, Outcome]:
+        """The estimate after a height, and what became of it."""
+        estimate = self.predicted(before, reading.stamp, following)
+        known = estimate.altimeters.get(source)
+        offset = 0.0 if known is None else known.offset
+        measurement = height(
+            estimate.state, reading.height - offset, reading.variance, reading.imu_from_frame
+        )
+        residual, row = float(measurement.residual[0]), measurement.jacobian[0]
+        variance = float(row @ self.settled(estimate).state.covariance @ row)
+        if known is None:
+            first = Altimeter(reading.stamp, residual, variance + reading.variance)
+            return _with_altimeter(estimate, source, first), Outcome("accepted", 1.0, 1)
+        elapsed_s = (reading.stamp - known.start) * 1e-9
+        wandered = 2.0 * reading.wander * -math.expm1(-elapsed_s / reading.correlated_s)
+        floor = known.variance + reading.variance + wandered
+        nis = residual * residual / (variance + floor)
+        if nis > gate(1):
+            estimate, is_enough = _with_rejection(estimate, source)
+            if not is_enough:
+                return estimate, Outcome("rejected", nis, 1)
+            first = Altimeter(reading.stamp, offset + residual, variance + reading.variance)
+            return _with_altimeter(estimate, source, first), Outcome("reacquired", nis, 1)
+        estimate = _with_run(estimate, source, None) if source in estimate.runs else estimate
+        if variance > floor:
+            # The error of the height becomes (1 - gain) of its own and gain of the barometer's, which it has
+            # a part of already: whatever their correlation, standard deviations add to no more than this.
+            gain = 1.0 - floor / variance
+            noise = floor + 2.0 * (1.0 - gain) / gain * math.sqrt(variance * floor)
+            state = _raised(estimate.state, residual, noise, gain, reading.imu_from_frame)
+            estimate = estimate._replace(offset=estimate.offset._replace(is_lifted=True))
+            estimate = _moved(estimate, state)
         return estimate, Outcome("accepted", nis, 1)
 
     def after_steps(
@@ -921,8 +989,10 @@ def _moved(estimate: Estimate, state: FilterState, *, is_step: bool = False) -> 
         yaw = math.atan2(rotation[1, 0], rotation[0, 0])
         most = _YAW_RATE * elapsed_s
         rotation = rotation_exp(np.array((0.0, 0.0, -max(-most, min(yaw, most))))).dot(rotation)
-    if offset.is_followed:
+    if offset.is_followed or offset.is_lifted:
         gap = state.position - place
+        if not offset.is_followed:
+            gap[:2] = 0.0
         place = place + gap * min(1.0, _PLACE_RATE * elapsed_s / max(math.sqrt(gap @ gap), 1e-12))
     offset = offset._replace(
         rotation=rotation, shift=place - rotation.dot(state.position), stamp=estimate.stamp
@@ -995,10 +1065,10 @@ def _gated(
         return _moved(estimate, corrected(state, measurement, found)), Outcome("accepted", nis, dimension)
     if source == STANDSTILL:  # the base may be turned or carried while its wheels stand
         return estimate, Outcome("rejected", nis, dimension)
-    run = estimate.runs.get(source) or Run(estimate.stamp, 0, 0)
-    run = Run(run.start, estimate.stamp, run.length + 1)
-    if run.length < _REACQUIRE_COUNT or estimate.stamp - run.start < _REACQUIRE_NS:
-        return _with_run(estimate, source, run), Outcome("rejected", nis, dimension)
+    estimate, is_enough = _with_rejection(estimate, source)
+    run = estimate.runs[source]
+    if not is_enough:
+        return estimate, Outcome("rejected", nis, dimension)
     if is_position:
         state = _without_place(state, measurement.residual)
     else:
@@ -1035,6 +1105,40 @@ def _without_place(state: FilterState, residual: Floats) -> FilterState:
     if len(residual) == 6:
         forgotten(covariance, slice(_YAW, _YAW + 1), float(residual[5] ** 2))
     return with_plain_covariance(state, covariance)
+
+
+def _raised(
+    state: FilterState, residual: float, noise: float, gain: float, imu_from_frame: Floats
+) -> FilterState:
+    """The state after a height of a frame that was ``residual`` [m] more, with the variance ``noise`` [m^2].
+
+    The part ``gain`` of it raises the base with its contacts, and nothing else: what an error that lasts
+    would say of velocity, tilt and biases is wrong. It is a consider filter, as ``_without_yaw_bias``, with
+    the covariance of this gain.
+    """
+    size = len(state.covariance)
+    row, up = np.zeros(size), np.zeros(size)
+    row[ROTATION], row[_UP] = -skew(state.rotation @ imu_from_frame[:3, 3])[2], 1.0
+    up[_UP] = up[_UP_OF_CONTACTS] = gain
+    rest = np.eye(size) - np.outer(up, row)
+    covariance = rest @ plain_covariance(state) @ rest.T + noise * np.outer(up, up)
+    raised = np.array((0.0, 0.0, gain * residual))
+    state = state._replace(position=state.position + raised, contacts=state.contacts + raised)
+    return with_plain_covariance(state, covariance)
+
+
+def _with_rejection(estimate: Estimate, source: str) -> tuple[Estimate, bool]:
+    """The estimate after a rejection more, and whether there were enough in a row to follow the source."""
+    run = estimate.runs.get(source) or Run(estimate.stamp, 0, 0)
+    run = Run(run.start, estimate.stamp, run.length + 1)
+    is_enough = run.length >= _REACQUIRE_COUNT and estimate.stamp - run.start >= _REACQUIRE_NS
+    return _with_run(estimate, source, run), is_enough
+
+
+def _with_altimeter(estimate: Estimate, source: str, altimeter: Altimeter) -> Estimate:
+    """The estimate with a source of heights that begins, or begins anew."""
+    estimate = _with_run(estimate, source, None)
+    return estimate._replace(altimeters={**estimate.altimeters, source: altimeter})
 
 
 def _with_run(estimate: Estimate, source: str, run: Run | None) -> Estimate:

@@ -81,6 +81,13 @@ def position(state: FilterState, measured: Floats, covariance: Floats, imu_from_
     return Measurement(measured - point, _point_jacobian(state, point), covariance)
 
 
+def height(state: FilterState, measured: float, variance: float, imu_from_frame: Floats) -> Measurement:
+    """The height of a frame's origin in the world [m], as a barometer measures it."""
+    point = state.position + state.rotation @ imu_from_frame[:3, 3]
+    residual = np.array([measured - float(point[2])])
+    return Measurement(residual, _point_jacobian(state, point)[2:], np.array([[variance]]))
+
+
 def pose(
     state: FilterState, world_from_frame: Floats, covariance: Floats, imu_from_frame: Floats
 ) -> Measurement:

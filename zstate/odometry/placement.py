@@ -54,7 +54,8 @@ def placed(estimate: Estimate, placement: Placement, imu_from_base: Floats) -> E
         name: compass._replace(offset=compass.offset - turn) for name, compass in estimate.compasses.items()
     }
     drift = Drift(state.position, estimate.drift.scale)
-    return at_its_estimate(estimate._replace(state=state, drift=drift, runs={}, compasses=compasses))
+    estimate = estimate._replace(state=state, drift=drift, runs={}, compasses=compasses, altimeters={})
+    return at_its_estimate(estimate)
 
 
 def is_finite(state: FilterState) -> bool:

@@ -15,8 +15,15 @@ from zstate.checks import Floats
 from zstate.errors import InvalidInput
 from zstate.odometry.estimator import BaseEstimator
 from zstate.odometry.map_estimator import MapEstimator
-from zstate.odometry.messages import Fix, Imu, Pose, Velocity
-from zstate.odometry.source_noise import FixNoise, HeadingNoise, PoseNoise, SensorNoise, VelocityNoise
+from zstate.odometry.messages import Fix, Imu, Pose, Pressure, Velocity
+from zstate.odometry.source_noise import (
+    BarometerNoise,
+    FixNoise,
+    HeadingNoise,
+    PoseNoise,
+    SensorNoise,
+    VelocityNoise,
+)
 from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.messages import covariance_matrix, from_block
@@ -172,6 +179,33 @@ def add_fix(estimators: Estimators, sensor: str, noise: FixNoise, message: Fix) 
     )
 
 
+def barometer_covariance(sensor: str, noise: BarometerNoise, message: Pressure) -> Floats:
+    """That of the height [m^2], (1, 1), without what weather does: by ``noise``, else of the message.
+
+    Raises InvalidInput as ``velocity_covariance``.
+    """
+    sigma = noise.height_sigma(message.pressure, message.variance)
+    if sigma is None:
+        raise InvalidInput(
+            f"pressures of {sensor!r} have no variance: state the noise of their heights by `--barometer "
+            f"{sensor}:sigma=0.5`, or sigma = 0.5 [m] in [barometer.{sensor}] of the settings"
+        )
+    return np.array([[sigma**2]])
+
+
+def add_pressure(estimators: Estimators, sensor: str, noise: BarometerNoise, message: Pressure) -> None:
+    """Pass the height by one pressure to the odometry."""
+    estimators.odometry.height(
+        message.stamp,
+        noise.height(message.pressure),
+        math.sqrt(float(barometer_covariance(sensor, noise, message)[0, 0])),
+        source=sensor,
+        frame=message.frame,
+        wander=noise.wander,
+        correlated_s=noise.correlated_s,
+    )
+
+
 def _unknown(covariance: Floats | None) -> str:
     return "no covariance" if covariance is None else "a covariance with variances that are not above zero"
 
@@ -181,6 +215,7 @@ KINDS = (
     SensorKind("pose", "pose", PoseNoise, add_pose, pose_covariance, is_enough=True),
     SensorKind("heading", "imu", HeadingNoise, add_heading, heading_covariance, text="the heading of {!r}"),
     SensorKind("fix", "fix", FixNoise, add_fix),
+    SensorKind("barometer", "pressure", BarometerNoise, add_pressure, barometer_covariance),
 )
 
 _BY_NOISE = {kind.noise: kind for kind in KINDS}

@@ -130,5 +130,55 @@ def _two(sigma: FixSigma) -> tuple[float, float]:
     return sigma if isinstance(sigma, tuple) else (sigma, HEIGHT_FACTOR * sigma)
 
 
-SensorNoise: TypeAlias = VelocityNoise | PoseNoise | HeadingNoise | FixNoise
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BarometerNoise:
+    """The noise of the heights of a barometer, in air.
+
+    ``sigma`` [m] is the standard deviation of each height; None if messages have it, as the variance of their
+    pressures. ``wander`` [m] is that of an error that changes over ``correlated_s`` [s], by wind, doors and
+    weather: raise it where hours of weather count. ``temperature_c`` is that of the air [degrees Celsius],
+    which makes it denser: 3 degrees are 1 % of a height. Raises InvalidInput unless all are finite, sigmas
+    and the time above zero, and the air above -100 degrees.
+    """
+
+    sigma: float | None = None
+    wander: float = 4.0
+    correlated_s: float = 300.0
+    temperature_c: float = 15.0
+
+    def __post_init__(self) -> None:
+        given = {"sigma": self.sigma, "wander": self.wander, "correlated_s": self.correlated_s}
+        for name, value in given.items():
+            if value is not None and not 0.0 < value < math.inf:
+                raise InvalidInput(f"{name} of a barometer is above zero and finite; got {value!r}")
+        if not -100.0 < self.temperature_c < 100.0:
+            raise InvalidInput(
+                "the temperature of the air at a barometer is above -100 and below 100 degrees Celsius; got "
+                f"{self.temperature_c!r}"
+            )
+
+    def height(self, pressure: float) -> float:
+        """The height [m] of air of ``pressure`` [Pa] above that of 101325 Pa: only differences mean anything.
+
+        The integral of dh = -dp / (rho g), with the density of an ideal gas, rho = p / (R T).
+        """
+        return -self._scale * math.log(pressure / 101325.0)
+
+    def height_sigma(self, pressure: float, variance: float | None) -> float | None:
+        """The standard deviation of a height [m]: the stated one, else by ``variance`` [Pa^2] if known."""
+        if self.sigma is not None or not variance:
+            return self.sigma
+        return self._scale * math.sqrt(variance) / pressure
+
+    @property
+    def _scale(self) -> float:
+        """R T / g [m], over which the pressure falls to 1 / e."""
+        return _DRY_AIR * (self.temperature_c + 273.15) / 9.80665
+
+
+_DRY_AIR = 287.05
+"""[J/kg/K] The gas constant of dry air."""
+
+
+SensorNoise: TypeAlias = VelocityNoise | PoseNoise | HeadingNoise | FixNoise | BarometerNoise
 """What is stated of a sensor: the class says of which kind it is."""

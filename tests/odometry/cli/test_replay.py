@@ -18,6 +18,7 @@ from zstate import Transform, TransformBuffer, load_model
 from zstate.errors import InvalidInput
 from zstate.model.kinematics import Kinematics
 from zstate.odometry import (
+    BarometerNoise,
     BaseEstimator,
     Datum,
     DiffDrive,
@@ -38,7 +39,7 @@ from zstate.odometry.cli.replay import (
     sigma_factor,
 )
 from zstate.odometry.cli.settings_file import OdometrySettings
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Pressure, Velocity
 from zstate.odometry.simulated_rover import ImuReading
 from zstate.sources.square_drive import WheelPair
 from zstate.wire.messages import order_digest, to_block
@@ -131,6 +132,8 @@ def recorded(path: Path, *, covariance: float = 0.0) -> Path:
             latitude, longitude, altitude = DATUM.geodetic((map_x, map_y, 0.0))
             fix = Fix(stamp, 0, 6, "base_footprint", latitude, longitude, altitude, 0, 0, fix_upper, 2)
             write("r1", fix, stamp, "gps")
+            pressure = 9e4 + random.gauss(0.0, 3.0)
+            write("r1", Pressure(stamp, 0, 7, "base_footprint", pressure, 9.0), stamp, "bmp")
         write("r1", Fix(stamp, 0, 6, "base_footprint", None, None, status=-1), stamp, "gps")
     return path
 
@@ -203,6 +206,16 @@ def test_compass_that_lies_is_a_source_with_a_sentence_and_does_not_turn_the_odo
     assert "against the gyro" in compass.sentence
     yaws = [one.states[-1].odom_from_base.rpy[2] for one in (without, replayed)]
     assert math.remainder(yaws[1] - yaws[0], math.tau) == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.long
+def test_a_barometer_is_a_row_of_the_table_and_is_no_reason_to_change_its_noise(tmp_path: Path):
+    settings = replace(SETTINGS, barometer={"bmp": BarometerNoise()})
+    replayed = replay(str(recorded(tmp_path / "r.mcap", covariance=MOCAP_SIGMA**2)), "r1", settings)
+    (bmp,) = [one for one in replayed.health if one.name == "bmp"]
+    assert (bmp.accepted > 20, bmp.rejected, bmp.sentence) == (True, 0, "")
+    assert replayed.sigmas["bmp"] == pytest.approx([0.28], abs=0.01)  # 3 Pa
+    assert not any("bmp" in line for line in report_lines(replayed) if line.startswith("would fit"))
 
 
 @pytest.mark.long

@@ -9,6 +9,7 @@ from zstate import Transform, TransformBuffer
 from zstate.errors import ConfigError, InvalidInput
 from zstate.odometry import (
     Ackermann,
+    BarometerNoise,
     DiffDrive,
     FixNoise,
     ForceThresholds,
@@ -171,15 +172,17 @@ def test_noise_of_a_source_is_stated_on_the_command_line():
     assert parse_sensor("fix", "gps") == ("gps", FixNoise())
     assert parse_sensor("fix", "gps:sigma=1.5,correlated_s=30")[1] == FixNoise(sigma=1.5, correlated_s=30.0)
     assert FixNoise(sigma=1.5).sigmas == (1.5, 15.0)
+    assert parse_sensor("barometer", "bmp:sigma=0.3") == ("bmp", BarometerNoise(sigma=0.3))
 
 
 def test_file_has_receivers_and_the_origin_of_their_map(tmp_path: Path):
     text = 'map = "site/map"\nplanar = true\ndatum = [48.1, 11.5, 560.0]\n' + ROVER
-    text += "[fix.gps]\nsigma = [1.5, 4.0]\n[heading.imu]\nsigma_deg = 5.0\n"
+    text += "[fix.gps]\nsigma = [1.5, 4.0]\n[heading.imu]\nsigma_deg = 5.0\n[barometer.bmp]\nwander = 2\n"
     settings = read_settings(written(tmp_path, text))
     assert (settings.map, settings.datum, settings.planar) == ("site/map", (48.1, 11.5, 560.0), True)
     assert settings.fix == {"gps": FixNoise(sigma=(1.5, 4.0))}
     assert settings.heading == {"imu": HeadingNoise(sigma_deg=5.0)}
+    assert settings.barometer == {"bmp": BarometerNoise(wander=2.0)}
     with pytest.raises(ConfigError, match="a place has a latitude of -90 to 90"):
         read_settings(written(tmp_path, text.replace("48.1", "98.1")))
     with pytest.raises(

@@ -104,6 +104,12 @@ _OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
     "A satellite receiver, which places the odometry in a map, x east and y north. Its noise is that of its "
     "messages, or sigma.",
 )
+@_sensor_option(
+    "barometer",
+    "sigma=M",
+    "A barometer, which bounds the drift of the height. The noise of its heights is that of its messages, or "
+    "sigma; that of weather comes on top.",
+)
 @click.option("--map", "map_frame", metavar="FRAME", help="The frame of that map; default: map.")
 @click.option(
     "--datum",

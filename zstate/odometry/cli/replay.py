@@ -347,7 +347,7 @@ def _sigma_lines(replayed: ReplayedOdometry) -> Iterator[str]:
         metres = ", ".join(f"{value:.2g}" for value in fitting[:3])
         if len(fitting) == 3:
             yield f"would fit: [velocity.{one.name}] sigma = [{metres}]"
-        else:
+        elif len(fitting) == 6:
             degrees = ", ".join(f"{math.degrees(value):.2g}" for value in fitting[3:])
             yield f"would fit: [pose.{one.name}] sigma = [{metres}], sigma_deg = [{degrees}]"
 

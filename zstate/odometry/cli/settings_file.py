@@ -21,6 +21,7 @@ from zstate.errors import InvalidInput
 from zstate.model.robot import RobotModel
 from zstate.odometry import (
     Ackermann,
+    BarometerNoise,
     BaseEstimator,
     Datum,
     DiffDrive,
@@ -83,13 +84,13 @@ class LegSettings:
 class OdometrySettings:
     """The sensors, frames and noise of one robot.
 
-    ``velocity``, ``pose``, ``heading`` and ``fix`` are further sensors by name, with what is stated of their
-    noise; those of ``heading`` are IMUs whose orientation shows the yaw. Fixes place the odometry in the
-    frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an altitude [m]; by
-    default it is the first fix. ``base`` None is the root of the model. Without an ``initial_pose`` the base
-    starts at the origin, once it is aligned at rest. ``planar``: its z, roll and pitch are published as zero.
-    Raises InvalidInput for names that no sensor can have,
-    for wheels of several kinds, and for a datum that is no place on the Earth.
+    ``velocity``, ``pose``, ``heading``, ``fix`` and ``barometer`` are further sensors by name, with what is
+    stated of their noise; those of ``heading`` are IMUs whose orientation shows the yaw. Fixes place the
+    odometry in the frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an
+    altitude [m]; by default it is the first fix. ``base`` None is the root of the model. Without an
+    ``initial_pose`` the base starts at the origin, once it is aligned at rest. ``planar``: its z, roll and
+    pitch are published as zero. Raises InvalidInput for names that no sensor can have, for wheels of several
+    kinds, and for a datum that is no place on the Earth.
     """
 
     imu: str = "imu"
@@ -97,6 +98,7 @@ class OdometrySettings:
     pose: dict[str, PoseNoise] = field(default_factory=dict[str, PoseNoise])
     heading: dict[str, HeadingNoise] = field(default_factory=dict[str, HeadingNoise])
     fix: dict[str, FixNoise] = field(default_factory=dict[str, FixNoise])
+    barometer: dict[str, BarometerNoise] = field(default_factory=dict[str, BarometerNoise])
     map: str = "map"
     datum: tuple[float, float, float] | None = None
     odom: str = "odom"
