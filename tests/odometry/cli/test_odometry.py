@@ -16,7 +16,14 @@ from helpers.processes import DEADLINE_S, repeated, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
 from zstate.net.session import Session
-from zstate.odometry import ImuPublisher, VelocityPublisher
+from zstate.odometry import (
+    Datum,
+    DatumPublisher,
+    FixPublisher,
+    ImuPublisher,
+    PressurePublisher,
+    VelocityPublisher,
+)
 
 SETTINGS = str(Path(__file__).parents[3] / "models" / "rover.toml")
 
@@ -145,6 +152,31 @@ def test_stated_noise_and_initial_pose_place_the_base_where_it_starts():
         )
     assert [*pose.translation[:2], pose.rpy[2]] == pytest.approx([2.0, 1.0, math.pi / 2], abs=0.05)
     assert [pose.translation[2], *pose.pose7[3:5]] == [0.0, 0.0, 0.0]  # in the plane
+
+
+def test_another_datum_for_a_map_of_several_robots_ends_the_command_with_both_and_their_distance():
+    def publish() -> None:
+        flow.publish([0.0, 0.0, 0.0])
+        gps.publish(48.2, 11.5, 560.0)
+        barometer.publish(95000.0)
+
+    with (
+        connect() as session,
+        walker(session),
+        VelocityPublisher(session, "walker", "flow", frame="base") as flow,
+        FixPublisher(session, "walker", "gps", frame="base") as gps,
+        PressurePublisher(session, "walker", "bmp", frame="base") as barometer,
+        DatumPublisher(session, "first", "site/map") as site,
+        repeated(publish),
+    ):
+        site.set(Datum(48.1, 11.5, 560.0))
+        command = ("odometry", "walker", "--base", "base", "--map", "site/map", "--velocity", "flow:sigma=1")
+        command = (*command, "--fix", "gps:sigma=1", "--barometer", "bmp:sigma=0.5")
+        message = failure(*command, "--datum", "48.2", "11.5", "560")
+        started = "as 'odometry', from its IMU 'imu', 'flow', 'gps', 'bmp'"
+        run_until(lambda: True, *command, after=started)
+    assert "'site/map' is 48.2000000 11.5000000 560.00 here and 48.1000000 11.5000000 560.00" in message
+    assert "of 'first', 11120." in message
 
 
 @pytest.mark.processes
