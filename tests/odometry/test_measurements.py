@@ -8,7 +8,7 @@ from helpers.filter_states import derivative, log_so3, moved, some_state
 
 from zstate import InvalidInput
 from zstate.odometry import measurements
-from zstate.odometry.invariant_filter import FilterState, Floats, Measurement, updated
+from zstate.odometry.invariant_filter import FilterState, Floats, Measurement, updated, with_tracked
 from zstate.odometry.rotations import rotation_exp
 
 GYRO = np.array([0.3, -0.5, 0.8])
@@ -49,6 +49,19 @@ def test_the_jacobian_of_a_pose_is_the_derivative_near_the_expected_pose():
     np.testing.assert_allclose(
         measurements.pose(state, here, np.eye(6), mount()).jacobian, expected, atol=1e-9
     )
+
+
+@pytest.mark.parametrize("log_scale", [0.0, 0.3])
+def test_another_odometry_that_is_where_the_body_is_differs_by_both_errors(log_scale: float):
+    state = with_tracked(some_state(), "camera", 0.1)
+    state = state._replace(tracked=(state.tracked[0]._replace(log_scale=log_scale),))
+
+    def expected(error: Floats) -> Floats:
+        return -measurements.tracking(moved(state, error), "camera", np.eye(6), mount()).residual
+
+    measured = measurements.tracking(state, "camera", np.eye(6), mount())
+    np.testing.assert_allclose(measured.jacobian, derivative(expected, len(state.covariance)), atol=1e-9)
+    np.testing.assert_allclose(measured.residual, 0.0, atol=1e-12)
 
 
 def test_the_pose_of_a_frame_has_the_covariance_of_its_errors_in_world_axes():

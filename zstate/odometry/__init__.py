@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     )
     from zstate.odometry.requests import request_odometry
     from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
-    from zstate.odometry.source_noise import FixNoise, HeadingNoise, PoseNoise, VelocityNoise
+    from zstate.odometry.source_noise import FixNoise, HeadingNoise, PoseNoise, RelativeNoise, VelocityNoise
     from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
 __all__ = [
@@ -49,6 +49,7 @@ __all__ = [
     "OdometryPublisher",
     "PoseNoise",
     "PosePublisher",
+    "RelativeNoise",
     "SensorListener",
     "SimulatedRover",
     "SimulatedWheels",
@@ -85,6 +86,7 @@ _HOMES = {
     "OdometryNode": "node",
     "OdometryPublisher": "publishers",
     "PoseNoise": "source_noise",
+    "RelativeNoise": "source_noise",
     "PosePublisher": "publishers",
     "SensorListener": "node",
     "SimulatedRover": "simulated_rover",

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from zstate import se3
 from zstate._util.format import did_you_mean, format_duration
 from zstate.buffer.buffer import TransformBuffer, check_duration
-from zstate.checks import Floats
+from zstate.checks import Floats, real_numbers
 from zstate.clock import Clock, check_stamp
 from zstate.errors import InFuture, InPast, InvalidInput, NoData
 from zstate.odometry.alignment import COARSE_S, Alignment, align, start_at
@@ -44,6 +44,7 @@ from zstate.odometry.fusion import (
     Steps,
     imu_remarks,
     is_still,
+    lead_remarks,
     odom_pose,
 )
 from zstate.odometry.health import Outcome, SourceHealth, SourceRecord
@@ -63,6 +64,8 @@ from zstate.odometry.measurements import (
 from zstate.odometry.measurements import position as measured_position
 from zstate.odometry.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_RATE, MAX_SPEED
 from zstate.odometry.placement import Placement, is_finite, last_pose, placed
+from zstate.odometry.relative import RelativePose
+from zstate.odometry.source_noise import RelativeNoise
 from zstate.odometry.stamp_order import Held, StampOrder
 from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions, displacement
 from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
@@ -127,7 +130,7 @@ class BaseState:
     is_coasting: bool
 
 
-_Input: TypeAlias = Inertia | Reading | Displacement | Heading | Contacts | Steps | Placement
+_Input: TypeAlias = Inertia | Reading | Displacement | RelativePose | Heading | Contacts | Steps | Placement
 
 
 class _Event:
@@ -417,6 +420,34 @@ class BaseEstimator:
         numbers = (*odom_from_base.pose7.tolist(), *noise.diagonal().tolist())
         self._offer(_Event(source, reading, numbers), is_shared=False)
 
+    def relative_pose(
+        self,
+        stamp: int,
+        world_from_frame: Transform,
+        covariance: ArrayLike | None = None,
+        *,
+        source: str,
+        noise: RelativeNoise | None = None,
+    ) -> None:
+        """A pose of another odometry at ``stamp``, as of visual or lidar odometry, in a world of its own.
+
+        The displacement since its last one is used, with a constant scale, which is estimated. Its target is
+        any frame, its source one on the robot. ``covariance`` (6, 6), of ``Transform.covariance``, is used as
+        ``noise`` says (by default not), but for one that is none, such as zeros. A displacement that the
+        other sources contradict is rejected, and so a jump does no harm. Raises InvalidInput, which names the
+        source, for NaN and more than 1e8 m; UnknownFrame for the frame.
+        """
+        checked_vector(world_from_frame.translation, source, "position", MAX_DISTANCE)
+        mount, matrix = self._mount(world_from_frame.source), world_from_frame.matrix
+        known = (
+            None if covariance is None else real_numbers(covariance, f"the covariance of source {source!r}")
+        )
+        if known is not None and (known.shape != (6, 6) or not np.isfinite(known).all()):
+            raise InvalidInput(f"the covariance of source {source!r} is finite, (6, 6); got {known.tolist()}")
+        world = world_from_frame.target
+        reading = RelativePose(check_stamp(stamp), world, matrix, known, noise or RelativeNoise(), mount)
+        self._offer(_Event(source, reading, world_from_frame.pose7.tolist()))
+
     def heading(self, stamp: int, yaw: float, sigma: float, *, source: str, frame: str | None = None) -> None:
         """The yaw of ``frame``, by default the base, at ``stamp`` [rad], with a standard deviation.
 
@@ -522,6 +553,7 @@ class BaseEstimator:
                 f"rejected for {(run.stamp - run.start) * 1e-9:.1f} s in a row: the estimate is lost, unless "
                 "another source confirms it"
             )
+        found += lead_remarks(last, name)
         compass = last.compasses.get(name)
         if compass is not None and compass.deviation > 0.0:
             degrees = math.degrees(math.sqrt(compass.deviation))
@@ -770,6 +802,8 @@ class BaseEstimator:
                 after, outcome = fusion.after_steps(self._legs, estimate, reading, following)
             case Displacement():
                 after, outcome = fusion.after_pause(estimate, reading, following)
+            case RelativePose():
+                after, outcome = fusion.after_relative(estimate, event.source, reading, following)
             case Heading():
                 after, outcome = fusion.after_heading(estimate, event.source, reading, following)
             case Reading():

@@ -18,6 +18,8 @@ kept.
   lowered below that of the source, which is the stated one or, if larger, the mean square that its
   innovations have shown for 20 s. A compass that is wrong by tens of degrees loses its weight; one that is
   right still bounds the drift. It may be off by 0.5 rad until it has been read in all directions.
+- Of another odometry the displacements between its poses are used, with a constant scale, which velocities
+  and positions of other sources show. A jump is rejected, and the way goes on from there.
 - The pose of the odometry frame is continuous (REP 105): it is the integral of the predictions. What a
   reading corrects of the place or the yaw remains an ``Offset``, whose square is part of the covariance.
 """
@@ -27,6 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -44,18 +47,23 @@ from zstate.odometry.invariant_filter import (
     ImuNoise,
     Innovation,
     Measurement,
+    carried,
     corrected,
     forgotten,
     initial_state,
     innovation,
     plain_covariance,
     predict,
+    tracked_pose,
     updated,
     white_noise,
     with_plain_covariance,
+    with_tracked,
+    without_tracked,
 )
 from zstate.odometry.legs import Foot, Legs, Stance, stance_after, updated_by_feet
-from zstate.odometry.measurements import heading, yaw_rate, zero_velocity
+from zstate.odometry.measurements import heading, tracking, yaw_rate, zero_velocity
+from zstate.odometry.relative import RelativePose, moved_between
 from zstate.odometry.rotations import rotation_exp, skew
 from zstate.odometry.turning import (
     COMPARED_S,
@@ -130,6 +138,8 @@ _UNPROVEN, _SECTORS = 0.5, 12
 """[rad] The standard deviation of a compass at first, and in how many directions it is proven."""
 _PROVEN = 0.1
 """[rad] One that may be off by less, from ten directions on, measures the gyro's bias and turns the pose."""
+_SCALE_SIGMAS, _SCALE = 3.0, 0.03
+"""A scale of another odometry that differs from 1 by more, in standard deviations and by part, is named."""
 _SAMPLED_S, _SAMPLED_GAIN, _SLOWEST_NS = 0.01, 0.05, 350_000_000
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
@@ -251,11 +261,19 @@ class Vibration(NamedTuple):
     repeated: int = 0
 
 
+class Lead(NamedTuple):
+    """The last pose of another odometry, and how many of its displacements the sigmas were stated for."""
+
+    last: RelativePose
+    stated: int = 0
+    shown: int = 0
+
+
 class Offset(NamedTuple):
     """From the estimate to the continuous pose of the IMU: ``rotation @ place + shift``. ``rotation`` (3, 3).
 
     It was last changed at ``stamp``. ``is_followed``: it fades, as poses are measured in the odometry frame;
-    ``is_turned``: its yaw fades, as a compass is right.
+    ``is_turned``: its yaw fades, as a compass is right, or another odometry measures turns.
     """
 
     rotation: Floats
@@ -341,6 +359,7 @@ class Estimate(NamedTuple):
     lost_at: int | None = None
     runs: dict[str, Run] = {}  # noqa: RUF012 - replaced, never written to
     compasses: dict[str, Compass] = {}  # noqa: RUF012 - replaced, never written to
+    leads: dict[str, Lead] = {}  # noqa: RUF012 - replaced, never written to
 
 
 def started(stamp: int, state: FilterState) -> Estimate:
@@ -405,7 +424,17 @@ class Fusion:
             estimate = self.settled(estimate)
             estimate = estimate._replace(offset=estimate.offset._replace(is_followed=True))
         measurement = reading.measure(estimate.state, estimate.rate)
-        return _gated(estimate, source, measurement, is_position=reading.is_position, axis=reading.upright)
+        if reading.is_position:
+            return _gated(
+                estimate, source, measurement, lambda state, _: _without_place(state, measurement.residual)
+            )
+        return _gated(
+            estimate,
+            source,
+            measurement,
+            lambda state, seconds: _without_velocity(state, measurement.residual, seconds),
+            kept=None if reading.upright is None else partial(_without_yaw_bias, axis=reading.upright),
+        )
 
     def after_pause(
         self, before: Estimate, reading: Displacement, following: Inertia | None
@@ -488,6 +517,44 @@ class Fusion:
                 found = _without_yaw_bias(found, estimate.state.rotation[2])
             estimate = _moved(estimate, corrected(estimate.state, measurement, found))
         return estimate, Outcome("accepted", nis, 1)
+
+    def after_relative(
+        self, before: Estimate, source: str, reading: RelativePose, following: Inertia | None
+    ) -> tuple[Estimate, Outcome]:
+        """The estimate after a pose of another odometry, by the displacement from the last one."""
+        estimate = self.predicted(before, reading.stamp, following)
+        lead = estimate.leads.get(source)
+        found = tracked_pose(estimate.state, source)  # none as after a pause of all data
+        is_first = lead is None or lead.last.world != reading.world or lead.last.stamp == reading.stamp
+        if lead is None or found is None or is_first:
+            return _led(estimate, source, Lead(reading)), Outcome("accepted", math.nan, 0)
+        estimate = estimate._replace(offset=estimate.offset._replace(is_turned=True))
+        move, elapsed_s = moved_between(lead.last, reading), (reading.stamp - lead.last.stamp) * 1e-9
+        mount, state = reading.imu_from_frame, estimate.state
+        state = carried(state, source, move.moved, move.walk, mount, dt_s=elapsed_s)
+        estimate = estimate._replace(state=state)
+        wheels_at = estimate.wheels_at
+        is_driven = wheels_at is not None and reading.stamp - wheels_at <= _WHEELS_VALID_NS
+        measurement = tracking(state, source, move.spread, mount)
+        after, outcome = _gated(
+            estimate,
+            source,
+            measurement,
+            lambda state, seconds: _without_velocity(state, measurement.residual[3:] / elapsed_s, seconds),
+            kept=None if is_driven else partial(_without_scale, row=found[0] + 6),
+            is_step=True,
+        )
+        if outcome.fate == "rejected":
+            angle, way = (float(np.linalg.norm(part)) for part in np.split(measurement.residual, 2))
+            failure = (
+                f"it moved by {move.way:.2g} m in {elapsed_s:.2g} s, {way:.2g} m and "
+                f"{math.degrees(angle):.2g} degrees away from the motion by the other sources"
+            )
+            outcome = outcome._replace(failure=failure)
+        counted = Lead(reading, lead.stated + move.is_stated, lead.shown + (not move.is_stated))
+        if outcome.fate == "accepted":
+            return after._replace(leads={**after.leads, source: counted}), outcome
+        return _led(after, source, counted), outcome
 
     def after_steps(
         self, legs: Legs, before: Estimate, reading: Steps, following: Inertia | None
@@ -717,7 +784,9 @@ class Fusion:
         )
         if not (is_still and rest.was_still):
             return self._within_bounds(estimate), None
-        found, outcome = _gated(estimate, STANDSTILL, zero_velocity(state, gyro, _REST_SPEED, sigma))
+        # The base may be turned or carried while its wheels stand.
+        still = zero_velocity(state, gyro, _REST_SPEED, sigma)
+        found, outcome = _gated(estimate, STANDSTILL, still, None)
         if outcome.fate == "accepted" and not estimate.was_at_rest:
             # The comparison with the wheels is of the bias before.
             found = found._replace(was_at_rest=True, turning=Turning())
@@ -795,6 +864,30 @@ def imu_remarks(estimate: Estimate) -> list[str]:
         how = "wheels measured the way" if pause.is_bridged else "the base may have driven anywhere meanwhile"
         found.append(f"all data paused for {pause.seconds:.1f} s: {how}")
     return [text for text in found if text]
+
+
+def lead_remarks(estimate: Estimate, source: str) -> list[str]:
+    """What is known of another odometry: its scale, and whether its covariances are of use."""
+    found, lead = tracked_pose(estimate.state, source), estimate.leads.get(source)
+    if found is None or lead is None:
+        return []
+    texts = list[str]()
+    row, tracked = found
+    sigma = math.sqrt(float(estimate.state.covariance[row + 6, row + 6]))
+    if abs(tracked.log_scale) > max(_SCALE_SIGMAS * sigma, _SCALE):
+        factor = math.exp(-tracked.log_scale)
+        what = "long" if factor > 1.0 else "short"
+        texts.append(
+            f"its displacements are {factor:.2f} times as long as those by the other sources: they are too "
+            f"{what}, and scaled so"
+        )
+    kind = lead.last.noise.covariance
+    if kind != "stated" and lead.stated > lead.shown:
+        texts.append(
+            f"its covariances do not grow as {kind} ones do, or are zero: the stated sigmas were used for "
+            f"{lead.stated} of {lead.stated + lead.shown} displacements"
+        )
+    return texts
 
 
 def _with_tilt(estimate: Estimate, reading: Reading) -> dict[int, Floats]:
@@ -979,32 +1072,36 @@ def _gated(
     estimate: Estimate,
     source: str,
     measurement: Measurement,
+    lost: Callable[[FilterState, float], FilterState] | None,
     *,
-    is_position: bool = False,
-    axis: Floats | None = None,
+    kept: Callable[[Innovation], Innovation] | None = None,
+    is_step: bool = False,
 ) -> tuple[Estimate, Outcome]:
-    """The estimate after a measurement, if it passes the gate. ``axis``: see ``_without_yaw_bias``."""
+    """The estimate after a measurement, if it passes the gate.
+
+    ``lost(state, seconds)`` has forgotten what a source that was rejected for so long contradicts; without it
+    a source is never followed. ``kept`` makes a gain that keeps a part of the state; for ``is_step`` see
+    ``_moved``.
+    """
     state, dimension = estimate.state, len(measurement.residual)
     found = innovation(state, measurement)
     nis = found.nis
     if nis <= gate(dimension):
         if source in estimate.runs:
             estimate = _with_run(estimate, source, None)
-        if axis is not None:
-            found = _without_yaw_bias(found, axis)
-        return _moved(estimate, corrected(state, measurement, found)), Outcome("accepted", nis, dimension)
-    if source == STANDSTILL:  # the base may be turned or carried while its wheels stand
+        if kept is not None:
+            found = kept(found)
+        after = _moved(estimate, corrected(state, measurement, found), is_step=is_step)
+        return after, Outcome("accepted", nis, dimension)
+    if lost is None:
         return estimate, Outcome("rejected", nis, dimension)
     run = estimate.runs.get(source) or Run(estimate.stamp, 0, 0)
     run = Run(run.start, estimate.stamp, run.length + 1)
     if run.length < _REACQUIRE_COUNT or estimate.stamp - run.start < _REACQUIRE_NS:
         return _with_run(estimate, source, run), Outcome("rejected", nis, dimension)
-    if is_position:
-        state = _without_place(state, measurement.residual)
-    else:
-        state = _without_velocity(state, measurement.residual, (estimate.stamp - run.start) * 1e-9)
+    state = lost(state, (estimate.stamp - run.start) * 1e-9)
     found = innovation(state, measurement)
-    state = corrected(state, measurement, found if axis is None else _without_yaw_bias(found, axis))
+    state = corrected(state, measurement, found if kept is None else kept(found))
     estimate = _moved(_with_run(estimate, source, None), state)._replace(lost_at=estimate.stamp)
     return estimate, Outcome("reacquired", nis, dimension)
 
@@ -1021,6 +1118,17 @@ def _without_yaw_bias(found: Innovation, axis: Floats) -> Innovation:
     return found._replace(gain=gain)
 
 
+def _without_scale(found: Innovation, row: int) -> Innovation:
+    """The innovation with a gain that leaves the scale of the source, the error ``row``, as it is.
+
+    With an IMU alone another odometry would learn it from accelerations, which vibration and tilt are part
+    of: on a real drive it became 0.6. Wheels, feet, velocities and positions show it.
+    """
+    gain = found.gain.copy()
+    gain[row] = 0.0
+    return found._replace(gain=gain)
+
+
 def _without_velocity(state: FilterState, residual: Floats, seconds: float) -> FilterState:
     """The state with an unknown velocity: it was wrong by the residual for so long."""
     error = float(residual[:3] @ residual[:3])
@@ -1031,6 +1139,7 @@ def _without_velocity(state: FilterState, residual: Floats, seconds: float) -> F
 
 def _without_place(state: FilterState, residual: Floats) -> FilterState:
     """The state with an unknown position and yaw: they are wrong by the residual."""
+    state = without_tracked(state)  # the jump is no motion from there
     covariance = forgotten(plain_covariance(state), POSITION, float(residual[:3] @ residual[:3]))
     if len(residual) == 6:
         forgotten(covariance, slice(_YAW, _YAW + 1), float(residual[5] ** 2))
@@ -1040,6 +1149,12 @@ def _without_place(state: FilterState, residual: Floats) -> FilterState:
 def _with_run(estimate: Estimate, source: str, run: Run | None) -> Estimate:
     others = {name: other for name, other in estimate.runs.items() if name != source}
     return estimate._replace(runs=others if run is None else {**others, source: run})
+
+
+def _led(estimate: Estimate, source: str, lead: Lead) -> Estimate:
+    """The estimate with the pose by a source at its own."""
+    state = with_tracked(estimate.state, source, lead.last.noise.scale)
+    return estimate._replace(state=state, leads={**estimate.leads, source: lead})
 
 
 def _with_compass(estimate: Estimate, source: str, compass: Compass) -> Estimate:

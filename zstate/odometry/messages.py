@@ -17,6 +17,7 @@ from zstate.wire.messages import (
     check_limit,
     check_quaternion,
     finite_numbers,
+    order_digest,
 )
 
 
@@ -190,8 +191,8 @@ class Fix(StampedMessage, frozen=True, array_like=True, gc=False):
             raise InvalidInput("an altitude and a covariance need a latitude and a longitude")
 
 
-SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix
-SENSOR_STREAMS = ("imu", "velocity", "pose", "fix")
+SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix | Odometry
+SENSOR_STREAMS = ("imu", "velocity", "pose", "fix", "odometry")
 """The streams of these messages."""
 
 _Measurement = TypeVar("_Measurement", bound=SensorMessage)
@@ -202,9 +203,16 @@ def with_full_names(message: _Measurement, robot: str) -> _Measurement:
     if isinstance(message, Pose):
         parent, child = full_name(robot, message.parent), message.child and full_name(robot, message.child)
         return msgspec.structs.replace(message, parent=parent, child=child)
+    if isinstance(message, Odometry):
+        assert message.edges is not None
+        edges = tuple((full_name(robot, parent), full_name(robot, child)) for parent, child in message.edges)
+        return msgspec.structs.replace(message, edges=edges, order=order_digest(edges))
     return msgspec.structs.replace(message, frame=full_name(robot, message.frame))
 
 
 def frame_of(message: SensorMessage) -> str:
     """The frame that was measured; empty for a pose of the base of the robot."""
+    if isinstance(message, Odometry):
+        assert message.edges is not None
+        return message.edges[0][1]
     return message.child if isinstance(message, Pose) else message.frame

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 from zstate.errors import InvalidInput
 
@@ -14,6 +14,9 @@ Sigma: TypeAlias = float | tuple[float, float, float]
 FixSigma: TypeAlias = float | tuple[float, float]
 """Standard deviations of a fix, horizontal and vertical; of one number the vertical one is ten times."""
 
+
+CovarianceKind: TypeAlias = Literal["stated", "dependent", "independent"]
+"""What covariances of poses of another odometry are: of no use, of dead reckoning, or of each pose alone."""
 
 HEIGHT_FACTOR = 10.0
 """Of a height by satellites, all of which are above: it is less sure than the position."""
@@ -130,5 +133,39 @@ def _two(sigma: FixSigma) -> tuple[float, float]:
     return sigma if isinstance(sigma, tuple) else (sigma, HEIGHT_FACTOR * sigma)
 
 
-SensorNoise: TypeAlias = VelocityNoise | PoseNoise | HeadingNoise | FixNoise
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelativeNoise:
+    """The noise of another odometry, of which only the motion between two poses counts; one for a source.
+
+    Of a displacement, ``sigma`` [m per square root of a metre] and ``sigma_deg`` [degrees, likewise] are the
+    standard deviations by its way, and ``floor`` [m] and ``floor_deg`` [degrees] those of any, also at rest.
+    ``scale`` is that of the logarithm of a constant factor of its translations: 0.05 for stereo cameras, 0.5
+    for an unknown device, 3 for one camera.
+
+    ``covariance`` says what the covariances of its poses are: "stated", of no use, as those of most drivers,
+    which send zeros or constants; "dependent", of dead reckoning, which only grow; "independent", of poses
+    that are each measured, as by matching scans with a map. What they say of a displacement is added to the
+    floor in place of the sigmas. Raises InvalidInput for anything else.
+    """
+
+    sigma: float = 0.05
+    sigma_deg: float = 0.5
+    floor: float = 0.005
+    floor_deg: float = 0.1
+    scale: float = 0.05
+    covariance: CovarianceKind = "stated"
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "sigma_deg", "floor", "floor_deg", "scale"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise InvalidInput(f"{name} of a relative source is above zero and finite; got {value!r}")
+        if self.covariance not in get_args(CovarianceKind):
+            raise InvalidInput(
+                f"the covariance of a relative source is one of {', '.join(get_args(CovarianceKind))}; got "
+                f"{self.covariance!r}"
+            )
+
+
+SensorNoise: TypeAlias = VelocityNoise | PoseNoise | RelativeNoise | HeadingNoise | FixNoise
 """What is stated of a sensor: the class says of which kind it is."""

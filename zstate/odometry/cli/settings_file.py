@@ -33,6 +33,7 @@ from zstate.odometry import (
     MapEstimator,
     Mecanum,
     PoseNoise,
+    RelativeNoise,
     SpeedThresholds,
     VelocityNoise,
     Wheels,
@@ -83,8 +84,9 @@ class LegSettings:
 class OdometrySettings:
     """The sensors, frames and noise of one robot.
 
-    ``velocity``, ``pose``, ``heading`` and ``fix`` are further sensors by name, with what is stated of their
-    noise; those of ``heading`` are IMUs whose orientation shows the yaw. Fixes place the odometry in the
+    ``velocity``, ``pose``, ``relative``, ``heading`` and ``fix`` are further sensors by name, with what is
+    stated of their noise; those of ``relative`` are other odometries by stream and name, as "pose/camera",
+    those of ``heading`` IMUs whose orientation shows the yaw. Fixes place the odometry in the
     frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an altitude [m]; by
     default it is the first fix. ``base`` None is the root of the model. Without an ``initial_pose`` the base
     starts at the origin, once it is aligned at rest. Raises InvalidInput for names that no sensor can have,
@@ -94,6 +96,7 @@ class OdometrySettings:
     imu: str = "imu"
     velocity: dict[str, VelocityNoise] = field(default_factory=dict[str, VelocityNoise])
     pose: dict[str, PoseNoise] = field(default_factory=dict[str, PoseNoise])
+    relative: dict[str, RelativeNoise] = field(default_factory=dict[str, RelativeNoise])
     heading: dict[str, HeadingNoise] = field(default_factory=dict[str, HeadingNoise])
     fix: dict[str, FixNoise] = field(default_factory=dict[str, FixNoise])
     map: str = "map"
@@ -109,8 +112,9 @@ class OdometrySettings:
     legs: LegSettings | None = None
 
     def __post_init__(self) -> None:
-        for name in (self.imu, *(one.name for one in self.sensors)):
-            check_writer(name)
+        check_writer(self.imu)
+        for one in self.sensors:
+            one.check()
         kinds = [kind for kind in ("diff_drive", "ackermann", "mecanum") if getattr(self, kind) is not None]
         if len(kinds) > 1:
             raise InvalidInput(f"a robot has wheels of one kind, not of {' and '.join(kinds)}")
@@ -235,21 +239,26 @@ def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
 
     Raises InvalidInput.
     """
-    noise = next(kind.noise for kind in KINDS if kind.name == kind_name)
+    kind = next(kind for kind in KINDS if kind.name == kind_name)
     name, colon, stated = text.partition(":")
-    known = msgspec.inspect.type_info(noise)
+    known = msgspec.inspect.type_info(kind.noise)
     assert isinstance(known, msgspec.inspect.DataclassType)
+    texts = {one.name for one in known.fields if isinstance(one.type, msgspec.inspect.LiteralType)}
     names = [one.name for one in known.fields]
-    values: dict[str, float] = {}
+    units = {name: "TEXT" if name in texts else "NUMBER" for name in names}
+    values: dict[str, Any] = {}
     for part in stated.split(",") if colon else ():
         key, _, value = part.strip().partition("=")
         if key not in names or key in values:
             raise InvalidInput(
-                f"{part!r} is not part of SENSOR:{','.join(f'{name}=NUMBER' for name in names)}"
+                f"{part!r} is not part of SENSOR:"
+                f"{','.join(f'{one}={units[one]}' for one in names)}"
                 f"{did_you_mean(key, names)}"
             )
-        values[key] = _number(key, value)
-    return check_writer(name), noise(**values)
+        values[key] = value if key in texts else _number(key, value)
+    sensor = Sensor(kind, name, kind.noise(**values))
+    sensor.check()
+    return sensor.name, sensor.noise
 
 
 def _number(key: str, value: str, unit: str = "") -> float:
