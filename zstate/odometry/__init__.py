@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from zstate.odometry.publishers import (
         FixPublisher,
         ImuPublisher,
+        MagneticFieldPublisher,
         OdometryPublisher,
         PosePublisher,
         VelocityPublisher,
@@ -41,6 +42,7 @@ __all__ = [
     "ImuPublisher",
     "LegNoise",
     "Legs",
+    "MagneticFieldPublisher",
     "MapCorrection",
     "MapEstimator",
     "MapState",
@@ -78,6 +80,7 @@ _HOMES = {
     "ImuPublisher": "publishers",
     "LegNoise": "legs",
     "Legs": "legs",
+    "MagneticFieldPublisher": "publishers",
     "MapCorrection": "map_correction",
     "MapEstimator": "map_estimator",
     "MapState": "map_estimator",
