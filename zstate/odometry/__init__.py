@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from zstate.odometry.health import SourceHealth
     from zstate.odometry.invariant_filter import ImuNoise
     from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
+    from zstate.odometry.magnetism import earth_field
     from zstate.odometry.map_correction import MapCorrection
     from zstate.odometry.map_estimator import MapEstimator, MapState
     from zstate.odometry.node import OdometryNode, SensorListener
@@ -23,7 +24,13 @@ if TYPE_CHECKING:
     )
     from zstate.odometry.requests import request_odometry
     from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
-    from zstate.odometry.source_noise import FixNoise, HeadingNoise, PoseNoise, VelocityNoise
+    from zstate.odometry.source_noise import (
+        FixNoise,
+        HeadingNoise,
+        MagnetometerNoise,
+        PoseNoise,
+        VelocityNoise,
+    )
     from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
 __all__ = [
@@ -43,6 +50,7 @@ __all__ = [
     "LegNoise",
     "Legs",
     "MagneticFieldPublisher",
+    "MagnetometerNoise",
     "MapCorrection",
     "MapEstimator",
     "MapState",
@@ -61,6 +69,7 @@ __all__ = [
     "WheelNoise",
     "WheelVelocity",
     "Wheels",
+    "earth_field",
     "request_odometry",
 ]
 
@@ -81,6 +90,7 @@ _HOMES = {
     "LegNoise": "legs",
     "Legs": "legs",
     "MagneticFieldPublisher": "publishers",
+    "MagnetometerNoise": "source_noise",
     "MapCorrection": "map_correction",
     "MapEstimator": "map_estimator",
     "MapState": "map_estimator",
@@ -99,6 +109,7 @@ _HOMES = {
     "WheelNoise": "wheels",
     "WheelVelocity": "wheels",
     "Wheels": "wheels",
+    "earth_field": "magnetism",
     "request_odometry": "requests",
 }
 
