@@ -30,6 +30,7 @@ from zstate.odometry import (
     ImuNoise,
     LegNoise,
     Legs,
+    MagnetometerNoise,
     MapEstimator,
     Mecanum,
     PoseNoise,
@@ -83,18 +84,19 @@ class LegSettings:
 class OdometrySettings:
     """The sensors, frames and noise of one robot.
 
-    ``velocity``, ``pose``, ``heading`` and ``fix`` are further sensors by name, with what is stated of their
-    noise; those of ``heading`` are IMUs whose orientation shows the yaw. Fixes place the odometry in the
-    frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an altitude [m]; by
-    default it is the first fix. ``base`` None is the root of the model. Without an ``initial_pose`` the base
-    starts at the origin, once it is aligned at rest. Raises InvalidInput for names that no sensor can have,
-    for wheels of several kinds, and for a datum that is no place on the Earth.
+    ``velocity``, ``pose``, ``heading``, ``magnetometer`` and ``fix`` are further sensors by name, with what
+    is stated of their noise; those of ``heading`` are IMUs whose orientation shows the yaw. Fixes place
+    the odometry in the frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an
+    altitude [m]; by default it is the first fix. ``base`` None is the root of the model. Without an
+    ``initial_pose`` the base starts at the origin, once it is aligned at rest. Raises InvalidInput for names
+    that no sensor can have, for wheels of several kinds, and for a datum that is no place on the Earth.
     """
 
     imu: str = "imu"
     velocity: dict[str, VelocityNoise] = field(default_factory=dict[str, VelocityNoise])
     pose: dict[str, PoseNoise] = field(default_factory=dict[str, PoseNoise])
     heading: dict[str, HeadingNoise] = field(default_factory=dict[str, HeadingNoise])
+    magnetometer: dict[str, MagnetometerNoise] = field(default_factory=dict[str, MagnetometerNoise])
     fix: dict[str, FixNoise] = field(default_factory=dict[str, FixNoise])
     map: str = "map"
     datum: tuple[float, float, float] | None = None
@@ -239,8 +241,8 @@ def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
     name, colon, stated = text.partition(":")
     known = msgspec.inspect.type_info(noise)
     assert isinstance(known, msgspec.inspect.DataclassType)
-    names = [one.name for one in known.fields]
-    values: dict[str, float] = {}
+    names = [one.name for one in known.fields if _is_number(one.type)]
+    values: dict[str, Any] = {}
     for part in stated.split(",") if colon else ():
         key, _, value = part.strip().partition("=")
         if key not in names or key in values:
@@ -250,6 +252,11 @@ def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
             )
         values[key] = _number(key, value)
     return check_writer(name), noise(**values)
+
+
+def _is_number(kind: msgspec.inspect.Type) -> bool:
+    kinds = kind.types if isinstance(kind, msgspec.inspect.UnionType) else (kind,)
+    return any(isinstance(one, msgspec.inspect.FloatType) for one in kinds)
 
 
 def _number(key: str, value: str, unit: str = "") -> float:
