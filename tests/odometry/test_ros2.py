@@ -1,4 +1,4 @@
-"""IMUs, velocities, fixes and odometry as ROS 2 messages; rosbags is the independent encoder."""
+"""IMUs, velocities, fixes, magnetic fields and odometry as ROS 2 messages, against those of rosbags."""
 
 from __future__ import annotations
 
@@ -13,7 +13,16 @@ from mcap_ros2._dynamic import generate_dynamic
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import MAX_RATE, MAX_SPEED, Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import (
+    MAX_RATE,
+    MAX_SPEED,
+    Fix,
+    Imu,
+    MagneticField,
+    Odometry,
+    Pose,
+    Velocity,
+)
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import Message, from_block, order_digest, to_block
 from zstate.wire.ros2.decoder import RosDecoder
@@ -22,6 +31,7 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
     IMU,
+    MAGNETIC_FIELD,
     NAV_SAT_FIX,
     ODOMETRY,
     POSE_WITH_COVARIANCE,
@@ -100,6 +110,11 @@ def rosbags_fix(
     return rosbags_cdr(NAV_SAT_FIX.name, *fields, **options)
 
 
+def rosbags_magnetic_field(field: Any, covariance: Any, **options: bool) -> bytes:
+    matrix = np.array(covariance, dtype=float).ravel()
+    return rosbags_cdr(MAGNETIC_FIELD.name, header("mast"), vector("Vector3", field), matrix, **options)
+
+
 def rosbags_odometry(
     pose_covariance: Any, twist_covariance: Any, parent: str = "odom", **options: bool
 ) -> bytes:
@@ -127,6 +142,7 @@ NAN3 = [np.nan] * 3
 LINEAR_ONLY = np.full((6, 6), np.nan)
 LINEAR_ONLY[:3, :3] = symmetric(3)
 PLACE = (47.5, -8.25, 450.0)
+FIELD = (21.5e-6, -1.25e-6, -43.75e-6)
 ODOMETRY_HEAD = (*HEAD, order_digest(EDGE), to_block(POSE), EDGE)
 
 CASES = [
@@ -182,6 +198,16 @@ CASES = [
     ("fix", Fix(*HEAD, "gps", None, None, status=-1), rosbags_fix(NAN3, NONE, 0, -1)),
     ("fix", Fix(*HEAD, "gps", None, None, status=-2), rosbags_fix(NAN3, NONE, 0, -2)),
     (
+        "magnetic_field",
+        MagneticField(*HEAD, "mast", to_block(FIELD)),
+        rosbags_magnetic_field(FIELD, NONE),
+    ),
+    (
+        "magnetic_field",
+        MagneticField(*HEAD, "mast", to_block(FIELD), triangle(1e-14 * symmetric(3))),
+        rosbags_magnetic_field(FIELD, 1e-14 * symmetric(3)),
+    ),
+    (
         "odometry",
         Odometry(*ODOMETRY_HEAD, None, to_block(TWIST), None),
         rosbags_odometry(np.zeros((6, 6)), np.zeros((6, 6))),
@@ -201,6 +227,9 @@ def test_messages_of_big_endian_machines_are_read_too():
     assert decoded("odometry", turned) == decoded("odometry", rosbags_odometry(*covariances))
     fix = PLACE, symmetric(3), 3, -1, 0x8009
     assert decoded("fix", rosbags_fix(*fix, little_endian=False)) == decoded("fix", rosbags_fix(*fix))
+    field = FIELD, 1e-14 * symmetric(3)
+    turned = rosbags_magnetic_field(*field, little_endian=False)
+    assert decoded("magnetic_field", turned) == decoded("magnetic_field", rosbags_magnetic_field(*field))
 
 
 def test_mcap_ros2_support_decodes_measurements():
@@ -221,6 +250,11 @@ def test_mcap_ros2_support_decodes_measurements():
     assert (theirs.status.status, theirs.status.service, theirs.longitude) == (-1, 9, -8.25)
     assert list(theirs.position_covariance) == symmetric(3).ravel().tolist()
     assert theirs.position_covariance_type == 2
+    field = MagneticField(*HEAD, "mast", to_block(FIELD), triangle(symmetric(3)))
+    kind = generate_dynamic(MAGNETIC_FIELD.name, MAGNETIC_FIELD.definition)[MAGNETIC_FIELD.name]
+    theirs = kind(encoded(field))
+    assert (theirs.header.frame_id, theirs.magnetic_field.z) == ("mast", FIELD[2])
+    assert list(theirs.magnetic_field_covariance) == symmetric(3).ravel().tolist()
 
 
 def test_orientation_of_zeros_is_none():
@@ -273,6 +307,16 @@ def test_nothing_but_status_and_service_is_taken_from_a_fix_without_a_position()
         ("fix", rosbags_fix(PLACE, np.triu(symmetric(3))), "malformed", "symmetric and finite"),
         ("fix", rosbags_fix(PLACE, -symmetric(3)), "malformed", "variances of a fix are not negative"),
         ("fix", rosbags_fix(PLACE, NONE, 0)[:-1], "truncated", "1 more are expected"),
+        (
+            *("magnetic_field", rosbags_magnetic_field([21.5, -1.25, -43.75], NONE), "malformed"),
+            "fields are in tesla, at most 1; got 21.5, -1.25, -43.75, which may be microtesla",
+        ),
+        ("magnetic_field", rosbags_magnetic_field([2e-5, 0, np.nan], NONE), "malformed", "finite numbers"),
+        (
+            *("magnetic_field", rosbags_magnetic_field(FIELD, -symmetric(3)), "malformed"),
+            "variances of a magnetic field are not negative",
+        ),
+        ("magnetic_field", rosbags_magnetic_field(FIELD, NONE)[:-1], "truncated", "72 more are expected"),
         ("odometry", rosbags_odometry(symmetric(6) * np.inf, symmetric(6)), "malformed", "finite"),
     ],
 )
@@ -337,7 +381,9 @@ def test_a_fix_is_the_same_after_ros(position: Any, status: int, service: int, k
 
 
 @given(
-    st.binary(max_size=400), st.sampled_from(["imu", "velocity", "pose", "fix", "odometry"]), st.booleans()
+    st.binary(max_size=400),
+    st.sampled_from(["imu", "velocity", "pose", "fix", "magnetic_field", "odometry"]),
+    st.booleans(),
 )
 def test_arbitrary_bytes_raise_only_message_error(data: bytes, stream: Any, has_header: bool):
     payload = b"\x00\x01\x00\x00" + data if has_header else data

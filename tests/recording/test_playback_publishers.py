@@ -27,6 +27,7 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import (
     FixPublisher,
     ImuPublisher,
+    MagneticFieldPublisher,
     OdometryPublisher,
     PosePublisher,
     VelocityPublisher,
@@ -54,10 +55,10 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
 
 SCAN_STREAMS = ("scan", "map")
-ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "odometry")
+ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "magnetic_field", "odometry")
 
 COUNT = 20
-SENSORS = ("imu/chest", "velocity/flow", "pose/mocap", "fix/gps", "odometry/wheels")
+SENSORS = ("imu/chest", "velocity/flow", "pose/mocap", "fix/gps", "magnetic_field/mag", "odometry/wheels")
 CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
 
 
@@ -404,7 +405,7 @@ def test_an_active_sensor_is_not_replayed(sessions, scanned: Path):
 
 @pytest.fixture
 def driven(sessions, tmp_path: Path) -> Path:
-    """A cart with an IMU, a velocity, poses, fixes and odometry, recorded from the native wire."""
+    """A cart with a sensor of each kind and odometry, recorded from the native wire."""
     writer, reader = sessions
     path = tmp_path / "driven.mcap"
     with (
@@ -413,6 +414,7 @@ def driven(sessions, tmp_path: Path) -> Path:
         OdometryPublisher(writer, "cart", "wheels") as odometry,
         PosePublisher(writer, "cart", "mocap") as mocap,
         FixPublisher(writer, "cart", "gps") as gps,
+        MagneticFieldPublisher(writer, "cart", "mag", covariance=np.eye(3) * 1e-14) as mag,
         Recorder(reader, path, ["cart"]) as recorder,
     ):
         wait_for_stream_readers(writer, "cart", *SENSORS)
@@ -423,6 +425,7 @@ def driven(sessions, tmp_path: Path) -> Path:
             base = Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1]).with_covariance(np.eye(6) * (n + 1))
             odometry.publish(base, [n, 0, 0], [0, 0, 0], stamp)
             mocap.publish(base, stamp)
+            mag.publish([n * 1e-6, 0, -4e-5], stamp)
             if n % 2:
                 gps.publish(47.5, n, 450.0, stamp, covariance=np.eye(3) * (n + 1), status=2, service=9)
             else:

@@ -38,6 +38,7 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import (
     FixPublisher,
     ImuPublisher,
+    MagneticFieldPublisher,
     OdometryPublisher,
     PosePublisher,
     VelocityPublisher,
@@ -63,7 +64,7 @@ from zstate.wire.native import encode, encoding_of
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
 
-ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "odometry")
+ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "magnetic_field", "odometry")
 
 PERIOD = 1_000_000
 ROS_KEYS = RmwKeys(Ros2Options())
@@ -694,9 +695,12 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
         OdometryPublisher(writer, "r1", "odom", [wire]) as odometry,
         PosePublisher(writer, "r1", "mocap", [wire]) as mocap,
         FixPublisher(writer, "r1", "gps", [wire], frame="mast") as gps,
+        MagneticFieldPublisher(writer, "r1", "mag", [wire], frame="mast") as mag,
         Recorder(reader, path, ["r1"], wire=wire) as recorder,
     ):
-        for stream, name in zip(ODOMETRY_STREAMS, ("imu", "flow", "mocap", "gps", "odom"), strict=True):
+        for stream, name in zip(
+            ODOMETRY_STREAMS, ("imu", "flow", "mocap", "gps", "mag", "odom"), strict=True
+        ):
             keys = {"native": f"zstate/r1/{stream}/{name}", "ros2": ROS_KEYS.key("r1", stream, name)}
             wait_for_reader(writer, keys[wire])
         for k in range(5):
@@ -706,7 +710,8 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
             odometry.publish(pose, [k, 0, 0], [0, 0, 1], now + k * PERIOD, twist_covariance=covariance)
             mocap.publish(pose, now + k)
             gps.publish(47.5, 8.0 + k, None, now + k, covariance=np.eye(3), covariance_type=1, status=1)
-        until(lambda: [count(recorder, "r1", one) for one in ODOMETRY_STREAMS] == [5] * 5)
+            mag.publish([k * 1e-6, 0, -4e-5], now + k)
+        until(lambda: [count(recorder, "r1", one) for one in ODOMETRY_STREAMS] == [5] * 6)
         until(lambda: count(recorder, "r1", {"native": "transforms", "ros2": "tf"}[wire]) == 5)
         live = [
             listener.buffer.wait("odom", "base", at, DEADLINE_S) for at in (now + PERIOD // 2, now + PERIOD)
@@ -720,13 +725,14 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
         assert [one.twist.twist.linear.x for one in by_topic["/flow"]] == list(range(5))
         assert [one.pose.pose.position.x for one in by_topic["/mocap"]] == list(range(5))
         assert [one.longitude for one in by_topic["/gps"]] == [8.0 + k for k in range(5)]
+        assert [one.magnetic_field.x for one in by_topic["/mag"]] == [k * 1e-6 for k in range(5)]
         assert {(one.status.status, one.position_covariance_type) for one in by_topic["/gps"]} == {(1, 1)}
         assert [one.pose.pose.position.x for one in by_topic["/odom"]] == list(range(5))
         assert [one.transforms[0].child_frame_id for one in by_topic["/tf"]] == ["base"] * 5
     with Recording(path) as recording:
         readings, velocities = list(recording.imu("r1", "imu")), list(recording.velocities())
         samples, poses = list(recording.odometry("r1", "odom")), list(recording.poses("r1", "mocap"))
-        fixes = list(recording.fixes("r1", "gps"))
+        fixes, fields = list(recording.fixes("r1", "gps")), list(recording.magnetic_fields("r1"))
         buffer = recording.buffer()
         recorded = [buffer.lookup("odom", "base", at) for at in (now + PERIOD // 2, now + PERIOD)]
         streams = {one.stream for one in recorded_robots(recording.info)[0].streams}
@@ -744,6 +750,9 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
     assert [from_block(one.twist).tolist() for one in samples] == [[k, 0, 0, 0, 0, 1] for k in range(5)]
     assert [(one.stamp, one.frame, one.longitude, one.altitude) for one in fixes] == [
         (now + k, "r1/mast", 8.0 + k, None) for k in range(5)
+    ]
+    assert [(one.stamp, one.frame, from_block(one.field)[0]) for one in fields] == [
+        (now + k, "r1/mast", k * 1e-6) for k in range(5)
     ]
     assert set(ODOMETRY_STREAMS) <= streams
     for there, here in zip(live, recorded, strict=True):

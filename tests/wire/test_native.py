@@ -20,7 +20,7 @@ from zstate.driving.messages import (
     Stop,
 )
 from zstate.errors import MessageError
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Velocity
 from zstate.plugins import all_streams
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.streams import LATCHED_BYTES, StreamName
@@ -249,6 +249,13 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
     "fix without a position": (
         Fix(STAMP, 300, 2**63 + 5, "gps", None, None, status=-1),
         header(11)[:-10] + fixstr("gps") + NIL * 3 + b"\xff\x00" + NIL + b"\x00",
+    ),
+    "magnetic_field": (
+        MagneticField(STAMP, 300, 2**63 + 5, "mag", to_block([0.5, 0.25, -1.0]), to_block(range(6))),
+        header(6)[:-10]
+        + fixstr("mag")
+        + bin8(struct.pack("<3d", 0.5, 0.25, -1.0))
+        + bin8(struct.pack("<6d", *range(6))),
     ),
     "odometry": (
         Odometry(

@@ -33,6 +33,7 @@ from zstate.net.session import Session
 from zstate.odometry import (
     FixPublisher,
     ImuPublisher,
+    MagneticFieldPublisher,
     OdometryPublisher,
     PosePublisher,
     VelocityPublisher,
@@ -111,7 +112,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
         if wire == "native":
             odometry = opened.enter_context(TransformPublisher(writer, "r1", "odometry", program="driver"))
             odometry.publish([Transform("odom", "world", (1.0, 0.0, 0.0), UPRIGHT)])
-        wheels, imu, flow, mocap, gps = (
+        wheels, imu, flow, mocap, gps, mag = (
             opened.enter_context(kind(writer, "r1", name, (wire,), program="driver"))
             for kind, name in (
                 (OdometryPublisher, "odom"),
@@ -119,6 +120,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
                 (VelocityPublisher, "flow"),
                 (PosePublisher, "mocap"),
                 (FixPublisher, "gps"),
+                (MagneticFieldPublisher, "mag"),
             )
         )
 
@@ -130,6 +132,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
             flow.publish([0, 0, 0])
             mocap.publish(Transform("map", "odom", (1.0, 0.0, 0.0), UPRIGHT))
             gps.publish(47.5, 8.25)
+            mag.publish([2e-5, 0, -4e-5])
 
         with repeated(publish):
             yield

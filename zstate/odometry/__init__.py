@@ -10,19 +10,28 @@ if TYPE_CHECKING:
     from zstate.odometry.health import SourceHealth
     from zstate.odometry.invariant_filter import ImuNoise
     from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
+    from zstate.odometry.magnetism import earth_field
     from zstate.odometry.map_correction import MapCorrection
     from zstate.odometry.map_estimator import MapEstimator, MapState
     from zstate.odometry.node import OdometryNode, SensorListener
     from zstate.odometry.publishers import (
         FixPublisher,
         ImuPublisher,
+        MagneticFieldPublisher,
         OdometryPublisher,
         PosePublisher,
         VelocityPublisher,
     )
     from zstate.odometry.requests import request_odometry
     from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
-    from zstate.odometry.source_noise import FixNoise, HeadingNoise, PoseNoise, RelativeNoise, VelocityNoise
+    from zstate.odometry.source_noise import (
+        FixNoise,
+        HeadingNoise,
+        MagnetometerNoise,
+        PoseNoise,
+        RelativeNoise,
+        VelocityNoise,
+    )
     from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
 __all__ = [
@@ -41,6 +50,8 @@ __all__ = [
     "ImuPublisher",
     "LegNoise",
     "Legs",
+    "MagneticFieldPublisher",
+    "MagnetometerNoise",
     "MapCorrection",
     "MapEstimator",
     "MapState",
@@ -60,6 +71,7 @@ __all__ = [
     "WheelNoise",
     "WheelVelocity",
     "Wheels",
+    "earth_field",
     "request_odometry",
 ]
 
@@ -79,6 +91,8 @@ _HOMES = {
     "ImuPublisher": "publishers",
     "LegNoise": "legs",
     "Legs": "legs",
+    "MagneticFieldPublisher": "publishers",
+    "MagnetometerNoise": "source_noise",
     "MapCorrection": "map_correction",
     "MapEstimator": "map_estimator",
     "MapState": "map_estimator",
@@ -98,6 +112,7 @@ _HOMES = {
     "WheelNoise": "wheels",
     "WheelVelocity": "wheels",
     "Wheels": "wheels",
+    "earth_field": "magnetism",
     "request_odometry": "requests",
 }
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Velocity
 from zstate.wire.keys import full_name
 from zstate.wire.messages import covariance_matrix, from_block
 
@@ -64,6 +64,12 @@ def fix_document(message: Fix, robot: str) -> dict[str, Any]:
     return document | dict(zip(("sigma_east", "sigma_north", "sigma_up"), sigmas, strict=True))
 
 
+def magnetic_field_document(message: MagneticField, robot: str) -> dict[str, Any]:
+    """A magnetic field at a sensor of ``robot``: stamp [ns], field [T], and sigmas if known."""
+    document = {**_head(message, robot), "field": _list(message.field)}
+    return document | _sigmas([("field", message.covariance)])
+
+
 def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
     """Odometry of ``robot``: stamp [ns], frames, pose [m], velocities [m/s, rad/s], and sigmas if known."""
     ((parent, child),) = message.edges or (("", ""),)
@@ -81,7 +87,7 @@ def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
     return document | _sigmas([("pose", message.covariances), ("twist", message.twist_covariance)])
 
 
-def _head(message: Imu | Velocity | Fix, robot: str) -> dict[str, Any]:
+def _head(message: Imu | Velocity | Fix | MagneticField, robot: str) -> dict[str, Any]:
     return {"stamp": message.stamp, "seq": message.seq, "frame": full_name(robot, message.frame)}
 
 

@@ -37,6 +37,7 @@ from zstate.odometry.fusion import (
     Contacts,
     Displacement,
     Estimate,
+    Field,
     Fusion,
     Heading,
     Inertia,
@@ -50,6 +51,7 @@ from zstate.odometry.fusion import (
 from zstate.odometry.health import Outcome, SourceHealth, SourceRecord
 from zstate.odometry.invariant_filter import FilterState, ImuNoise, Measurement
 from zstate.odometry.legs import Legs
+from zstate.odometry.magnetism import EarthField, check_strength
 from zstate.odometry.measurements import (
     MAX_SIGMA,
     MIN_SIGMA,
@@ -62,7 +64,7 @@ from zstate.odometry.measurements import (
     yaw_curvature,
 )
 from zstate.odometry.measurements import position as measured_position
-from zstate.odometry.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_RATE, MAX_SPEED
+from zstate.odometry.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_FIELD, MAX_RATE, MAX_SPEED
 from zstate.odometry.placement import Placement, is_finite, last_pose, placed
 from zstate.odometry.relative import RelativePose
 from zstate.odometry.source_noise import RelativeNoise
@@ -130,7 +132,9 @@ class BaseState:
     is_coasting: bool
 
 
-_Input: TypeAlias = Inertia | Reading | Displacement | RelativePose | Heading | Contacts | Steps | Placement
+_Input: TypeAlias = (
+    Inertia | Reading | Displacement | RelativePose | Heading | Field | Contacts | Steps | Placement
+)
 
 
 class _Event:
@@ -463,8 +467,39 @@ class BaseEstimator:
                 f"a heading of source {source!r} is at most {_LARGEST_YAW:g} rad, with a sigma of "
                 f"{MIN_SIGMA:g} to {MAX_SIGMA:g} rad; got yaw={yaw!r}, sigma={sigma!r}"
             )
-        reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, mount)
+        reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, mount[:3, 0])
         self._offer(_Event(source, reading, (yaw, sigma)))
+
+    def magnetic_field(
+        self,
+        stamp: int,
+        field: ArrayLike,
+        sigma: float,
+        *,
+        source: str,
+        frame: str | None = None,
+        expected: EarthField | None = None,
+    ) -> None:
+        """The magnetic field in the axes of ``frame`` at ``stamp``, x y z [T], (3,), of which a yaw is known.
+
+        ``frame`` is the base by default. ``sigma`` [rad] is that of the yaw, which is levelled by the
+        attitude at that stamp, and is used as that of a ``heading``. A field is rejected, with a sentence in
+        ``health``, if its strength differs by more than 10 %, or its dip by more than 5 degrees, from the
+        mean of ten readings in a row at the start, or from the field of the Earth that is ``expected``.
+        Raises InvalidInput, which names the source, for NaN, for less than 1e-6 or more than 1e-3 T, and for
+        a sigma outside of 1e-9 to 1e9.
+        """
+        vector = checked_vector(field, source, "magnetic field", MAX_FIELD)
+        check_strength(math.sqrt(vector @ vector), source)
+        if not MIN_SIGMA <= sigma <= MAX_SIGMA:
+            raise InvalidInput(
+                f"the yaw by a field of source {source!r} has a sigma of {MIN_SIGMA:g} to {MAX_SIGMA:g} rad; "
+                f"got {sigma!r}"
+            )
+        vector, ahead = self._mount(frame or self.base)[:3, :3].dot(vector), self._imu_from_base[:3, 0]
+        reading = Field(check_stamp(stamp), vector, float(sigma) ** 2, ahead, expected)
+        self._record(source).has_bounds = True
+        self._offer(_Event(source, reading, (*vector.tolist(), sigma)))
 
     @property
     def clock(self) -> Clock:
@@ -806,6 +841,8 @@ class BaseEstimator:
                 after, outcome = fusion.after_relative(estimate, event.source, reading, following)
             case Heading():
                 after, outcome = fusion.after_heading(estimate, event.source, reading, following)
+            case Field():
+                after, outcome = fusion.after_field(estimate, event.source, reading, following)
             case Reading():
                 after, outcome = fusion.after_reading(estimate, event.source, reading, following)
         return after, outcome

@@ -20,6 +20,8 @@ kept.
   right still bounds the drift. It may be off by 0.5 rad until it has been read in all directions.
 - Of another odometry the displacements between its poses are used, with a constant scale, which velocities
   and positions of other sources show. A jump is rejected, and the way goes on from there.
+- A magnetic field is a heading, that of the axis along the field. Iron and motors change its strength or its
+  dip as well: a field that differs from the one at the start, or from the Earth's, is rejected.
 - The pose of the odometry frame is continuous (REP 105): it is the integral of the predictions. What a
   reading corrects of the place or the yaw remains an ``Offset``, whose square is part of the covariance.
 """
@@ -62,6 +64,7 @@ from zstate.odometry.invariant_filter import (
     without_tracked,
 )
 from zstate.odometry.legs import Foot, Legs, Stance, stance_after, updated_by_feet
+from zstate.odometry.magnetism import EarthField, UsualField, usual_after
 from zstate.odometry.measurements import heading, tracking, yaw_rate, zero_velocity
 from zstate.odometry.relative import RelativePose, moved_between
 from zstate.odometry.rotations import rotation_exp, skew
@@ -195,12 +198,28 @@ class Displacement(NamedTuple):
 
 
 class Heading(NamedTuple):
-    """The yaw of a frame in the axes of a compass [rad], with its variance [rad^2]."""
+    """The yaw of an axis in the axes of a compass [rad], with its variance [rad^2].
+
+    ``axis`` (3,) has the length 1 and is in the axes of the IMU.
+    """
 
     stamp: int
     yaw: float
     variance: float
-    imu_from_frame: Floats
+    axis: Floats
+
+
+class Field(NamedTuple):
+    """A magnetic field in the axes of the IMU [T], (3,), with the variance of the yaw that it shows [rad^2].
+
+    ``ahead`` (3,) is the x axis of the base there, and ``expected`` the field of the Earth, if known.
+    """
+
+    stamp: int
+    field: Floats
+    variance: float
+    ahead: Floats
+    expected: EarthField | None
 
 
 class Contacts(NamedTuple):
@@ -320,7 +339,7 @@ class Estimate(NamedTuple):
     ``rate`` and ``force`` are those of the IMU at ``stamp``, interpolated, or assumed if ``is_coasting``.
     ``moved_at`` is the stamp of the last velocity that was not zero, ``angular`` the rate by wheels in the
     IMU's axes [rad/s], ``wheels_at`` their stamp, ``swept`` the integral of the gyro since then [rad], (3,).
-    ``touching`` are the feet on the ground, if measured.
+    ``touching`` are the feet on the ground, if measured. ``fields`` are what magnetometers usually measure.
     ``sampled_s`` is the mean time between samples of the IMU, over which the noise of a rate is averaged.
     ``tilts`` has for each direction the vertical less that of the base, in the IMU's axes, (3,). ``fastest``
     is the greatest speed that was measured [m/s]. ``anchor`` is the estimate at the last reading before
@@ -360,6 +379,7 @@ class Estimate(NamedTuple):
     runs: dict[str, Run] = {}  # noqa: RUF012 - replaced, never written to
     compasses: dict[str, Compass] = {}  # noqa: RUF012 - replaced, never written to
     leads: dict[str, Lead] = {}  # noqa: RUF012 - replaced, never written to
+    fields: dict[str, UsualField] = {}  # noqa: RUF012 - replaced, never written to
 
 
 def started(stamp: int, state: FilterState) -> Estimate:
@@ -472,14 +492,46 @@ class Fusion:
         )
         return estimate, Outcome("accepted", math.nan, 0)
 
-    def after_heading(
-        self, before: Estimate, source: str, reading: Heading, following: Inertia | None
+    def after_field(
+        self, before: Estimate, source: str, reading: Field, following: Inertia | None
     ) -> tuple[Estimate, Outcome]:
-        """The estimate after a heading, and what became of it."""
+        """The estimate after a magnetic field, and what became of it: its axis has the yaw of north, zero.
+
+        Raises InvalidInput if it is not the field that is usual, or expected.
+        """
+        estimate = self.predicted(before, reading.stamp, following)
+        rotation, strength = estimate.state.rotation, math.sqrt(reading.field @ reading.field)
+        axis = reading.field / strength
+        x, y, z = rotation.dot(axis).tolist()
+        dip = math.atan2(-z, math.hypot(x, y))
+        usual = usual_after(estimate.fields.get(source), strength, dip, reading.expected)
+        compasses = estimate.compasses
+        if usual.readings == 1:
+            compasses = {name: one for name, one in compasses.items() if name != source}
+        estimate = estimate._replace(fields={**estimate.fields, source: usual}, compasses=compasses)
+        ahead = rotation.dot(reading.ahead)
+        direction = math.atan2(ahead[1], ahead[0]) - math.atan2(y, x)
+        north = Heading(reading.stamp, 0.0, reading.variance, axis)
+        return self.after_heading(estimate, source, north, following, direction=direction)
+
+    def after_heading(
+        self,
+        before: Estimate,
+        source: str,
+        reading: Heading,
+        following: Inertia | None,
+        *,
+        direction: float | None = None,
+    ) -> tuple[Estimate, Outcome]:
+        """The estimate after a heading, and what became of it.
+
+        ``direction`` is that of the base by this compass [rad], by default the yaw itself.
+        """
+        sector = _sector(reading.yaw if direction is None else direction)
         estimate = self.predicted(before, reading.stamp, following)
         compass = estimate.compasses.get(source)
         offset = 0.0 if compass is None else compass.offset
-        measurement = heading(estimate.state, reading.yaw - offset, reading.variance, reading.imu_from_frame)
+        measurement = heading(estimate.state, reading.yaw - offset, reading.variance, reading.axis)
         residual = float(measurement.residual[0])
         row = measurement.jacobian[0]
         settled = self.settled(estimate)
@@ -488,14 +540,14 @@ class Fusion:
         turned = estimate.offset.rotation
         against_gyro = residual - math.atan2(float(turned[1, 0]), float(turned[0, 0]))
         if compass is None:
-            sectors = {_sector(reading.yaw): (reading.stamp, against_gyro - residual)}  # less the offset
+            sectors = {sector: (reading.stamp, against_gyro - residual)}  # less the offset
             first = Compass(reading.stamp, reading.stamp, residual, variance, 0.0, 0.0, sectors)
             return _with_compass(estimate, source, first), Outcome("accepted", 1.0, 1)
         # The first reading has an error as well, and that of our yaw then is part of the present one.
         expected = variance + 2.0 * reading.variance
         share = 1.0 - math.exp(-(reading.stamp - compass.stamp) * 1e-9 / _DEVIATION_S)
         excess = compass.excess + share * (residual * residual - expected - compass.excess)
-        sectors = {**compass.sectors, _sector(reading.yaw): (reading.stamp, against_gyro)}
+        sectors = {**compass.sectors, sector: (reading.stamp, against_gyro)}
         bias_variance = float(np.diag(estimate.state.covariance)[GYRO_BIAS].max())
         spread = _spread(sectors, reading.stamp, against_gyro, bias_variance) - 2.0 * reading.variance
         deviation = max(compass.deviation, excess, spread)

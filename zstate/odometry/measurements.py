@@ -117,16 +117,17 @@ def tracking(state: FilterState, source: str, covariance: Floats, imu_from_frame
     return Measurement(np.concatenate((angles, shift)), jacobian, spread.dot(covariance).dot(spread.T))
 
 
-def heading(state: FilterState, yaw: float, variance: float, imu_from_frame: Floats) -> Measurement:
-    """The direction of a frame's x axis in the level plane [rad], from the world's x axis towards its y axis.
+def heading(state: FilterState, yaw: float, variance: float, axis: Floats) -> Measurement:
+    """The direction of ``axis`` in the level plane [rad], from the world's x axis towards its y axis.
 
-    Raises InvalidInput if the axis is within 6 degrees of the vertical, where it has none.
+    ``axis`` (3,) has the length 1 and is in the IMU's axes. Raises InvalidInput if it is within 6 degrees of
+    the vertical, where it has none.
     """
-    x, y, z = (state.rotation @ imu_from_frame[:3, 0]).tolist()
+    x, y, z = (state.rotation @ axis).tolist()
     level = x * x + y * y
     if level < _LEVEL * _LEVEL:
         raise InvalidInput(
-            f"the x axis of this frame has no heading: it is {math.degrees(math.asin(abs(z))):.0f} degrees "
+            f"this axis has no heading: it is {math.degrees(math.asin(abs(z))):.0f} degrees "
             "from level; leave headings out at such poses"
         )
     jacobian = np.zeros((1, len(state.covariance)))

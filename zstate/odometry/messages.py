@@ -46,6 +46,9 @@ MAX_RATE, MAX_ACCELERATION = 1e3, 1e5
 MAX_SPEED, MAX_DISTANCE = 1e4, 1e8
 """[m/s] and [m], likewise: above the speed of satellites, and twice the circumference of the Earth."""
 
+MAX_FIELD = 1.0
+"""[T] In any axis, likewise: above that of permanent magnets, and 15,000 times that of the Earth."""
+
 
 class Imu(StampedMessage, frozen=True, array_like=True, gc=False):
     """One reading of an inertial measurement unit, in the axes of ``frame``, which is named as in edges.
@@ -191,8 +194,30 @@ class Fix(StampedMessage, frozen=True, array_like=True, gc=False):
             raise InvalidInput("an altitude and a covariance need a latitude and a longitude")
 
 
-SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix | Odometry
-SENSOR_STREAMS = ("imu", "velocity", "pose", "fix", "odometry")
+class MagneticField(StampedMessage, frozen=True, array_like=True, gc=False):
+    """The magnetic field at a sensor, in the axes of ``frame``, which is named as in edges.
+
+    ``field`` [T] is a block of x y z. ``covariance`` [T^2] is a block of the upper triangle, 6 numbers, or
+    None if it is not known.
+    """
+
+    frame: str
+    field: bytes
+    covariance: bytes | None = None
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
+        numbers = finite_numbers("a magnetic field", self.field, 3)
+        if max(map(abs, numbers)) > MAX_FIELD:
+            raise InvalidInput(
+                f"magnetic fields are in tesla, at most {MAX_FIELD:g}; got {', '.join(map(str, numbers))}, "
+                "which may be microtesla (1e-6 T) or milligauss (1e-7 T): that of the Earth is 2e-5 to 7e-5"
+            )
+        check_covariance("a magnetic field", self.covariance, 3)
+
+
+SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix | MagneticField | Odometry
+SENSOR_STREAMS = ("imu", "velocity", "pose", "fix", "magnetic_field", "odometry")
 """The streams of these messages."""
 
 _Measurement = TypeVar("_Measurement", bound=SensorMessage)

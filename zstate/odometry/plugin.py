@@ -41,6 +41,15 @@ FIX = Stream(
     ros="zstate.odometry.ros2:FIX_STREAM",
     document="zstate.odometry.documents:fix_document",
 )
+MAGNETIC_FIELD = Stream(
+    "magnetic_field",
+    f"{_MESSAGES}:MagneticField",
+    summary="magnetic field at a sensor",
+    named=True,
+    start="start the program of the sensor, with its zstate.odometry.MagneticFieldPublisher",
+    ros="zstate.odometry.ros2:MAGNETIC_FIELD_STREAM",
+    document="zstate.odometry.documents:magnetic_field_document",
+)
 ODOMETRY = Stream(
     "odometry",
     f"{_MESSAGES}:Odometry",
@@ -54,7 +63,7 @@ ODOMETRY = Stream(
 
 PLUGIN = Plugin(
     "odometry",
-    streams=(IMU, VELOCITY, POSE, FIX, ODOMETRY),
+    streams=(IMU, VELOCITY, POSE, FIX, MAGNETIC_FIELD, ODOMETRY),
     commands={
         "odometry": Command(
             "zstate.odometry.cli.odometry:odometry_command",

@@ -1,4 +1,4 @@
-"""Publishers of inertial measurements, of velocities, poses and fixes, and of odometry."""
+"""Publishers of inertial measurements, velocities, poses, fixes and magnetic fields, and of odometry."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zstate.errors import InvalidInput
 from zstate.net.session import Session
 from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Velocity
 from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
 from zstate.wire.keys import full_name
 from zstate.wire.messages import to_block
@@ -214,6 +214,42 @@ class FixPublisher(MeasurementPublisher):
                     *(triangle, 0 if triangle is None else index(covariance_type)),
                 )
             )
+
+
+class MagneticFieldPublisher(MeasurementPublisher):
+    """Publishes the magnetic fields that one magnetometer of a robot measures, in the axes of ``frame``.
+
+    ``covariance`` [T^2], (3, 3), is published with each of them if it is given. Sensors, frames, writers and
+    threads are those of ``ImuPublisher``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        sensor: str = "magnetic_field",
+        wires: str | Sequence[str] = ("native",),
+        *,
+        frame: str | None = None,
+        covariance: ArrayLike | None = None,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        self.frame = sensor if frame is None else frame
+        self._covariance = _covariance(covariance, "covariance", 3)
+        full_name(robot, self.frame)
+        super().__init__(session, robot, "magnetic_field", sensor, wires=wires, clock=clock, program=program)
+
+    def publish(self, field: ArrayLike, stamp: int | None = None) -> None:
+        """Publish one field at ``stamp`` [ns]; default: now.
+
+        ``field`` is x y z in tesla: 1 uT is 1e-6 T, and 1 gauss 1e-4 T. Raises as ``ImuPublisher.publish``,
+        and InvalidInput for more than 1 T.
+        """
+        with self._refusals:
+            stamp = self._clock.now() if stamp is None else check_stamp(stamp)
+            vector = _numbers(field, "field", 3)
+            self._send(MagneticField(stamp, 0, 0, self.frame, vector, self._covariance))
 
 
 class OdometryPublisher(EdgePublisher):

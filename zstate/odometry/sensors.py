@@ -14,11 +14,13 @@ import numpy as np
 from zstate.checks import Floats
 from zstate.errors import InvalidInput
 from zstate.odometry.estimator import BaseEstimator
+from zstate.odometry.magnetism import EarthField, check_strength, earth_field
 from zstate.odometry.map_estimator import MapEstimator
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Velocity
 from zstate.odometry.source_noise import (
     FixNoise,
     HeadingNoise,
+    MagnetometerNoise,
     PoseNoise,
     RelativeNoise,
     SensorNoise,
@@ -203,6 +205,36 @@ def add_relative(estimators: Estimators, sensor: str, noise: RelativeNoise, mess
     base.relative_pose(message.stamp, pose, covariance, source=sensor, noise=noise)
 
 
+def magnetometer_covariance(sensor: str, noise: MagnetometerNoise, message: MagneticField) -> Floats:
+    """That of the yaw by a magnetic field [rad^2], (1, 1).
+
+    Raises InvalidInput for a field in which no compass works, and as ``expected_field``.
+    """
+    field = noise.calibrated(from_block(message.field))
+    check_strength(math.sqrt(field @ field), sensor)
+    expected_field(noise, message)
+    return np.array([[math.radians(noise.sigma_deg) ** 2]])
+
+
+def expected_field(noise: MagnetometerNoise, message: MagneticField) -> EarthField | None:
+    """The field of the Earth at the place of a magnetometer, if that is stated. Raises as ``earth_field``."""
+    return None if noise.place is None else earth_field(*noise.place, message.stamp)
+
+
+def add_magnetic_field(
+    estimators: Estimators, sensor: str, noise: MagnetometerNoise, message: MagneticField
+) -> None:
+    """Pass one magnetic field to the odometry, whose attitude levels it."""
+    estimators.odometry.magnetic_field(
+        message.stamp,
+        noise.calibrated(from_block(message.field)),
+        math.radians(noise.sigma_deg),
+        source=f"{sensor} field",
+        frame=message.frame,
+        expected=expected_field(noise, message),
+    )
+
+
 def add_fix(estimators: Estimators, sensor: str, noise: FixNoise, message: Fix) -> None:
     """Pass one fix to what places the odometry in a map. Raises InvalidInput for a message without a fix."""
     latitude, longitude = message.latitude, message.longitude
@@ -240,6 +272,14 @@ KINDS = (
     ),
     SensorKind(
         "heading", ("imu",), HeadingNoise, add_heading, heading_covariance, text="the heading of {!r}"
+    ),
+    SensorKind(
+        "magnetometer",
+        ("magnetic_field",),
+        MagnetometerNoise,
+        add_magnetic_field,
+        magnetometer_covariance,
+        text="the magnetometer {!r}",
     ),
     SensorKind("fix", ("fix",), FixNoise, add_fix),
 )

@@ -6,7 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
+import numpy as np
+
+from zstate.checks import Floats
 from zstate.errors import InvalidInput
+from zstate.odometry.geodesy import check_place
 
 Sigma: TypeAlias = float | tuple[float, float, float]
 """Standard deviations of x, y and z; one number is that of each."""
@@ -98,6 +102,37 @@ class HeadingNoise:
         _check_sigma("sigma_deg", self.sigma_deg)
 
 
+_Three: TypeAlias = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MagnetometerNoise:
+    """The noise and the calibration of a magnetometer.
+
+    ``sigma_deg`` [degrees] is that of the yaw, by errors that do not average out. The field is ``soft_iron``
+    (3, 3) times the measured one less ``bias`` [T], both in the axes of the sensor. ``place`` is a latitude
+    and a longitude [degrees]: fields are then compared with that of the Earth there, not with the first ones.
+    Raises InvalidInput unless the sigma is above zero, all are finite, and it is a place.
+    """
+
+    sigma_deg: float = 5.0
+    bias: _Three = (0.0, 0.0, 0.0)
+    soft_iron: tuple[_Three, _Three, _Three] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    place: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        _check_sigma("sigma_deg", self.sigma_deg)
+        for name, numbers in (("bias", self.bias), ("soft_iron", sum(self.soft_iron, ()))):
+            if not all(map(math.isfinite, numbers)):
+                raise InvalidInput(f"{name} of a magnetometer is finite; got {numbers!r}")
+        if self.place is not None:
+            check_place(*self.place, 0.0)
+
+    def calibrated(self, field: Floats) -> Floats:
+        """The field of a measured one [T], (3,)."""
+        return np.array(self.soft_iron).dot(field - np.array(self.bias))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixNoise:
     """The noise of the fixes of a satellite receiver.
@@ -167,5 +202,5 @@ class RelativeNoise:
             )
 
 
-SensorNoise: TypeAlias = VelocityNoise | PoseNoise | RelativeNoise | HeadingNoise | FixNoise
+x
 """What is stated of a sensor: the class says of which kind it is."""

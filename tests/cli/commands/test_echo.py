@@ -31,6 +31,7 @@ from zstate.cli.output.joint_state_text import ChangeFilter
 from zstate.odometry import (
     FixPublisher,
     ImuPublisher,
+    MagneticFieldPublisher,
     OdometryPublisher,
     PosePublisher,
     VelocityPublisher,
@@ -273,6 +274,7 @@ def test_a_topic_of_ros_leads_to_its_wire(command: str):
                 **{"sigma_east": 1.0, "sigma_north": 2.0, "sigma_up": 3.0},
             },
         ),
+        ("magnetic_field", {"frame": "r1/mag", "field": [2e-5, 0.0, -4e-5], "field_sigma": [1e-7] * 3}),
         ("velocity", {"frame": "r1/flow", "linear": [0.5, 0.0, 0.0], "velocity_sigma": [2.0, 2.0, 2.0]}),
     ],
 )
@@ -286,6 +288,7 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
         VelocityPublisher(session, "r1", "flow") as velocity,
         PosePublisher(session, "r1", "mocap") as mocap,
         FixPublisher(session, "r1", "gps") as gps,
+        MagneticFieldPublisher(session, "r1", "mag", covariance=np.eye(3) * 1e-14) as mag,
     ):
 
         def publish() -> None:
@@ -294,6 +297,7 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
             velocity.publish([0.5, 0, 0], covariance=np.eye(3) * 4)
             mocap.publish(base)
             gps.publish(47.5, 8.25, covariance=variances[:3, :3])
+            mag.publish([2e-5, 0, -4e-5])
 
         with repeated(publish):
             document = json.loads(run_cli("echo", "r1", "--stream", stream, "--once", "--json").stdout)
@@ -304,7 +308,7 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
     names = {writer["stream"]: writer["names"] for writer in listed[0]["writers"]}
     assert names == {
         **{"odometry": ["odometry"], "imu": ["imu"], "velocity": ["flow"], "pose": ["mocap"]},
-        "fix": ["gps"],
+        **{"fix": ["gps"], "magnetic_field": ["mag"]},
     }
     assert all(writer["rate_hz"] for writer in listed[0]["writers"])
 

@@ -15,6 +15,7 @@ from zstate.wire.ros2.types import (
     JOINT_STATE,
     JOINT_TRAJECTORY,
     LASER_SCAN,
+    MAGNETIC_FIELD,
     NAV_SAT_FIX,
     OCCUPANCY_GRID,
     ODOMETRY,
@@ -39,6 +40,7 @@ TYPES = (
     IMU,
     TWIST_WITH_COVARIANCE,
     NAV_SAT_FIX,
+    MAGNETIC_FIELD,
     ODOMETRY,
 )
 EACH = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])

@@ -105,6 +105,12 @@ _OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
     "sigma_deg.",
 )
 @_sensor_option(
+    "magnetometer",
+    "sigma_deg=DEG",
+    "A magnetometer, whose field shows the yaw. Its noise is sigma_deg, by default 5; calibration and place "
+    "are set by --file.",
+)
+@_sensor_option(
     "fix",
     "sigma=M",
     "A satellite receiver, which places the odometry in a map, x east and y north. Its noise is that of its "

@@ -30,6 +30,7 @@ from zstate.odometry import (
     ImuNoise,
     LegNoise,
     Legs,
+    MagnetometerNoise,
     MapEstimator,
     Mecanum,
     PoseNoise,
@@ -84,10 +85,10 @@ class LegSettings:
 class OdometrySettings:
     """The sensors, frames and noise of one robot.
 
-    ``velocity``, ``pose``, ``relative``, ``heading`` and ``fix`` are further sensors by name, with what is
-    stated of their noise; those of ``relative`` are other odometries by stream and name, as "pose/camera",
-    those of ``heading`` IMUs whose orientation shows the yaw. Fixes place the odometry in the
-    frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an altitude [m]; by
+    ``velocity``, ``pose``, ``relative``, ``heading``, ``magnetometer`` and ``fix`` are further sensors by
+    name, with what is stated of their noise; those of ``relative`` are other odometries by stream and name,
+    as "pose/camera", those of ``heading`` IMUs whose orientation shows the yaw. Fixes place the odometry in
+    the frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an altitude [m]; by
     default it is the first fix. ``base`` None is the root of the model. Without an ``initial_pose`` the base
     starts at the origin, once it is aligned at rest. Raises InvalidInput for names that no sensor can have,
     for wheels of several kinds, and for a datum that is no place on the Earth.
@@ -98,6 +99,7 @@ class OdometrySettings:
     pose: dict[str, PoseNoise] = field(default_factory=dict[str, PoseNoise])
     relative: dict[str, RelativeNoise] = field(default_factory=dict[str, RelativeNoise])
     heading: dict[str, HeadingNoise] = field(default_factory=dict[str, HeadingNoise])
+    magnetometer: dict[str, MagnetometerNoise] = field(default_factory=dict[str, MagnetometerNoise])
     fix: dict[str, FixNoise] = field(default_factory=dict[str, FixNoise])
     map: str = "map"
     datum: tuple[float, float, float] | None = None
@@ -244,7 +246,7 @@ def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
     known = msgspec.inspect.type_info(kind.noise)
     assert isinstance(known, msgspec.inspect.DataclassType)
     texts = {one.name for one in known.fields if isinstance(one.type, msgspec.inspect.LiteralType)}
-    names = [one.name for one in known.fields]
+    names = [one.name for one in known.fields if one.name in texts or _is_number(one.type)]
     units = {name: "TEXT" if name in texts else "NUMBER" for name in names}
     values: dict[str, Any] = {}
     for part in stated.split(",") if colon else ():
@@ -259,6 +261,11 @@ def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
     sensor = Sensor(kind, name, kind.noise(**values))
     sensor.check()
     return sensor.name, sensor.noise
+
+
+def _is_number(kind: msgspec.inspect.Type) -> bool:
+    kinds = kind.types if isinstance(kind, msgspec.inspect.UnionType) else (kind,)
+    return any(isinstance(one, msgspec.inspect.FloatType) for one in kinds)
 
 
 def _number(key: str, value: str, unit: str = "") -> float:

@@ -113,6 +113,11 @@ _FIELDS: dict[str, Fields] = {
         ("float64[9]", "position_covariance"),
         ("uint8", "position_covariance_type"),
     ),
+    "sensor_msgs/MagneticField": (
+        ("std_msgs/Header", "header"),
+        ("geometry_msgs/Vector3", "magnetic_field"),
+        ("float64[9]", "magnetic_field_covariance"),
+    ),
 }
 # The numbers of type_description_interfaces/FieldType.
 _NESTED, _ARRAY, _UNBOUNDED_SEQUENCE = 1, 48, 144
@@ -201,3 +206,4 @@ TWIST_WITH_COVARIANCE = RosType.from_fields("geometry_msgs/TwistWithCovarianceSt
 ODOMETRY = RosType.from_fields("nav_msgs/Odometry")
 IMU = RosType.from_fields("sensor_msgs/Imu")
 NAV_SAT_FIX = RosType.from_fields("sensor_msgs/NavSatFix")
+MAGNETIC_FIELD = RosType.from_fields("sensor_msgs/MagneticField")
