@@ -75,6 +75,7 @@ HOMES = {
     "std_msgs": "bridges",
     "tf2_msgs": "bridges",
     "prometheus_client": "metrics",
+    "pygeomag": "odometry",
     "viser": "view",
     "websockets": "foxglove",
     "trimesh": "view",

@@ -328,6 +328,57 @@ def compass_calls(
     return calls
 
 
+class OtherErrors(NamedTuple):
+    """Of another odometry, by its way [m and degrees per root of a metre], and of each pose [m, degrees]."""
+
+    sigma: float = 0.02
+    sigma_deg: float = 0.3
+    floor: float = 0.002
+    floor_deg: float = 0.05
+
+
+OTHER_ERRORS = OtherErrors()
+
+
+def other_odometry_calls(
+    drive: Drive,
+    random: np.random.Generator,
+    *,
+    errors: OtherErrors = OTHER_ERRORS,
+    scale: float = 1.0,
+    jumps: Sequence[tuple[float, float, float]] = (),  # from when [s], and by how much in x and y
+    hertz: float = 10.0,
+    **options: Any,
+) -> list[Call]:
+    """Poses of the base in a world of its own, by dead reckoning of ``scale`` times the true ways."""
+    times, place = np.arange(0.005, drive.seconds, 1.0 / hertz), np.array((5.0, -3.0, 0.4))
+    truth = np.stack([drive.at(row, times) for row in (drive.x, drive.y, drive.yaw)], axis=1)
+    calls, sigmas = list[Call](), np.array((errors.sigma, errors.sigma, math.radians(errors.sigma_deg)))
+    white = np.repeat((errors.floor, math.radians(errors.floor_deg)), 3)
+    for row, t in enumerate(times.tolist()):
+        before = truth[max(row - 1, 0)]
+        way, turn = _turned(truth[row, :2] - before[:2], -before[2]), truth[row, 2] - before[2]
+        step = np.append(way * scale, turn) + random.normal(0.0, 1.0, 3) * sigmas * math.sqrt(np.hypot(*way))
+        place = place + np.append(_turned(step[:2], place[2]), step[2])
+        for at, x, y in jumps:
+            if t - 1.0 / hertz < at <= t:
+                place += (x, y, 0.0)
+        x, y, z, roll, pitch, yaw = random.normal(0.0, 1.0, 6) * white
+        pose = Transform.from_rpy(
+            "camera_odom",
+            "base_link",
+            (place[0] + x, place[1] + y, z),
+            (roll, pitch, math.remainder(place[2] + yaw, math.tau)),
+        )
+        calls.append(Call(t, "relative_pose", (pose,), {"source": "camera", **options}))
+    return calls
+
+
+def _turned(vector: Floats, yaw: float) -> Floats:
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    return np.array((cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]))
+
+
 def merged(*lists: Iterable[Call]) -> list[Call]:
     """All calls in the order of their stamps."""
     return sorted((call for calls in lists for call in calls), key=lambda call: call.t)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from zstate.odometry.invariant_filter import FilterState, Floats
+from zstate.odometry.invariant_filter import FilterState, Floats, Tracked
 from zstate.odometry.rotations import rotation_exp
 
 
@@ -40,13 +40,12 @@ def moved(state: FilterState, error: Floats) -> FilterState:
     size = 5 + len(state.contacts)
     algebra = np.zeros((size, size))
     algebra[:3, :3] = np.cross(np.eye(3), error[:3])
-    algebra[:3, 3:] = np.concatenate((error[3:9], error[15:])).reshape(-1, 3).T
-    matrix = power = np.eye(size)
-    for n in range(1, 30):
-        power = power @ algebra / n
-        matrix = matrix + power
-    matrix = matrix @ _group(state)
+    first = 15 + 7 * len(state.tracked)
+    algebra[:3, 3:] = np.concatenate((error[3:9], error[first:])).reshape(-1, 3).T
+    matrix = _series(algebra) @ _group(state)
+    errors = error[15:first].reshape(-1, 7)
     return state._replace(
+        tracked=tuple(moved_pose(one, part) for one, part in zip(state.tracked, errors, strict=True)),
         rotation=matrix[:3, :3],
         velocity=matrix[:3, 3],
         position=matrix[:3, 4],
@@ -54,6 +53,24 @@ def moved(state: FilterState, error: Floats) -> FilterState:
         gyro_bias=state.gyro_bias + error[9:12],
         accel_bias=state.accel_bias + error[12:15],
     )
+
+
+def moved_pose(tracked: Tracked, error: Floats) -> Tracked:
+    """``exp(error) tracked``, and the logarithm of the scale plus its error."""
+    algebra, pose = np.zeros((4, 4)), np.eye(4)
+    algebra[:3, :3], algebra[:3, 3] = np.cross(np.eye(3), error[:3]), error[3:6]
+    pose[:3, :3], pose[:3, 3] = tracked.rotation, tracked.position
+    pose = _series(algebra) @ pose
+    log_scale = tracked.log_scale + float(error[6])
+    return Tracked(tracked.source, pose[:3, :3], pose[:3, 3], log_scale)
+
+
+def _series(algebra: Floats) -> Floats:
+    matrix = power = np.eye(len(algebra))
+    for n in range(1, 30):
+        power = power @ algebra / n
+        matrix = matrix + power
+    return matrix
 
 
 def small_error(truth: FilterState, estimate: FilterState) -> Floats:

@@ -267,7 +267,7 @@ def test_a_pressure_is_a_height_by_the_density_of_the_air():
 def test_a_barometer_is_a_source_of_heights_with_a_noise_that_is_stated_or_its_own():
     base = Recorder()
     one = sensor("bmp", BarometerNoise(sigma=0.4, wander=2.0, correlated_s=60.0))
-    assert (one.kind.name, one.kind.stream) == ("barometer", "pressure")
+    assert (one.kind.name, one.stream) == ("barometer", "pressure")
     message = Pressure(5, 0, 1, "r1/mast", 101225.0, 36.0)
     one.add(Estimators(base), message)  # pyright: ignore[reportArgumentType]
     sensor("bmp", BarometerNoise()).add(Estimators(base), message)  # pyright: ignore[reportArgumentType]

@@ -94,7 +94,7 @@ def read(before: Estimate, yaw: float, measured: float, yaw_sigma: float = SIGMA
     """The estimate of a base that heads to ``yaw`` after a heading of the compass, and what became of it."""
     estimate = at_rest(yaw, yaw_sigma)._replace(compasses=before.compasses)
     estimate, outcome = FUSION.after_heading(
-        estimate, "compass", Heading(0, measured, SIGMA**2, np.eye(4)), None
+        estimate, "compass", Heading(0, measured, SIGMA**2, np.eye(3)[0]), None
     )
     return estimate, outcome.fate
 
@@ -151,7 +151,7 @@ def test_a_compass_is_off_by_half_the_range_of_its_errors_less_its_noise_and_the
     estimate, _ = read(at_rest(), 0.1, 0.1)
     for yaw, wrong, stamp in ((1.6, error, 0), (3.2, -error, seconds * S)):
         estimate = at_rest(yaw, SIGMA, bias_sigma)._replace(stamp=stamp, compasses=estimate.compasses)
-        reading = Heading(stamp, yaw + wrong, SIGMA**2, np.eye(4))
+        reading = Heading(stamp, yaw + wrong, SIGMA**2, np.eye(3)[0])
         estimate, _ = FUSION.after_heading(estimate, "compass", reading, None)
     expected = error**2 - 2.0 * SIGMA**2 - (bias_sigma * seconds) ** 2
     assert estimate.compasses["compass"].deviation == pytest.approx(expected)

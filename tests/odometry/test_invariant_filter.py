@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.filter_states import derivative, moved, small_error, some_state
+from helpers.filter_states import derivative, log_so3, moved, moved_pose, small_error, some_state
 from helpers.imu_simulation import SimulatedBody, mean_band
 
 from zstate import InvalidInput
@@ -141,6 +141,59 @@ def test_a_new_contact_has_the_error_of_the_position_and_of_its_offset():
     np.testing.assert_array_equal(left.contacts, grown.contacts[1:])
     kept = [*range(15), *range(18, 24)]
     np.testing.assert_array_equal(left.covariance, grown.covariance[np.ix_(kept, kept)])
+
+
+def displacement(way: tuple[float, float, float]) -> Floats:
+    moved_by = np.eye(4)
+    moved_by[:3, :3] = rotation_exp(np.array([0.2, -0.1, 0.6]))
+    moved_by[:3, 3] = way
+    return moved_by
+
+
+def test_a_pose_that_is_carried_on_has_the_error_that_it_had_and_that_of_the_displacement():
+    """By its definition: the truth is ``exp(error) moved`` from the true pose, at the true scale."""
+    mount = np.eye(4)
+    mount[:3, :3], mount[:3, 3] = rotation_exp(np.array([0.4, -1.1, 2.0])), (0.3, -0.2, 0.5)
+    state = iekf.with_tracked(some_state(), "camera", 0.1)
+    # The state has the velocity of that way in 0.5 s, so that an error of the scale is one along it.
+    way = mount[:3, :3].T @ state.rotation.T @ state.velocity * 0.5
+    moved_by, walk = displacement((way[0], way[1], way[2])), np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-4
+    size = len(state.covariance)
+    after = iekf.carried(state, "camera", moved_by, walk, mount, dt_s=0.5)
+
+    def error_of(error: Floats, noise: Floats) -> Floats:
+        twist = moved_pose(iekf.Tracked("", moved_by[:3, :3], moved_by[:3, 3], 0.0), np.append(noise, 0.0))
+        true_move = np.eye(4)
+        true_move[:3, :3], true_move[:3, 3] = twist.rotation, twist.position
+        truth = iekf.carried(moved(state, error), "camera", true_move, walk, mount, dt_s=0.5).tracked[0]
+        turn = truth.rotation @ after.tracked[0].rotation.T
+        return np.concatenate((log_so3(turn), truth.position - turn @ after.tracked[0].position))
+
+    by_error = derivative(lambda error: error_of(error, np.zeros(6)), size)
+    by_noise = derivative(lambda noise: error_of(np.zeros(size), noise), 6)
+    expected = by_error @ state.covariance @ by_error.T + by_noise @ walk @ by_noise.T
+    np.testing.assert_allclose(after.covariance[15:21, 15:21], expected, atol=1e-9)
+    np.testing.assert_allclose(after.covariance[:15, 15:21], (state.covariance @ by_error.T)[:15], atol=1e-9)
+    np.testing.assert_array_equal(after.covariance[:15, :15], state.covariance[:15, :15])
+
+
+def test_poses_by_other_odometries_and_contacts_have_their_own_places_in_the_covariance():
+    state = some_state()
+    grown = iekf.with_tracked(iekf.with_tracked(state, "camera", 0.1), "lidar", 0.2)
+    kept = [*range(15), *range(29, 35)]
+    np.testing.assert_array_equal(grown.covariance[np.ix_(kept, kept)], state.covariance)
+    assert [grown.covariance[row, row] for row in (21, 28)] == pytest.approx([0.01, 0.04])
+    # At first such a pose has the error of the state.
+    same = [*range(3), *range(6, 9)]
+    np.testing.assert_array_equal(grown.covariance[22:28, :15], state.covariance[same, :15])
+    offset = np.array([0.2, 0.1, -0.5])
+    stood = iekf.without_contact(iekf.with_contact(grown, "new", offset, np.eye(3)), "foot0")
+    measured = iekf.innovation(stood, measurements.contact(stood, "new", offset, np.zeros((3, 3))))
+    np.testing.assert_allclose(measured.covariance, np.eye(3), atol=1e-12)
+    after = iekf.predict(stood, RATE, FORCE, 0.01, NOISE, contact_noise=0.1)
+    assert after.tracked == stood.tracked
+    np.testing.assert_array_equal(after.covariance[15:29, 15:29], stood.covariance[15:29, 15:29])
+    np.testing.assert_array_equal(iekf.without_tracked(grown).covariance, state.covariance)
 
 
 def test_contacts_that_are_not_there_are_refused_by_name():

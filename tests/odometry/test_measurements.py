@@ -8,7 +8,7 @@ from helpers.filter_states import derivative, log_so3, moved, some_state
 
 from zstate import InvalidInput
 from zstate.odometry import measurements
-from zstate.odometry.invariant_filter import FilterState, Floats, Measurement, updated
+from zstate.odometry.invariant_filter import FilterState, Floats, Measurement, updated, with_tracked
 from zstate.odometry.rotations import rotation_exp
 
 GYRO = np.array([0.3, -0.5, 0.8])
@@ -26,7 +26,7 @@ KINDS: dict[str, Callable[[FilterState], Measurement]] = {
     "body velocity": lambda s: measurements.body_velocity(s, np.ones(3), np.eye(3), mount(), GYRO),
     "zero velocity": lambda s: measurements.zero_velocity(s, GYRO, 0.1, 0.01),
     "position": lambda s: measurements.position(s, np.ones(3), np.eye(3), mount()),
-    "heading": lambda s: measurements.heading(s, 0.4, 1.0, mount()),
+    "heading": lambda s: measurements.heading(s, 0.4, 1.0, mount()[:3, 0]),
     "contact": lambda s: measurements.contact(s, "foot1", np.ones(3), np.eye(3)),
 }
 
@@ -49,6 +49,19 @@ def test_the_jacobian_of_a_pose_is_the_derivative_near_the_expected_pose():
     np.testing.assert_allclose(
         measurements.pose(state, here, np.eye(6), mount()).jacobian, expected, atol=1e-9
     )
+
+
+@pytest.mark.parametrize("log_scale", [0.0, 0.3])
+def test_another_odometry_that_is_where_the_body_is_differs_by_both_errors(log_scale: float):
+    state = with_tracked(some_state(), "camera", 0.1)
+    state = state._replace(tracked=(state.tracked[0]._replace(log_scale=log_scale),))
+
+    def expected(error: Floats) -> Floats:
+        return -measurements.tracking(moved(state, error), "camera", np.eye(6), mount()).residual
+
+    measured = measurements.tracking(state, "camera", np.eye(6), mount())
+    np.testing.assert_allclose(measured.jacobian, derivative(expected, len(state.covariance)), atol=1e-9)
+    np.testing.assert_allclose(measured.residual, 0.0, atol=1e-12)
 
 
 def test_the_pose_of_a_frame_has_the_covariance_of_its_errors_in_world_axes():
@@ -113,7 +126,7 @@ def test_a_measured_pose_moves_the_frame_to_it():
 
 def test_headings_differ_by_the_short_way_round():
     state = some_state(feet=0)._replace(rotation=rotation_exp(np.array([0.0, 0.0, 3.0])))
-    residual = measurements.heading(state, -3.0, 1.0, np.eye(4)).residual
+    residual = measurements.heading(state, -3.0, 1.0, np.eye(3)[0]).residual
     assert residual[0] == pytest.approx(2.0 * np.pi - 6.0)
 
 
@@ -121,7 +134,7 @@ def test_an_axis_within_six_degrees_of_the_vertical_has_no_heading():
     def heading(degrees: float) -> Measurement:
         turn = np.array([0.0, np.radians(degrees), 0.0])
         return measurements.heading(
-            some_state(feet=0)._replace(rotation=rotation_exp(turn)), 0.0, 1.0, np.eye(4)
+            some_state(feet=0)._replace(rotation=rotation_exp(turn)), 0.0, 1.0, np.eye(3)[0]
         )
 
     with pytest.raises(InvalidInput, match="87 degrees from level"):

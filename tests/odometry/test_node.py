@@ -17,6 +17,7 @@ from helpers.processes import DEADLINE_S, until
 from helpers.robots import STAMP
 
 from zstate import SecondWriter, StatePublisher, TransformBuffer, TransformListener, connect, load_model
+from zstate.checks import Floats
 from zstate.clock import ManualClock, SystemClock
 from zstate.errors import InvalidInput, Unreachable
 from zstate.model.kinematics import Kinematics
@@ -32,6 +33,8 @@ from zstate.odometry import (
     HeadingNoise,
     ImuNoise,
     ImuPublisher,
+    MagneticFieldPublisher,
+    MagnetometerNoise,
     MapEstimator,
     OdometryNode,
     PoseNoise,
@@ -41,12 +44,15 @@ from zstate.odometry import (
     VelocityNoise,
     VelocityPublisher,
 )
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Pressure, Velocity
+from zstate.odometry.magnetism import EarthField
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Pressure, Velocity
 from zstate.odometry.requests import request_odometry
 from zstate.odometry.sensors import (
     Estimators,
     add_heading,
+    add_magnetic_field,
     heading_covariance,
+    magnetometer_covariance,
     pose_covariance,
     velocity_covariance,
 )
@@ -215,11 +221,63 @@ def test_heading_of_an_imu_is_the_yaw_of_its_frame_and_needs_a_stated_noise():
         heading_covariance("imu", HeadingNoise(), msgspec.structs.replace(message, orientation=None))
 
 
+FIELD = MagneticField(1_750_000_000_000_000_000, 0, 1, "r1/mag", to_block([21e-6, 0.0, -40e-6]))
+"""In June 2025."""
+
+
+def test_field_of_a_magnetometer_is_calibrated_and_expected_to_be_that_of_the_earth_at_its_place():
+    base = Recorder()
+    noise = MagnetometerNoise(bias=(1e-6, 0.0, 0.0), place=(48.1, 11.5))
+    for one in (MagnetometerNoise(), noise):
+        add_magnetic_field(Estimators(base), "mag", one, FIELD)  # pyright: ignore[reportArgumentType]
+    (_, raw, sigma, options), (stamp, field, _, placed) = base.fields
+    assert options == {"source": "mag field", "frame": "r1/mag", "expected": None}
+    assert raw.tolist() == [21e-6, 0.0, -40e-6]
+    assert sigma == pytest.approx(math.radians(5.0))
+    assert (stamp, field) == (FIELD.stamp, pytest.approx([20e-6, 0.0, -40e-6]))
+    expected = placed["expected"]
+    assert isinstance(expected, EarthField)
+    assert expected.strength == pytest.approx(48.7e-6, rel=0.02)  # of Munich
+
+
+def test_noise_of_a_magnetometer_is_stated_and_a_field_in_gauss_refused():
+    assert magnetometer_covariance("mag", MagnetometerNoise(sigma_deg=8.0), FIELD) == pytest.approx(
+        math.radians(8.0) ** 2
+    )
+    in_gauss = msgspec.structs.replace(FIELD, field=to_block([0.21, 0.0, -0.4]))
+    with pytest.raises(InvalidInput, match=r"'mag' is 0.452 T, and that of the Earth 2e-5 to 7e-5 T"):
+        magnetometer_covariance("mag", MagnetometerNoise(), in_gauss)
+    of_1970 = msgspec.structs.replace(FIELD, stamp=STAMP % 1_000_000_000)
+    with pytest.raises(InvalidInput, match=r"stamps are of the year 1970.0"):
+        magnetometer_covariance("mag", MagnetometerNoise(place=(48.1, 11.5)), of_1970)
+
+
+@pytest.mark.long
+def test_magnetometer_is_a_source_of_the_live_odometry():
+    with rover_with_odometry(sensors=[("mag", MagnetometerNoise())]) as (rover, node, _, session):
+        with MagneticFieldPublisher(session, "r1", "mag", frame="base_footprint") as mag:
+            rover.truth.drive((-4.0, 4.0))
+
+            def has_turned() -> bool:
+                yaw = rover.truth.pose.yaw
+                mag.publish([2e-5 * math.cos(yaw), -2e-5 * math.sin(yaw), -4e-5])
+                return yaw > math.tau
+
+            until(has_turned)
+        (health,) = [one for one in node.health() if one.name == "mag field"]
+        assert (health.accepted > 10, health.rejected, health.sentence) == (True, 0, "")
+        assert node.refused == {}
+
+
 class Recorder:
-    """In place of an estimator: its calls of ``heading``."""
+    """In place of an estimator: its calls of ``heading`` and of ``magnetic_field``."""
 
     def __init__(self) -> None:
         self.headings: list[tuple[int, float, float, dict[str, str]]] = []
+        self.fields: list[tuple[int, Floats, float, dict[str, object]]] = []
+
+    def magnetic_field(self, stamp: int, field: Floats, sigma: float, **options: object) -> None:
+        self.fields.append((stamp, field, sigma, options))
 
     def heading(self, stamp: int, yaw: float, sigma: float, **options: str) -> None:
         self.headings.append((stamp, yaw, sigma, options))
@@ -387,6 +445,7 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
     poses: list[tuple[str, Pose]] = []
     fixes: list[tuple[str, Fix]] = []
     pressures: list[tuple[str, Pressure]] = []
+    fields: list[tuple[str, MagneticField]] = []
     base = Transform("map", "base", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     with (
         SensorListener(
@@ -398,6 +457,7 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
                 "pose": lambda sensor, pose: poses.append((sensor, pose)),
                 "fix": lambda sensor, fix: fixes.append((sensor, fix)),
                 "pressure": lambda sensor, pressure: pressures.append((sensor, pressure)),
+                "magnetic_field": lambda sensor, field: fields.append((sensor, field)),
             },
             wire=wire,
         ) as listener,
@@ -407,6 +467,7 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
         PosePublisher(writer, "r1", "mocap", wire) as mocap,
         FixPublisher(writer, "r1", "gps", wire) as gps,
         PressurePublisher(writer, "r1", "bmp", wire) as barometer,
+        MagneticFieldPublisher(writer, "r1", "mag", wire, frame="mast") as mag,
     ):
 
         def publish() -> bool:
@@ -416,7 +477,8 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
             mocap.publish(base)
             gps.publish(47.5, 8.25)
             barometer.publish(101325.0)
-            others = (velocities, poses, fixes, pressures)
+            mag.publish([2e-5, 0, -4e-5])
+            others = (velocities, poses, fixes, fields, pressures)
             return len({sensor for sensor, _ in readings}) == 2 and all(others)
 
         until(publish)
@@ -426,6 +488,7 @@ def test_messages_of_all_sensors_of_the_robot_arrive_with_full_names_of_frames(s
         assert {(sensor, one.frame, one.pressure) for sensor, one in pressures} == {
             ("bmp", "r1/bmp", 101325.0)
         }
+        assert {(sensor, one.frame) for sensor, one in fields} == {("mag", "r1/mast")}
         assert {(sensor, one.frame, one.latitude) for sensor, one in fixes} == {("gps", "r1/gps", 47.5)}
         child = {"native": "r1/base", "ros2": ""}[wire]  # ROS does not name it
         assert {(sensor, one.parent, one.child) for sensor, one in poses} == {("mocap", "r1/map", child)}

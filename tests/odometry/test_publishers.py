@@ -1,4 +1,4 @@
-"""Publishers of IMUs, velocities, fixes and odometry, read back from the network."""
+"""Publishers of IMUs, velocities, fixes, magnetic fields and odometry, read back from the network."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import (
     FixPublisher,
     ImuPublisher,
+    MagneticFieldPublisher,
     OdometryPublisher,
     PosePublisher,
     PressurePublisher,
     VelocityPublisher,
 )
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Pressure, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Pressure, Velocity
 from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.messages import Message, covariance_matrix, covariances_of, from_block
@@ -175,6 +176,40 @@ def test_wrong_fix_is_refused_and_counted(
         with pytest.raises(InvalidInput, match=text):
             publisher.publish(*arguments, **options)
         assert (publisher.sensor, publisher.frame) == ("fix", "fix")
+        assert (publisher.stats.sent, publisher.stats.refused) == (0, 1)
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+def test_magnetic_field_arrives_as_it_was_published(sessions, wire: str):
+    writer, reader = sessions
+    fields = Messages(reader, "magnetic_field", wire)
+    covariance = 1e-14 * np.array([[1.0, 0.5, 0.0], [0.5, 2.0, 0.25], [0.0, 0.25, 9.0]])
+    with MagneticFieldPublisher(
+        writer, "r1", "mag", [wire], frame="mast", covariance=covariance, clock=ManualClock(7)
+    ) as publisher:
+        first = fields.first(lambda: publisher.publish([2e-5, -1e-6, -4e-5], 5))
+        publisher.publish([2e-5, 0, 0])
+        until(lambda: fields[-1].stamp == 7)
+    assert isinstance(first, MagneticField)
+    assert (first.stamp, first.frame) == (5, "mast")
+    assert from_block(first.field).tolist() == [2e-5, -1e-6, -4e-5]
+    assert first.covariance is not None
+    assert covariance_matrix(first.covariance).tolist() == covariance.tolist()
+
+
+@pytest.mark.parametrize(
+    ("field", "text"),
+    [
+        ([21.0, 0.0, -43.0], r"at most 1; got 21.0, 0.0, -43.0, which may be microtesla \(1e-6 T\)"),
+        ([2e-5, 0.0], r"field takes 3 numbers, \(x, y, z\); got shape \(2,\)"),
+        ([2e-5, 0.0, np.nan], "a magnetic field of finite numbers"),
+    ],
+)
+def test_magnetic_field_of_no_sensor_is_refused_and_counted(sessions, field: list[float], text: str):
+    with MagneticFieldPublisher(sessions[0], "r1") as publisher:
+        with pytest.raises(InvalidInput, match=text):
+            publisher.publish(field)
+        assert (publisher.sensor, publisher.frame) == ("magnetic_field", "magnetic_field")
         assert (publisher.stats.sent, publisher.stats.refused) == (0, 1)
 
 

@@ -1,4 +1,4 @@
-"""IMUs, velocities, fixes and odometry as ROS 2 messages; rosbags is the independent encoder."""
+"""IMUs, velocities, fixes, magnetic fields and odometry as ROS 2 messages, against those of rosbags."""
 
 from __future__ import annotations
 
@@ -13,7 +13,17 @@ from mcap_ros2._dynamic import generate_dynamic
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import MAX_RATE, MAX_SPEED, Fix, Imu, Odometry, Pose, Pressure, Velocity
+from zstate.odometry.messages import (
+    MAX_RATE,
+    MAX_SPEED,
+    Fix,
+    Imu,
+    MagneticField,
+    Odometry,
+    Pose,
+    Pressure,
+    Velocity,
+)
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import Message, from_block, order_digest, to_block
 from zstate.wire.ros2.decoder import RosDecoder
@@ -23,6 +33,7 @@ from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
     FLUID_PRESSURE,
     IMU,
+    MAGNETIC_FIELD,
     NAV_SAT_FIX,
     ODOMETRY,
     POSE_WITH_COVARIANCE,
@@ -105,6 +116,11 @@ def rosbags_pressure(pressure: float, variance: float, **options: bool) -> bytes
     return rosbags_cdr(FLUID_PRESSURE.name, header("barometer"), pressure, variance, **options)
 
 
+def rosbags_magnetic_field(field: Any, covariance: Any, **options: bool) -> bytes:
+    matrix = np.array(covariance, dtype=float).ravel()
+    return rosbags_cdr(MAGNETIC_FIELD.name, header("mast"), vector("Vector3", field), matrix, **options)
+
+
 def rosbags_odometry(
     pose_covariance: Any, twist_covariance: Any, parent: str = "odom", **options: bool
 ) -> bytes:
@@ -132,6 +148,7 @@ NAN3 = [np.nan] * 3
 LINEAR_ONLY = np.full((6, 6), np.nan)
 LINEAR_ONLY[:3, :3] = symmetric(3)
 PLACE = (47.5, -8.25, 450.0)
+FIELD = (21.5e-6, -1.25e-6, -43.75e-6)
 ODOMETRY_HEAD = (*HEAD, order_digest(EDGE), to_block(POSE), EDGE)
 
 CASES = [
@@ -189,6 +206,16 @@ CASES = [
     ("pressure", Pressure(*HEAD, "barometer", 101325.0, 2.25), rosbags_pressure(101325.0, 2.25)),
     ("pressure", Pressure(*HEAD, "barometer", 95000.5), rosbags_pressure(95000.5, 0.0)),
     (
+        "magnetic_field",
+        MagneticField(*HEAD, "mast", to_block(FIELD)),
+        rosbags_magnetic_field(FIELD, NONE),
+    ),
+    (
+        "magnetic_field",
+        MagneticField(*HEAD, "mast", to_block(FIELD), triangle(1e-14 * symmetric(3))),
+        rosbags_magnetic_field(FIELD, 1e-14 * symmetric(3)),
+    ),
+    (
         "odometry",
         Odometry(*ODOMETRY_HEAD, None, to_block(TWIST), None),
         rosbags_odometry(np.zeros((6, 6)), np.zeros((6, 6))),
@@ -210,6 +237,9 @@ def test_messages_of_big_endian_machines_are_read_too():
     assert decoded("fix", rosbags_fix(*fix, little_endian=False)) == decoded("fix", rosbags_fix(*fix))
     turned = rosbags_pressure(101325.0, 2.25, little_endian=False)
     assert decoded("pressure", turned) == Pressure(*HEAD, "barometer", 101325.0, 2.25)
+    field = FIELD, 1e-14 * symmetric(3)
+    turned = rosbags_magnetic_field(*field, little_endian=False)
+    assert decoded("magnetic_field", turned) == decoded("magnetic_field", rosbags_magnetic_field(*field))
 
 
 def test_mcap_ros2_support_decodes_measurements():
@@ -230,6 +260,11 @@ def test_mcap_ros2_support_decodes_measurements():
     assert (theirs.status.status, theirs.status.service, theirs.longitude) == (-1, 9, -8.25)
     assert list(theirs.position_covariance) == symmetric(3).ravel().tolist()
     assert theirs.position_covariance_type == 2
+    field = MagneticField(*HEAD, "mast", to_block(FIELD), triangle(symmetric(3)))
+    kind = generate_dynamic(MAGNETIC_FIELD.name, MAGNETIC_FIELD.definition)[MAGNETIC_FIELD.name]
+    theirs = kind(encoded(field))
+    assert (theirs.header.frame_id, theirs.magnetic_field.z) == ("mast", FIELD[2])
+    assert list(theirs.magnetic_field_covariance) == symmetric(3).ravel().tolist()
 
 
 def test_orientation_of_zeros_is_none():
@@ -290,6 +325,16 @@ def test_nothing_but_status_and_service_is_taken_from_a_fix_without_a_position()
         ("pressure", rosbags_pressure(np.nan, 0.0), "malformed", "got nan"),
         ("pressure", rosbags_pressure(9e4, -1.0), "malformed", "the variance of a pressure is 0 or more"),
         ("pressure", rosbags_pressure(9e4, 0.0)[:-1], "truncated", "more are expected"),
+        (
+            *("magnetic_field", rosbags_magnetic_field([21.5, -1.25, -43.75], NONE), "malformed"),
+            "fields are in tesla, at most 1; got 21.5, -1.25, -43.75, which may be microtesla",
+        ),
+        ("magnetic_field", rosbags_magnetic_field([2e-5, 0, np.nan], NONE), "malformed", "finite numbers"),
+        (
+            *("magnetic_field", rosbags_magnetic_field(FIELD, -symmetric(3)), "malformed"),
+            "variances of a magnetic field are not negative",
+        ),
+        ("magnetic_field", rosbags_magnetic_field(FIELD, NONE)[:-1], "truncated", "72 more are expected"),
         ("odometry", rosbags_odometry(symmetric(6) * np.inf, symmetric(6)), "malformed", "finite"),
     ],
 )
@@ -355,7 +400,7 @@ def test_a_fix_is_the_same_after_ros(position: Any, status: int, service: int, k
 
 @given(
     st.binary(max_size=400),
-    st.sampled_from(["imu", "velocity", "pose", "fix", "pressure", "odometry"]),
+    st.sampled_from(["imu", "velocity", "pose", "fix", "magnetic_field", "pressure", "odometry"]),
     st.booleans(),
 )
 def test_arbitrary_bytes_raise_only_message_error(data: bytes, stream: Any, has_header: bool):

@@ -29,6 +29,7 @@ from zstate.odometry import (
     DatumPublisher,
     FixPublisher,
     ImuPublisher,
+    MagneticFieldPublisher,
     OdometryPublisher,
     PosePublisher,
     PressurePublisher,
@@ -57,10 +58,13 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
 
 SCAN_STREAMS = ("scan", "map")
-ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "pressure", "odometry")
+ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "magnetic_field", "pressure", "odometry")
 
 COUNT = 20
-SENSORS = ("imu/chest", "velocity/flow", "pose/mocap", "fix/gps", "pressure/bmp", "odometry/wheels")
+SENSORS = (
+    *("imu/chest", "velocity/flow", "pose/mocap", "fix/gps", "magnetic_field/mag", "pressure/bmp"),
+    "odometry/wheels",
+)
 CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
 
 
@@ -407,7 +411,7 @@ def test_an_active_sensor_is_not_replayed(sessions, scanned: Path):
 
 @pytest.fixture
 def driven(sessions, tmp_path: Path) -> Path:
-    """A cart with an IMU, a velocity, poses, fixes and odometry, recorded from the native wire."""
+    """A cart with a sensor of each kind and odometry, recorded from the native wire."""
     writer, reader = sessions
     path = tmp_path / "driven.mcap"
     with (
@@ -417,6 +421,7 @@ def driven(sessions, tmp_path: Path) -> Path:
         PosePublisher(writer, "cart", "mocap") as mocap,
         FixPublisher(writer, "cart", "gps") as gps,
         PressurePublisher(writer, "cart", "bmp") as barometer,
+        MagneticFieldPublisher(writer, "cart", "mag", covariance=np.eye(3) * 1e-14) as mag,
         Recorder(reader, path, ["cart"]) as recorder,
     ):
         wait_for_stream_readers(writer, "cart", *SENSORS)
@@ -428,6 +433,7 @@ def driven(sessions, tmp_path: Path) -> Path:
             odometry.publish(base, [n, 0, 0], [0, 0, 0], stamp)
             mocap.publish(base, stamp)
             barometer.publish(101325.0 - n, stamp, variance=2.25 if n % 2 else None)
+            mag.publish([n * 1e-6, 0, -4e-5], stamp)
             if n % 2:
                 gps.publish(47.5, n, 450.0, stamp, covariance=np.eye(3) * (n + 1), status=2, service=9)
             else:

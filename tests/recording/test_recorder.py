@@ -38,6 +38,7 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry import (
     FixPublisher,
     ImuPublisher,
+    MagneticFieldPublisher,
     OdometryPublisher,
     PosePublisher,
     PressurePublisher,
@@ -64,7 +65,7 @@ from zstate.wire.native import encode, encoding_of
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
 
-ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "pressure", "odometry")
+ODOMETRY_STREAMS = ("imu", "velocity", "pose", "fix", "magnetic_field", "pressure", "odometry")
 
 PERIOD = 1_000_000
 ROS_KEYS = RmwKeys(Ros2Options())
@@ -686,8 +687,7 @@ def test_scans_and_maps_are_recorded_as_published(sessions, tmp_path: Path, wire
 def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_path: Path, wire: str):
     writer, reader = sessions
     covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-3
-    path = tmp_path / "run.mcap"
-    now = time.time_ns()
+    path, now = tmp_path / "run.mcap", time.time_ns()
     with (
         TransformListener(reader, "r1", wire=wire, follow="tf") as listener,
         ImuPublisher(writer, "r1", "imu", [wire], frame="chest") as imu,
@@ -696,10 +696,11 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
         PosePublisher(writer, "r1", "mocap", [wire]) as mocap,
         FixPublisher(writer, "r1", "gps", [wire], frame="mast") as gps,
         PressurePublisher(writer, "r1", "bmp", [wire]) as barometer,
+        MagneticFieldPublisher(writer, "r1", "mag", [wire], frame="mast") as mag,
         Recorder(reader, path, ["r1"], wire=wire) as recorder,
     ):
         for stream, name in zip(
-            ODOMETRY_STREAMS, ("imu", "flow", "mocap", "gps", "bmp", "odom"), strict=True
+            ODOMETRY_STREAMS, ("imu", "flow", "mocap", "gps", "mag", "bmp", "odom"), strict=True
         ):
             keys = {"native": f"zstate/r1/{stream}/{name}", "ros2": ROS_KEYS.key("r1", stream, name)}
             wait_for_reader(writer, keys[wire])
@@ -711,7 +712,8 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
             mocap.publish(pose, now + k)
             barometer.publish(101325.0 - k, now + k, variance=2.25)
             gps.publish(47.5, 8.0 + k, None, now + k, covariance=np.eye(3), covariance_type=1, status=1)
-        until(lambda: [count(recorder, "r1", one) for one in ODOMETRY_STREAMS] == [5] * 6)
+            mag.publish([k * 1e-6, 0, -4e-5], now + k)
+        until(lambda: [count(recorder, "r1", one) for one in ODOMETRY_STREAMS] == [5] * 7)
         until(lambda: count(recorder, "r1", {"native": "transforms", "ros2": "tf"}[wire]) == 5)
         live = [
             listener.buffer.wait("odom", "base", at, DEADLINE_S) for at in (now + PERIOD // 2, now + PERIOD)
@@ -724,15 +726,19 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
         assert [one.angular_velocity.x for one in by_topic["/imu"]] == list(range(5))
         assert [one.twist.twist.linear.x for one in by_topic["/flow"]] == list(range(5))
         assert [one.pose.pose.position.x for one in by_topic["/mocap"]] == list(range(5))
-        assert [one.fluid_pressure for one in by_topic["/bmp"]] == [101325.0 - k for k in range(5)]
         assert [one.longitude for one in by_topic["/gps"]] == [8.0 + k for k in range(5)]
+        assert [
+            (bmp.fluid_pressure, mag.magnetic_field.x)
+            for bmp, mag in zip(by_topic["/bmp"], by_topic["/mag"], strict=True)
+        ] == [(101325.0 - k, k * 1e-6) for k in range(5)]
         assert {(one.status.status, one.position_covariance_type) for one in by_topic["/gps"]} == {(1, 1)}
         assert [one.pose.pose.position.x for one in by_topic["/odom"]] == list(range(5))
         assert [one.transforms[0].child_frame_id for one in by_topic["/tf"]] == ["base"] * 5
     with Recording(path) as recording:
         readings, velocities = list(recording.imu("r1", "imu")), list(recording.velocities())
         samples, poses = list(recording.odometry("r1", "odom")), list(recording.poses("r1", "mocap"))
-        fixes, pressures = list(recording.fixes("r1", "gps")), list(recording.pressures("r1", "bmp"))
+        more = recording.fixes("r1", "gps"), recording.pressures("r1"), recording.magnetic_fields("r1")
+        fixes, *others = (list(one) for one in more)
         buffer = recording.buffer()
         recorded = [buffer.lookup("odom", "base", at) for at in (now + PERIOD // 2, now + PERIOD)]
         streams = {one.stream for one in recorded_robots(recording.info)[0].streams}
@@ -751,9 +757,10 @@ def test_sensors_and_odometry_are_recorded_and_looked_up_as_live(sessions, tmp_p
     assert [(one.stamp, one.frame, one.longitude, one.altitude) for one in fixes] == [
         (now + k, "r1/mast", 8.0 + k, None) for k in range(5)
     ]
-    assert [(one.frame, one.pressure, one.variance) for one in pressures] == [
-        ("r1/bmp", 101325.0 - k, 2.25) for k in range(5)
-    ]
+    assert [
+        (bmp.frame, bmp.pressure, bmp.variance, mag.stamp, mag.frame, from_block(mag.field)[0])
+        for bmp, mag in zip(*others, strict=True)
+    ] == [("r1/bmp", 101325.0 - k, 2.25, now + k, "r1/mast", k * 1e-6) for k in range(5)]
     assert set(ODOMETRY_STREAMS) <= streams
     for there, here in zip(live, recorded, strict=True):
         assert (there.pose7 == here.pose7).all()

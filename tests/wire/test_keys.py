@@ -133,6 +133,7 @@ def test_every_key_of_a_robot_lies_under_its_own_prefix():
     assert keys.stream_key("r1", "fix", "gps") == "zstate/r1/fix/gps"
     assert keys.stream_key("r1", "pressure", "bmp") == "zstate/r1/pressure/bmp"
     assert keys.stream_key("r1", "datum", "map") == "zstate/r1/datum/map"
+    assert keys.stream_key("r1", "magnetic_field", "mag") == "zstate/r1/magnetic_field/mag"
     assert keys.stream_key("r1", "odometry", "odometry") == "zstate/r1/odometry/odometry"
     assert keys.LOOKUP.key("panda") == "zstate/panda/lookup"
     assert keys.WRITER_TOKEN.key("panda", "tf", "x") == "zstate/panda/@writer/tf/x"

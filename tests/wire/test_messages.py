@@ -7,7 +7,17 @@ import pytest
 
 from zstate.driving.messages import DriverState, JointTrajectory, with_short_texts
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Pressure, Velocity, with_full_names
+from zstate.odometry.messages import (
+    Fix,
+    Imu,
+    MagneticField,
+    MapDatum,
+    Odometry,
+    Pose,
+    Pressure,
+    Velocity,
+    with_full_names,
+)
 from zstate.plugins import stream_named
 from zstate.scans.messages import LaserScan, OccupancyGrid, cells_of
 from zstate.wire.messages import (
@@ -181,6 +191,11 @@ def datum(**changed: Any) -> MapDatum:
     return MapDatum(**{**fields, "latitude": 47.5, "longitude": 8.25, "altitude": 450.0, **changed})
 
 
+def magnetic_field(**changed: Any) -> MagneticField:
+    fields: dict[str, Any] = {"stamp": 5, "seq": 0, "session": 1, "frame": "mag"}
+    return MagneticField(**{**fields, "field": to_block([2e-5, 0, -4e-5]), **changed})
+
+
 def odometry(**changed: Any) -> Odometry:
     edge = (("odom", "base"),)
     fields: dict[str, Any] = {
@@ -243,6 +258,14 @@ def odometry(**changed: Any) -> Odometry:
         (fix, {"covariance": bytes(48)}, "got 0 with one"),
         (fix, {"covariance": bytes(48), "covariance_type": 4}, "got 4 with one"),
         (fix, {"covariance_type": 3}, "got 3 without one"),
+        (magnetic_field, {"frame": ""}, "1 to 1024 characters, not 0"),
+        (magnetic_field, {"field": bytes(16)}, "3 numbers take 24 bytes, not 16"),
+        (magnetic_field, {"field": to_block([0, np.nan, 0])}, "a magnetic field of finite numbers"),
+        # the field of the Earth in microtesla, and in milligauss
+        (magnetic_field, {"field": to_block([21.0, 0, -43.0])}, "tesla, .* -43.0, which may be microtesla"),
+        (magnetic_field, {"field": to_block([210.0, 0, -430.0])}, "tesla, .* or milligauss"),
+        (magnetic_field, {"covariance": bytes(40)}, "of 6 numbers take 48 bytes, not 40"),
+        (magnetic_field, {"covariance": to_block([1, 0, 0, -2, 0, 3])}, "variances of a magnetic field"),
         (odometry, {"edges": None}, "odometry has one edge"),
         (odometry, {"poses": bytes(112)}, "1 edges need as many poses, not 2"),
         (odometry, {"covariances": bytes(168 * 2)}, "21 numbers of covariance each"),
@@ -311,7 +334,10 @@ def test_messages_of_sensors_and_odometry_fit_the_limit_of_their_streams():
     frame, six = "\U0001f916" * 1024, bytes(21 * 8)
     edge = ((frame, frame),)
     largest = odometry(edges=edge, order=order_digest(edge), covariances=six, twist_covariance=six)
-    of_sensors = imu(frame=frame), fix(frame=frame, covariance=bytes(48), covariance_type=3)
+    of_sensors = (
+        *(imu(frame=frame), fix(frame=frame, covariance=bytes(48), covariance_type=3)),
+        magnetic_field(frame=frame, covariance=bytes(48)),
+    )
     assert max(len(encode(one)) for one in (*of_sensors, largest)) <= stream_named("odometry").max_bytes
 
 
@@ -319,6 +345,7 @@ def test_frames_of_a_measurement_get_their_full_names():
     assert with_full_names(imu(), "r1").frame == "r1/imu"
     assert with_full_names(fix(), "r1").frame == "r1/gps"
     assert with_full_names(pressure(), "r1").frame == "r1/bmp"
+    assert with_full_names(magnetic_field(), "r1").frame == "r1/mag"
     placed = with_full_names(pose(parent="hall/map"), "r1")
     assert (placed.parent, placed.child) == ("hall/map", "r1/base")
     assert with_full_names(pose(child=""), "r1").child == ""  # of the base

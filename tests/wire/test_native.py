@@ -20,7 +20,16 @@ from zstate.driving.messages import (
     Stop,
 )
 from zstate.errors import MessageError
-from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Pressure, Velocity
+from zstate.odometry.messages import (
+    Fix,
+    Imu,
+    MagneticField,
+    MapDatum,
+    Odometry,
+    Pose,
+    Pressure,
+    Velocity,
+)
 from zstate.plugins import all_streams
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.streams import LATCHED_BYTES, StreamName
@@ -261,6 +270,13 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         header(7)[:-10]
         + fixstr("fleet/map")
         + b"".join(b"\xcb" + struct.pack(">d", number) for number in (47.5, -8.25, 450.0)),
+    ),
+    "magnetic_field": (
+        MagneticField(STAMP, 300, 2**63 + 5, "mag", to_block([0.5, 0.25, -1.0]), to_block(range(6))),
+        header(6)[:-10]
+        + fixstr("mag")
+        + bin8(struct.pack("<3d", 0.5, 0.25, -1.0))
+        + bin8(struct.pack("<6d", *range(6))),
     ),
     "odometry": (
         Odometry(

@@ -35,6 +35,7 @@ from zstate.odometry import (
     DatumPublisher,
     FixPublisher,
     ImuPublisher,
+    MagneticFieldPublisher,
     OdometryPublisher,
     PosePublisher,
     PressurePublisher,
@@ -115,7 +116,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
             odometry = opened.enter_context(TransformPublisher(writer, "r1", "odometry", program="driver"))
             odometry.publish([Transform("odom", "world", (1.0, 0.0, 0.0), UPRIGHT)])
             opened.enter_context(DatumPublisher(writer, "r1", program="driver")).set(Datum(47.5, 8.25))
-        wheels, imu, flow, mocap, gps, barometer = (
+        wheels, imu, flow, mocap, gps, barometer, mag = (
             opened.enter_context(kind(writer, "r1", name, (wire,), program="driver"))
             for kind, name in (
                 (OdometryPublisher, "odom"),
@@ -124,6 +125,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
                 (PosePublisher, "mocap"),
                 (FixPublisher, "gps"),
                 (PressurePublisher, "bmp"),
+                (MagneticFieldPublisher, "mag"),
             )
         )
 
@@ -136,6 +138,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
             mocap.publish(Transform("map", "odom", (1.0, 0.0, 0.0), UPRIGHT))
             gps.publish(47.5, 8.25)
             barometer.publish(101325.0)
+            mag.publish([2e-5, 0, -4e-5])
 
         with repeated(publish):
             yield

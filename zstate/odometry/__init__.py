@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from zstate.odometry.health import SourceHealth
     from zstate.odometry.invariant_filter import ImuNoise
     from zstate.odometry.legs import ForceThresholds, LegNoise, Legs, SpeedThresholds
+    from zstate.odometry.magnetism import earth_field
     from zstate.odometry.map_correction import MapCorrection
     from zstate.odometry.map_estimator import MapEstimator, MapState
     from zstate.odometry.node import OdometryNode, SensorListener
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
         DatumPublisher,
         FixPublisher,
         ImuPublisher,
+        MagneticFieldPublisher,
         OdometryPublisher,
         PosePublisher,
         PressurePublisher,
@@ -24,7 +26,15 @@ if TYPE_CHECKING:
     )
     from zstate.odometry.requests import request_odometry
     from zstate.odometry.simulated_rover import SimulatedRover, SimulatedWheels
-    from zstate.odometry.source_noise import BarometerNoise, FixNoise, HeadingNoise, PoseNoise, VelocityNoise
+    from zstate.odometry.source_noise import (
+        BarometerNoise,
+        FixNoise,
+        HeadingNoise,
+        MagnetometerNoise,
+        PoseNoise,
+        RelativeNoise,
+        VelocityNoise,
+    )
     from zstate.odometry.wheels import Ackermann, DiffDrive, Mecanum, WheelNoise, Wheels, WheelVelocity
 
 __all__ = [
@@ -45,6 +55,8 @@ __all__ = [
     "ImuPublisher",
     "LegNoise",
     "Legs",
+    "MagneticFieldPublisher",
+    "MagnetometerNoise",
     "MapCorrection",
     "MapEstimator",
     "MapState",
@@ -54,6 +66,7 @@ __all__ = [
     "PoseNoise",
     "PosePublisher",
     "PressurePublisher",
+    "RelativeNoise",
     "SensorListener",
     "SimulatedRover",
     "SimulatedWheels",
@@ -64,6 +77,7 @@ __all__ = [
     "WheelNoise",
     "WheelVelocity",
     "Wheels",
+    "earth_field",
     "request_odometry",
 ]
 
@@ -85,6 +99,8 @@ _HOMES = {
     "ImuPublisher": "publishers",
     "LegNoise": "legs",
     "Legs": "legs",
+    "MagneticFieldPublisher": "publishers",
+    "MagnetometerNoise": "source_noise",
     "MapCorrection": "map_correction",
     "MapEstimator": "map_estimator",
     "MapState": "map_estimator",
@@ -92,6 +108,7 @@ _HOMES = {
     "OdometryNode": "node",
     "OdometryPublisher": "publishers",
     "PoseNoise": "source_noise",
+    "RelativeNoise": "source_noise",
     "PosePublisher": "publishers",
     "PressurePublisher": "publishers",
     "SensorListener": "node",
@@ -104,6 +121,7 @@ _HOMES = {
     "WheelNoise": "wheels",
     "WheelVelocity": "wheels",
     "Wheels": "wheels",
+    "earth_field": "magnetism",
     "request_odometry": "requests",
 }
 

@@ -8,7 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Pressure, Velocity
+from zstate.odometry.messages import (
+    Fix,
+    Imu,
+    MagneticField,
+    MapDatum,
+    Odometry,
+    Pose,
+    Pressure,
+    Velocity,
+)
 from zstate.wire.keys import full_name
 from zstate.wire.messages import covariance_matrix, from_block
 
@@ -77,6 +86,12 @@ def datum_document(message: MapDatum, robot: str) -> dict[str, Any]:
     return {**_head(message, robot), **{name: getattr(message, name) for name in place}}
 
 
+def magnetic_field_document(message: MagneticField, robot: str) -> dict[str, Any]:
+    """A magnetic field at a sensor of ``robot``: stamp [ns], field [T], and sigmas if known."""
+    document = {**_head(message, robot), "field": _list(message.field)}
+    return document | _sigmas([("field", message.covariance)])
+
+
 def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
     """Odometry of ``robot``: stamp [ns], frames, pose [m], velocities [m/s, rad/s], and sigmas if known."""
     ((parent, child),) = message.edges or (("", ""),)
@@ -94,7 +109,7 @@ def odometry_document(message: Odometry, robot: str) -> dict[str, Any]:
     return document | _sigmas([("pose", message.covariances), ("twist", message.twist_covariance)])
 
 
-def _head(message: Imu | Velocity | Fix | Pressure | MapDatum, robot: str) -> dict[str, Any]:
+def _head(message: Imu | Velocity | Fix | MagneticField | Pressure | MapDatum, robot: str) -> dict[str, Any]:
     return {"stamp": message.stamp, "seq": message.seq, "frame": full_name(robot, message.frame)}
 
 

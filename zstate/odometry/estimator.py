@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from zstate import se3
 from zstate._util.format import did_you_mean, format_duration
 from zstate.buffer.buffer import TransformBuffer, check_duration
-from zstate.checks import Floats
+from zstate.checks import Floats, real_numbers
 from zstate.clock import Clock, check_stamp
 from zstate.errors import InFuture, InPast, InvalidInput, NoData
 from zstate.odometry.alignment import COARSE_S, Alignment, align, start_at
@@ -37,6 +37,7 @@ from zstate.odometry.fusion import (
     Contacts,
     Displacement,
     Estimate,
+    Field,
     Fusion,
     Heading,
     Height,
@@ -45,11 +46,13 @@ from zstate.odometry.fusion import (
     Steps,
     imu_remarks,
     is_still,
+    lead_remarks,
     odom_pose,
 )
 from zstate.odometry.health import Outcome, SourceHealth, SourceRecord
 from zstate.odometry.invariant_filter import FilterState, ImuNoise, Measurement
 from zstate.odometry.legs import Legs
+from zstate.odometry.magnetism import EarthField, check_strength
 from zstate.odometry.measurements import (
     MAX_SIGMA,
     MIN_SIGMA,
@@ -62,8 +65,10 @@ from zstate.odometry.measurements import (
     yaw_curvature,
 )
 from zstate.odometry.measurements import position as measured_position
-from zstate.odometry.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_RATE, MAX_SPEED
+from zstate.odometry.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_FIELD, MAX_RATE, MAX_SPEED
 from zstate.odometry.placement import Placement, is_finite, last_pose, placed
+from zstate.odometry.relative import RelativePose
+from zstate.odometry.source_noise import RelativeNoise
 from zstate.odometry.stamp_order import Held, StampOrder
 from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions, displacement
 from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
@@ -128,7 +133,9 @@ class BaseState:
     is_coasting: bool
 
 
-_Input: TypeAlias = Inertia | Reading | Displacement | Heading | Height | Contacts | Steps | Placement
+_Input: TypeAlias = (
+    Inertia | Reading | Displacement | RelativePose | Heading | Height | Field | Contacts | Steps | Placement
+)
 
 
 class _Event:
@@ -418,6 +425,34 @@ class BaseEstimator:
         numbers = (*odom_from_base.pose7.tolist(), *noise.diagonal().tolist())
         self._offer(_Event(source, reading, numbers), is_shared=False)
 
+    def relative_pose(
+        self,
+        stamp: int,
+        world_from_frame: Transform,
+        covariance: ArrayLike | None = None,
+        *,
+        source: str,
+        noise: RelativeNoise | None = None,
+    ) -> None:
+        """A pose of another odometry at ``stamp``, as of visual or lidar odometry, in a world of its own.
+
+        The displacement since its last one is used, with a constant scale, which is estimated. Its target is
+        any frame, its source one on the robot. ``covariance`` (6, 6), of ``Transform.covariance``, is used as
+        ``noise`` says (by default not), but for one that is none, such as zeros. A displacement that the
+        other sources contradict is rejected, and so a jump does no harm. Raises InvalidInput, which names the
+        source, for NaN and more than 1e8 m; UnknownFrame for the frame.
+        """
+        checked_vector(world_from_frame.translation, source, "position", MAX_DISTANCE)
+        mount, matrix = self._mount(world_from_frame.source), world_from_frame.matrix
+        known = (
+            None if covariance is None else real_numbers(covariance, f"the covariance of source {source!r}")
+        )
+        if known is not None and (known.shape != (6, 6) or not np.isfinite(known).all()):
+            raise InvalidInput(f"the covariance of source {source!r} is finite, (6, 6); got {known.tolist()}")
+        world = world_from_frame.target
+        reading = RelativePose(check_stamp(stamp), world, matrix, known, noise or RelativeNoise(), mount)
+        self._offer(_Event(source, reading, world_from_frame.pose7.tolist()))
+
     def heading(self, stamp: int, yaw: float, sigma: float, *, source: str, frame: str | None = None) -> None:
         """The yaw of ``frame``, by default the base, at ``stamp`` [rad], with a standard deviation.
 
@@ -433,7 +468,7 @@ class BaseEstimator:
                 f"a heading of source {source!r} is at most {_LARGEST_YAW:g} rad, with a sigma of "
                 f"{MIN_SIGMA:g} to {MAX_SIGMA:g} rad; got yaw={yaw!r}, sigma={sigma!r}"
             )
-        reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, mount)
+        reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, mount[:3, 0])
         self._offer(_Event(source, reading, (yaw, sigma)))
 
     def height(
@@ -467,6 +502,37 @@ class BaseEstimator:
         numbers = float(height), float(sigma) ** 2, float(wander) ** 2, float(correlated_s)
         self._record(source).has_bounds = True
         self._offer(_Event(source, Height(check_stamp(stamp), *numbers, mount), numbers))
+
+    def magnetic_field(
+        self,
+        stamp: int,
+        field: ArrayLike,
+        sigma: float,
+        *,
+        source: str,
+        frame: str | None = None,
+        expected: EarthField | None = None,
+    ) -> None:
+        """The magnetic field in the axes of ``frame`` at ``stamp``, x y z [T], (3,), of which a yaw is known.
+
+        ``frame`` is the base by default. ``sigma`` [rad] is that of the yaw, which is levelled by the
+        attitude at that stamp, and is used as that of a ``heading``. A field is rejected, with a sentence in
+        ``health``, if its strength differs by more than 10 %, or its dip by more than 5 degrees, from the
+        mean of ten readings in a row at the start, or from the field of the Earth that is ``expected``.
+        Raises InvalidInput, which names the source, for NaN, for less than 1e-6 or more than 1e-3 T, and for
+        a sigma outside of 1e-9 to 1e9.
+        """
+        vector = checked_vector(field, source, "magnetic field", MAX_FIELD)
+        check_strength(math.sqrt(vector @ vector), source)
+        if not MIN_SIGMA <= sigma <= MAX_SIGMA:
+            raise InvalidInput(
+                f"the yaw by a field of source {source!r} has a sigma of {MIN_SIGMA:g} to {MAX_SIGMA:g} rad; "
+                f"got {sigma!r}"
+            )
+        vector, ahead = self._mount(frame or self.base)[:3, :3].dot(vector), self._imu_from_base[:3, 0]
+        reading = Field(check_stamp(stamp), vector, float(sigma) ** 2, ahead, expected)
+        self._record(source).has_bounds = True
+        self._offer(_Event(source, reading, (*vector.tolist(), sigma)))
 
     @property
     def clock(self) -> Clock:
@@ -555,6 +621,7 @@ class BaseEstimator:
                 f"rejected for {(run.stamp - run.start) * 1e-9:.1f} s in a row: the estimate is lost, unless "
                 "another source confirms it"
             )
+        found += lead_remarks(last, name)
         compass = last.compasses.get(name)
         if compass is not None and compass.deviation > 0.0:
             degrees = math.degrees(math.sqrt(compass.deviation))
@@ -803,10 +870,14 @@ class BaseEstimator:
                 after, outcome = fusion.after_steps(self._legs, estimate, reading, following)
             case Displacement():
                 after, outcome = fusion.after_pause(estimate, reading, following)
+            case RelativePose():
+                after, outcome = fusion.after_relative(estimate, event.source, reading, following)
             case Heading():
                 after, outcome = fusion.after_heading(estimate, event.source, reading, following)
             case Height():
                 after, outcome = fusion.after_height(estimate, event.source, reading, following)
+            case Field():
+                after, outcome = fusion.after_field(estimate, event.source, reading, following)
             case Reading():
                 after, outcome = fusion.after_reading(estimate, event.source, reading, following)
         return after, outcome

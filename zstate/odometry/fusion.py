@@ -22,6 +22,10 @@ kept.
   weather. The height is never known better than by what the barometer may have wandered since its first
   reading, and moves alone: velocity, tilt and biases learn nothing from it. A barometer that is rejected for
   two seconds, as in a gust, begins anew.
+- Of another odometry the displacements between its poses are used, with a constant scale, which velocities
+  and positions of other sources show. A jump is rejected, and the way goes on from there.
+- A magnetic field is a heading, that of the axis along the field. Iron and motors change its strength or its
+  dip as well: a field that differs from the one at the start, or from the Earth's, is rejected.
 - The pose of the odometry frame is continuous (REP 105): it is the integral of the predictions. What a
   reading corrects of the place or the yaw remains an ``Offset``, whose square is part of the covariance.
 """
@@ -31,6 +35,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -48,18 +53,24 @@ from zstate.odometry.invariant_filter import (
     ImuNoise,
     Innovation,
     Measurement,
+    carried,
     corrected,
     forgotten,
     initial_state,
     innovation,
     plain_covariance,
     predict,
+    tracked_pose,
     updated,
     white_noise,
     with_plain_covariance,
+    with_tracked,
+    without_tracked,
 )
 from zstate.odometry.legs import Foot, Legs, Stance, stance_after, updated_by_feet
-from zstate.odometry.measurements import heading, height, yaw_rate, zero_velocity
+from zstate.odometry.magnetism import EarthField, UsualField, usual_after
+from zstate.odometry.measurements import heading, height, tracking, yaw_rate, zero_velocity
+from zstate.odometry.relative import RelativePose, moved_between
 from zstate.odometry.rotations import rotation_exp, skew
 from zstate.odometry.turning import (
     COMPARED_S,
@@ -134,6 +145,8 @@ _UNPROVEN, _SECTORS = 0.5, 12
 """[rad] The standard deviation of a compass at first, and in how many directions it is proven."""
 _PROVEN = 0.1
 """[rad] One that may be off by less, from ten directions on, measures the gyro's bias and turns the pose."""
+_SCALE_SIGMAS, _SCALE = 3.0, 0.03
+"""A scale of another odometry that differs from 1 by more, in standard deviations and by part, is named."""
 _SAMPLED_S, _SAMPLED_GAIN, _SLOWEST_NS = 0.01, 0.05, 350_000_000
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
@@ -190,12 +203,28 @@ class Displacement(NamedTuple):
 
 
 class Heading(NamedTuple):
-    """The yaw of a frame in the axes of a compass [rad], with its variance [rad^2]."""
+    """The yaw of an axis in the axes of a compass [rad], with its variance [rad^2].
+
+    ``axis`` (3,) has the length 1 and is in the axes of the IMU.
+    """
 
     stamp: int
     yaw: float
     variance: float
-    imu_from_frame: Floats
+    axis: Floats
+
+
+class Field(NamedTuple):
+    """A magnetic field in the axes of the IMU [T], (3,), with the variance of the yaw that it shows [rad^2].
+
+    ``ahead`` (3,) is the x axis of the base there, and ``expected`` the field of the Earth, if known.
+    """
+
+    stamp: int
+    field: Floats
+    variance: float
+    ahead: Floats
+    expected: EarthField | None
 
 
 class Height(NamedTuple):
@@ -281,11 +310,20 @@ class Vibration(NamedTuple):
     repeated: int = 0
 
 
+class Lead(NamedTuple):
+    """The last pose of another odometry, and how many of its displacements the sigmas were stated for."""
+
+    last: RelativePose
+    stated: int = 0
+    shown: int = 0
+
+
 class Offset(NamedTuple):
     """From the estimate to the continuous pose of the IMU: ``rotation @ place + shift``. ``rotation`` (3, 3).
 
     It was last changed at ``stamp``. ``is_followed``: it fades, as poses are measured in the odometry frame;
-    ``is_turned``: its yaw fades, as a compass is right; ``is_lifted``: its height fades, by a barometer.
+    ``is_turned``: its yaw fades, as a compass is right, or another odometry measures turns; ``is_lifted``:
+    its height fades, by a barometer.
     """
 
     rotation: Floats
@@ -333,7 +371,7 @@ class Estimate(NamedTuple):
     ``rate`` and ``force`` are those of the IMU at ``stamp``, interpolated, or assumed if ``is_coasting``.
     ``moved_at`` is the stamp of the last velocity that was not zero, ``angular`` the rate by wheels in the
     IMU's axes [rad/s], ``wheels_at`` their stamp, ``swept`` the integral of the gyro since then [rad], (3,).
-    ``touching`` are the feet on the ground, if measured.
+    ``touching`` are the feet on the ground, if measured. ``fields`` are what magnetometers usually measure.
     ``sampled_s`` is the mean time between samples of the IMU, over which the noise of a rate is averaged.
     ``tilts`` has for each direction the vertical less that of the base, in the IMU's axes, (3,). ``fastest``
     is the greatest speed that was measured [m/s]. ``anchor`` is the estimate at the last reading before
@@ -373,6 +411,8 @@ class Estimate(NamedTuple):
     runs: dict[str, Run] = {}  # noqa: RUF012 - replaced, never written to
     compasses: dict[str, Compass] = {}  # noqa: RUF012 - replaced, never written to
     altimeters: dict[str, Altimeter] = {}  # noqa: RUF012 - replaced, never written to
+    leads: dict[str, Lead] = {}  # noqa: RUF012 - replaced, never written to
+    fields: dict[str, UsualField] = {}  # noqa: RUF012 - replaced, never written to
 
 
 def started(stamp: int, state: FilterState) -> Estimate:
@@ -437,7 +477,17 @@ class Fusion:
             estimate = self.settled(estimate)
             estimate = estimate._replace(offset=estimate.offset._replace(is_followed=True))
         measurement = reading.measure(estimate.state, estimate.rate)
-        return _gated(estimate, source, measurement, is_position=reading.is_position, axis=reading.upright)
+        if reading.is_position:
+            return _gated(
+                estimate, source, measurement, lambda state, _: _without_place(state, measurement.residual)
+            )
+        return _gated(
+            estimate,
+            source,
+            measurement,
+            lambda state, seconds: _without_velocity(state, measurement.residual, seconds),
+            kept=None if reading.upright is None else partial(_without_yaw_bias, axis=reading.upright),
+        )
 
     def after_pause(
         self, before: Estimate, reading: Displacement, following: Inertia | None
@@ -475,14 +525,46 @@ class Fusion:
         )
         return estimate, Outcome("accepted", math.nan, 0)
 
-    def after_heading(
-        self, before: Estimate, source: str, reading: Heading, following: Inertia | None
+    def after_field(
+        self, before: Estimate, source: str, reading: Field, following: Inertia | None
     ) -> tuple[Estimate, Outcome]:
-        """The estimate after a heading, and what became of it."""
+        """The estimate after a magnetic field, and what became of it: its axis has the yaw of north, zero.
+
+        Raises InvalidInput if it is not the field that is usual, or expected.
+        """
+        estimate = self.predicted(before, reading.stamp, following)
+        rotation, strength = estimate.state.rotation, math.sqrt(reading.field @ reading.field)
+        axis = reading.field / strength
+        x, y, z = rotation.dot(axis).tolist()
+        dip = math.atan2(-z, math.hypot(x, y))
+        usual = usual_after(estimate.fields.get(source), strength, dip, reading.expected)
+        compasses = estimate.compasses
+        if usual.readings == 1:
+            compasses = {name: one for name, one in compasses.items() if name != source}
+        estimate = estimate._replace(fields={**estimate.fields, source: usual}, compasses=compasses)
+        ahead = rotation.dot(reading.ahead)
+        direction = math.atan2(ahead[1], ahead[0]) - math.atan2(y, x)
+        north = Heading(reading.stamp, 0.0, reading.variance, axis)
+        return self.after_heading(estimate, source, north, following, direction=direction)
+
+    def after_heading(
+        self,
+        before: Estimate,
+        source: str,
+        reading: Heading,
+        following: Inertia | None,
+        *,
+        direction: float | None = None,
+    ) -> tuple[Estimate, Outcome]:
+        """The estimate after a heading, and what became of it.
+
+        ``direction`` is that of the base by this compass [rad], by default the yaw itself.
+        """
+        sector = _sector(reading.yaw if direction is None else direction)
         estimate = self.predicted(before, reading.stamp, following)
         compass = estimate.compasses.get(source)
         offset = 0.0 if compass is None else compass.offset
-        measurement = heading(estimate.state, reading.yaw - offset, reading.variance, reading.imu_from_frame)
+        measurement = heading(estimate.state, reading.yaw - offset, reading.variance, reading.axis)
         residual = float(measurement.residual[0])
         row = measurement.jacobian[0]
         settled = self.settled(estimate)
@@ -491,14 +573,14 @@ class Fusion:
         turned = estimate.offset.rotation
         against_gyro = residual - math.atan2(float(turned[1, 0]), float(turned[0, 0]))
         if compass is None:
-            sectors = {_sector(reading.yaw): (reading.stamp, against_gyro - residual)}  # less the offset
+            sectors = {sector: (reading.stamp, against_gyro - residual)}  # less the offset
             first = Compass(reading.stamp, reading.stamp, residual, variance, 0.0, 0.0, sectors)
             return _with_compass(estimate, source, first), Outcome("accepted", 1.0, 1)
         # The first reading has an error as well, and that of our yaw then is part of the present one.
         expected = variance + 2.0 * reading.variance
         share = 1.0 - math.exp(-(reading.stamp - compass.stamp) * 1e-9 / _DEVIATION_S)
         excess = compass.excess + share * (residual * residual - expected - compass.excess)
-        sectors = {**compass.sectors, _sector(reading.yaw): (reading.stamp, against_gyro)}
+        sectors = {**compass.sectors, sector: (reading.stamp, against_gyro)}
         bias_variance = float(np.diag(estimate.state.covariance)[GYRO_BIAS].max())
         spread = _spread(sectors, reading.stamp, against_gyro, bias_variance) - 2.0 * reading.variance
         deviation = max(compass.deviation, excess, spread)
@@ -556,6 +638,44 @@ class Fusion:
             estimate = estimate._replace(offset=estimate.offset._replace(is_lifted=True))
             estimate = _moved(estimate, state)
         return estimate, Outcome("accepted", nis, 1)
+
+    def after_relative(
+        self, before: Estimate, source: str, reading: RelativePose, following: Inertia | None
+    ) -> tuple[Estimate, Outcome]:
+        """The estimate after a pose of another odometry, by the displacement from the last one."""
+        estimate = self.predicted(before, reading.stamp, following)
+        lead = estimate.leads.get(source)
+        found = tracked_pose(estimate.state, source)  # none as after a pause of all data
+        is_first = lead is None or lead.last.world != reading.world or lead.last.stamp == reading.stamp
+        if lead is None or found is None or is_first:
+            return _led(estimate, source, Lead(reading)), Outcome("accepted", math.nan, 0)
+        estimate = estimate._replace(offset=estimate.offset._replace(is_turned=True))
+        move, elapsed_s = moved_between(lead.last, reading), (reading.stamp - lead.last.stamp) * 1e-9
+        mount, state = reading.imu_from_frame, estimate.state
+        state = carried(state, source, move.moved, move.walk, mount, dt_s=elapsed_s)
+        estimate = estimate._replace(state=state)
+        wheels_at = estimate.wheels_at
+        is_driven = wheels_at is not None and reading.stamp - wheels_at <= _WHEELS_VALID_NS
+        measurement = tracking(state, source, move.spread, mount)
+        after, outcome = _gated(
+            estimate,
+            source,
+            measurement,
+            lambda state, seconds: _without_velocity(state, measurement.residual[3:] / elapsed_s, seconds),
+            kept=None if is_driven else partial(_without_scale, row=found[0] + 6),
+            is_step=True,
+        )
+        if outcome.fate == "rejected":
+            angle, way = (float(np.linalg.norm(part)) for part in np.split(measurement.residual, 2))
+            failure = (
+                f"it moved by {move.way:.2g} m in {elapsed_s:.2g} s, {way:.2g} m and "
+                f"{math.degrees(angle):.2g} degrees away from the motion by the other sources"
+            )
+            outcome = outcome._replace(failure=failure)
+        counted = Lead(reading, lead.stated + move.is_stated, lead.shown + (not move.is_stated))
+        if outcome.fate == "accepted":
+            return after._replace(leads={**after.leads, source: counted}), outcome
+        return _led(after, source, counted), outcome
 
     def after_steps(
         self, legs: Legs, before: Estimate, reading: Steps, following: Inertia | None
@@ -785,7 +905,9 @@ class Fusion:
         )
         if not (is_still and rest.was_still):
             return self._within_bounds(estimate), None
-        found, outcome = _gated(estimate, STANDSTILL, zero_velocity(state, gyro, _REST_SPEED, sigma))
+        # The base may be turned or carried while its wheels stand.
+        still = zero_velocity(state, gyro, _REST_SPEED, sigma)
+        found, outcome = _gated(estimate, STANDSTILL, still, None)
         if outcome.fate == "accepted" and not estimate.was_at_rest:
             # The comparison with the wheels is of the bias before.
             found = found._replace(was_at_rest=True, turning=Turning())
@@ -863,6 +985,30 @@ def imu_remarks(estimate: Estimate) -> list[str]:
         how = "wheels measured the way" if pause.is_bridged else "the base may have driven anywhere meanwhile"
         found.append(f"all data paused for {pause.seconds:.1f} s: {how}")
     return [text for text in found if text]
+
+
+def lead_remarks(estimate: Estimate, source: str) -> list[str]:
+    """What is known of another odometry: its scale, and whether its covariances are of use."""
+    found, lead = tracked_pose(estimate.state, source), estimate.leads.get(source)
+    if found is None or lead is None:
+        return []
+    texts = list[str]()
+    row, tracked = found
+    sigma = math.sqrt(float(estimate.state.covariance[row + 6, row + 6]))
+    if abs(tracked.log_scale) > max(_SCALE_SIGMAS * sigma, _SCALE):
+        factor = math.exp(-tracked.log_scale)
+        what = "long" if factor > 1.0 else "short"
+        texts.append(
+            f"its displacements are {factor:.2f} times as long as those by the other sources: they are too "
+            f"{what}, and scaled so"
+        )
+    kind = lead.last.noise.covariance
+    if kind != "stated" and lead.stated > lead.shown:
+        texts.append(
+            f"its covariances do not grow as {kind} ones do, or are zero: the stated sigmas were used for "
+            f"{lead.stated} of {lead.stated + lead.shown} displacements"
+        )
+    return texts
 
 
 def _with_tilt(estimate: Estimate, reading: Reading) -> dict[int, Floats]:
@@ -1049,32 +1195,36 @@ def _gated(
     estimate: Estimate,
     source: str,
     measurement: Measurement,
+    lost: Callable[[FilterState, float], FilterState] | None,
     *,
-    is_position: bool = False,
-    axis: Floats | None = None,
+    kept: Callable[[Innovation], Innovation] | None = None,
+    is_step: bool = False,
 ) -> tuple[Estimate, Outcome]:
-    """The estimate after a measurement, if it passes the gate. ``axis``: see ``_without_yaw_bias``."""
+    """The estimate after a measurement, if it passes the gate.
+
+    ``lost(state, seconds)`` has forgotten what a source that was rejected for so long contradicts; without it
+    a source is never followed. ``kept`` makes a gain that keeps a part of the state; for ``is_step`` see
+    ``_moved``.
+    """
     state, dimension = estimate.state, len(measurement.residual)
     found = innovation(state, measurement)
     nis = found.nis
     if nis <= gate(dimension):
         if source in estimate.runs:
             estimate = _with_run(estimate, source, None)
-        if axis is not None:
-            found = _without_yaw_bias(found, axis)
-        return _moved(estimate, corrected(state, measurement, found)), Outcome("accepted", nis, dimension)
-    if source == STANDSTILL:  # the base may be turned or carried while its wheels stand
+        if kept is not None:
+            found = kept(found)
+        after = _moved(estimate, corrected(state, measurement, found), is_step=is_step)
+        return after, Outcome("accepted", nis, dimension)
+    if lost is None:
         return estimate, Outcome("rejected", nis, dimension)
     estimate, is_enough = _with_rejection(estimate, source)
     run = estimate.runs[source]
     if not is_enough:
         return estimate, Outcome("rejected", nis, dimension)
-    if is_position:
-        state = _without_place(state, measurement.residual)
-    else:
-        state = _without_velocity(state, measurement.residual, (estimate.stamp - run.start) * 1e-9)
+    state = lost(state, (estimate.stamp - run.start) * 1e-9)
     found = innovation(state, measurement)
-    state = corrected(state, measurement, found if axis is None else _without_yaw_bias(found, axis))
+    state = corrected(state, measurement, found if kept is None else kept(found))
     estimate = _moved(_with_run(estimate, source, None), state)._replace(lost_at=estimate.stamp)
     return estimate, Outcome("reacquired", nis, dimension)
 
@@ -1091,6 +1241,17 @@ def _without_yaw_bias(found: Innovation, axis: Floats) -> Innovation:
     return found._replace(gain=gain)
 
 
+def _without_scale(found: Innovation, row: int) -> Innovation:
+    """The innovation with a gain that leaves the scale of the source, the error ``row``, as it is.
+
+    With an IMU alone another odometry would learn it from accelerations, which vibration and tilt are part
+    of: on a real drive it became 0.6. Wheels, feet, velocities and positions show it.
+    """
+    gain = found.gain.copy()
+    gain[row] = 0.0
+    return found._replace(gain=gain)
+
+
 def _without_velocity(state: FilterState, residual: Floats, seconds: float) -> FilterState:
     """The state with an unknown velocity: it was wrong by the residual for so long."""
     error = float(residual[:3] @ residual[:3])
@@ -1101,6 +1262,7 @@ def _without_velocity(state: FilterState, residual: Floats, seconds: float) -> F
 
 def _without_place(state: FilterState, residual: Floats) -> FilterState:
     """The state with an unknown position and yaw: they are wrong by the residual."""
+    state = without_tracked(state)  # the jump is no motion from there
     covariance = forgotten(plain_covariance(state), POSITION, float(residual[:3] @ residual[:3]))
     if len(residual) == 6:
         forgotten(covariance, slice(_YAW, _YAW + 1), float(residual[5] ** 2))
@@ -1144,6 +1306,12 @@ def _with_altimeter(estimate: Estimate, source: str, altimeter: Altimeter) -> Es
 def _with_run(estimate: Estimate, source: str, run: Run | None) -> Estimate:
     others = {name: other for name, other in estimate.runs.items() if name != source}
     return estimate._replace(runs=others if run is None else {**others, source: run})
+
+
+def _led(estimate: Estimate, source: str, lead: Lead) -> Estimate:
+    """The estimate with the pose by a source at its own."""
+    state = with_tracked(estimate.state, source, lead.last.noise.scale)
+    return estimate._replace(state=state, leads={**estimate.leads, source: lead})
 
 
 def _with_compass(estimate: Estimate, source: str, compass: Compass) -> Estimate:

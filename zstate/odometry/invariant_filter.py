@@ -11,13 +11,15 @@ To first order ``xi`` is, with the cross product matrix [.],
     velocity   v - v' + [v'] phi     [m/s]
     position   p - p' + [p'] phi     [m], and contacts likewise
 
-Covariances have this order, then the biases of gyro and accelerometer, then contacts: (15 + 3k, 15 + 3k).
+Covariances have this order, then the biases of gyro and accelerometer, then tracked poses, then contacts:
+(n, n) with n = 15 + 7e + 3k.
 Apart from biases, the propagation of this error does not depend on the estimate, so that the filter stays
 consistent where one with Euler angles or a linear position error does not.
 
 Formulas: Hartley, Ghaffari, Eustice, Grizzle, "Contact-aided invariant extended Kalman filtering for robot
 state estimation", IJRR 39 (2020), with the sign of the error changed; Barrau, Bonnabel, "The invariant
-extended Kalman filter as a stable observer", IEEE TAC 62 (2017).
+extended Kalman filter as a stable observer", IEEE TAC 62 (2017). Tracked poses with a scale: Weiss, Siegwart,
+"Real-time metric state estimation for modular vision-inertial systems", ICRA 2011.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ GRAVITY = np.array([0.0, 0.0, -9.80665])
 
 ROTATION, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
-"""The places of the errors in a covariance; that of contact i is 15 + 3i to 18 + 3i."""
+"""The places of the errors in a covariance; ``tracked_pose`` and ``contact_row`` have the others."""
+
+_TRACKED_SIZE = 7
 
 _STANDARD_GRAVITY = -float(GRAVITY[2])
 _HALF_GRAVITY = 0.5 * GRAVITY
@@ -75,13 +79,27 @@ class ImuNoise:
                 )
 
 
+class Tracked(NamedTuple):
+    """The pose of the IMU, world_from_imu, by another odometry: it is carried along by its displacements.
+
+    Its error has seven numbers: rotation and position, as those of the pose of the state, and that of
+    ``log_scale``, the logarithm of what the translations of this source have to be multiplied by.
+    """
+
+    source: str
+    rotation: Floats
+    position: Floats
+    log_scale: float
+
+
 class FilterState(NamedTuple):
     """An estimate and the covariance of its error. Arrays are not to be written to.
 
     ``rotation`` is world_from_imu, (3, 3); ``velocity`` [m/s] and ``position`` [m] of the IMU in the world,
     (3,); ``gyro_bias`` [rad/s] and ``accel_bias`` [m/s^2] in the IMU's axes, (3,). ``feet`` are the names of
     the k contacts, and ``contacts`` their points in the world [m], (k, 3). ``covariance`` is that of the
-    right-invariant error, (15 + 3k, 15 + 3k), in the order of the module's docstring.
+    right-invariant error, (n, n), in the order of the module's docstring. ``tracked`` are the poses by e
+    other odometries.
     """
 
     rotation: Floats
@@ -92,6 +110,7 @@ class FilterState(NamedTuple):
     feet: tuple[str, ...]
     contacts: Floats
     covariance: Floats
+    tracked: tuple[Tracked, ...] = ()
 
 
 class Measurement(NamedTuple):
@@ -139,10 +158,10 @@ def initial_state(
 
 
 def plain_covariance(state: FilterState) -> Floats:
-    """The covariance of plain errors: (15 + 3k, 15 + 3k).
+    """The covariance of plain errors: (n, n).
 
-    They are the rotation about world axes [rad] and the differences of velocity, position, biases and
-    contacts, each truth minus estimate.
+    They are the rotation about world axes [rad] and the differences of velocity, position, biases, tracked
+    poses and contacts, each truth minus estimate.
     """
     plain_from_invariant = 2.0 * np.eye(len(state.covariance)) - _invariant_from_plain(state)
     return plain_from_invariant @ state.covariance @ plain_from_invariant.T
@@ -197,7 +216,7 @@ def predict(
     turn = turned[1] * -dt_s
     shifts = points.dot(SKEW).reshape(-1, 3).dot(turn)
 
-    size = len(state.covariance)
+    size, first = len(state.covariance), _first_contact_row(state)
     transition = _identity(size).copy()
     fall = _STANDARD_GRAVITY * dt_s
     transition[3, 1], transition[4, 0] = fall, -fall
@@ -207,8 +226,8 @@ def predict(
     transition[3:9, GYRO_BIAS] = shifts[:6]
     transition[POSITION, ACCEL_BIAS] = turned[2] * (-dt_s * dt_s)
     if state.feet:
-        transition[15:, GYRO_BIAS] = shifts[6:]
-    walks = _walks(noise, contact_noise, size)
+        transition[first:, GYRO_BIAS] = shifts[6:]
+    walks = _walks(noise, contact_noise, first, size)
     if white is None:
         white = white_noise(noise)
     effects = transition[:, 9:15] - _constant_biases(size)
@@ -227,6 +246,7 @@ def predict(
         state.feet,
         state.contacts,
         covariance,
+        state.tracked,
     )
 
 
@@ -298,7 +318,90 @@ def contact_row(state: FilterState, foot: str) -> int:
         raise InvalidInput(
             f"foot {foot!r} is not in contact; in contact are: {', '.join(state.feet) or 'none'}"
         )
-    return 15 + 3 * state.feet.index(foot)
+    return _first_contact_row(state) + 3 * state.feet.index(foot)
+
+
+def tracked_pose(state: FilterState, source: str) -> tuple[int, Tracked] | None:
+    """The first row of the pose by ``source`` in the covariance, and the pose; None without one."""
+    for number, tracked in enumerate(state.tracked):
+        if tracked.source == source:
+            return 15 + _TRACKED_SIZE * number, tracked
+    return None
+
+
+def with_tracked(state: FilterState, source: str, scale_sigma: float) -> FilterState:
+    """The state with the pose by ``source`` at the present one, from where its displacements carry it on.
+
+    ``scale_sigma`` is the standard deviation of the logarithm of the scale of a new source.
+    """
+    found, covariance = tracked_pose(state, source), state.covariance
+    if found is None:
+        row, size = _first_contact_row(state), len(covariance)
+        places = [*range(row), *range(row + _TRACKED_SIZE, size + _TRACKED_SIZE)]
+        grown = np.zeros((size + _TRACKED_SIZE, size + _TRACKED_SIZE))
+        grown[np.ix_(places, places)] = covariance
+        grown[row + 6, row + 6] = scale_sigma * scale_sigma
+        covariance = grown
+        tracked = (*state.tracked, Tracked(source, state.rotation, state.position, 0.0))
+    else:
+        row, last = found
+        here = last._replace(rotation=state.rotation, position=state.position)
+        tracked = tuple(here if one is last else one for one in state.tracked)
+    rows = np.arange(len(covariance))
+    rows[row : row + 6] = *range(ROTATION.start, ROTATION.stop), *range(POSITION.start, POSITION.stop)
+    return state._replace(covariance=covariance[np.ix_(rows, rows)], tracked=tracked)
+
+
+def carried(
+    state: FilterState, source: str, moved: Floats, covariance: Floats, imu_from_frame: Floats, *, dt_s: float
+) -> FilterState:
+    """The state after ``source`` has measured that a frame moved by ``moved``, earlier_from_present, (4, 4).
+
+    ``covariance`` (6, 6) is that of what its error grows by: rotation, then translation, of ``exp(error)
+    moved``. The way of ``dt_s`` seconds that an error of the scale changes is that of the state. The measured
+    one has the noise of the poses, which would shrink the scale (attenuation by errors in variables).
+    """
+    found = tracked_pose(state, source)
+    assert found is not None
+    row, last = found
+    start = _pose(last.rotation, last.position).dot(imu_from_frame)
+    scaled = moved.copy()
+    scaled[:3, 3] *= math.exp(last.log_scale)
+    frame_from_imu = np.linalg.inv(imu_from_frame)
+    end = start.dot(scaled).dot(frame_from_imu)
+    transition = _identity(len(state.covariance)).copy()
+    transition[row + 3 : row + 6, row + 6] = state.velocity * dt_s
+    grown = transition.dot(state.covariance).dot(transition.T)
+    spread = adjoint(start)
+    grown[row : row + 6, row : row + 6] += spread.dot(covariance).dot(spread.T)
+    here = last._replace(rotation=end[:3, :3], position=end[:3, 3])
+    tracked = tuple(here if one is last else one for one in state.tracked)
+    return state._replace(covariance=grown, tracked=tracked)
+
+
+def without_tracked(state: FilterState) -> FilterState:
+    """The state without poses by other odometries, as if its own changes but by motion."""
+    first = _first_contact_row(state)
+    kept = np.r_[:15, first : len(state.covariance)]
+    return state._replace(covariance=state.covariance[np.ix_(kept, kept)], tracked=())
+
+
+def adjoint(pose: Floats) -> Floats:
+    """What turns the error of a displacement from a pose, (4, 4), into that of the world: (6, 6)."""
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = pose[:3, :3]
+    matrix[3:, :3] = skew(pose[:3, 3]).dot(pose[:3, :3])
+    return matrix
+
+
+def _pose(rotation: Floats, position: Floats) -> Floats:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    return pose
+
+
+def _first_contact_row(state: FilterState) -> int:
+    return 15 + _TRACKED_SIZE * len(state.tracked)
 
 
 def _moved(state: FilterState, error: Floats, covariance: Floats) -> FilterState:
@@ -309,7 +412,12 @@ def _moved(state: FilterState, error: Floats, covariance: Floats) -> FilterState
     turned = turned.dot(_THREE_HALVES - turned.T.dot(turned) * 0.5)
     contacts = state.contacts
     if state.feet:
-        contacts = contacts.dot(rotation.T) + error[15:].reshape(-1, 3).dot(left_jacobian.T)
+        moves = error[_first_contact_row(state) :].reshape(-1, 3)
+        contacts = contacts.dot(rotation.T) + moves.dot(left_jacobian.T)
+    tracked = state.tracked
+    if tracked:
+        errors = error[15 : _first_contact_row(state)].reshape(-1, _TRACKED_SIZE)
+        tracked = tuple(_moved_tracked(one, moved) for one, moved in zip(tracked, errors, strict=True))
     return FilterState(
         turned,
         rotation.dot(state.velocity) + left_jacobian.dot(error[VELOCITY]),
@@ -319,6 +427,17 @@ def _moved(state: FilterState, error: Floats, covariance: Floats) -> FilterState
         state.feet,
         contacts,
         covariance,
+        tracked,
+    )
+
+
+def _moved_tracked(pose: Tracked, error: Floats) -> Tracked:
+    rotation, left_jacobian, _ = gammas(error[:3])
+    return Tracked(
+        pose.source,
+        rotation.dot(pose.rotation),
+        rotation.dot(pose.position) + left_jacobian.dot(error[3:6]),
+        pose.log_scale + float(error[6]),
     )
 
 
@@ -337,7 +456,10 @@ def _invariant_from_plain(state: FilterState) -> Floats:
     matrix = np.eye(len(state.covariance))
     matrix[VELOCITY, ROTATION] = skew(state.velocity)
     matrix[POSITION, ROTATION] = skew(state.position)
-    matrix[15:, ROTATION] = (state.contacts @ SKEW).reshape(-1, 3)
+    first = _first_contact_row(state)
+    for row, tracked in zip(range(15, first, _TRACKED_SIZE), state.tracked, strict=True):
+        matrix[row + 3 : row + 6, row : row + 3] = skew(tracked.position)
+    matrix[first:, ROTATION] = (state.contacts @ SKEW).reshape(-1, 3)
     return matrix
 
 
@@ -359,6 +481,7 @@ def white_noise(noise: ImuNoise) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def _walks(noise: ImuNoise, contact_noise: float, size: int) -> Floats:
-    """Squared densities of the random walks of the errors: (size,)."""
-    return np.repeat((0.0, noise.gyro_bias, noise.accel_bias, contact_noise), (9, 3, 3, size - 15)) ** 2
+def _walks(noise: ImuNoise, contact_noise: float, first_contact: int, size: int) -> Floats:
+    """Squared densities of the random walks of the errors: (size,). Tracked poses have none."""
+    counts = (9, 3, 3, first_contact - 15, size - first_contact)
+    return np.repeat((0.0, noise.gyro_bias, noise.accel_bias, 0.0, contact_noise), counts) ** 2

@@ -22,9 +22,11 @@ from zstate.odometry.invariant_filter import (
     VELOCITY,
     FilterState,
     Measurement,
+    adjoint,
     contact_row,
+    tracked_pose,
 )
-from zstate.odometry.rotations import IDENTITY, skew
+from zstate.odometry.rotations import IDENTITY, gammas, skew
 
 MIN_SIGMA, MAX_SIGMA = 1e-9, 1e9
 """The bounds of standard deviations, in any unit. What is worse measures nothing; squares stay in range."""
@@ -103,16 +105,36 @@ def pose(
     return Measurement(residual, _pose_jacobian(state, expected), covariance)
 
 
-def heading(state: FilterState, yaw: float, variance: float, imu_from_frame: Floats) -> Measurement:
-    """The direction of a frame's x axis in the level plane [rad], from the world's x axis towards its y axis.
+def tracking(state: FilterState, source: str, covariance: Floats, imu_from_frame: Floats) -> Measurement:
+    """Another odometry has the body where it is: ``log(X_s X^-1)`` of its pose and that of the state.
 
-    Raises InvalidInput if the axis is within 6 degrees of the vertical, where it has none.
+    ``covariance`` (6, 6) is that of the noise of its pose of the frame, in the axes of the frame: rotation,
+    then position.
     """
-    x, y, z = (state.rotation @ imu_from_frame[:3, 0]).tolist()
+    found = tracked_pose(state, source)
+    assert found is not None
+    row, tracked = found
+    turn = tracked.rotation.dot(state.rotation.T)
+    angles = np.array(se3.rotation_vector(se3.quaternion_from_matrix(turn), se3.SCALARS))
+    shift = _inverse(gammas(angles)[1]).dot(tracked.position - turn.dot(state.position))
+    jacobian = np.zeros((6, len(state.covariance)))
+    jacobian[:3, ROTATION] = jacobian[3:, POSITION] = IDENTITY
+    jacobian[:, row : row + 6] = -np.eye(6)
+    spread = adjoint(_world_from_frame(state, imu_from_frame))
+    return Measurement(np.concatenate((angles, shift)), jacobian, spread.dot(covariance).dot(spread.T))
+
+
+def heading(state: FilterState, yaw: float, variance: float, axis: Floats) -> Measurement:
+    """The direction of ``axis`` in the level plane [rad], from the world's x axis towards its y axis.
+
+    ``axis`` (3,) has the length 1 and is in the IMU's axes. Raises InvalidInput if it is within 6 degrees of
+    the vertical, where it has none.
+    """
+    x, y, z = (state.rotation @ axis).tolist()
     level = x * x + y * y
     if level < _LEVEL * _LEVEL:
         raise InvalidInput(
-            f"the x axis of this frame has no heading: it is {math.degrees(math.asin(abs(z))):.0f} degrees "
+            f"this axis has no heading: it is {math.degrees(math.asin(abs(z))):.0f} degrees "
             "from level; leave headings out at such poses"
         )
     jacobian = np.zeros((1, len(state.covariance)))
@@ -132,7 +154,7 @@ def contact(state: FilterState, foot: str, offset: Floats, covariance: Floats) -
     jacobian = np.zeros((3, len(state.covariance)))
     jacobian[:, POSITION] = -imu_from_world
     jacobian[:, row : row + 3] = imu_from_world
-    expected = imu_from_world @ (state.contacts[(row - 15) // 3] - state.position)
+    expected = imu_from_world @ (state.contacts[state.feet.index(foot)] - state.position)
     return Measurement(offset - expected, jacobian, covariance)
 
 
@@ -245,6 +267,10 @@ def _world_from_frame(state: FilterState, imu_from_frame: Floats) -> Floats:
     world_from_frame = state.rotation.dot(imu_from_frame[:3])
     world_from_frame[:, 3] += state.position
     return np.concatenate((world_from_frame, imu_from_frame[3:]))
+
+
+def _inverse(matrix: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
 def _point_jacobian(state: FilterState, point: Floats) -> Floats:

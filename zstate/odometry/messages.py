@@ -19,6 +19,7 @@ from zstate.wire.messages import (
     check_limit,
     check_quaternion,
     finite_numbers,
+    order_digest,
 )
 
 
@@ -49,6 +50,9 @@ MAX_PRESSURE = 1e9
 
 MAX_SPEED, MAX_DISTANCE = 1e4, 1e8
 """[m/s] and [m], likewise: above the speed of satellites, and twice the circumference of the Earth."""
+
+MAX_FIELD = 1.0
+"""[T] In any axis, likewise: above that of permanent magnets, and 15,000 times that of the Earth."""
 
 
 class Imu(StampedMessage, frozen=True, array_like=True, gc=False):
@@ -195,6 +199,28 @@ class Fix(StampedMessage, frozen=True, array_like=True, gc=False):
             raise InvalidInput("an altitude and a covariance need a latitude and a longitude")
 
 
+class MagneticField(StampedMessage, frozen=True, array_like=True, gc=False):
+    """The magnetic field at a sensor, in the axes of ``frame``, which is named as in edges.
+
+    ``field`` [T] is a block of x y z. ``covariance`` [T^2] is a block of the upper triangle, 6 numbers, or
+    None if it is not known.
+    """
+
+    frame: str
+    field: bytes
+    covariance: bytes | None = None
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
+        numbers = finite_numbers("a magnetic field", self.field, 3)
+        if max(map(abs, numbers)) > MAX_FIELD:
+            raise InvalidInput(
+                f"magnetic fields are in tesla, at most {MAX_FIELD:g}; got {', '.join(map(str, numbers))}, "
+                "which may be microtesla (1e-6 T) or milligauss (1e-7 T): that of the Earth is 2e-5 to 7e-5"
+            )
+        check_covariance("a magnetic field", self.covariance, 3)
+
+
 class Pressure(StampedMessage, frozen=True, array_like=True, gc=False):
     """A reading of a barometer, or of another sensor of the pressure of a fluid: sensor_msgs/FluidPressure.
 
@@ -237,8 +263,8 @@ class MapDatum(StampedMessage, frozen=True, array_like=True, gc=False):
         return Datum(self.latitude, self.longitude, self.altitude)
 
 
-SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix | Pressure
-SENSOR_STREAMS = ("imu", "velocity", "pose", "fix", "pressure")
+SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix | MagneticField | Pressure | Odometry
+SENSOR_STREAMS = ("imu", "velocity", "pose", "fix", "magnetic_field", "pressure", "odometry")
 """The streams of these messages."""
 
 _Measurement = TypeVar("_Measurement", bound=SensorMessage)
@@ -249,9 +275,16 @@ def with_full_names(message: _Measurement, robot: str) -> _Measurement:
     if isinstance(message, Pose):
         parent, child = full_name(robot, message.parent), message.child and full_name(robot, message.child)
         return msgspec.structs.replace(message, parent=parent, child=child)
+    if isinstance(message, Odometry):
+        assert message.edges is not None
+        edges = tuple((full_name(robot, parent), full_name(robot, child)) for parent, child in message.edges)
+        return msgspec.structs.replace(message, edges=edges, order=order_digest(edges))
     return msgspec.structs.replace(message, frame=full_name(robot, message.frame))
 
 
 def frame_of(message: SensorMessage) -> str:
     """The frame that was measured; empty for a pose of the base of the robot."""
+    if isinstance(message, Odometry):
+        assert message.edges is not None
+        return message.edges[0][1]
     return message.child if isinstance(message, Pose) else message.frame

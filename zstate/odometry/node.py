@@ -221,6 +221,8 @@ class OdometryNode(Closeable):
         self._sensors = tuple(sensor(name, noise) for name, noise in sensors)
         self._contradictions: dict[str, str] = {}
         """Against the datum of the map, by the key of that of another robot."""
+        if any((one.stream, one.writer) == ("odometry", writer) for one in self._sensors):
+            raise InvalidInput(f"the odometry {writer!r} is no source of itself; name one of both otherwise")
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._restart()
@@ -246,7 +248,7 @@ class OdometryNode(Closeable):
                     robot,
                     {
                         stream: partial(self._on_message, stream)
-                        for stream in ("imu", *(one.kind.stream for one in self._sensors))
+                        for stream in ("imu", *(one.stream for one in self._sensors))
                     },
                 )
             )
@@ -335,7 +337,7 @@ class OdometryNode(Closeable):
 
     def _on_message(self, stream: StreamName, name: str, message: SensorMessage) -> None:
         is_imu = (stream, name) == ("imu", self._imu)
-        sensors = [one for one in self._sensors if (one.kind.stream, one.name) == (stream, name)]
+        sensors = [one for one in self._sensors if (one.stream, one.writer) == (stream, name)]
         if not is_imu and not sensors:
             return
         with self._lock:

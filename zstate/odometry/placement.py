@@ -16,7 +16,7 @@ import numpy as np
 from zstate import se3
 from zstate.checks import Floats
 from zstate.odometry.fusion import Drift, Estimate, at_its_estimate, odom_pose
-from zstate.odometry.invariant_filter import POSITION, ROTATION, VELOCITY, FilterState
+from zstate.odometry.invariant_filter import POSITION, ROTATION, VELOCITY, FilterState, without_tracked
 from zstate.odometry.measurements import frame_pose
 from zstate.odometry.rotations import skew
 from zstate.transform import Transform
@@ -43,11 +43,12 @@ class Placement(NamedTuple):
 
 def placed(estimate: Estimate, placement: Placement, imu_from_base: Floats) -> Estimate:
     """The estimate, without constant errors that are not in its covariance yet, with the base there."""
-    current, _ = frame_pose(estimate.state, imu_from_base)
+    placed_state = without_tracked(estimate.state)
+    current, _ = frame_pose(placed_state, imu_from_base)
     turn = _yaw(placement.odom_from_base) - _yaw(current)
     cosine, sine = math.cos(turn), math.sin(turn)
     rotation = np.array(((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0)))
-    state = _in_moved_world(estimate.state, rotation, -rotation @ current[:3, 3])
+    state = _in_moved_world(placed_state, rotation, -rotation @ current[:3, 3])
     state = state._replace(covariance=_with_known_place(state, placement.covariance))
     state = _in_moved_world(state, np.eye(3), placement.odom_from_base[:3, 3])
     compasses = {

@@ -59,6 +59,15 @@ DATUM = Stream(
     start="start one: `zstate odometry {robot} --fix SENSOR`",
     document="zstate.odometry.documents:datum_document",
 )
+MAGNETIC_FIELD = Stream(
+    "magnetic_field",
+    f"{_MESSAGES}:MagneticField",
+    summary="magnetic field at a sensor",
+    named=True,
+    start="start the program of the sensor, with its zstate.odometry.MagneticFieldPublisher",
+    ros="zstate.odometry.ros2:MAGNETIC_FIELD_STREAM",
+    document="zstate.odometry.documents:magnetic_field_document",
+)
 ODOMETRY = Stream(
     "odometry",
     f"{_MESSAGES}:Odometry",
@@ -72,7 +81,7 @@ ODOMETRY = Stream(
 
 PLUGIN = Plugin(
     "odometry",
-    streams=(IMU, VELOCITY, POSE, FIX, PRESSURE, DATUM, ODOMETRY),
+    streams=(IMU, VELOCITY, POSE, FIX, MAGNETIC_FIELD, PRESSURE, DATUM, ODOMETRY),
     commands={
         "odometry": Command(
             "zstate.odometry.cli.odometry:odometry_command",

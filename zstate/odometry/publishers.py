@@ -17,7 +17,16 @@ from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.static_publisher import ValuePublisher
 from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
 from zstate.odometry.geodesy import Datum
-from zstate.odometry.messages import Fix, Imu, MapDatum, Odometry, Pose, Pressure, Velocity
+from zstate.odometry.messages import (
+    Fix,
+    Imu,
+    MagneticField,
+    MapDatum,
+    Odometry,
+    Pose,
+    Pressure,
+    Velocity,
+)
 from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
 from zstate.wire.keys import check_writer, full_name
 from zstate.wire.messages import to_block
@@ -283,6 +292,42 @@ class DatumPublisher(ValuePublisher):
             write_all(self._latched, message)
             out.seq += 1
             self.datum = datum
+
+
+class MagneticFieldPublisher(MeasurementPublisher):
+    """Publishes the magnetic fields that one magnetometer of a robot measures, in the axes of ``frame``.
+
+    ``covariance`` [T^2], (3, 3), is published with each of them if it is given. Sensors, frames, writers and
+    threads are those of ``ImuPublisher``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        sensor: str = "magnetic_field",
+        wires: str | Sequence[str] = ("native",),
+        *,
+        frame: str | None = None,
+        covariance: ArrayLike | None = None,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        self.frame = sensor if frame is None else frame
+        self._covariance = _covariance(covariance, "covariance", 3)
+        full_name(robot, self.frame)
+        super().__init__(session, robot, "magnetic_field", sensor, wires=wires, clock=clock, program=program)
+
+    def publish(self, field: ArrayLike, stamp: int | None = None) -> None:
+        """Publish one field at ``stamp`` [ns]; default: now.
+
+        ``field`` is x y z in tesla: 1 uT is 1e-6 T, and 1 gauss 1e-4 T. Raises as ``ImuPublisher.publish``,
+        and InvalidInput for more than 1 T.
+        """
+        with self._refusals:
+            stamp = self._clock.now() if stamp is None else check_stamp(stamp)
+            vector = _numbers(field, "field", 3)
+            self._send(MagneticField(stamp, 0, 0, self.frame, vector, self._covariance))
 
 
 class OdometryPublisher(EdgePublisher):

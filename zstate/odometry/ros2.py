@@ -1,4 +1,4 @@
-"""IMUs, velocities, poses, fixes, pressures and odometry as ROS 2 messages.
+"""IMUs, velocities, poses, fixes, magnetic fields, pressures and odometry as ROS 2 messages.
 
 ROS has matrices where zstate has upper triangles or None. A covariance of zeros is not known
 (sensor_msgs/Imu), nor is a variance of zero (sensor_msgs/FluidPressure), and so is what a first number of -1
@@ -15,7 +15,7 @@ from math import isfinite, isnan, nan
 import numpy as np
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Pressure, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Pressure, Velocity
 from zstate.wire.messages import covariance_matrix, from_block, order_digest, to_block
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.qos import Qos
@@ -24,6 +24,7 @@ from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import (
     FLUID_PRESSURE,
     IMU,
+    MAGNETIC_FIELD,
     NAV_SAT_FIX,
     ODOMETRY,
     POSE_WITH_COVARIANCE,
@@ -200,6 +201,29 @@ def decode_pressure(payload: bytes, session: int, seq: int, names: FrameNames) -
         raise reader.malformed(str(error)) from None
 
 
+def encode_magnetic_field(field: MagneticField, names: FrameNames) -> bytes:
+    """The sensor_msgs/MagneticField of a field; raises as ``encode_imu``."""
+    writer = CdrWriter()
+    writer.stamp(field.stamp)
+    writer.text(names.to_ros(field.frame))
+    writer.numbers(field.field + _matrix(field.covariance, 3))
+    return writer.payload()
+
+
+def decode_magnetic_field(payload: bytes, session: int, seq: int, names: FrameNames) -> MagneticField:
+    """The field in a sensor_msgs/MagneticField; raises as ``decode_velocity``.
+
+    One without an axis, which is NaN there, is malformed.
+    """
+    reader = CdrReader(payload, MAGNETIC_FIELD.name)
+    stamp, frame = reader.stamp(), names.to_zstate(reader.text())
+    field, covariance = reader.numbers(3), reader.numbers(9)
+    try:
+        return MagneticField(stamp, seq, session, frame, field, _triangle(covariance, 3))
+    except InvalidInput as error:
+        raise reader.malformed(str(error)) from None
+
+
 def encode_odometry(odometry: Odometry, names: FrameNames) -> bytes:
     """The nav_msgs/Odometry of a sample; raises as ``encode_imu``."""
     assert odometry.edges is not None
@@ -271,6 +295,14 @@ FIX_STREAM = RosStream(
 )
 PRESSURE_STREAM = RosStream(
     FLUID_PRESSURE, _QOS, encode=encode_pressure, decode=decode_pressure, is_named=True, is_of_sensor=True
+)
+MAGNETIC_FIELD_STREAM = RosStream(
+    MAGNETIC_FIELD,
+    _QOS,
+    encode=encode_magnetic_field,
+    decode=decode_magnetic_field,
+    is_named=True,
+    is_of_sensor=True,
 )
 ODOMETRY_STREAM = RosStream(
     ODOMETRY, _QOS, encode=encode_odometry, decode=decode_odometry, is_named=True, is_of_sensor=True

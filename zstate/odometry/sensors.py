@@ -14,18 +14,22 @@ import numpy as np
 from zstate.checks import Floats
 from zstate.errors import InvalidInput
 from zstate.odometry.estimator import BaseEstimator
+from zstate.odometry.magnetism import EarthField, check_strength, earth_field
 from zstate.odometry.map_estimator import MapEstimator
-from zstate.odometry.messages import Fix, Imu, Pose, Pressure, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Pressure, Velocity
 from zstate.odometry.source_noise import (
     BarometerNoise,
     FixNoise,
     HeadingNoise,
+    MagnetometerNoise,
     PoseNoise,
+    RelativeNoise,
     SensorNoise,
     VelocityNoise,
 )
 from zstate.streams import StreamName
 from zstate.transform import Transform
+from zstate.wire.keys import check_writer
 from zstate.wire.messages import covariance_matrix, from_block
 
 
@@ -37,9 +41,10 @@ class Estimators(NamedTuple):
 
 
 class SensorKind(NamedTuple):
-    """What makes the messages of ``stream`` a source.
+    """What makes the messages of ``streams`` a source.
 
-    ``name`` is that of its option and of its table of settings, which have the fields of ``noise``.
+    ``name`` is that of its option and of its table of settings, which have the fields of ``noise``. A sensor
+    of a kind with several streams is named with that of its own, as "odometry/camera".
     ``add(estimators, sensor, noise, message)`` passes a message on; ``covariance(sensor, noise, message)`` is
     that of its numbers, None if only the estimator knows it. Both raise InvalidInput, with what to do, if
     the noise is not known, and for a message that measures nothing. ``is_enough``: with an IMU and nothing
@@ -47,20 +52,37 @@ class SensorKind(NamedTuple):
     """
 
     name: str
-    stream: StreamName
+    streams: tuple[StreamName, ...]
     noise: type[SensorNoise]
     add: Callable[[Estimators, str, Any, Any], None]
-    covariance: Callable[[str, Any, Any], Floats] | None = None
+    covariance: Callable[[str, Any, Any], Floats | None] | None = None
     is_enough: bool = False
     text: str = "{!r}"
 
 
 class Sensor(NamedTuple):
-    """One sensor of a robot, by its name in ``stream``, with what is stated of its noise."""
+    """One sensor of a robot, as it is named in settings, with what is stated of its noise."""
 
     kind: SensorKind
     name: str
     noise: SensorNoise
+
+    @property
+    def stream(self) -> StreamName:
+        """That of its messages."""
+        return self.kind.streams[0] if len(self.kind.streams) == 1 else self.name.partition("/")[0]
+
+    @property
+    def writer(self) -> str:
+        """Its name in the stream."""
+        return self.name if len(self.kind.streams) == 1 else self.name.partition("/")[2]
+
+    def check(self) -> None:
+        """Raise InvalidInput for a name that no sensor of this kind can have."""
+        if self.stream not in self.kind.streams:
+            names = " or ".join(f"{one}/NAME" for one in self.kind.streams)
+            raise InvalidInput(f"a source of {self.kind.name!r} is {names}; got {self.name!r}")
+        check_writer(self.writer)
 
     def __str__(self) -> str:
         return self.kind.text.format(self.name)
@@ -160,6 +182,60 @@ def add_heading(estimators: Estimators, sensor: str, noise: HeadingNoise, messag
     estimators.odometry.heading(message.stamp, yaw, sigma, source=f"{sensor} heading", frame=message.frame)
 
 
+def relative_covariance(sensor: str, noise: RelativeNoise, message: Pose | Odometry) -> None:
+    """None: that of a displacement is by two poses. Raises InvalidInput for covariances that are needed."""
+    known = message.covariances if isinstance(message, Odometry) else message.covariance
+    if noise.covariance != "stated" and known is None:
+        raise InvalidInput(
+            f"poses of {sensor!r} have no covariance that could be {noise.covariance}; leave `covariance` "
+            "out, and state sigma [m per square root of a metre] and sigma_deg of its displacements"
+        )
+
+
+def add_relative(estimators: Estimators, sensor: str, noise: RelativeNoise, message: Pose | Odometry) -> None:
+    """Pass a pose of another odometry to the odometry, which uses its displacements."""
+    base = estimators.odometry
+    if isinstance(message, Odometry):
+        assert message.edges is not None
+        ((world, frame),) = message.edges
+        numbers, known = message.poses, message.covariances
+    else:
+        world, frame, numbers, known = message.parent, message.child, message.pose, message.covariance
+    pose = Transform.from_pose7(world, frame or base.base, from_block(numbers))
+    covariance = None if known is None else covariance_matrix(known)
+    base.relative_pose(message.stamp, pose, covariance, source=sensor, noise=noise)
+
+
+def magnetometer_covariance(sensor: str, noise: MagnetometerNoise, message: MagneticField) -> Floats:
+    """That of the yaw by a magnetic field [rad^2], (1, 1).
+
+    Raises InvalidInput for a field in which no compass works, and as ``expected_field``.
+    """
+    field = noise.calibrated(from_block(message.field))
+    check_strength(math.sqrt(field @ field), sensor)
+    expected_field(noise, message)
+    return np.array([[math.radians(noise.sigma_deg) ** 2]])
+
+
+def expected_field(noise: MagnetometerNoise, message: MagneticField) -> EarthField | None:
+    """The field of the Earth at the place of a magnetometer, if that is stated. Raises as ``earth_field``."""
+    return None if noise.place is None else earth_field(*noise.place, message.stamp)
+
+
+def add_magnetic_field(
+    estimators: Estimators, sensor: str, noise: MagnetometerNoise, message: MagneticField
+) -> None:
+    """Pass one magnetic field to the odometry, whose attitude levels it."""
+    estimators.odometry.magnetic_field(
+        message.stamp,
+        noise.calibrated(from_block(message.field)),
+        math.radians(noise.sigma_deg),
+        source=f"{sensor} field",
+        frame=message.frame,
+        expected=expected_field(noise, message),
+    )
+
+
 def add_fix(estimators: Estimators, sensor: str, noise: FixNoise, message: Fix) -> None:
     """Pass one fix to what places the odometry in a map. Raises InvalidInput for a message without a fix."""
     latitude, longitude = message.latitude, message.longitude
@@ -211,11 +287,30 @@ def _unknown(covariance: Floats | None) -> str:
 
 
 KINDS = (
-    SensorKind("velocity", "velocity", VelocityNoise, add_velocity, velocity_covariance, is_enough=True),
-    SensorKind("pose", "pose", PoseNoise, add_pose, pose_covariance, is_enough=True),
-    SensorKind("heading", "imu", HeadingNoise, add_heading, heading_covariance, text="the heading of {!r}"),
-    SensorKind("fix", "fix", FixNoise, add_fix),
-    SensorKind("barometer", "pressure", BarometerNoise, add_pressure, barometer_covariance),
+    SensorKind("velocity", ("velocity",), VelocityNoise, add_velocity, velocity_covariance, is_enough=True),
+    SensorKind("pose", ("pose",), PoseNoise, add_pose, pose_covariance, is_enough=True),
+    SensorKind(
+        "relative",
+        ("pose", "odometry"),
+        RelativeNoise,
+        add_relative,
+        relative_covariance,
+        is_enough=True,
+        text="the motion by {!r}",
+    ),
+    SensorKind(
+        "heading", ("imu",), HeadingNoise, add_heading, heading_covariance, text="the heading of {!r}"
+    ),
+    SensorKind(
+        "magnetometer",
+        ("magnetic_field",),
+        MagnetometerNoise,
+        add_magnetic_field,
+        magnetometer_covariance,
+        text="the magnetometer {!r}",
+    ),
+    SensorKind("fix", ("fix",), FixNoise, add_fix),
+    SensorKind("barometer", ("pressure",), BarometerNoise, add_pressure, barometer_covariance),
 )
 
 _BY_NOISE = {kind.noise: kind for kind in KINDS}

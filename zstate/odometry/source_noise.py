@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Literal, TypeAlias, get_args
 
+import numpy as np
+
+from zstate.checks import Floats
 from zstate.errors import InvalidInput
+from zstate.odometry.geodesy import check_place
 
 Sigma: TypeAlias = float | tuple[float, float, float]
 """Standard deviations of x, y and z; one number is that of each."""
@@ -14,6 +18,9 @@ Sigma: TypeAlias = float | tuple[float, float, float]
 FixSigma: TypeAlias = float | tuple[float, float]
 """Standard deviations of a fix, horizontal and vertical; of one number the vertical one is ten times."""
 
+
+CovarianceKind: TypeAlias = Literal["stated", "dependent", "independent"]
+"""What covariances of poses of another odometry are: of no use, of dead reckoning, or of each pose alone."""
 
 HEIGHT_FACTOR = 10.0
 """Of a height by satellites, all of which are above: it is less sure than the position."""
@@ -95,6 +102,37 @@ class HeadingNoise:
         _check_sigma("sigma_deg", self.sigma_deg)
 
 
+_Three: TypeAlias = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MagnetometerNoise:
+    """The noise and the calibration of a magnetometer.
+
+    ``sigma_deg`` [degrees] is that of the yaw, by errors that do not average out. The field is ``soft_iron``
+    (3, 3) times the measured one less ``bias`` [T], both in the axes of the sensor. ``place`` is a latitude
+    and a longitude [degrees]: fields are then compared with that of the Earth there, not with the first ones.
+    Raises InvalidInput unless the sigma is above zero, all are finite, and it is a place.
+    """
+
+    sigma_deg: float = 5.0
+    bias: _Three = (0.0, 0.0, 0.0)
+    soft_iron: tuple[_Three, _Three, _Three] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    place: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        _check_sigma("sigma_deg", self.sigma_deg)
+        for name, numbers in (("bias", self.bias), ("soft_iron", sum(self.soft_iron, ()))):
+            if not all(map(math.isfinite, numbers)):
+                raise InvalidInput(f"{name} of a magnetometer is finite; got {numbers!r}")
+        if self.place is not None:
+            check_place(*self.place, 0.0)
+
+    def calibrated(self, field: Floats) -> Floats:
+        """The field of a measured one [T], (3,)."""
+        return np.array(self.soft_iron).dot(field - np.array(self.bias))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixNoise:
     """The noise of the fixes of a satellite receiver.
@@ -128,6 +166,40 @@ class FixNoise:
 
 def _two(sigma: FixSigma) -> tuple[float, float]:
     return sigma if isinstance(sigma, tuple) else (sigma, HEIGHT_FACTOR * sigma)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelativeNoise:
+    """The noise of another odometry, of which only the motion between two poses counts; one for a source.
+
+    Of a displacement, ``sigma`` [m per square root of a metre] and ``sigma_deg`` [degrees, likewise] are the
+    standard deviations by its way, and ``floor`` [m] and ``floor_deg`` [degrees] those of any, also at rest.
+    ``scale`` is that of the logarithm of a constant factor of its translations: 0.05 for stereo cameras, 0.5
+    for an unknown device, 3 for one camera.
+
+    ``covariance`` says what the covariances of its poses are: "stated", of no use, as those of most drivers,
+    which send zeros or constants; "dependent", of dead reckoning, which only grow; "independent", of poses
+    that are each measured, as by matching scans with a map. What they say of a displacement is added to the
+    floor in place of the sigmas. Raises InvalidInput for anything else.
+    """
+
+    sigma: float = 0.05
+    sigma_deg: float = 0.5
+    floor: float = 0.005
+    floor_deg: float = 0.1
+    scale: float = 0.05
+    covariance: CovarianceKind = "stated"
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "sigma_deg", "floor", "floor_deg", "scale"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise InvalidInput(f"{name} of a relative source is above zero and finite; got {value!r}")
+        if self.covariance not in get_args(CovarianceKind):
+            raise InvalidInput(
+                f"the covariance of a relative source is one of {', '.join(get_args(CovarianceKind))}; got "
+                f"{self.covariance!r}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,5 +252,7 @@ _DRY_AIR = 287.05
 """[J/kg/K] The gas constant of dry air."""
 
 
-SensorNoise: TypeAlias = VelocityNoise | PoseNoise | HeadingNoise | FixNoise | BarometerNoise
+SensorNoise: TypeAlias = (
+    VelocityNoise | PoseNoise | RelativeNoise | HeadingNoise | MagnetometerNoise | FixNoise | BarometerNoise
+)
 """What is stated of a sensor: the class says of which kind it is."""

@@ -71,7 +71,16 @@ from zstate.wire.messages import (
 
 if TYPE_CHECKING:
     from zstate.driving.messages import DriverState, JointCommand, Stop
-    from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Pressure, SensorMessage, Velocity
+    from zstate.odometry.messages import (
+        Fix,
+        Imu,
+        MagneticField,
+        Odometry,
+        Pose,
+        Pressure,
+        SensorMessage,
+        Velocity,
+    )
     from zstate.scans.grid import Grid
     from zstate.scans.messages import LaserScan, OccupancyGrid
     from zstate.scans.scan import Scan
@@ -256,6 +265,10 @@ class Recording(Closeable):
     def pressures(self, robot: str | None = None, sensor: str | None = None) -> Iterator[Pressure]:
         """The readings of the barometers of ``robot``, likewise."""
         return self.sensor_messages("pressure", robot, sensor)
+
+    def magnetic_fields(self, robot: str | None = None, sensor: str | None = None) -> Iterator[MagneticField]:
+        """The magnetic fields at the sensors of ``robot``, likewise."""
+        return self.sensor_messages("magnetic_field", robot, sensor)
 
     def odometry(self, robot: str | None = None, writer: str | None = None) -> Iterator[Odometry]:
         """The odometry of ``robot``, by default of all robots, or of one ``writer``, likewise.

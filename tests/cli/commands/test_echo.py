@@ -31,6 +31,7 @@ from zstate.cli.output.joint_state_text import ChangeFilter
 from zstate.odometry import (
     FixPublisher,
     ImuPublisher,
+    MagneticFieldPublisher,
     OdometryPublisher,
     PosePublisher,
     PressurePublisher,
@@ -275,6 +276,7 @@ def test_a_topic_of_ros_leads_to_its_wire(command: str):
             },
         ),
         ("pressure", {"frame": "r1/bmp", "pressure": 101325.0, "sigma": 1.5}),
+        ("magnetic_field", {"frame": "r1/mag", "field": [2e-5, 0.0, -4e-5], "field_sigma": [1e-7] * 3}),
         ("velocity", {"frame": "r1/flow", "linear": [0.5, 0.0, 0.0], "velocity_sigma": [2.0, 2.0, 2.0]}),
     ],
 )
@@ -289,6 +291,7 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
         PosePublisher(session, "r1", "mocap") as mocap,
         FixPublisher(session, "r1", "gps") as gps,
         PressurePublisher(session, "r1", "bmp") as barometer,
+        MagneticFieldPublisher(session, "r1", "mag", covariance=np.eye(3) * 1e-14) as mag,
     ):
 
         def publish() -> None:
@@ -298,6 +301,7 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
             mocap.publish(base)
             gps.publish(47.5, 8.25, covariance=variances[:3, :3])
             barometer.publish(101325.0, variance=2.25)
+            mag.publish([2e-5, 0, -4e-5])
 
         with repeated(publish):
             document = json.loads(run_cli("echo", "r1", "--stream", stream, "--once", "--json").stdout)
@@ -308,7 +312,7 @@ def test_odometry_and_measurements_are_documents(stream: str, expected: dict[str
     names = {writer["stream"]: writer["names"] for writer in listed[0]["writers"]}
     assert names == {
         **{"odometry": ["odometry"], "imu": ["imu"], "velocity": ["flow"], "pose": ["mocap"]},
-        **{"fix": ["gps"], "pressure": ["bmp"]},
+        **{"fix": ["gps"], "magnetic_field": ["mag"], "pressure": ["bmp"]},
     }
     assert all(writer["rate_hz"] for writer in listed[0]["writers"])
 

@@ -211,7 +211,7 @@ def test_requests_place_the_base_of_a_running_odometry_and_start_it_anew(spawn: 
 def test_unusable_options_are_explained(tmp_path: Path):
     wheels = "left=l,right=r,radius=0.1,track=0.5"
     for arguments, error in (
-        ((), "an IMU alone drifts by metres in seconds; add --diff-drive, --feet, --velocity, --pose or"),
+        ((), "an IMU alone drifts by metres in seconds; add --diff-drive, --feet, --velocity, --pose, "),
         (("--diff-drive", "left=l"), "right, radius, track missing"),
         (("--diff-drive", wheels, "--plot", "a.png"), "--plot needs --replay RECORDING"),
         (("--diff-drive", wheels, "--reference", "pose/gps"), "--reference needs --replay RECORDING"),

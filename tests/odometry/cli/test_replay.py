@@ -25,6 +25,7 @@ from zstate.odometry import (
     FixNoise,
     HeadingNoise,
     ImuNoise,
+    MagnetometerNoise,
     PoseNoise,
     SimulatedRover,
     SourceHealth,
@@ -39,7 +40,7 @@ from zstate.odometry.cli.replay import (
     sigma_factor,
 )
 from zstate.odometry.cli.settings_file import OdometrySettings
-from zstate.odometry.messages import Fix, Imu, Odometry, Pose, Pressure, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Pressure, Velocity
 from zstate.odometry.simulated_rover import ImuReading
 from zstate.sources.square_drive import WheelPair
 from zstate.wire.messages import order_digest, to_block
@@ -56,6 +57,8 @@ FLOW_SIGMA, MOCAP_SIGMA = 0.04, 0.02
 FLOW_DELAY_MS, JOINT_DELAY_MS = 60, 0
 MAP_FROM_ODOM = 3.0, -2.0, 2.0
 """x y [m] and yaw [rad]."""
+MAGNET_T = 2e-5
+"""The level field, towards x at the start."""
 DATUM = Datum(48.1, 11.5, 560.0)
 
 
@@ -134,6 +137,10 @@ def recorded(path: Path, *, covariance: float = 0.0) -> Path:
             write("r1", fix, stamp, "gps")
             pressure = 9e4 + random.gauss(0.0, 3.0)
             write("r1", Pressure(stamp, 0, 7, "base_footprint", pressure, 9.0), stamp, "bmp")
+            level = MAGNET_T * math.cos(yaw), -MAGNET_T * math.sin(yaw)
+            for sensor, unit in (("mag", 1.0), ("gauss", 1e4)):
+                field = to_block([unit * level[0], unit * level[1], -unit * 2.0 * MAGNET_T])
+                write("r1", MagneticField(stamp, 0, 7, "base_footprint", field), stamp, sensor)
         write("r1", Fix(stamp, 0, 6, "base_footprint", None, None, status=-1), stamp, "gps")
     return path
 
@@ -216,6 +223,19 @@ def test_a_barometer_is_a_row_of_the_table_and_is_no_reason_to_change_its_noise(
     assert (bmp.accepted > 20, bmp.rejected, bmp.sentence) == (True, 0, "")
     assert replayed.sigmas["bmp"] == pytest.approx([0.28], abs=0.01)  # 3 Pa
     assert not any("bmp" in line for line in report_lines(replayed) if line.startswith("would fit"))
+
+
+@pytest.mark.long
+def test_magnetometer_is_a_source_with_a_row_and_one_in_gauss_is_refused(tmp_path: Path):
+    path = str(recorded(tmp_path / "r.mcap"))
+    replayed = replay(path, "r1", replace(SETTINGS, magnetometer={"mag": MagnetometerNoise()}))
+    (field,) = [one for one in replayed.health if one.name == "mag field"]
+    assert (field.accepted > 20, field.rejected, field.sentence) == (True, 0, "")
+    assert any(line.startswith("mag field ") for line in report_lines(replayed))
+    assert not any("would fit" in line for line in report_lines(replayed))
+    settings = replace(SETTINGS, magnetometer={"gauss": MagnetometerNoise()})
+    with pytest.raises(InvalidInput, match=r"'gauss' is 0.447 T, .* 1 gauss 1e-4 T"):
+        replay(path, "r1", settings)
 
 
 @pytest.mark.long

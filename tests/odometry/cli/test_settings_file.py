@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from zstate import Transform, TransformBuffer
@@ -16,6 +17,7 @@ from zstate.odometry import (
     HeadingNoise,
     ImuNoise,
     LegNoise,
+    MagnetometerNoise,
     PoseNoise,
     SpeedThresholds,
     VelocityNoise,
@@ -169,6 +171,8 @@ def test_noise_of_a_source_is_stated_on_the_command_line():
         (0.01,) * 3 + (0.0174533,) * 3
     )
     assert parse_sensor("heading", "imu:sigma_deg=5") == ("imu", HeadingNoise(sigma_deg=5.0))
+    assert parse_sensor("magnetometer", "mag") == ("mag", MagnetometerNoise(sigma_deg=5.0))
+    assert parse_sensor("magnetometer", "mag:sigma_deg=8")[1] == MagnetometerNoise(sigma_deg=8.0)
     assert parse_sensor("fix", "gps") == ("gps", FixNoise())
     assert parse_sensor("fix", "gps:sigma=1.5,correlated_s=30")[1] == FixNoise(sigma=1.5, correlated_s=30.0)
     assert FixNoise(sigma=1.5).sigmas == (1.5, 15.0)
@@ -189,6 +193,42 @@ def test_file_has_receivers_and_the_origin_of_their_map(tmp_path: Path):
         ConfigError, match=r"rover.toml:\d+: fix.gps: sigma of a satellite receiver is above zero"
     ):
         read_settings(written(tmp_path, text.replace("4.0]", "0.0]")))
+
+
+def test_what_is_no_number_is_stated_in_a_file_alone():
+    with pytest.raises(InvalidInput, match=r"'bias=1' is not part of SENSOR:sigma_deg=NUMBER$"):
+        parse_sensor("magnetometer", "mag:bias=1")
+
+
+MAGNETOMETER = """
+[magnetometer.mag]
+sigma_deg = 8.0
+bias = [1e-6, 0.0, -3e-6]
+soft_iron = [[0.0, 2.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+place = [48.1, 11.5]
+"""
+
+
+def test_file_has_the_calibration_and_the_place_of_a_magnetometer(tmp_path: Path):
+    noise = read_settings(written(tmp_path, ROVER + MAGNETOMETER)).magnetometer["mag"]
+    assert (noise.sigma_deg, noise.place) == (8.0, (48.1, 11.5))
+    # The bias is subtracted first.
+    assert noise.calibrated(np.array((21e-6, 5e-6, -43e-6))) == pytest.approx([10e-6, 20e-6, -40e-6])
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "text"),
+    [
+        ("8.0", "0.0", "magnetometer.mag: sigma_deg is a standard deviation above zero"),
+        ("-3e-6]", "nan]", "magnetometer.mag: bias of a magnetometer is finite; got"),
+        ("2.0", "inf", "magnetometer.mag: soft_iron of a magnetometer is finite; got"),
+        ("48.1", "98.1", "magnetometer.mag: a place has a latitude of -90 to 90"),
+        ("bias = [1e-6, ", "bias = [", "magnetometer.mag.bias: .*length 3"),
+    ],
+)
+def test_unusable_settings_of_a_magnetometer_are_named(tmp_path: Path, right: str, wrong: str, text: str):
+    with pytest.raises(ConfigError, match=rf"rover.toml:\d+: {text}"):
+        read_settings(written(tmp_path, ROVER + MAGNETOMETER.replace(right, wrong)))
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from zstate.wire.ros2.types import (
     JOINT_STATE,
     JOINT_TRAJECTORY,
     LASER_SCAN,
+    MAGNETIC_FIELD,
     NAV_SAT_FIX,
     OCCUPANCY_GRID,
     ODOMETRY,
@@ -41,6 +42,7 @@ TYPES = (
     TWIST_WITH_COVARIANCE,
     NAV_SAT_FIX,
     FLUID_PRESSURE,
+    MAGNETIC_FIELD,
     ODOMETRY,
 )
 EACH = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])

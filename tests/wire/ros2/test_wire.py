@@ -206,6 +206,7 @@ STREAMS = st.sampled_from(
         "velocity",
         "pose",
         "fix",
+        "magnetic_field",
         "odometry",
         "clock",
     ]

@@ -23,7 +23,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import Floats
 from zstate.model.joint_history import JointHistory
 from zstate.odometry import Wheels
-from zstate.odometry.messages import Imu, Pose, Velocity
+from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
 from zstate.streams import StreamName
 from zstate.wire.messages import StampedMessage, from_block
 
@@ -76,7 +76,7 @@ class Motions:
         """That of a sensor whose messages show a yaw or a speed; None for one of another stream."""
         if stream == "velocity":
             return self.delay(*self.of_velocities(messages))
-        return self.delay(self.of_poses(messages), None) if stream == "pose" else None
+        return self.delay(self.of_poses(messages), None) if stream in ("pose", "odometry") else None
 
     def delay(self, yaw: Series | None, speed: Series | None) -> Delay | None:
         """That of a source with this yaw and this speed, where it has them."""
@@ -92,9 +92,10 @@ class Motions:
             return None, speed
         return _integrated(seconds, (np.array(rates) @ rotation.T)[:, 2]), speed
 
-    def of_poses(self, messages: Sequence[Pose]) -> Series:
+    def of_poses(self, messages: Sequence[Pose | Odometry]) -> Series:
         """Their yaw."""
-        x, y, z, w = np.array([from_block(one.pose)[3:] for one in messages]).T
+        blocks = [one.poses if isinstance(one, Odometry) else one.pose for one in messages]
+        x, y, z, w = np.array([from_block(block)[3:] for block in blocks]).T
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         return Series(self._times(messages), np.unwrap(yaw))
 

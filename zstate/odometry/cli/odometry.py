@@ -93,10 +93,22 @@ _OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
     "sigma and sigma_deg.",
 )
 @_sensor_option(
+    "relative",
+    "sigma=M,sigma_deg=DEG,scale=PART",
+    "Another odometry, as of cameras, pose/NAME or odometry/NAME: only its motion counts. sigma and "
+    "sigma_deg are those of a metre of its way, scale that of a constant factor.",
+)
+@_sensor_option(
     "heading",
     "sigma_deg=DEG",
     "An IMU whose orientation shows the yaw, as by a compass. Its noise is that of its messages, or "
     "sigma_deg.",
+)
+@_sensor_option(
+    "magnetometer",
+    "sigma_deg=DEG",
+    "A magnetometer, whose field shows the yaw. Its noise is sigma_deg, by default 5; calibration and place "
+    "are set by --file.",
 )
 @_sensor_option(
     "fix",
@@ -227,6 +239,7 @@ def odometry_command(
     zstate odometry go2 --feet FL_foot,FR_foot,RL_foot,RR_foot
     zstate odometry r1 --file r1.toml
     zstate odometry r1 --velocity wheels:sigma=0.05                # [m/s]; messages without covariance
+    zstate odometry r1 --diff-drive ... --relative pose/camera     # visual odometry
     zstate odometry r1 --diff-drive ... --fix gps                  # and map -> odom, by GPS
     zstate odometry r1 --file r1.toml --replay run.mcap --plot run.png
     zstate odometry r1 --file r1.toml --replay run.mcap --reference pose/mocap
@@ -259,7 +272,8 @@ def odometry_command(
         settings = replace(settings, diff_drive=diff_drive, ackermann=None, mecanum=None)
     if not settings.has_joints and not any(one.kind.is_enough for one in settings.sensors):
         raise click.UsageError(
-            "an IMU alone drifts by metres in seconds; add --diff-drive, --feet, --velocity, --pose or --file"
+            "an IMU alone drifts by metres in seconds; add --diff-drive, --feet, --velocity, --pose, "
+            "--relative or --file"
         )
     if replay is not None:
         _replay(replay, robot, settings, reference, plot)
@@ -352,7 +366,7 @@ def _wait_for_sensors(
 
     waiter = ConditionWaiter()
     models: dict[str, RobotModel] = {}
-    needed = [("imu", settings.imu), *((one.kind.stream, one.name) for one in settings.sensors)]
+    needed = [("imu", settings.imu), *((one.stream, one.writer) for one in settings.sensors)]
     """The stream and the name of each sensor."""
     heard: dict[StreamName, dict[str, SensorMessage]] = {stream: {} for stream, _ in needed}
     """The first message of each sensor, by stream."""
@@ -392,7 +406,7 @@ def _wait_for_sensors(
     ):
         waiter.wait_for(lambda: not reason(), None, reason)
     for one in settings.sensors:
-        one.covariance(heard[one.kind.stream][one.name])
+        one.covariance(heard[one.stream][one.writer])
     return base(), frame_of(heard["imu"][settings.imu]), models.get(robot)
 
 

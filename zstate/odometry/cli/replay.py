@@ -130,7 +130,7 @@ def replay(
             if isinstance(message, RobotDescription) and model is None:
                 model = parse_urdf(message.urdf, f"the URDF of {robot!r}")
         readings = _messages(recording, robot, "imu", settings.imu)
-        recorded = [(one, _messages(recording, robot, one.kind.stream, one.name)) for one in settings.sensors]
+        recorded = [(one, _messages(recording, robot, one.stream, one.writer)) for one in settings.sensors]
         joints = recording.joint_states(robot) if settings.has_joints else None
         truth = None if reference is None else _messages(recording, robot, reference.stream, reference.sensor)
     base = settings.base or (None if model is None else model.root)
@@ -155,7 +155,7 @@ def replay(
         covariances = [known for message in messages if (known := one.covariance(message)) is not None]
         if covariances:
             sigmas[one.name] = np.median([np.sqrt(np.diag(known)) for known in covariances], axis=0)
-        delays[one.name] = motions.delay_of(one.kind.stream, messages)
+        delays[one.name] = motions.delay_of(one.stream, messages)
         events += [(message.stamp, False, partial(one.add, estimators, message)) for message in messages]
     if joints is not None:
         events += [
@@ -180,8 +180,8 @@ def _messages(recording: Recording, robot: str, stream: StreamName, sensor: str)
 
     Raises InvalidInput, with near misses, for a sensor without any.
     """
-    messages = recording.odometry if stream == "odometry" else partial(recording.sensor_messages, stream)
-    found = [one for one in messages(robot, sensor) if not isinstance(one, Fix) or one.status >= 0]
+    messages = recording.sensor_messages(stream, robot, sensor)
+    found = [one for one in messages if not isinstance(one, Fix) or one.status >= 0]
     if found:
         return sorted(found, key=attrgetter("stamp"))
     robots = recorded_robots(recording.info)

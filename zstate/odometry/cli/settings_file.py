@@ -31,9 +31,11 @@ from zstate.odometry import (
     ImuNoise,
     LegNoise,
     Legs,
+    MagnetometerNoise,
     MapEstimator,
     Mecanum,
     PoseNoise,
+    RelativeNoise,
     SpeedThresholds,
     VelocityNoise,
     Wheels,
@@ -84,8 +86,9 @@ class LegSettings:
 class OdometrySettings:
     """The sensors, frames and noise of one robot.
 
-    ``velocity``, ``pose``, ``heading``, ``fix`` and ``barometer`` are further sensors by name, with what is
-    stated of their noise; those of ``heading`` are IMUs whose orientation shows the yaw. Fixes place the
+    ``velocity``, ``pose``, ``relative``, ``heading``, ``magnetometer``, ``fix`` and ``barometer`` are further
+    sensors by name, with what is stated of their noise; those of ``relative`` are other odometries by stream
+    and name, as "pose/camera", those of ``heading`` IMUs whose orientation shows the yaw. Fixes place the
     odometry in the frame ``map``, whose origin ``datum`` has a latitude and longitude [degrees] and an
     altitude [m]; by default it is the first fix. ``base`` None is the root of the model. Without an
     ``initial_pose`` the base starts at the origin, once it is aligned at rest. ``planar``: its z, roll and
@@ -96,7 +99,9 @@ class OdometrySettings:
     imu: str = "imu"
     velocity: dict[str, VelocityNoise] = field(default_factory=dict[str, VelocityNoise])
     pose: dict[str, PoseNoise] = field(default_factory=dict[str, PoseNoise])
+    relative: dict[str, RelativeNoise] = field(default_factory=dict[str, RelativeNoise])
     heading: dict[str, HeadingNoise] = field(default_factory=dict[str, HeadingNoise])
+    magnetometer: dict[str, MagnetometerNoise] = field(default_factory=dict[str, MagnetometerNoise])
     fix: dict[str, FixNoise] = field(default_factory=dict[str, FixNoise])
     barometer: dict[str, BarometerNoise] = field(default_factory=dict[str, BarometerNoise])
     map: str = "map"
@@ -113,8 +118,9 @@ class OdometrySettings:
     legs: LegSettings | None = None
 
     def __post_init__(self) -> None:
-        for name in (self.imu, *(one.name for one in self.sensors)):
-            check_writer(name)
+        check_writer(self.imu)
+        for one in self.sensors:
+            one.check()
         kinds = [kind for kind in ("diff_drive", "ackermann", "mecanum") if getattr(self, kind) is not None]
         if len(kinds) > 1:
             raise InvalidInput(f"a robot has wheels of one kind, not of {' and '.join(kinds)}")
@@ -239,21 +245,31 @@ def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
 
     Raises InvalidInput.
     """
-    noise = next(kind.noise for kind in KINDS if kind.name == kind_name)
+    kind = next(kind for kind in KINDS if kind.name == kind_name)
     name, colon, stated = text.partition(":")
-    known = msgspec.inspect.type_info(noise)
+    known = msgspec.inspect.type_info(kind.noise)
     assert isinstance(known, msgspec.inspect.DataclassType)
-    names = [one.name for one in known.fields]
-    values: dict[str, float] = {}
+    texts = {one.name for one in known.fields if isinstance(one.type, msgspec.inspect.LiteralType)}
+    names = [one.name for one in known.fields if one.name in texts or _is_number(one.type)]
+    units = {name: "TEXT" if name in texts else "NUMBER" for name in names}
+    values: dict[str, Any] = {}
     for part in stated.split(",") if colon else ():
         key, _, value = part.strip().partition("=")
         if key not in names or key in values:
             raise InvalidInput(
-                f"{part!r} is not part of SENSOR:{','.join(f'{name}=NUMBER' for name in names)}"
+                f"{part!r} is not part of SENSOR:"
+                f"{','.join(f'{one}={units[one]}' for one in names)}"
                 f"{did_you_mean(key, names)}"
             )
-        values[key] = _number(key, value)
-    return check_writer(name), noise(**values)
+        values[key] = value if key in texts else _number(key, value)
+    sensor = Sensor(kind, name, kind.noise(**values))
+    sensor.check()
+    return sensor.name, sensor.noise
+
+
+def _is_number(kind: msgspec.inspect.Type) -> bool:
+    kinds = kind.types if isinstance(kind, msgspec.inspect.UnionType) else (kind,)
+    return any(isinstance(one, msgspec.inspect.FloatType) for one in kinds)
 
 
 def _number(key: str, value: str, unit: str = "") -> float:

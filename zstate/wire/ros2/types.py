@@ -118,6 +118,11 @@ _FIELDS: dict[str, Fields] = {
         ("float64", "fluid_pressure"),
         ("float64", "variance"),
     ),
+    "sensor_msgs/MagneticField": (
+        ("std_msgs/Header", "header"),
+        ("geometry_msgs/Vector3", "magnetic_field"),
+        ("float64[9]", "magnetic_field_covariance"),
+    ),
 }
 # The numbers of type_description_interfaces/FieldType.
 _NESTED, _ARRAY, _UNBOUNDED_SEQUENCE = 1, 48, 144
@@ -207,3 +212,4 @@ ODOMETRY = RosType.from_fields("nav_msgs/Odometry")
 IMU = RosType.from_fields("sensor_msgs/Imu")
 FLUID_PRESSURE = RosType.from_fields("sensor_msgs/FluidPressure")
 NAV_SAT_FIX = RosType.from_fields("sensor_msgs/NavSatFix")
+MAGNETIC_FIELD = RosType.from_fields("sensor_msgs/MagneticField")

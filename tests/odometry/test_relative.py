@@ -1,0 +1,275 @@
+"""Another odometry as a source: its displacements, scale and jumps, and what its covariances are worth."""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import recordings
+from helpers.base_motion import stamp_at, tilted_mount
+from helpers.drives import (
+    Call,
+    Run,
+    imu_calls,
+    joint_calls,
+    merged,
+    new_estimator,
+    other_odometry_calls,
+    run,
+    wandering,
+)
+from helpers.recordings import HUSKY_REST_S, Recording, calls_of, played, score
+
+from zstate import InvalidInput, Transform
+from zstate.odometry import BaseEstimator, DiffDrive, SourceHealth
+from zstate.odometry.health import chi_square_quantile
+from zstate.odometry.relative import RelativePose, moved_between
+from zstate.odometry.rotations import rotation_exp
+from zstate.odometry.source_noise import RelativeNoise
+
+WHEELS = DiffDrive("left", "right", 0.1, 0.5)
+NOISE = RelativeNoise(sigma=0.02, sigma_deg=0.3, floor=0.002, floor_deg=0.05)
+"""That of ``other_odometry_calls``."""
+
+
+def calls_on(seed: int, seconds: float, *, has_wheels: bool = True, **options: Any) -> list[Call]:
+    """An IMU, another odometry, and wheels on a drive from rest."""
+    random, drive = np.random.default_rng(seed), wandering(seed, seconds)
+    wheels = joint_calls(drive, WHEELS, random) if has_wheels else []
+    others = other_odometry_calls(drive, random, **{"noise": NOISE, **options})
+    return merged(imu_calls(drive, tilted_mount(), random), wheels, others)
+
+
+def driven(
+    seed: int, seconds: float, *, has_wheels: bool = True, **options: Any
+) -> tuple[Run, BaseEstimator]:
+    base = new_estimator(wheels=WHEELS if has_wheels else None)
+    calls = calls_on(seed, seconds, has_wheels=has_wheels, **options)
+    return run(base, wandering(seed, seconds), calls), base
+
+
+def camera_of(base: BaseEstimator) -> SourceHealth:
+    return next(source for source in base.health() if source.name == "camera")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("has_wheels", [False, True])
+def test_errors_are_as_large_as_their_covariances(has_wheels: bool):
+    """Ten drives of 40 s. Constant errors that are part of the claim are an upper limit of the errors."""
+    ends = [driven(seed, 40.0, has_wheels=has_wheels)[0].end for seed in range(10)]
+    squares = np.mean([end.squares for end in ends], axis=0)
+    for square in squares[:3]:
+        assert square < chi_square_quantile(0.999, 3 * len(ends)) / len(ends)
+    assert max(end.sigmas for end in ends) < math.sqrt(chi_square_quantile(0.999, 2))
+
+
+def test_with_an_imu_it_is_enough_to_know_where_the_base_is():
+    """An IMU alone would be off by hundreds of metres."""
+    found, base = driven(1, 30.0, has_wheels=False)
+    assert wandering(1, 30.0).way > 10.0
+    assert found.end.plane < 1.0
+    assert found.end.claim < 1.0
+    assert camera_of(base).rejected == 0
+    assert camera_of(base).sentence == ""
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.3])
+def test_a_scale_that_is_off_is_found_by_the_wheels_and_named(scale: float):
+    found, base = driven(1, 30.0, scale=scale)
+    kind = "short" if scale < 1.0 else "long"
+    words = re.search(
+        r"displacements are (.*) times as long as .*: they are too (\w*)", camera_of(base).sentence
+    )
+    assert words
+    assert float(words[1]) == pytest.approx(scale, abs=0.03)
+    assert words[2] == kind
+    assert found.end.sigmas < 3.0
+    right, _ = driven(1, 30.0)
+    assert found.end.plane < right.end.plane + 0.1
+
+
+def test_a_scale_that_nothing_shows_is_a_part_of_the_claim():
+    """Displacements that are 30 % too long, of a device whose scale is known to 30 %, and an IMU."""
+    found, base = driven(1, 30.0, has_wheels=False, scale=1.3, noise=RelativeNoise(scale=0.3))
+    assert found.end.plane > 0.5
+    assert found.end.sigmas < 3.0
+    assert "times as long" not in camera_of(base).sentence
+
+
+@pytest.mark.parametrize("has_wheels", [False, True])
+def test_a_jump_is_rejected_and_named_and_the_way_goes_on_from_there(has_wheels: bool):
+    jumps = [(15.0, 2.0, 1.0), (20.0, -5.0, 0.0)]
+    right, _ = driven(1, 30.0, has_wheels=has_wheels)
+    found, base = driven(1, 30.0, has_wheels=has_wheels, jumps=jumps)
+    assert camera_of(base).rejected == 2
+    assert (
+        "2 of its last 200 readings could not be used: it moved by 5 m in 0.1 s" in camera_of(base).sentence
+    )
+    assert found.end.plane < right.end.plane + 0.1
+    assert found.end.sigmas < 3.0
+
+
+def test_the_order_of_arrival_does_not_matter():
+    """Poses of the other odometry 0.3 s late, states read all the time."""
+    calls = calls_on(2, 8.0)
+    late = sorted(calls, key=lambda call: call.t + 0.3 * (call.kind == "relative_pose"))
+    one, other = new_estimator(wheels=WHEELS), new_estimator(wheels=WHEELS)
+    run(one, wandering(2, 8.0), calls, every_s=10.0)
+    run(other, wandering(2, 8.0), late, every_s=0.5)
+    first, second = one.state(stamp_at(7.5)), other.state(stamp_at(7.5))
+    np.testing.assert_allclose(first.odom_from_base.pose7, second.odom_from_base.pose7, atol=1e-9)
+    np.testing.assert_allclose(first.covariance.pose, second.covariance.pose, atol=1e-9)
+
+
+def test_a_base_that_is_placed_stays_there_whatever_its_other_odometry_says():
+    _, base = driven(2, 10.0)
+    there = Transform.from_rpy("odom", "base_link", (20.0, 5.0, 0.0), (0.0, 0.0, 1.0))
+    base.set_pose(there)
+    after = [call for call in calls_on(2, 12.0) if call.t > 10.0]
+    for call in after[:60]:
+        getattr(base, call.kind)(stamp_at(call.t), *call.values, **call.options)
+    moved = there.inverse() @ base.state().odom_from_base
+    assert np.hypot(*moved.translation[:2]) < 1.0
+
+
+def test_a_world_of_another_name_is_another_odometry():
+    """As after a restart that says so: no displacement leads from one to the other."""
+    _, base = driven(2, 10.0)
+    pose = Transform.from_rpy("camera_odom_2", "base_link", (100.0, 0.0, 0.0), (0.0, 0.0, 3.0))
+    before = base.state().odom_from_base.translation
+    base.relative_pose(base.newest, pose, source="camera", noise=NOISE)
+    assert camera_of(base).rejected == 0
+    np.testing.assert_allclose(base.state().odom_from_base.translation, before, atol=1e-9)
+
+
+def pose_of(
+    number: int, covariance: np.ndarray | None, kind: str, *, way: float = 0.5, turn: float = 0.1
+) -> RelativePose:
+    """The pose ``number`` on an arc."""
+    step, pose = np.eye(4), np.eye(4)
+    step[:3, :3], step[:3, 3] = rotation_exp(np.array([0.0, 0.0, turn])), (way, 0.0, 0.0)
+    for _ in range(number):
+        pose = pose @ step
+    noise = RelativeNoise(covariance=kind)  # pyright: ignore[reportArgumentType]
+    return RelativePose(number, "camera_odom", pose, covariance, noise, np.eye(4))
+
+
+def adjoint_of(pose: np.ndarray) -> np.ndarray:
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = pose[:3, :3]
+    matrix[3:, :3] = np.cross(pose[:3, 3], np.eye(3)).T @ pose[:3, :3]
+    return matrix
+
+
+def test_covariances_of_dead_reckoning_grow_by_that_of_the_displacement():
+    """``exp(e) T`` of a pose is ``exp(e) T exp(n) Z`` one displacement later: its error has grown by Ad n."""
+    step = np.diag([1e-6, 2e-6, 3e-6, 4e-4, 5e-4, 6e-4])  # rotation first, in the axes of the base
+    errors, known = np.zeros((6, 6)), list[np.ndarray]()
+    for number in range(32):
+        pose = pose_of(number, None, "dependent").pose
+        plain_from_error = np.eye(6)
+        plain_from_error[3:, :3] = -np.cross(pose[:3, 3], np.eye(3)).T
+        plain = plain_from_error @ errors @ plain_from_error.T
+        known.append(np.roll(plain, (3, 3), axis=(0, 1)))
+        errors = errors + adjoint_of(pose) @ step @ adjoint_of(pose).T
+    found = moved_between(pose_of(30, known[30], "dependent"), pose_of(31, known[31], "dependent"))
+    assert not found.is_stated
+    np.testing.assert_allclose(found.walk, step, atol=1e-12)
+
+
+def test_covariances_of_poses_that_were_measured_one_by_one_are_their_noise():
+    covariance = np.diag([0.01, 0.04, 0.09, 1e-4, 4e-4, 9e-4])
+    first, second = (pose_of(number, covariance, "independent", turn=0.5 * math.pi) for number in (0, 1))
+    found = moved_between(first, second)
+    floor = np.repeat((math.radians(0.1) ** 2, 0.005**2), 3)
+    # A quarter of a turn: x of the world is -y of the base.
+    expected = np.array([4e-4, 1e-4, 9e-4, 0.04, 0.01, 0.09])
+    np.testing.assert_allclose(found.spread, np.diag(floor + expected), atol=1e-12)
+    assert not found.walk.any()
+
+
+@pytest.mark.parametrize("kind", ["dependent", "independent"])
+@pytest.mark.parametrize("covariance", [None, np.zeros((6, 6)), np.diag([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])])
+def test_covariances_that_are_none_leave_the_stated_sigmas(kind: str, covariance: np.ndarray | None):
+    found = moved_between(pose_of(2, covariance, kind), pose_of(3, covariance, kind))
+    stated = moved_between(pose_of(2, None, "stated"), pose_of(3, None, "stated"))
+    assert found.is_stated
+    np.testing.assert_array_equal(found.walk, stated.walk)
+    # 0.05 m and 0.5 degrees a root of a metre, and 2 % of the turn of 0.1 rad.
+    turned = math.radians(0.5) ** 2 * 0.5 + (0.02 * 0.1) ** 2
+    np.testing.assert_allclose(np.diag(found.walk), np.repeat((turned, 0.05**2 * 0.5), 3), rtol=1e-6)
+
+
+def test_covariances_of_no_use_are_named():
+    """A driver that sends a constant for what its poses are off by, as many do."""
+    constant = {"noise": RelativeNoise(covariance="dependent")}
+    calls = [
+        call._replace(values=(*call.values, 0.01 * np.eye(6))) if call.kind == "relative_pose" else call
+        for call in calls_on(1, 10.0, **constant)
+    ]
+    base = new_estimator(wheels=WHEELS)
+    run(base, wandering(1, 10.0), calls)
+    assert "its covariances do not grow as dependent ones do" in camera_of(base).sentence
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"sigma": 0.0}, "sigma of a relative source is above zero"),
+        ({"scale": math.inf}, "scale of a relative source"),
+        ({"covariance": "diagonal"}, "one of stated, dependent, independent; got 'diagonal'"),
+    ],
+)
+def test_noise_that_cannot_be_is_refused(changed: dict[str, Any], why: str):
+    with pytest.raises(InvalidInput, match=why):
+        RelativeNoise(**changed)
+
+
+def test_a_covariance_of_another_shape_is_refused_with_the_name_of_its_source():
+    pose = Transform("camera_odom", "base_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    with pytest.raises(InvalidInput, match=r"covariance of source 'camera' is finite, \(6, 6\)"):
+        new_estimator().relative_pose(stamp_at(1.0), pose, np.eye(3), source="camera")
+
+
+@cache
+def husky() -> Recording:
+    return recordings.load("husky")
+
+
+def driver_calls(start: float) -> list[Call]:
+    """The dead reckoning of the Husky's own driver: the integral of the speed and the turn of its wheels.
+
+    It has no gyro: on its own it is off by 2.5 m rms from rest, and by 7 m from its start in motion.
+    """
+    calls, (x, y, yaw), before = list[Call](), (0.0, 0.0, 0.0), None
+    for t, speed, rate in husky().wheels.tolist():
+        dt_s = 0.0 if before is None else t - before
+        x, y = x + speed * math.cos(yaw) * dt_s, y + speed * math.sin(yaw) * dt_s
+        yaw, before = math.remainder(yaw + rate * dt_s, math.tau), t
+        pose = Transform.from_rpy("wheel_odom", "base_link", (x, y, 0.0), (0.0, 0.0, yaw))
+        calls.append(Call(t, "relative_pose", (pose,), {"source": "driver"}))
+    return [call for call in calls if call.t >= start]
+
+
+@pytest.mark.long
+def test_the_odometry_of_a_real_drivers_wheels_and_the_gyro_are_inside_their_claim():
+    """The Husky from rest: 3.2 m rms by GPS were measured, whose errors are 0.8 to 1.7 m; NEES 0.5."""
+    imu = [call for call in calls_of(husky(), start=HUSKY_REST_S) if call.kind == "imu"]
+    track = played(husky(), merged(imu, driver_calls(HUSKY_REST_S)))
+    found = score(husky(), track)
+    assert found.error < 4.0
+    assert found.nees < 2.0
+    assert found.end_sigmas < 3.0
+
+
+@pytest.mark.long
+def test_beside_velocities_of_its_wheels_it_makes_a_real_drive_no_worse():
+    calls = calls_of(husky(), start=HUSKY_REST_S)
+    without = score(husky(), played(husky(), calls))
+    found = score(husky(), played(husky(), merged(calls, driver_calls(HUSKY_REST_S))))
+    assert found.error < 1.1 * without.error
+    assert found.nees < 2.0
