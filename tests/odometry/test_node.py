@@ -187,9 +187,9 @@ def test_heading_of_an_imu_is_the_yaw_of_its_frame_and_needs_a_stated_noise():
     half = 0.5 * 0.7
     orientation = to_block([0.0, 0.0, math.sin(half), math.cos(half)])
     message = Imu(STAMP, 0, 1, IMU, to_block([0.0] * 3), to_block([0.0] * 3), orientation)
-    add_heading(Estimators(base), "imu", HeadingNoise(sigma_deg=2.0), message)  # pyright: ignore[reportArgumentType]
+    add_heading(Estimators(base), "imu", HeadingNoise(sigma_deg=2.0, gate=0.99), message)  # pyright: ignore[reportArgumentType]
     ((stamp, yaw, sigma, options),) = base.headings
-    assert (stamp, options) == (STAMP, {"source": "imu heading", "frame": IMU})
+    assert (stamp, options) == (STAMP, {"source": "imu heading", "frame": IMU, "gate": 0.99})
     assert (yaw, sigma) == pytest.approx((0.7, math.radians(2.0)))
     covariance = to_block(np.diag((1.0, 1.0, 0.04))[np.triu_indices(3)])
     stated = msgspec.structs.replace(message, orientation_covariance=covariance)
@@ -206,9 +206,9 @@ class Recorder:
     """In place of an estimator: its calls of ``heading``."""
 
     def __init__(self) -> None:
-        self.headings: list[tuple[int, float, float, dict[str, str]]] = []
+        self.headings: list[tuple[int, float, float, dict[str, object]]] = []
 
-    def heading(self, stamp: int, yaw: float, sigma: float, **options: str) -> None:
+    def heading(self, stamp: int, yaw: float, sigma: float, **options: object) -> None:
         self.headings.append((stamp, yaw, sigma, options))
 
 

@@ -82,25 +82,25 @@ _OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
 @click.option("--imu", metavar="SENSOR", help="The IMU: a stream of ROBOT; default: imu.")
 @_sensor_option(
     "velocity",
-    "sigma=M/S,scale=PART",
+    "sigma=M/S,scale=PART,axes=x+y,...",
     "A further stream of measured velocities. Its noise is that of its messages, or the standard deviation "
-    "sigma; scale is that of a constant relative error.",
+    "sigma; scale is that of a constant relative error. axes are the numbers that are used.",
 )
 @_sensor_option(
     "pose",
-    "sigma=M,sigma_deg=DEG",
+    "sigma=M,sigma_deg=DEG,axes=x+yaw,...",
     "A further stream of measured poses in the frame of the odometry. Its noise is that of its messages, or "
-    "sigma and sigma_deg.",
+    "sigma and sigma_deg. axes are the numbers that are used, of x, y, z, roll, pitch and yaw.",
 )
 @_sensor_option(
     "heading",
-    "sigma_deg=DEG",
+    "sigma_deg=DEG,...",
     "An IMU whose orientation shows the yaw, as by a compass. Its noise is that of its messages, or "
     "sigma_deg.",
 )
 @_sensor_option(
     "fix",
-    "sigma=M",
+    "sigma=M,...",
     "A satellite receiver, which places the odometry in a map, x east and y north. Its noise is that of its "
     "messages, or sigma.",
 )
@@ -205,6 +205,9 @@ def odometry_command(
     mounts of the sensors are those of the robot's model. Data may be late and out of order. The robot should
     stand still for a few seconds at first: gravity aligns the IMU, and its gyro is zeroed. Later rests,
     on wheels or on all feet, zero it again.
+
+    Each of these sensors may also state delay_s, by how much its stamps are late against those of the IMU
+    [s], and gate, the part of right readings that pass, by default 0.999.
 
     Each source has a NIS, the mean square of what it contradicts in units of its sigmas. `zstate monitor` and
     `zstate doctor` show the sentences about sources whose sigmas are wrong. The settings of a robot with the

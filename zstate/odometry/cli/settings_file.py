@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -38,15 +38,21 @@ from zstate.odometry import (
     Wheels,
 )
 from zstate.odometry.sensors import KINDS, Sensor
-from zstate.odometry.source_noise import SensorNoise
+from zstate.odometry.source_noise import SensorNoise, SourceNoise
 from zstate.transform import Transform
 from zstate.wire.keys import check_writer, full_name
 
 MEMS_NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)
 """That of an inexpensive IMU, for robots without another setting."""
 
+WHEEL_KINDS = ("diff_drive", "ackermann", "mecanum")
+"""The tables of wheels, of which a robot has one."""
+
 DEFAULT_SPEEDS = SpeedThresholds(touchdown=0.1, liftoff=0.2)
 """Those of the feet of walking robots without another setting."""
+
+_AXES = "axes"
+"""The one key of a sensor that is a list."""
 
 T = TypeVar("T")
 PlanarPose = tuple[float, float, float]
@@ -111,7 +117,7 @@ class OdometrySettings:
     def __post_init__(self) -> None:
         for name in (self.imu, *(one.name for one in self.sensors)):
             check_writer(name)
-        kinds = [kind for kind in ("diff_drive", "ackermann", "mecanum") if getattr(self, kind) is not None]
+        kinds = [kind for kind in WHEEL_KINDS if getattr(self, kind) is not None]
         if len(kinds) > 1:
             raise InvalidInput(f"a robot has wheels of one kind, not of {' and '.join(kinds)}")
         if self.datum is not None:
@@ -231,7 +237,7 @@ def parse_feet(text: str) -> LegSettings:
 
 
 def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
-    """``SENSOR[:sigma=NUMBER,...]``: a sensor of this kind, and what is stated of its noise.
+    """``SENSOR[:sigma=NUMBER,axes=x+y,...]``: a sensor of this kind, and what is stated of its noise.
 
     Raises InvalidInput.
     """
@@ -239,17 +245,21 @@ def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
     name, colon, stated = text.partition(":")
     known = msgspec.inspect.type_info(noise)
     assert isinstance(known, msgspec.inspect.DataclassType)
-    names = [one.name for one in known.fields]
-    values: dict[str, float] = {}
+    common = {one.name for one in fields(SourceNoise)}
+    names = sorted((one.name for one in known.fields), key=common.__contains__)
+    values: dict[str, Any] = {}
     for part in stated.split(",") if colon else ():
         key, _, value = part.strip().partition("=")
         if key not in names or key in values:
             raise InvalidInput(
-                f"{part!r} is not part of SENSOR:{','.join(f'{name}=NUMBER' for name in names)}"
-                f"{did_you_mean(key, names)}"
+                f"{part!r} is not part of SENSOR:{','.join(map(_assigned, names))}{did_you_mean(key, names)}"
             )
-        values[key] = _number(key, value)
+        values[key] = tuple(value.split("+")) if key == _AXES else _number(key, value)
     return check_writer(name), noise(**values)
+
+
+def _assigned(key: str) -> str:
+    return f"{key}=x+y" if key == _AXES else f"{key}=NUMBER"
 
 
 def _number(key: str, value: str, unit: str = "") -> float:
