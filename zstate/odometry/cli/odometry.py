@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
-    from zstate.odometry import DiffDrive, OdometryNode
+    from zstate.odometry import DiffDrive, MapEstimator, OdometryNode
     from zstate.odometry.cli.reference import ReferenceName
     from zstate.odometry.cli.settings_file import LegSettings, OdometrySettings, PlanarPose
     from zstate.odometry.messages import SensorMessage
@@ -299,6 +299,7 @@ def _publish(
         listener = opened.enter_context(TransformListener(session, robot))
         base, imu_frame, model = _wait_for_sensors(session, robot, settings, listener)
         estimator = settings.estimator(robot, base, imu_frame, listener.buffer, model)
+        in_map = settings.map_estimator(robot, estimator, listener.buffer)
         node = opened.enter_context(
             OdometryNode(
                 session,
@@ -306,7 +307,7 @@ def _publish(
                 estimator,
                 imu=settings.imu,
                 sensors=[(one.name, one.noise) for one in settings.sensors],
-                in_map=settings.map_estimator(robot, estimator, listener.buffer),
+                in_map=in_map,
                 has_joints=settings.has_joints,
                 writer=writer,
                 rate_hz=rate_hz,
@@ -320,7 +321,7 @@ def _publish(
             if wait_interruptible(node.has_failed, seconds):
                 fail(str(node.failure))
         finally:
-            for line in _end_lines(node):
+            for line in _end_lines(node, in_map):
                 print_wrapped(line)
 
 
@@ -398,12 +399,14 @@ def _sources_text(settings: OdometrySettings) -> str:
     )
 
 
-def _end_lines(node: OdometryNode) -> Iterator[str]:
-    from zstate.odometry.cli.replay import health_text
+def _end_lines(node: OdometryNode, in_map: MapEstimator | None) -> Iterator[str]:
+    from zstate.odometry.cli.replay import health_text, jump_lines
 
     yield f"{count_text(node.published, 'sample')} published"
     for one in node.health():
         yield health_text(one)
+    if in_map is not None:
+        yield from jump_lines(in_map.refused_jumps())
 
 
 def _replay(
