@@ -23,6 +23,7 @@ from zstate.model.joint_history import JointHistory
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, Datum, MapState, SourceHealth
 from zstate.odometry.cli.delay import Delay, Motions
+from zstate.odometry.cli.heard import recorded_names
 from zstate.odometry.cli.reference import Comparison, Path, ReferenceName, compared, reference_path
 from zstate.odometry.cli.settings_file import WHEEL_KINDS, OdometrySettings, others_text
 from zstate.odometry.estimator import WHEELS
@@ -31,7 +32,6 @@ from zstate.odometry.health import WINDOW
 from zstate.odometry.messages import Fix, Odometry, Pose
 from zstate.odometry.sensors import Estimators, add_imu
 from zstate.recording.cli.plot import new_figure
-from zstate.recording.info import recorded_robots
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.streams import StreamName
 from zstate.wire.keys import full_name
@@ -202,9 +202,7 @@ def _messages(recording: Recording, robot: str, stream: StreamName, sensor: str)
     found = [one for one in messages(robot, sensor) if not isinstance(one, Fix) or one.status >= 0]
     if found:
         return sorted(found, key=attrgetter("stamp"))
-    robots = recorded_robots(recording.info)
-    streams = [one for recorded in robots if recorded.name == robot for one in recorded.streams]
-    known = {one.writer for one in streams if one.stream == stream and one.count}
+    known = recorded_names(recording.info, robot, stream)
     raise InvalidInput(
         f"{recording.info.path} has no message on {stream}/{sensor} of {robot!r}{others_text(sensor, known)}"
     )
