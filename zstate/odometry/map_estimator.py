@@ -10,10 +10,10 @@ positions of the antenna. map -> odom is the difference of both at one stamp (RE
 - Errors of a fix wander: they are correlated over ``FixNoise.correlated_s``. A filter takes errors as
   independent, so the variance of each fix is multiplied by (1 + a) / (1 - a), a = exp(-dt / correlated_s)
   with dt the time since the last one. The mean of many is then as uncertain as it is.
-- A fix is refused if it is further than the 99.9 % gate from where the base is in the map; if it jumps from
-  the last one, less the way driven, by more than a fix is uncertain; or if over half a minute the fixes leave
-  the way by wheels and gyro, with the yaw in the map from before: a drift takes that with it. After a drift,
-  all are refused.
+- A fix is refused if it is further than the gate of its source, by default 99.9 %, from where the base is in
+  the map; if it jumps from the last one, less the way driven, by more than a fix is uncertain; or if over
+  half a minute the fixes leave the way by wheels and gyro, with the yaw in the map from before: a drift takes
+  that with it. After a drift, all are refused.
 - Fixes that are refused, but agree with each other and the way for ``correlated_s`` and 20 m, or for twice
   that time, are believed: the pose in the map moves there, and velocity and biases stay.
 - A drift across the way is as an error of the yaw: if the yaw is not known well, it is followed for a while.
@@ -37,7 +37,7 @@ from zstate.clock import check_stamp
 from zstate.errors import InPast, InvalidInput, LookupFailed, NoData
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.geodesy import Datum, check_place
-from zstate.odometry.health import WINDOW, SourceHealth, chi_square_quantile
+from zstate.odometry.health import WINDOW, SourceHealth, chi_square_quantile, gate
 from zstate.odometry.map_alignment import Fixes, MapAlignment, align_in_map, turn
 from zstate.odometry.rotations import skew
 from zstate.odometry.source_noise import HEIGHT_FACTOR, FixNoise
@@ -59,7 +59,6 @@ _KEPT_APART = 1.0 / 200.0
 _LEVEL = 0.01
 """[rad] Roll and pitch are those of the odometry."""
 
-_GATE = 0.999
 _WAY = 0.02
 """Of the length of a way by wheels, its error is about this part: ``VelocityNoise.scale``."""
 _WANDER_S = (25.0, 40.0)
@@ -147,6 +146,8 @@ class _Receiver:
     """By how much the variance of fixes is larger than stated."""
     is_doubted: bool = False
     """They have left the way, as a drift does; then they are taken again once they are believed."""
+    refused_jump: float = math.nan
+    """A fix that jumps by more [m] than this, in any direction, would have been refused at the last one."""
     accepted_count: int = 0
     refused_count: int = 0
     last_refusal: tuple[int, str] = (0, "")
@@ -252,6 +253,15 @@ class MapEstimator:
         map_from_odom = Transform.from_pose7(self.map, self.odometry.odom, pose7, there.stamp)
         return MapState(there.stamp, there.odom_from_base, map_from_odom, there.covariance.pose)
 
+    def refused_jumps(self) -> dict[str, float]:
+        """By receiver, from which jump [m] on its fixes are refused, whatever their direction.
+
+        It is that of its last fix that was used; a receiver without one has none.
+        """
+        self._use_waiting()
+        found = {name: receiver.refused_jump for name, receiver in sorted(self._receivers.items())}
+        return {name: jump for name, jump in found.items() if math.isfinite(jump)}
+
     def health(self) -> tuple[SourceHealth, ...]:
         """The health of each receiver, by name."""
         self._use_waiting()
@@ -339,7 +349,7 @@ class MapEstimator:
         while _grown(kept, now)[5] > _MOST_YAW_GROWN**2:
             del kept[0]
         alignment = self._alignment(receiver)
-        if alignment.misfit > chi_square_quantile(_GATE, max(alignment.freedom, 1)):
+        if alignment.misfit > gate(max(alignment.freedom, 1), receiver.noise.gate):
             self._refuse(receiver, passed.fix.stamp, "not where wheels and gyro lead from earlier ones")
             del kept[:-1]
             return
@@ -402,7 +412,15 @@ class MapEstimator:
         measured, noise = fix.there.copy(), fix.variances * (factor * receiver.excess)
         if not fix.has_height:
             measured[2], noise[2] = antenna[2], _UNKNOWN_HEIGHT**2
-        in_map.position(fix.stamp, measured, np.diag(noise), source=name, frame=receiver.frame)
+        in_map.position(
+            fix.stamp,
+            measured,
+            np.diag(noise),
+            source=name,
+            frame=receiver.frame,
+            gate=receiver.noise.gate,
+        )
+        receiver.refused_jump = _refused_jump(receiver, passed, covariance)
         receiver.accepted_count += 1
         receiver.refused.clear()
         taken = receiver.taken
@@ -553,18 +571,31 @@ def _square(apart: Floats, covariance: Floats) -> float:
 
 def _contradiction(receiver: _Receiver, passed: _Passed, antenna: Floats, covariance: Floats) -> str:
     """By what a fix contradicts the pose in the map, or the fix before; empty if it does not."""
-    gate = chi_square_quantile(_GATE, 2)
+    most = gate(2, receiver.noise.gate)
     apart = (passed.fix.there - antenna)[:2]
-    if _square(apart, covariance) > gate:
+    if _square(apart, covariance) > most:
         return f"{np.hypot(*apart):.1f} m from where wheels, gyro and earlier fixes lead"
     if not receiver.taken:
         return ""
-    elapsed_s = (passed.fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9
-    share = 0.5 if elapsed_s < receiver.noise.correlated_s else 1.0  # errors of neighbours are alike
     jump, covariance = _difference(receiver.taken[-1], passed, receiver.excess)
-    if _square(jump, covariance) > share * gate:
+    if _square(jump, covariance) > _neighbour_share(receiver, passed) * most:
         return f"{np.hypot(*jump):.1f} m from the one before, but for the way by wheels and gyro"
     return ""
+
+
+def _neighbour_share(receiver: _Receiver, passed: _Passed) -> float:
+    """The part of the gate that counts for a jump from the last fix: errors of neighbours are alike."""
+    elapsed_s = (passed.fix.stamp - receiver.taken[-1].fix.stamp) * 1e-9
+    return 0.5 if elapsed_s < receiver.noise.correlated_s else 1.0
+
+
+def _refused_jump(receiver: _Receiver, passed: _Passed, covariance: Floats) -> float:
+    """From which distance [m] on a fix in place of this one contradicts, whatever its direction."""
+    squares = [float(np.linalg.eigvalsh(covariance)[-1])]
+    if receiver.taken:
+        _, between = _difference(receiver.taken[-1], passed, receiver.excess)
+        squares.append(_neighbour_share(receiver, passed) * float(np.linalg.eigvalsh(between)[-1]))
+    return math.sqrt(gate(2, receiver.noise.gate) * min(squares))
 
 
 def _drift(receiver: _Receiver, passed: _Passed) -> str:
@@ -573,7 +604,7 @@ def _drift(receiver: _Receiver, passed: _Passed) -> str:
         elapsed_s = (passed.fix.stamp - earlier.fix.stamp) * 1e-9
         if _WANDER_S[0] <= elapsed_s <= _WANDER_S[1]:
             wander, covariance = _difference(earlier, passed, _UNPROVEN)
-            if _square(wander, covariance) > chi_square_quantile(_GATE, 2):
+            if _square(wander, covariance) > gate(2, receiver.noise.gate):
                 off = np.hypot(*wander)
                 return f"{off:.1f} m off the way by wheels and gyro since one {elapsed_s:.0f} s before"
             break
