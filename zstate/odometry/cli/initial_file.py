@@ -305,10 +305,11 @@ class _Sensor:
             known = message.covariance
             variances = np.zeros(3) if known is None else np.diag(covariance_matrix(known))
             return variances if (variances > 0.0).all() else None
-        if self.kind.covariance is None:
-            return None
+        noise = self.kind.noise()
+        if self.kind.covariance is None or getattr(noise, "sigma_deg", None) is not None:
+            return None  # what messages state is of no use for it
         try:
-            known = self.kind.covariance(self._name, self.kind.noise(), message)
+            known = self.kind.covariance(self._name, noise, message)
         except InvalidInput:
             return None
         return None if known is None else np.diag(known)
