@@ -274,7 +274,9 @@ def test_a_barometer_is_a_source_of_heights_with_a_noise_that_is_stated_or_its_o
     (stamp, height, sigma, options), (_, _, own, _) = base.calls
     assert (stamp, sigma) == (5, 0.4)
     assert height == pytest.approx(8.33, abs=0.01)
-    assert options == {"source": "bmp", "frame": "r1/mast", "wander": 2.0, "correlated_s": 60.0}
+    assert options == {
+        **{"source": "bmp", "frame": "r1/mast", "wander": 2.0, "correlated_s": 60.0, "gate": 0.999}
+    }
     assert own == pytest.approx(0.5, abs=0.01)  # 6 Pa
     unknown = Pressure(5, 0, 1, "r1/mast", 101225.0)
     with pytest.raises(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -431,6 +432,24 @@ def test_an_antenna_anywhere_on_the_robot_shows_where_its_base_is():
     assert abs(yaw) < 0.05
     wrong, _ = true_error(circled(antenna_calls(LEVER, "base_link")))
     assert np.hypot(*wrong[:2]) > 0.3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("gate", [0.999, 1.0 - 1e-9])
+@pytest.mark.parametrize("direction", [0.0, 1.6, 3.2, 4.8])
+def test_a_jump_is_refused_from_that_distance_on_which_is_told(direction: float, gate: float):
+    """Give or take half of it, for the noise of this fix and of the one before."""
+    noise = replace(RTK, gate=gate)
+    calls = [one._replace(options={**one.options, "noise": noise}) for one in antenna_calls(LEVER, "antenna")]
+    *before, last, following = calls[:60]
+    jump = circled([*before, last], following.t).refused_jumps()["gps"]
+    refused: list[int] = []
+    for part in (0.5, 1.5):
+        away = jump * part * np.array((math.cos(direction), math.sin(direction), 0.0))
+        place = HUSKY_DATUM.geodetic(HUSKY_DATUM.enu(*last.values) + away)
+        estimator = circled([*before, last._replace(values=place)], following.t)
+        refused.append(estimator.health()[0].rejected)
+    assert refused == [0, 1]
 
 
 def test_a_second_receiver_is_fused_as_well():

@@ -206,9 +206,9 @@ def test_heading_of_an_imu_is_the_yaw_of_its_frame_and_needs_a_stated_noise():
     half = 0.5 * 0.7
     orientation = to_block([0.0, 0.0, math.sin(half), math.cos(half)])
     message = Imu(STAMP, 0, 1, IMU, to_block([0.0] * 3), to_block([0.0] * 3), orientation)
-    add_heading(Estimators(base), "imu", HeadingNoise(sigma_deg=2.0), message)  # pyright: ignore[reportArgumentType]
+    add_heading(Estimators(base), "imu", HeadingNoise(sigma_deg=2.0, gate=0.99), message)  # pyright: ignore[reportArgumentType]
     ((stamp, yaw, sigma, options),) = base.headings
-    assert (stamp, options) == (STAMP, {"source": "imu heading", "frame": IMU})
+    assert (stamp, options) == (STAMP, {"source": "imu heading", "frame": IMU, "gate": 0.99})
     assert (yaw, sigma) == pytest.approx((0.7, math.radians(2.0)))
     covariance = to_block(np.diag((1.0, 1.0, 0.04))[np.triu_indices(3)])
     stated = msgspec.structs.replace(message, orientation_covariance=covariance)
@@ -231,7 +231,7 @@ def test_field_of_a_magnetometer_is_calibrated_and_expected_to_be_that_of_the_ea
     for one in (MagnetometerNoise(), noise):
         add_magnetic_field(Estimators(base), "mag", one, FIELD)  # pyright: ignore[reportArgumentType]
     (_, raw, sigma, options), (stamp, field, _, placed) = base.fields
-    assert options == {"source": "mag field", "frame": "r1/mag", "expected": None}
+    assert options == {"source": "mag field", "frame": "r1/mag", "expected": None, "gate": 0.999}
     assert raw.tolist() == [21e-6, 0.0, -40e-6]
     assert sigma == pytest.approx(math.radians(5.0))
     assert (stamp, field) == (FIELD.stamp, pytest.approx([20e-6, 0.0, -40e-6]))
@@ -273,13 +273,13 @@ class Recorder:
     """In place of an estimator: its calls of ``heading`` and of ``magnetic_field``."""
 
     def __init__(self) -> None:
-        self.headings: list[tuple[int, float, float, dict[str, str]]] = []
+        self.headings: list[tuple[int, float, float, dict[str, object]]] = []
         self.fields: list[tuple[int, Floats, float, dict[str, object]]] = []
 
     def magnetic_field(self, stamp: int, field: Floats, sigma: float, **options: object) -> None:
         self.fields.append((stamp, field, sigma, options))
 
-    def heading(self, stamp: int, yaw: float, sigma: float, **options: str) -> None:
+    def heading(self, stamp: int, yaw: float, sigma: float, **options: object) -> None:
         self.headings.append((stamp, yaw, sigma, options))
 
 

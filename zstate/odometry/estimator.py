@@ -49,13 +49,15 @@ from zstate.odometry.fusion import (
     lead_remarks,
     odom_pose,
 )
-from zstate.odometry.health import Outcome, SourceHealth, SourceRecord
+from zstate.odometry.health import GATE_PROBABILITY, Outcome, SourceHealth, SourceRecord, check_gate
 from zstate.odometry.invariant_filter import FilterState, ImuNoise, Measurement
 from zstate.odometry.legs import Legs
 from zstate.odometry.magnetism import EarthField, check_strength
 from zstate.odometry.measurements import (
+    ALL_ROWS,
     MAX_SIGMA,
     MIN_SIGMA,
+    Rows,
     body_velocity,
     checked_noise,
     checked_vector,
@@ -68,7 +70,7 @@ from zstate.odometry.measurements import position as measured_position
 from zstate.odometry.messages import MAX_ACCELERATION, MAX_DISTANCE, MAX_FIELD, MAX_RATE, MAX_SPEED
 from zstate.odometry.placement import Placement, is_finite, last_pose, placed
 from zstate.odometry.relative import RelativePose
-from zstate.odometry.source_noise import RelativeNoise
+from zstate.odometry.source_noise import POSE_AXES, VELOCITY_AXES, RelativeNoise, axis_rows
 from zstate.odometry.stamp_order import Held, StampOrder
 from zstate.odometry.wheels import Wheels, WheelVelocity, check_wheel_positions, displacement
 from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
@@ -261,12 +263,19 @@ class BaseEstimator:
         return other
 
     def position(
-        self, stamp: int, position: ArrayLike, covariance: ArrayLike, *, source: str, frame: str
+        self,
+        stamp: int,
+        position: ArrayLike,
+        covariance: ArrayLike,
+        *,
+        source: str,
+        frame: str,
+        gate: float = GATE_PROBABILITY,
     ) -> None:
         """The position of the origin of ``frame`` in ``odom`` at ``stamp`` [m], (3,), as of an antenna.
 
-        ``covariance`` (3, 3) is that of errors that are independent of those of other readings. Raises
-        InvalidInput and UnknownFrame as ``pose``.
+        ``covariance`` (3, 3) is that of errors that are independent of those of other readings. ``gate`` is
+        as in ``velocity``. Raises InvalidInput and UnknownFrame as ``pose``.
         """
         measured = checked_vector(position, source, "position", MAX_DISTANCE)
         noise = checked_noise(None, covariance, 3, source)
@@ -275,7 +284,7 @@ class BaseEstimator:
         def measure(state: FilterState, _: Floats) -> Measurement:
             return measured_position(state, measured, noise, mount)
 
-        reading = Reading(check_stamp(stamp), measure, is_position=True)
+        reading = Reading(check_stamp(stamp), measure, is_position=True, gate=check_gate(gate))
         self._offer(_Event(source, reading, (*measured.tolist(), *noise.diagonal().tolist())))
 
     def set_pose(self, odom_from_base: Transform) -> None:
@@ -322,19 +331,25 @@ class BaseEstimator:
         frame: str | None = None,
         scale: float = 0.02,
         source: str = WHEELS,
+        axes: Sequence[str] = VELOCITY_AXES,
+        gate: float = GATE_PROBABILITY,
     ) -> None:
         """The velocity of the origin of ``frame`` in its own axes at ``stamp``, x y z [m/s], (3,).
 
         Its noise is given by ``sigma``, standard deviations (3,), or by ``covariance``, (3, 3). ``frame`` is
         the base by default. ``angular`` [rad/s] (3,) is used while the IMU is silent, and to know standstill.
-        ``scale`` is the standard deviation of a constant relative error, as of a radius of wheels.
+        ``scale`` is the standard deviation of a constant relative error, as of a radius of wheels. ``axes``
+        are those that are measured, and ``gate`` the part of readings that pass if all sigmas are right.
         Raises InvalidInput, which names the source, for NaN, for what is no covariance, for more than
         1e4 m/s or 1e3 rad/s, and for standard deviations outside of 1e-9 to 1e9; UnknownFrame for the frame.
         """
         vector = checked_vector(linear, source, "velocity", MAX_SPEED)
         rate = None if angular is None else checked_vector(angular, source, "angular velocity", MAX_RATE)
-        noise = checked_noise(sigma, covariance, 3, source)
+        rows = list(axis_rows("velocity", axes, VELOCITY_AXES))
+        vector[[row for row in range(3) if row not in rows]] = 0.0
+        noise = checked_noise(sigma, covariance, 3, source, rows)
         measured = WheelVelocity(vector, np.zeros(3) if rate is None else rate, noise)
+        check_gate(gate)
         if not 0.0 <= scale <= MAX_SIGMA:
             raise InvalidInput(
                 f"the scale of source {source!r} is a standard deviation of 0 to {MAX_SIGMA:g}; got {scale!r}"
@@ -345,7 +360,14 @@ class BaseEstimator:
             source,
             stamp,
             lambda base: base._insert_velocity(
-                stamp, measured, frame, source, scale, has_rate=rate is not None
+                stamp,
+                measured,
+                frame,
+                source,
+                scale=scale,
+                gate=gate,
+                has_rate=rate is not None,
+                rows=rows,
             ),
         )
 
@@ -359,7 +381,8 @@ class BaseEstimator:
     ) -> None:
         """The joints by name at ``stamp`` [ns]: positions [rad] or [m], for wheels and legs.
 
-        Two readings of wheels are a displacement, whose mean velocity is fused at the middle of the interval.
+        Two readings of wheels are a displacement, whose mean velocity is fused at the middle of the interval;
+        the delay of ``WheelNoise`` is subtracted from their stamps.
         ``velocities`` or ``efforts`` [Nm] or [N] are needed to detect contacts of feet. Others than the
         joints of wheels and legs are ignored. Raises InvalidInput without wheels and legs, and for missing
         joints and NaN.
@@ -373,7 +396,8 @@ class BaseEstimator:
         wheels = self._wheels
         if wheels is not None:
             found = check_wheel_positions(wheels, positions)
-            self._offer_reading(WHEELS, stamp, lambda base: base._insert_rotations(wheels, stamp, found))
+            rolled = check_stamp(stamp - wheels.noise.delay_ns)
+            self._offer_reading(WHEELS, rolled, lambda base: base._insert_rotations(wheels, rolled, found))
         if self._legs is not None:
             numbers = [float(positions.get(name, math.nan)) for name in self._legs.joint_names]
             steps = Steps(stamp, self._legs.feet(positions), velocities, efforts)
@@ -402,12 +426,22 @@ class BaseEstimator:
         flags = [float(name in down) for name in names]
         self._offer(_Event(CONTACTS, Contacts(check_stamp(stamp), down), flags))
 
-    def pose(self, stamp: int, odom_from_base: Transform, covariance: ArrayLike, *, source: str) -> None:
+    def pose(
+        self,
+        stamp: int,
+        odom_from_base: Transform,
+        covariance: ArrayLike,
+        *,
+        source: str,
+        axes: Sequence[str] = POSE_AXES,
+        gate: float = GATE_PROBABILITY,
+    ) -> None:
         """The pose of a frame on the robot in ``odom`` at ``stamp``, as of motion capture.
 
-        ``covariance`` (6, 6) has the order and axes of ``Transform.covariance``. Raises InvalidInput, which
-        names the source, for another target than ``odom``, NaN, what is no covariance, more than 1e8 m, and
-        standard deviations outside of 1e-9 to 1e9; UnknownFrame for the frame.
+        ``covariance`` (6, 6) has the order and axes of ``Transform.covariance``, and ``axes`` are those of
+        them that are measured; ``gate`` is as in ``velocity``. Raises InvalidInput, which names the source,
+        for another target than ``odom``, NaN, what is no covariance, more than 1e8 m, and standard deviations
+        outside of 1e-9 to 1e9; UnknownFrame for the frame.
         """
         if odom_from_base.target != self.odom:
             raise InvalidInput(
@@ -415,13 +449,14 @@ class BaseEstimator:
             )
         checked_vector(odom_from_base.translation, source, "position", MAX_DISTANCE)
         mount = self._mount(odom_from_base.source)
-        noise = checked_noise(None, covariance, 6, source)
+        rows = list(axis_rows("pose", axes, POSE_AXES))
+        noise = checked_noise(None, covariance, 6, source, rows)
         matrix = odom_from_base.matrix
 
         def measure(state: FilterState, _: Floats) -> Measurement:
-            return pose(state, matrix, noise, mount)
+            return pose(state, matrix, noise, mount, rows=rows)
 
-        reading = Reading(check_stamp(stamp), measure, is_position=True)
+        reading = Reading(check_stamp(stamp), measure, is_position=True, rows=rows, gate=check_gate(gate))
         numbers = (*odom_from_base.pose7.tolist(), *noise.diagonal().tolist())
         self._offer(_Event(source, reading, numbers), is_shared=False)
 
@@ -453,14 +488,23 @@ class BaseEstimator:
         reading = RelativePose(check_stamp(stamp), world, matrix, known, noise or RelativeNoise(), mount)
         self._offer(_Event(source, reading, world_from_frame.pose7.tolist()))
 
-    def heading(self, stamp: int, yaw: float, sigma: float, *, source: str, frame: str | None = None) -> None:
+    def heading(
+        self,
+        stamp: int,
+        yaw: float,
+        sigma: float,
+        *,
+        source: str,
+        frame: str | None = None,
+        gate: float = GATE_PROBABILITY,
+    ) -> None:
         """The yaw of ``frame``, by default the base, at ``stamp`` [rad], with a standard deviation.
 
         It is relative to the first one of this source, because the odometry frame has no north. ``sigma`` is
         that of errors that do not average out: the yaw will not be known better by it. See
         ``zstate.odometry.fusion``. A heading while the axis is within 6 degrees of the vertical, where it has
-        none, is rejected. Raises InvalidInput, which names the source, for NaN and a sigma outside of 1e-9 to
-        1e9.
+        none, is rejected. ``gate`` is as in ``velocity``. Raises InvalidInput, which names the source, for
+        NaN and a sigma outside of 1e-9 to 1e9.
         """
         mount = self._mount(frame or self.base)
         if not (abs(yaw) <= _LARGEST_YAW and MIN_SIGMA <= sigma <= MAX_SIGMA):
@@ -468,7 +512,8 @@ class BaseEstimator:
                 f"a heading of source {source!r} is at most {_LARGEST_YAW:g} rad, with a sigma of "
                 f"{MIN_SIGMA:g} to {MAX_SIGMA:g} rad; got yaw={yaw!r}, sigma={sigma!r}"
             )
-        reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, mount[:3, 0])
+        axis = mount[:3, 0]
+        reading = Heading(check_stamp(stamp), float(yaw), float(sigma) ** 2, axis, check_gate(gate))
         self._offer(_Event(source, reading, (yaw, sigma)))
 
     def height(
@@ -481,13 +526,14 @@ class BaseEstimator:
         frame: str | None = None,
         wander: float = 0.0,
         correlated_s: float = 300.0,
+        gate: float = GATE_PROBABILITY,
     ) -> None:
         """The height of ``frame``, by default the base, at ``stamp`` [m], above any level, up positive.
 
         It is relative to the first one of this source, as the odometry frame has no sea level. ``sigma`` [m]
         is the standard deviation of each reading, ``wander`` [m] that of an error besides that changes over
         ``correlated_s`` [s], as by weather. The height will not be known better by it than both together
-        allow, and nothing but the height is corrected. See ``zstate.odometry.fusion``. Raises InvalidInput,
+        allow, and nothing but the height is corrected. ``gate`` is as in ``velocity``. Raises InvalidInput,
         which names the source, for NaN, more than 1e8 m, a sigma outside of 1e-9 to 1e9, a wander outside of
         0 to 1e9, and a time that is not above zero.
         """
@@ -501,7 +547,7 @@ class BaseEstimator:
             )
         numbers = float(height), float(sigma) ** 2, float(wander) ** 2, float(correlated_s)
         self._record(source).has_bounds = True
-        self._offer(_Event(source, Height(check_stamp(stamp), *numbers, mount), numbers))
+        self._offer(_Event(source, Height(check_stamp(stamp), *numbers, mount, check_gate(gate)), numbers))
 
     def magnetic_field(
         self,
@@ -512,6 +558,7 @@ class BaseEstimator:
         source: str,
         frame: str | None = None,
         expected: EarthField | None = None,
+        gate: float = GATE_PROBABILITY,
     ) -> None:
         """The magnetic field in the axes of ``frame`` at ``stamp``, x y z [T], (3,), of which a yaw is known.
 
@@ -530,7 +577,7 @@ class BaseEstimator:
                 f"got {sigma!r}"
             )
         vector, ahead = self._mount(frame or self.base)[:3, :3].dot(vector), self._imu_from_base[:3, 0]
-        reading = Field(check_stamp(stamp), vector, float(sigma) ** 2, ahead, expected)
+        reading = Field(check_stamp(stamp), vector, float(sigma) ** 2, ahead, expected, check_gate(gate))
         self._record(source).has_bounds = True
         self._offer(_Event(source, reading, (*vector.tolist(), sigma)))
 
@@ -725,7 +772,10 @@ class BaseEstimator:
             reading = Displacement(stamp, first[0], way, turn, mount)
             self._insert(_Event(WHEELS, reading, (*way.tolist(), turn)))
         else:
-            self._insert_velocity(stamp, measured, wheels.frame, WHEELS, wheels.noise.scale, has_rate=True)
+            noise = wheels.noise
+            self._insert_velocity(
+                stamp, measured, wheels.frame, WHEELS, scale=noise.scale, gate=noise.gate, has_rate=True
+            )
 
     def _insert_velocity(
         self,
@@ -733,16 +783,19 @@ class BaseEstimator:
         measured: WheelVelocity,
         frame: str | None,
         source: str,
-        scale: float,
         *,
+        scale: float,
+        gate: float,
         has_rate: bool,
+        rows: Rows = ALL_ROWS,
     ) -> None:
+        """Insert a velocity, whose covariance is that of ``rows`` of it."""
         linear, angular, noise = measured
         mount = self._mount(frame or self.base)
         rate = angular if has_rate else None
 
         def measure(state: FilterState, gyro: Floats) -> Measurement:
-            return body_velocity(state, linear, noise, mount, gyro)
+            return body_velocity(state, linear, noise, mount, gyro, rows=rows)
 
         reading = Reading(
             stamp,
@@ -752,6 +805,7 @@ class BaseEstimator:
             scale=scale,
             upright=mount[:3, 2],
             speed=math.sqrt(linear @ linear),
+            gate=gate,
         )
         numbers = (*linear.tolist(), *angular.tolist(), *noise.diagonal().tolist())
         self._insert(_Event(source, reading, numbers))

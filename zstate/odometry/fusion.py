@@ -9,8 +9,8 @@ kept.
 - Without samples for more than 0.1 s, the base keeps its velocity in its own axes, and turns at the rate of
   the wheels, with large noise. If the wheels are silent, too, it turns at the last rate, give or take a
   constant 0.5 rad/s. The displacement of the wheels over such a pause replaces all of that.
-- A reading whose NIS exceeds the 99.9 % gate is rejected. After two seconds of rejections in a row, the
-  estimate follows: it forgets its velocity, or place, and keeps biases and tilt.
+- A reading whose NIS exceeds the gate of its source, by default 99.9 %, is rejected. After two seconds of
+  rejections in a row, the estimate follows: it forgets its velocity, or place, and keeps biases and tilt.
 - If wheels, or all feet, and the gyro agree for 0.1 s that the base stands, its velocity is zero, and the
   gyro measures its own bias. The yaw rate of wheels shows a bias that was never measured so (``turning.py``).
 - A heading is relative to the first one of its source: the odometry frame has no north. The error of a
@@ -33,7 +33,7 @@ kept.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -42,7 +42,7 @@ import numpy as np
 
 from zstate import se3
 from zstate.checks import Floats
-from zstate.odometry.health import Outcome, gate
+from zstate.odometry.health import GATE_PROBABILITY, Outcome, gate
 from zstate.odometry.invariant_filter import (
     GRAVITY,
     GYRO_BIAS,
@@ -151,6 +151,8 @@ _SAMPLED_S, _SAMPLED_GAIN, _SLOWEST_NS = 0.01, 0.05, 350_000_000
 """The time between samples of the IMU before it is known, and how fast its mean follows."""
 
 _YAW = ROTATION.start + 2
+POSE_ROTATION, POSE_YAW = 3, 5
+"""The places of the rotation, and of that about z, in the covariance of a pose."""
 _LEVEL = slice(POSITION.start, POSITION.start + 2)
 _UP, _UP_OF_CONTACTS = POSITION.start + 2, slice(17, None, 3)
 
@@ -175,8 +177,9 @@ class Reading(NamedTuple):
 
     ``is_still`` is of velocities, else None; ``angular`` is their rate in the IMU's axes [rad/s], (3,), if
     known, and ``upright`` the z axis of the frame there. ``is_position``: it measures the position in the
-    world. ``scale`` is the standard deviation of a constant relative error of a velocity, ``speed`` its
-    length [m/s].
+    world, or other numbers of a pose: ``rows`` are their places in its covariance. ``scale`` is the standard
+    deviation of a constant relative error of a velocity, ``speed`` its length [m/s]. ``gate`` is the
+    probability that a reading passes.
     """
 
     stamp: int
@@ -187,6 +190,8 @@ class Reading(NamedTuple):
     scale: float = 0.0
     upright: Floats | None = None
     speed: float = 0.0
+    gate: float = GATE_PROBABILITY
+    rows: Sequence[int] = range(6)
 
 
 class Displacement(NamedTuple):
@@ -212,6 +217,7 @@ class Heading(NamedTuple):
     yaw: float
     variance: float
     axis: Floats
+    gate: float = GATE_PROBABILITY
 
 
 class Field(NamedTuple):
@@ -225,6 +231,7 @@ class Field(NamedTuple):
     variance: float
     ahead: Floats
     expected: EarthField | None
+    gate: float = GATE_PROBABILITY
 
 
 class Height(NamedTuple):
@@ -239,6 +246,7 @@ class Height(NamedTuple):
     wander: float
     correlated_s: float
     imu_from_frame: Floats
+    gate: float = GATE_PROBABILITY
 
 
 class Contacts(NamedTuple):
@@ -475,19 +483,18 @@ class Fusion:
             estimate = estimate._replace(drift=estimate.drift._replace(scale=reading.scale))
         if reading.is_position:
             estimate = self.settled(estimate)
-            estimate = estimate._replace(offset=estimate.offset._replace(is_followed=True))
+            follows = {"is_followed" if min(reading.rows) < POSE_ROTATION else "is_turned": True}
+            estimate = estimate._replace(offset=estimate.offset._replace(**follows))
         measurement = reading.measure(estimate.state, estimate.rate)
-        if reading.is_position:
-            return _gated(
-                estimate, source, measurement, lambda state, _: _without_place(state, measurement.residual)
-            )
-        return _gated(
-            estimate,
-            source,
-            measurement,
-            lambda state, seconds: _without_velocity(state, measurement.residual, seconds),
-            kept=None if reading.upright is None else partial(_without_yaw_bias, axis=reading.upright),
-        )
+        residual = measurement.residual
+
+        def lost(state: FilterState, seconds: float) -> FilterState:
+            if reading.is_position:
+                return _without_place(state, residual, reading.rows)
+            return _without_velocity(state, residual, seconds)
+
+        kept = None if reading.upright is None else partial(_without_yaw_bias, axis=reading.upright)
+        return _gated(estimate, source, measurement, lost, kept=kept, probability=reading.gate)
 
     def after_pause(
         self, before: Estimate, reading: Displacement, following: Inertia | None
@@ -588,7 +595,7 @@ class Fusion:
         estimate = _with_compass(estimate, source, compass)
         deviation = max(deviation, (_UNPROVEN * (1.0 - len(sectors) / _SECTORS)) ** 2)
         nis = residual * residual / expected
-        if residual * residual > gate(1) * (expected + deviation):
+        if residual * residual > gate(1, reading.gate) * (expected + deviation):
             return estimate, Outcome("rejected", nis, 1)
         floor = reading.variance + deviation + compass.offset_variance
         if variance > floor:
@@ -622,7 +629,7 @@ class Fusion:
         wandered = 2.0 * reading.wander * -math.expm1(-elapsed_s / reading.correlated_s)
         floor = known.variance + reading.variance + wandered
         nis = residual * residual / (variance + floor)
-        if nis > gate(1):
+        if nis > gate(1, reading.gate):
             estimate, is_enough = _with_rejection(estimate, source)
             if not is_enough:
                 return estimate, Outcome("rejected", nis, 1)
@@ -664,6 +671,7 @@ class Fusion:
             lambda state, seconds: _without_velocity(state, measurement.residual[3:] / elapsed_s, seconds),
             kept=None if is_driven else partial(_without_scale, row=found[0] + 6),
             is_step=True,
+            probability=reading.noise.gate,
         )
         if outcome.fate == "rejected":
             angle, way = (float(np.linalg.norm(part)) for part in np.split(measurement.residual, 2))
@@ -1199,8 +1207,9 @@ def _gated(
     *,
     kept: Callable[[Innovation], Innovation] | None = None,
     is_step: bool = False,
+    probability: float = GATE_PROBABILITY,
 ) -> tuple[Estimate, Outcome]:
-    """The estimate after a measurement, if it passes the gate.
+    """The estimate after a measurement, if it passes the gate of ``probability``.
 
     ``lost(state, seconds)`` has forgotten what a source that was rejected for so long contradicts; without it
     a source is never followed. ``kept`` makes a gain that keeps a part of the state; for ``is_step`` see
@@ -1209,7 +1218,7 @@ def _gated(
     state, dimension = estimate.state, len(measurement.residual)
     found = innovation(state, measurement)
     nis = found.nis
-    if nis <= gate(dimension):
+    if nis <= gate(dimension, probability):
         if source in estimate.runs:
             estimate = _with_run(estimate, source, None)
         if kept is not None:
@@ -1260,12 +1269,17 @@ def _without_velocity(state: FilterState, residual: Floats, seconds: float) -> F
     return state._replace(covariance=covariance)
 
 
-def _without_place(state: FilterState, residual: Floats) -> FilterState:
-    """The state with an unknown position and yaw: they are wrong by the residual."""
+def _without_place(state: FilterState, residual: Floats, rows: Sequence[int]) -> FilterState:
+    """The state without what was measured of position and yaw: they are wrong by the residual."""
     state = without_tracked(state)  # the jump is no motion from there
-    covariance = forgotten(plain_covariance(state), POSITION, float(residual[:3] @ residual[:3]))
-    if len(residual) == 6:
-        forgotten(covariance, slice(_YAW, _YAW + 1), float(residual[5] ** 2))
+    measured = dict(zip(rows, residual.tolist(), strict=False))
+    covariance = plain_covariance(state)
+    places = [row for row in measured if row < POSE_ROTATION]
+    error = sum(measured[row] ** 2 for row in places)
+    for row in places:
+        forgotten(covariance, slice(POSITION.start + row, POSITION.start + row + 1), error)
+    if POSE_YAW in measured:
+        forgotten(covariance, slice(_YAW, _YAW + 1), measured[POSE_YAW] ** 2)
     return with_plain_covariance(state, covariance)
 
 

@@ -16,6 +16,7 @@ from statistics import NormalDist
 from typing import Literal, NamedTuple
 
 from zstate._util.format import format_duration
+from zstate.errors import InvalidInput
 
 GATE_PROBABILITY = 0.999
 BAND_PROBABILITY = 0.95
@@ -199,9 +200,19 @@ def _rejection_text(window: list[Outcome]) -> str:
     return f"{rejected} of its last {len(window)} readings were rejected, which contradict the other sources"
 
 
-def gate(dimension: int) -> float:
-    """The NIS that 99.9 % of the readings of ``dimension`` numbers do not exceed."""
-    return chi_square_quantile(GATE_PROBABILITY, dimension)
+def gate(dimension: int, probability: float = GATE_PROBABILITY) -> float:
+    """The NIS that such a part of the readings of ``dimension`` numbers does not exceed."""
+    return chi_square_quantile(probability, dimension)
+
+
+def check_gate(probability: float) -> float:
+    """The same number. Raises InvalidInput unless it is above 0.5 and below 1."""
+    if not 0.5 < probability < 1.0:
+        raise InvalidInput(
+            "the gate of a source is the part of its readings that pass if its sigmas are right, above 0.5 "
+            f"and below 1, as 0.999; got {probability!r}"
+        )
+    return probability
 
 
 def nis_band(dimension: int, count: int) -> tuple[float, float]:

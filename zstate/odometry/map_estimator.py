@@ -10,10 +10,10 @@ positions of the antenna. map -> odom is the difference of both at one stamp (RE
 - Errors of a fix wander: they are correlated over ``FixNoise.correlated_s``. A filter takes errors as
   independent, so the variance of each fix is multiplied by (1 + a) / (1 - a), a = exp(-dt / correlated_s)
   with dt the time since the last one. The mean of many is then as uncertain as it is.
-- A fix is refused if it is further than the 99.9 % gate from where the base is in the map; if it jumps from
-  the last one, less the way driven, by more than a fix is uncertain; or if over half a minute the fixes leave
-  the way by wheels and gyro, with the yaw in the map from before: a drift takes that with it. After a drift,
-  all are refused.
+- A fix is refused if it is further than the gate of its source, by default 99.9 %, from where the base is in
+  the map; if it jumps from the last one, less the way driven, by more than a fix is uncertain; or if over
+  half a minute the fixes leave the way by wheels and gyro, with the yaw in the map from before: a drift takes
+  that with it. After a drift, all are refused.
 - Fixes that are refused, but agree with each other and the way for ``correlated_s`` and 20 m, or for twice
   that time, are believed: the pose in the map moves there, and velocity and biases stay.
 - The height of a fix has gates of its own: one that is refused leaves its position in use. It is believed as
@@ -40,7 +40,7 @@ from zstate.clock import check_stamp
 from zstate.errors import InPast, InvalidInput, LookupFailed, NoData
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.geodesy import SAME_DATUM_M, Datum, check_place
-from zstate.odometry.health import WINDOW, SourceHealth, chi_square_quantile
+from zstate.odometry.health import WINDOW, SourceHealth, chi_square_quantile, gate
 from zstate.odometry.map_alignment import Fixes, MapAlignment, align_in_map, turn
 from zstate.odometry.rotations import skew
 from zstate.odometry.source_noise import HEIGHT_FACTOR, FixNoise
@@ -62,7 +62,6 @@ _KEPT_APART = 1.0 / 200.0
 _LEVEL = 0.01
 """[rad] Roll and pitch are those of the odometry."""
 
-_GATE = 0.999
 _WAY = 0.02
 """Of the length of a way by wheels, its error is about this part: ``VelocityNoise.scale``."""
 _WANDER_S = (25.0, 40.0)
@@ -193,6 +192,8 @@ class _Receiver:
     height: _Trust = field(default_factory=_Trust)
     is_doubted: bool = False
     """They have left the way, as a drift does; then they are taken again once they are believed."""
+    refused_jump: float = math.nan
+    """A fix that jumps by more [m] than this, in any direction, would have been refused at the last one."""
     accepted_count: int = 0
 
 
@@ -311,6 +312,15 @@ class MapEstimator:
         map_from_odom = Transform.from_pose7(self.map, self.odometry.odom, pose7, there.stamp)
         return MapState(there.stamp, there.odom_from_base, map_from_odom, there.covariance.pose)
 
+    def refused_jumps(self) -> dict[str, float]:
+        """By receiver, from which jump [m] on its fixes are refused, whatever their direction.
+
+        It is that of its last fix that was used; a receiver without one has none.
+        """
+        self._use_waiting()
+        found = {name: receiver.refused_jump for name, receiver in sorted(self._receivers.items())}
+        return {name: jump for name, jump in found.items() if math.isfinite(jump)}
+
     def health(self) -> tuple[SourceHealth, ...]:
         """The health of each receiver, by name."""
         self._use_waiting()
@@ -401,7 +411,7 @@ class MapEstimator:
         while _grown(kept, now)[5] > _MOST_YAW_GROWN**2:
             del kept[0]
         alignment = self._alignment(receiver)
-        if alignment.misfit > chi_square_quantile(_GATE, max(alignment.freedom, 1)):
+        if alignment.misfit > gate(max(alignment.freedom, 1), receiver.noise.gate):
             receiver.plane.refuse(passed.fix.stamp, "not where wheels and gyro lead from earlier ones")
             del kept[:-1]
             return
@@ -477,7 +487,10 @@ class MapEstimator:
         variances[2] = factor * height.excess * fix.variances[2]
         if not fix.has_height:
             measured[2], variances[2] = antenna[2], _UNKNOWN_HEIGHT**2
-        in_map.position(fix.stamp, measured, np.diag(variances), source=name, frame=receiver.frame)
+        in_map.position(
+            fix.stamp, measured, np.diag(variances), source=name, frame=receiver.frame, gate=noise.gate
+        )
+        receiver.refused_jump = _refused_jump(receiver, passed, covariance)
         taken = receiver.taken
         if taken and fix.stamp < taken[-1].fix.stamp:
             return  # later ones are compared with the last one
@@ -645,12 +658,12 @@ def _contradiction(receiver: _Receiver, passed: _Passed, away: Floats, covarianc
 
     It is ``away`` [m] from where the antenna is with ``covariance``; of both the plane counts.
     """
-    gate, excess = chi_square_quantile(_GATE, 2), receiver.plane.excess
-    if _mahalanobis(away[:2], covariance[:2, :2] + excess * np.diag(passed.fix.variances[:2])) > gate:
+    most, excess = gate(2, receiver.noise.gate), receiver.plane.excess
+    if _mahalanobis(away[:2], covariance[:2, :2] + excess * np.diag(passed.fix.variances[:2])) > most:
         return f"{np.hypot(*away[:2]):.1f} m from where wheels, gyro and earlier fixes lead"
     if receiver.taken:
         last = receiver.taken[-1]
-        if _square(last, passed, excess) > _share(receiver, last, passed) * gate:
+        if _square(last, passed, excess) > _share(receiver, last, passed) * most:
             jump, _ = _difference(last, passed)
             return f"{np.hypot(*jump):.1f} m from the one before, but for the way by wheels and gyro"
     return ""
@@ -658,11 +671,11 @@ def _contradiction(receiver: _Receiver, passed: _Passed, away: Floats, covarianc
 
 def _wrong_height(receiver: _Receiver, passed: _Passed, away: float, variance: float) -> str:
     """The same of the height of a fix."""
-    gate, excess = chi_square_quantile(_GATE, 1), receiver.height.excess
-    if away**2 > gate * (variance + excess * passed.fix.variances[2]):
+    most, excess = gate(1, receiver.noise.gate), receiver.height.excess
+    if away**2 > most * (variance + excess * passed.fix.variances[2]):
         return f"{abs(away):.1f} m from where earlier ones and the odometry lead"
     last = next((one for one in reversed(receiver.taken) if one.fix.has_height), None)
-    if last is not None and _square_of_heights(last, passed, excess) > _share(receiver, last, passed) * gate:
+    if last is not None and _square_of_heights(last, passed, excess) > _share(receiver, last, passed) * most:
         return f"{abs(_rise(last, passed)):.1f} m from the one before, but for the way by the odometry"
     return ""
 
@@ -673,13 +686,25 @@ def _share(receiver: _Receiver, last: _Passed, passed: _Passed) -> float:
     return 0.5 if elapsed_s < receiver.noise.correlated_s else 1.0
 
 
+def _refused_jump(receiver: _Receiver, passed: _Passed, covariance: Floats) -> float:
+    """From which distance [m] on a fix in place of this one contradicts, whatever its direction."""
+    excess = receiver.plane.excess
+    in_place = covariance[:2, :2] + excess * np.diag(passed.fix.variances[:2])
+    squares = [float(np.linalg.eigvalsh(in_place)[-1])]
+    if receiver.taken:
+        last = receiver.taken[-1]
+        _, between = _difference(last, passed, excess)
+        squares.append(_share(receiver, last, passed) * float(np.linalg.eigvalsh(between)[-1]))
+    return math.sqrt(gate(2, receiver.noise.gate) * min(squares))
+
+
 def _drift(receiver: _Receiver, passed: _Passed) -> str:
     """By how much fixes have left the way in half a minute; empty if no more than honest ones do."""
     for earlier in receiver.taken:
         elapsed_s = (passed.fix.stamp - earlier.fix.stamp) * 1e-9
         if _WANDER_S[0] <= elapsed_s <= _WANDER_S[1]:
             wander, covariance = _difference(earlier, passed, _UNPROVEN)
-            if _mahalanobis(wander, covariance) > chi_square_quantile(_GATE, 2):
+            if _mahalanobis(wander, covariance) > gate(2, receiver.noise.gate):
                 off = np.hypot(*wander)
                 return f"{off:.1f} m off the way by wheels and gyro since one {elapsed_s:.0f} s before"
             break

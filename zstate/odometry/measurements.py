@@ -8,6 +8,7 @@ order they have. Numbers are those that ``checked_vector`` and ``checked_noise``
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,17 +32,28 @@ from zstate.odometry.rotations import IDENTITY, gammas, skew
 MIN_SIGMA, MAX_SIGMA = 1e-9, 1e9
 """The bounds of standard deviations, in any unit. What is worse measures nothing; squares stay in range."""
 
+Rows: TypeAlias = slice | list[int]
+ALL_ROWS = slice(None)
+"""All numbers of a measurement."""
+
 _LEVEL = math.sin(math.radians(6.0))
 """The shortest level part of a unit vector that has a heading: 84 degrees of pitch."""
 
 
 def body_velocity(
-    state: FilterState, linear: Floats, covariance: Floats, imu_from_frame: Floats, gyro: Floats
+    state: FilterState,
+    linear: Floats,
+    covariance: Floats,
+    imu_from_frame: Floats,
+    gyro: Floats,
+    *,
+    rows: Rows = ALL_ROWS,
 ) -> Measurement:
     """The velocity of a frame's origin in the world, in the axes of the frame [m/s], as wheels measure it.
 
     ``R_f^T (R^T v + omega x r)``, with ``r`` and ``R_f`` of ``imu_from_frame`` and omega of ``gyro``, the
-    IMU's rate at this instant [rad/s], less its bias. ``covariance`` (3, 3) is in the axes of the frame.
+    IMU's rate at this instant [rad/s], less its bias. ``covariance`` (m, m) is that of the m ``rows`` which
+    are measured, by default all three, in the axes of the frame.
     """
     frame_from_imu, lever = imu_from_frame[:3, :3].T, imu_from_frame[:3, 3]
     frame_from_world: Floats = frame_from_imu.dot(state.rotation.T)
@@ -51,7 +63,7 @@ def body_velocity(
     jacobian = np.zeros((3, len(state.covariance)))
     jacobian[:, VELOCITY] = frame_from_world
     jacobian[:, GYRO_BIAS] = by_bias
-    return Measurement(linear - expected, jacobian, covariance)
+    return Measurement((linear - expected)[rows], jacobian[rows], covariance)
 
 
 def yaw_rate(state: FilterState, rate: float, variance: float, upright: Floats, gyro: Floats) -> Measurement:
@@ -91,18 +103,23 @@ def height(state: FilterState, measured: float, variance: float, imu_from_frame:
 
 
 def pose(
-    state: FilterState, world_from_frame: Floats, covariance: Floats, imu_from_frame: Floats
+    state: FilterState,
+    world_from_frame: Floats,
+    covariance: Floats,
+    imu_from_frame: Floats,
+    *,
+    rows: Rows = ALL_ROWS,
 ) -> Measurement:
     """The pose of a frame in the world, (4, 4), as motion capture or scan matching measures it.
 
-    ``covariance`` (6, 6) is that of ``Transform.covariance``: position, then rotation about the axes of the
-    world.
+    ``covariance`` (m, m) is that of the m ``rows`` which are measured, by default all six of
+    ``Transform.covariance``: position, then rotation about the axes of the world.
     """
     expected = _world_from_frame(state, imu_from_frame)
     turn = world_from_frame[:3, :3] @ expected[:3, :3].T
     angles = se3.rotation_vector(se3.quaternion_from_matrix(turn), se3.SCALARS)
     residual = np.concatenate((world_from_frame[:3, 3] - expected[:3, 3], angles))
-    return Measurement(residual, _pose_jacobian(state, expected), covariance)
+    return Measurement(residual[rows], _pose_jacobian(state, expected)[rows], covariance)
 
 
 def tracking(state: FilterState, source: str, covariance: Floats, imu_from_frame: Floats) -> Measurement:
@@ -223,28 +240,36 @@ def checked_vector(values: ArrayLike, source: str, what: str, limit: float) -> F
     return vector.copy()
 
 
-def checked_noise(sigma: ArrayLike | None, covariance: ArrayLike | None, size: int, source: str) -> Floats:
-    """The covariance, (size, size), that is given as such or by standard deviations.
+def checked_noise(
+    sigma: ArrayLike | None,
+    covariance: ArrayLike | None,
+    size: int,
+    source: str,
+    rows: Rows = ALL_ROWS,
+) -> Floats:
+    """The covariance of m ``rows`` out of ``size``, (m, m), that is given as such or by standard deviations.
 
     Raises InvalidInput, which names the source, unless it is finite, symmetric and positive definite, with
-    standard deviations from ``MIN_SIGMA`` to ``MAX_SIGMA``.
+    standard deviations from ``MIN_SIGMA`` to ``MAX_SIGMA``; numbers of other rows may be any.
     """
     if (sigma is None) == (covariance is None):
         raise InvalidInput(f"the noise of source {source!r} is given by sigma or by covariance, one of both")
     if sigma is not None:
         sigmas = real_numbers(sigma, f"the sigma of source {source!r}")
-        if sigmas.shape != (size,) or not ((sigmas >= MIN_SIGMA) & (sigmas <= MAX_SIGMA)).all():
+        used = sigmas[rows] if sigmas.shape == (size,) else np.zeros(1)
+        if not ((used >= MIN_SIGMA) & (used <= MAX_SIGMA)).all():
             raise InvalidInput(
                 f"the sigma of source {source!r} is {size} standard deviations above zero, of {MIN_SIGMA:g} "
                 f"to {MAX_SIGMA:g}; got {sigmas.tolist()}"
             )
-        return np.diag(sigmas * sigmas)
+        return np.diag(used * used)
     assert covariance is not None
     matrix = real_numbers(covariance, f"the covariance of source {source!r}")
     if matrix.shape != (size, size):
         raise InvalidInput(
             f"the covariance of source {source!r} has shape ({size}, {size}); got {matrix.shape}"
         )
+    matrix = matrix[rows][:, rows]
     if not np.isfinite(matrix).all():
         raise InvalidInput(f"the covariance of source {source!r} must be finite; got {matrix.tolist()}")
     if np.abs(matrix - matrix.T).max() > 1e-6 * np.abs(matrix).max():

@@ -282,6 +282,11 @@ def with_full_names(message: _Measurement, robot: str) -> _Measurement:
     return msgspec.structs.replace(message, frame=full_name(robot, message.frame))
 
 
+def earlier(message: _Measurement, delay_ns: int) -> _Measurement:
+    """The same message with a stamp that is ``delay_ns`` before its own."""
+    return msgspec.structs.replace(message, stamp=message.stamp - delay_ns)
+
+
 def frame_of(message: SensorMessage) -> str:
     """The frame that was measured; empty for a pose of the base of the robot."""
     if isinstance(message, Odometry):

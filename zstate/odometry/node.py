@@ -347,7 +347,7 @@ class OdometryNode(Closeable):
                 self._add_imu(message)
             for one in sensors:
                 one.add(self._estimators, message)
-                self._publish_without_imu(message.stamp)
+                self._publish_without_imu()
             self._publish_datum()
 
     def _add_imu(self, message: Imu) -> None:
@@ -387,7 +387,7 @@ class OdometryNode(Closeable):
             with self._lock:
                 self._check_stamp(reading.stamp)
                 add_joints(self.base, self._joints.model, reading)
-                self._publish_without_imu(reading.stamp)
+                self._publish_without_imu()
         except InvalidInput as error:
             self._refusals.count("refused joints", error)
         except Exception as error:  # the next reading may be good
@@ -416,10 +416,11 @@ class OdometryNode(Closeable):
         if self.base.epoch != self._epoch:
             self._restart()
 
-    def _publish_without_imu(self, stamp: int) -> None:
+    def _publish_without_imu(self) -> None:
         self._check_epoch()
-        if stamp <= self.base.newest and stamp - self._imu_stamp > _SILENT_NS:
-            self._publish(stamp)
+        newest = self.base.newest  # readings of another time are not among it
+        if newest - self._imu_stamp > _SILENT_NS:
+            self._publish(newest)
 
     def _publish(self, stamp: int, at: int | None = None) -> None:
         """Publish the state ``at`` a stamp, or the newest one, if that is due at ``stamp``; with the lock."""

@@ -16,8 +16,10 @@ from zstate.errors import InvalidInput
 from zstate.odometry.estimator import BaseEstimator
 from zstate.odometry.magnetism import EarthField, check_strength, earth_field
 from zstate.odometry.map_estimator import MapEstimator
-from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Pressure, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Pressure, Velocity, earlier
 from zstate.odometry.source_noise import (
+    POSE_AXES,
+    VELOCITY_AXES,
     BarometerNoise,
     FixNoise,
     HeadingNoise,
@@ -26,6 +28,7 @@ from zstate.odometry.source_noise import (
     RelativeNoise,
     SensorNoise,
     VelocityNoise,
+    axis_rows,
 )
 from zstate.streams import StreamName
 from zstate.transform import Transform
@@ -88,7 +91,9 @@ class Sensor(NamedTuple):
         return self.kind.text.format(self.name)
 
     def add(self, estimators: Estimators, message: Any) -> None:
-        """Pass ``message`` on. Raises InvalidInput."""
+        """Pass ``message`` on, with the stamp of the instant that it measures. Raises InvalidInput."""
+        if self.noise.delay_ns:
+            message = earlier(message, self.noise.delay_ns)
         self.kind.add(estimators, self.name, self.noise, message)
 
     def covariance(self, message: Any) -> Floats | None:
@@ -104,12 +109,14 @@ def add_imu(base: BaseEstimator, message: Imu) -> None:
 def velocity_covariance(sensor: str, noise: VelocityNoise, message: Velocity) -> Floats:
     """That of the linear velocity [m^2/s^2], (3, 3): by ``noise``, else of the message.
 
-    Raises InvalidInput if neither states it: a driver that does not know variances sends zero or -1.
+    Raises InvalidInput if neither states it for the axes that are used: a driver that does not know variances
+    sends zero or -1.
     """
     if noise.sigmas is not None:
         return np.diag(np.square(noise.sigmas))
     covariance = None if message.covariance is None else covariance_matrix(message.covariance)[:3, :3]
-    if covariance is None or not (np.diag(covariance) > 0.0).all():
+    rows = list(axis_rows("velocity", noise.axes, VELOCITY_AXES))
+    if covariance is None or not (np.diag(covariance)[rows] > 0.0).all():
         raise InvalidInput(
             f"velocities of {sensor!r} have {_unknown(covariance)}: state their noise by `--velocity "
             f"{sensor}:sigma=0.05`, or sigma = 0.05 [m/s] in [velocity.{sensor}] of the settings"
@@ -127,6 +134,8 @@ def add_velocity(estimators: Estimators, sensor: str, noise: VelocityNoise, mess
         frame=message.frame,
         scale=noise.scale,
         source=sensor,
+        axes=noise.axes,
+        gate=noise.gate,
     )
 
 
@@ -138,7 +147,8 @@ def pose_covariance(sensor: str, noise: PoseNoise, message: Pose) -> Floats:
     if noise.sigmas is not None:
         return np.diag(np.square(noise.sigmas))
     covariance = None if message.covariance is None else covariance_matrix(message.covariance)
-    if covariance is None or not (np.diag(covariance) > 0.0).all():
+    rows = list(axis_rows("pose", noise.axes, POSE_AXES))
+    if covariance is None or not (np.diag(covariance)[rows] > 0.0).all():
         raise InvalidInput(
             f"poses of {sensor!r} have {_unknown(covariance)}: state their noise by `--pose "
             f"{sensor}:sigma=0.02,sigma_deg=1`, or sigma = 0.02 [m] and sigma_deg = 1.0 [degrees] in "
@@ -151,7 +161,14 @@ def add_pose(estimators: Estimators, sensor: str, noise: PoseNoise, message: Pos
     """Pass one measured pose to the odometry."""
     base = estimators.odometry
     measured = Transform.from_pose7(message.parent, message.child or base.base, from_block(message.pose))
-    base.pose(message.stamp, measured, pose_covariance(sensor, noise, message), source=sensor)
+    base.pose(
+        message.stamp,
+        measured,
+        pose_covariance(sensor, noise, message),
+        source=sensor,
+        axes=noise.axes,
+        gate=noise.gate,
+    )
 
 
 def heading_covariance(sensor: str, noise: HeadingNoise, message: Imu) -> Floats:
@@ -179,7 +196,9 @@ def add_heading(estimators: Estimators, sensor: str, noise: HeadingNoise, messag
     assert message.orientation is not None
     x, y, z, w = from_block(message.orientation).tolist()
     yaw = math.atan2(2.0 * (x * y + z * w), 1.0 - 2.0 * (y * y + z * z))
-    estimators.odometry.heading(message.stamp, yaw, sigma, source=f"{sensor} heading", frame=message.frame)
+    estimators.odometry.heading(
+        message.stamp, yaw, sigma, source=f"{sensor} heading", frame=message.frame, gate=noise.gate
+    )
 
 
 def relative_covariance(sensor: str, noise: RelativeNoise, message: Pose | Odometry) -> None:
@@ -233,6 +252,7 @@ def add_magnetic_field(
         source=f"{sensor} field",
         frame=message.frame,
         expected=expected_field(noise, message),
+        gate=noise.gate,
     )
 
 
@@ -279,6 +299,7 @@ def add_pressure(estimators: Estimators, sensor: str, noise: BarometerNoise, mes
         frame=message.frame,
         wander=noise.wander,
         correlated_s=noise.correlated_s,
+        gate=noise.gate,
     )
 
 

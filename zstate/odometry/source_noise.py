@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
+from zstate._util.format import did_you_mean
 from zstate.checks import Floats
 from zstate.errors import InvalidInput
 from zstate.odometry.geodesy import check_place
+from zstate.odometry.health import GATE_PROBABILITY, check_gate
 
 Sigma: TypeAlias = float | tuple[float, float, float]
 """Standard deviations of x, y and z; one number is that of each."""
@@ -18,6 +21,8 @@ Sigma: TypeAlias = float | tuple[float, float, float]
 FixSigma: TypeAlias = float | tuple[float, float]
 """Standard deviations of a fix, horizontal and vertical; of one number the vertical one is ten times."""
 
+VELOCITY_AXES, POSE_AXES = ("x", "y", "z"), ("x", "y", "z", "roll", "pitch", "yaw")
+"""The numbers of a velocity and of a pose; roll, pitch and yaw are a rotation about x, y and z."""
 
 CovarianceKind: TypeAlias = Literal["stated", "dependent", "independent"]
 """What covariances of poses of another odometry are: of no use, of dead reckoning, or of each pose alone."""
@@ -27,18 +32,64 @@ HEIGHT_FACTOR = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VelocityNoise:
+class SourceNoise:
+    """What may be stated of any source.
+
+    ``delay_s`` [s] is by how much its stamps are later than the IMU's, of one instant; it is subtracted.
+    ``gate`` is the part of readings that pass if noise and estimate are as stated: one that contradicts
+    the estimate by more is rejected. Raises InvalidInput for a delay of more than a minute, and for a gate
+    that is not above 0.5 and below 1.
+    """
+
+    delay_s: float = 0.0
+    gate: float = GATE_PROBABILITY
+
+    def __post_init__(self) -> None:
+        if not abs(self.delay_s) <= _LONGEST_DELAY_S:
+            raise InvalidInput(
+                f"delay_s is by how much stamps are late [s], at most {_LONGEST_DELAY_S:g}; got "
+                f"{self.delay_s!r}"
+            )
+        check_gate(self.gate)
+
+    @property
+    def delay_ns(self) -> int:
+        """By how much stamps are late [ns]."""
+        return round(self.delay_s * 1e9)
+
+
+_LONGEST_DELAY_S = 60.0
+
+
+def axis_rows(kind: str, axes: Sequence[str], known: Sequence[str]) -> tuple[int, ...]:
+    """The places of ``axes`` in ``known``, in its order. Raises InvalidInput, with near misses."""
+    listed = ", ".join(known)
+    for one in axes:
+        if one not in known:
+            raise InvalidInput(f"axes of a {kind} are {listed}, not {one!r}{did_you_mean(one, known)}")
+    if not axes or len(set(axes)) < len(axes):
+        given = ", ".join(axes) or "none"
+        raise InvalidInput(f"axes of a {kind} are some of {listed}, each once; got {given}")
+    return tuple(row for row, one in enumerate(known) if one in axes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VelocityNoise(SourceNoise):
     """The noise of measured velocities; one setting for a sensor.
 
     ``sigma`` [m/s] are standard deviations in the axes of the measured frame; None if messages have them, as
     covariances. ``scale`` is the standard deviation of a constant relative error, as of a radius of wheels.
-    Raises InvalidInput unless all are finite, and sigmas above zero.
+    ``axes`` are the numbers that are used, some of x, y and z of the measured frame. Raises InvalidInput
+    unless all are finite, and sigmas above zero.
     """
 
     sigma: Sigma | None = None
     scale: float = 0.02
+    axes: tuple[str, ...] = VELOCITY_AXES
 
     def __post_init__(self) -> None:
+        SourceNoise.__post_init__(self)
+        axis_rows("velocity", self.axes, VELOCITY_AXES)
         _check_sigma("sigma", self.sigma)
         if not 0.0 <= self.scale < math.inf:
             raise InvalidInput(f"the scale of a velocity is a part of it, 0 or more; got {self.scale!r}")
@@ -50,18 +101,22 @@ class VelocityNoise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PoseNoise:
+class PoseNoise(SourceNoise):
     """The noise of measured poses; one setting for a sensor.
 
     ``sigma`` [m] are standard deviations of the position, ``sigma_deg`` [degrees] of the rotation about the
-    axes of the frame in which poses are measured; both are None if messages have them, as covariances. Raises
-    InvalidInput for one without the other, and unless all are finite and above zero.
+    axes of the frame in which poses are measured; both are None if messages have them, as covariances.
+    ``axes`` are the numbers that are used, some of x, y, z, roll, pitch and yaw, along and about the same
+    axes. Raises InvalidInput for one sigma without the other, and unless all are finite and above zero.
     """
 
     sigma: Sigma | None = None
     sigma_deg: Sigma | None = None
+    axes: tuple[str, ...] = POSE_AXES
 
     def __post_init__(self) -> None:
+        SourceNoise.__post_init__(self)
+        axis_rows("pose", self.axes, POSE_AXES)
         _check_sigma("sigma", self.sigma)
         _check_sigma("sigma_deg", self.sigma_deg)
         if (self.sigma is None) != (self.sigma_deg is None):
@@ -89,7 +144,7 @@ def _check_sigma(name: str, sigma: Sigma | None) -> None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HeadingNoise:
+class HeadingNoise(SourceNoise):
     """The noise of headings, as of the orientation of an IMU with a compass; one setting for a sensor.
 
     ``sigma_deg`` [degrees] is that of errors that do not average out; None if messages have it, as a
@@ -99,6 +154,7 @@ class HeadingNoise:
     sigma_deg: float | None = None
 
     def __post_init__(self) -> None:
+        SourceNoise.__post_init__(self)
         _check_sigma("sigma_deg", self.sigma_deg)
 
 
@@ -106,7 +162,7 @@ _Three: TypeAlias = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MagnetometerNoise:
+class MagnetometerNoise(SourceNoise):
     """The noise and the calibration of a magnetometer.
 
     ``sigma_deg`` [degrees] is that of the yaw, by errors that do not average out. The field is ``soft_iron``
@@ -121,6 +177,7 @@ class MagnetometerNoise:
     place: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        SourceNoise.__post_init__(self)
         _check_sigma("sigma_deg", self.sigma_deg)
         for name, numbers in (("bias", self.bias), ("soft_iron", sum(self.soft_iron, ()))):
             if not all(map(math.isfinite, numbers)):
@@ -134,7 +191,7 @@ class MagnetometerNoise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FixNoise:
+class FixNoise(SourceNoise):
     """The noise of the fixes of a satellite receiver.
 
     ``sigma`` [m] are standard deviations of a position; None if messages have them, as covariances. ``floor``
@@ -148,6 +205,7 @@ class FixNoise:
     correlated_s: float = 20.0
 
     def __post_init__(self) -> None:
+        SourceNoise.__post_init__(self)
         given = {"sigma": self.sigma, "floor": self.floor, "correlated_s": self.correlated_s}
         for name, values in given.items():
             if values is not None and not all(0.0 < value < math.inf for value in _two(values)):
@@ -169,7 +227,7 @@ def _two(sigma: FixSigma) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RelativeNoise:
+class RelativeNoise(SourceNoise):
     """The noise of another odometry, of which only the motion between two poses counts; one for a source.
 
     Of a displacement, ``sigma`` [m per square root of a metre] and ``sigma_deg`` [degrees, likewise] are the
@@ -191,6 +249,7 @@ class RelativeNoise:
     covariance: CovarianceKind = "stated"
 
     def __post_init__(self) -> None:
+        SourceNoise.__post_init__(self)
         for name in ("sigma", "sigma_deg", "floor", "floor_deg", "scale"):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
@@ -203,7 +262,7 @@ class RelativeNoise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BarometerNoise:
+class BarometerNoise(SourceNoise):
     """The noise of the heights of a barometer, in air.
 
     ``sigma`` [m] is the standard deviation of each height; None if messages have it, as the variance of their
@@ -219,6 +278,7 @@ class BarometerNoise:
     temperature_c: float = 15.0
 
     def __post_init__(self) -> None:
+        SourceNoise.__post_init__(self)
         given = {"sigma": self.sigma, "wander": self.wander, "correlated_s": self.correlated_s}
         for name, value in given.items():
             if value is not None and not 0.0 < value < math.inf:

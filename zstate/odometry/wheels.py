@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from zstate._util.format import did_you_mean
 from zstate.checks import Floats, real_numbers
 from zstate.errors import InvalidInput
+from zstate.odometry.source_noise import SourceNoise
 
 _TURN_LIMIT = math.pi * (1.0 + 1e-9)
 _MOST_TURNED = 1e9
@@ -30,7 +31,7 @@ _STANDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WheelNoise:
+class WheelNoise(SourceNoise):
     """Standard deviations of the velocity that wheels measure; one setting for a robot.
 
     ``slip`` is a part of the speed, ``speed`` [m/s] what is left at rest (resolution of the encoders, play),
@@ -46,12 +47,13 @@ class WheelNoise:
     scale: float = 0.02
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            may_be_zero = field.name in {"slip", "scale"}
+        SourceNoise.__post_init__(self)
+        for name in ("slip", "speed", "lateral", "vertical", "scale"):
+            value = getattr(self, name)
+            may_be_zero = name in {"slip", "scale"}
             if not 0.0 <= value < math.inf or (value == 0.0 and not may_be_zero):
                 bound = "0 or more" if may_be_zero else "above 0"
-                raise InvalidInput(f"the noise {field.name!r} of wheels is finite and {bound}; got {value!r}")
+                raise InvalidInput(f"the noise {name!r} of wheels is finite and {bound}; got {value!r}")
 
     def covariance(self, along: float, across: float = 0.0, *, has_lateral: bool = True) -> Floats:
         """The covariance of a velocity of ``along`` and ``across`` the wheels [m/s]: (3, 3).

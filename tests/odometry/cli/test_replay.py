@@ -30,6 +30,7 @@ from zstate.odometry import (
     SimulatedRover,
     SourceHealth,
     VelocityNoise,
+    WheelNoise,
 )
 from zstate.odometry.cli.reference import ReferenceName
 from zstate.odometry.cli.replay import (
@@ -165,6 +166,38 @@ def test_table_has_used_rejected_nis_sigma_and_delay_of_each_source(tmp_path: Pa
 
 
 @pytest.mark.long
+def test_delay_that_would_fit_is_a_setting_and_none_is_left_with_it(tmp_path: Path):
+    settings = replace(SETTINGS, velocity={"flow": VelocityNoise(sigma=FLOW_SIGMA)})
+    path, key = str(recorded(tmp_path / "r.mcap")), "would fit: [velocity.flow] delay_s = "
+    late = replay(path, "r1", settings)
+    (line,) = [line for line in report_lines(late) if "delay_s" in line and line.startswith("would fit")]
+    assert line.startswith(key)
+    delay_s = float(line.removeprefix(key))
+    assert delay_s * 1e3 == pytest.approx(FLOW_DELAY_MS, abs=5.0)
+    flow = VelocityNoise(sigma=FLOW_SIGMA, delay_s=delay_s)
+    in_time = replay(path, "r1", replace(SETTINGS, velocity={"flow": flow}))
+    assert in_time.delays["flow"].delay_s == pytest.approx(0.0, abs=1e-3)
+    assert not [line for line in report_lines(in_time) if line.startswith("would fit") and "delay_s" in line]
+
+    def factor(replayed: ReplayedOdometry) -> float:
+        return next(sigma_factor(replayed, one) or 0.0 for one in replayed.health if one.name == "flow")
+
+    assert factor(in_time) < 0.8 * factor(late)
+
+
+@pytest.mark.long
+def test_delay_of_wheels_is_a_setting_of_their_noise(tmp_path: Path):
+    late = DiffDrive(
+        "left_wheel_joint", "right_wheel_joint", 0.08, 0.32, noise=WheelNoise(delay_s=-0.05)
+    )  # which is not so
+    replayed = replay(str(recorded(tmp_path / "r.mcap")), "r1", replace(SETTINGS, diff_drive=late))
+    assert replayed.delays["wheels"].delay_s == pytest.approx(0.05, abs=5e-3)
+    (delay_s,) = replayed.fitting_delays.values()
+    assert delay_s == pytest.approx(0.0, abs=5e-3)
+    assert list(replayed.fitting_delays) == ["[diff_drive] noise.delay_s"]
+
+
+@pytest.mark.long
 def test_sigma_that_would_fit_is_that_of_the_sensor(tmp_path: Path):
     """A sensor of x alone, in time: its y and z are exact, so that the mean of three numbers is 1/3 of x."""
     settings = replace(
@@ -175,7 +208,7 @@ def test_sigma_that_would_fit_is_that_of_the_sensor(tmp_path: Path):
     factor = sigma_factor(replayed, flow)
     assert factor is not None
     assert factor > 1.5
-    (line,) = [line for line in report_lines(replayed) if line.startswith("would fit: [velocity.flow]")]
+    (line,) = [line for line in report_lines(replayed) if line.startswith("would fit: [velocity.flow] sigma")]
     fitting = [float(number) for number in re.findall(r"[\d.]+", line.split("=")[1])]
     assert fitting == pytest.approx([factor * 0.2 * FLOW_SIGMA, factor, factor], rel=0.05)
 
@@ -249,9 +282,8 @@ def test_fixes_of_a_receiver_give_the_end_of_the_drive_in_the_map_and_on_the_ear
     errors = (state.map_from_base.translation - (x, y, 0.0))[:2]
     assert errors @ np.linalg.solve(state.covariance[:2, :2], errors) < 12.0
     assert math.remainder(state.map_from_base.rpy[2] - yaw, math.tau) ** 2 < 12.0 * state.covariance[5, 5]
-    (line,) = [
-        line for line in report_lines(replayed) if line.startswith("in 'r1/map', x east and y north of")
-    ]
+    lines = list(report_lines(replayed))
+    (line,) = [line for line in lines if line.startswith("in 'r1/map', x east and y north of")]
     latitude, longitude, _ = DATUM.geodetic(state.map_from_base.translation)
     assert line.endswith(f"{latitude:.7f} {longitude:.7f}")
     level = replay(str(tmp_path / "r.mcap"), "r1", replace(settings, planar=True))
@@ -260,6 +292,8 @@ def test_fixes_of_a_receiver_give_the_end_of_the_drive_in_the_map_and_on_the_ear
     assert level.in_map.map_from_base.translation[2] == np.abs(level.positions[:, 2]).max() == 0.0
     (gps,) = [one for one in replayed.health if one.name == "gps"]
     assert (gps.accepted > 20, gps.rejected) == (True, 0)
+    (jump,) = replayed.refused_jumps.values()
+    assert f"gps: at its last fix, one that jumps by more than {jump:.2g} m would be refused" in lines
 
 
 @pytest.mark.long

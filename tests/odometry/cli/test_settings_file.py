@@ -179,6 +179,24 @@ def test_noise_of_a_source_is_stated_on_the_command_line():
     assert parse_sensor("barometer", "bmp:sigma=0.3") == ("bmp", BarometerNoise(sigma=0.3))
 
 
+def test_delay_gate_and_axes_are_those_of_any_source_in_a_file_and_on_a_command_line(tmp_path: Path):
+    text = "[{}]\ndelay_s = 0.04\ngate = 0.99\n"
+    tables = ("velocity.a", "pose.b", "heading.c", "fix.d")
+    settings = read_settings(written(tmp_path, "".join(map(text.format, tables))))
+    for table, sensor in zip(tables, settings.sensors, strict=True):
+        kind, name = table.split(".")
+        assert (sensor.name, sensor.noise.delay_ns, sensor.noise.gate) == (name, 40_000_000, 0.99)
+        assert parse_sensor(kind, f"{name}:delay_s=0.04,gate=0.99") == (name, sensor.noise)
+    text = '[pose.mocap]\naxes = ["yaw", "x", "y"]\n[velocity.radar]\naxes = ["x"]\n'
+    settings = read_settings(written(tmp_path, text))
+    assert parse_sensor("pose", "mocap:axes=yaw+x+y")[1] == settings.pose["mocap"]
+    assert parse_sensor("velocity", "radar:axes=x")[1] == settings.velocity["radar"]
+    with pytest.raises(
+        ConfigError, match=r"pose.mocap: axes of a pose are x, .* not 'yw'; did you mean 'yaw'"
+    ):
+        read_settings(written(tmp_path, text.replace("yaw", "yw")))
+
+
 def test_file_has_receivers_and_the_origin_of_their_map(tmp_path: Path):
     text = 'map = "site/map"\nplanar = true\ndatum = [48.1, 11.5, 560.0]\n' + ROVER
     text += "[fix.gps]\nsigma = [1.5, 4.0]\n[heading.imu]\nsigma_deg = 5.0\n[barometer.bmp]\nwander = 2\n"
@@ -196,7 +214,9 @@ def test_file_has_receivers_and_the_origin_of_their_map(tmp_path: Path):
 
 
 def test_what_is_no_number_is_stated_in_a_file_alone():
-    with pytest.raises(InvalidInput, match=r"'bias=1' is not part of SENSOR:sigma_deg=NUMBER$"):
+    with pytest.raises(
+        InvalidInput, match=r"'bias=1' is not part of SENSOR:sigma_deg=NUMBER,delay_s=NUMBER,gate=NUMBER$"
+    ):
         parse_sensor("magnetometer", "mag:bias=1")
 
 
@@ -236,12 +256,18 @@ def test_unusable_settings_of_a_magnetometer_are_named(tmp_path: Path, right: st
     [
         (
             "wheels:sgma=1",
-            r"'sgma=1' is not part of SENSOR:sigma=NUMBER,scale=NUMBER; did you mean 'sigma'\?",
+            r"'sgma=1' is not part of SENSOR:sigma=NUMBER,scale=NUMBER,axes=x\+y,delay_s=NUMBER,gate=NUMBER; "
+            r"did you mean 'sigma'\?",
         ),
         ("wheels:sigma=1,sigma=2", "'sigma=2' is not part of"),
         ("wheels:sigma=a", "sigma is a number, not 'a'"),
         ("wheels:sigma=nan", "sigma is a standard deviation above zero, or three"),
         ("wheels:scale=-1", "the scale of a velocity is a part of it, 0 or more"),
+        ("wheels:axes=x+yaw", "axes of a velocity are x, y, z, not 'yaw'"),
+        ("wheels:axes=x+x", "axes of a velocity are some of x, y, z, each once; got x, x"),
+        ("wheels:delay_s=70", r"delay_s is by how much stamps are late \[s\], at most 60; got 70.0"),
+        ("wheels:gate=0.5", "the gate of a source is the part of its readings that pass .* got 0.5"),
+        ("wheels:gate=1", "above 0.5 and below 1, as 0.999; got 1.0"),
         ("wheels:", "'' is not part of"),
         ("a/b", "contains '/'"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -12,17 +13,18 @@ import click
 from click.core import ParameterSource
 
 from zstate.cli import options
-from zstate.cli.output.console import count_text, fail, print_wrapped
+from zstate.cli.output.console import count_text, fail, print_status, print_wrapped
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import LookupFailed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Collection, Iterator
 
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
-    from zstate.odometry import DiffDrive, OdometryNode
+    from zstate.odometry import DiffDrive, MapEstimator, OdometryNode
+    from zstate.odometry.cli.heard import Heard
     from zstate.odometry.cli.reference import ReferenceName
     from zstate.odometry.cli.settings_file import LegSettings, OdometrySettings, PlanarPose
     from zstate.odometry.messages import SensorMessage
@@ -76,21 +78,27 @@ def _parse_plot(file: str) -> Path:
 _OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
 """The parameters of the command that a request to a running odometry has a use for."""
 
+_OF_INIT = ("robot", "imu", "odom", "base", "init", "overwrite", "replay", "seconds", "network")
+"""Those that the first file of a robot has a use for."""
+
+_INIT_S = 5.0
+"""How long it listens: a receiver sends once a second, and an IMU at rest shows its noise."""
+
 
 @click.command("odometry")
 @click.argument("robot")
 @click.option("--imu", metavar="SENSOR", help="The IMU: a stream of ROBOT; default: imu.")
 @_sensor_option(
     "velocity",
-    "sigma=M/S,scale=PART",
+    "sigma=M/S,scale=PART,axes=x+y,...",
     "A further stream of measured velocities. Its noise is that of its messages, or the standard deviation "
-    "sigma; scale is that of a constant relative error.",
+    "sigma; scale is that of a constant relative error. axes are the numbers that are used.",
 )
 @_sensor_option(
     "pose",
-    "sigma=M,sigma_deg=DEG",
+    "sigma=M,sigma_deg=DEG,axes=x+yaw,...",
     "A further stream of measured poses in the frame of the odometry. Its noise is that of its messages, or "
-    "sigma and sigma_deg.",
+    "sigma and sigma_deg. axes are the numbers that are used, of x, y, z, roll, pitch and yaw.",
 )
 @_sensor_option(
     "relative",
@@ -100,7 +108,7 @@ _OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
 )
 @_sensor_option(
     "heading",
-    "sigma_deg=DEG",
+    "sigma_deg=DEG,...",
     "An IMU whose orientation shows the yaw, as by a compass. Its noise is that of its messages, or "
     "sigma_deg.",
 )
@@ -112,7 +120,7 @@ _OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
 )
 @_sensor_option(
     "fix",
-    "sigma=M",
+    "sigma=M,...",
     "A satellite receiver, which places the odometry in a map, x east and y north. Its noise is that of its "
     "messages, or sigma.",
 )
@@ -146,6 +154,12 @@ _OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
     metavar="FILE.toml",
     help="The settings of the robot, with the noise of its sensors; options take precedence.",
 )
+@click.option(
+    "--init",
+    metavar="FILE.toml",
+    help="Write the first such file, by what ROBOT publishes in --seconds, by default 5, or by --replay.",
+)
+@click.option("--overwrite", is_flag=True, help="Of --init: replace an existing FILE.toml.")
 @click.option("--odom", metavar="FRAME", help="The frame of the odometry; default: odom.")
 @click.option(
     "--base", metavar="FRAME", help="The frame that is placed in it; default: the root of the model."
@@ -208,6 +222,8 @@ def odometry_command(
     diff_drive: DiffDrive | None,
     feet: LegSettings | None,
     file: str | None,
+    init: str | None,
+    overwrite: bool,
     odom: str | None,
     base: str | None,
     initial_pose: PlanarPose | None,
@@ -230,11 +246,15 @@ def odometry_command(
     stand still for a few seconds at first: gravity aligns the IMU, and its gyro is zeroed. Later rests,
     on wheels or on all feet, zero it again.
 
+    Each of these sensors may also state delay_s, by how much its stamps are late against those of the IMU
+    [s], and gate, the part of right readings that pass, by default 0.999.
+
     Each source has a NIS, the mean square of what it contradicts in units of its sigmas. `zstate monitor` and
     `zstate doctor` show the sentences about sources whose sigmas are wrong. The settings of a robot with the
     noise of its sensors are a file, which `--replay` checks on a recording:
 
     \b
+    zstate odometry r1 --init r1.toml                              # the first file, of a robot at rest
     zstate odometry r1 --imu imu --diff-drive left=lw,right=rw,radius=0.08,track=0.32
     zstate odometry go2 --feet FL_foot,FR_foot,RL_foot,RR_foot
     zstate odometry r1 --file r1.toml
@@ -246,15 +266,31 @@ def odometry_command(
     zstate odometry r1 --set-pose 2 1 90                           # the base of the one that runs
     """
     if reset or set_pose is not None:
-        _check_request(click.get_current_context())
+        _check_options(_OF_REQUESTS, "--reset and --set-pose go to an odometry that runs")
         with open_session(network) as session:
             _request(session, robot, writer, reset=reset, place=set_pose)
         return
     from zstate.odometry.cli.settings_file import OdometrySettings, read_settings
 
+    if init is not None:
+        from zstate.odometry.cli.heard import heard_in, heard_live
+
+        _check_options(_OF_INIT, "--init writes a file")
+        settings = OdometrySettings(imu=imu or "imu", odom=odom or "odom", base=base)
+        _check_new(init, overwrite=overwrite)
+        if replay is not None:
+            heard = heard_in(replay, robot, seconds or _INIT_S)
+        else:
+            with open_session(network) as session:
+                print_status(f"listening to {robot!r} for {seconds or _INIT_S:g} s; it should stand")
+                heard = heard_live(session, robot, seconds or _INIT_S)
+        _write_initial_file(init, heard, settings)
+        return
     for option, value in (("--plot", plot), ("--reference", reference)):
         if value is not None and replay is None:
             raise click.UsageError(f"{option} needs --replay RECORDING")
+    if overwrite:
+        raise click.UsageError("--overwrite needs --init FILE.toml")
     settings = OdometrySettings() if file is None else read_settings(file)
     given = {
         "imu": imu,
@@ -282,14 +318,33 @@ def odometry_command(
         _publish(session, robot, settings, writer=writer, rate_hz=rate, seconds=seconds)
 
 
-def _check_request(context: click.Context) -> None:
-    """Refuse options of the odometry itself next to a request to one that runs."""
+def _check_options(known: Collection[str], purpose: str) -> None:
+    """Refuse options that have no use beside those of ``purpose``."""
+    context = click.get_current_context()
     for one in context.command.params:
         name = one.name or ""
-        if name not in _OF_REQUESTS and context.get_parameter_source(name) == ParameterSource.COMMANDLINE:
-            raise click.UsageError(
-                f"--reset and --set-pose go to an odometry that runs; {one.opts[0]} is not for it"
-            )
+        if name not in known and context.get_parameter_source(name) == ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"{purpose}; {one.opts[0]} is not for it")
+
+
+def _check_new(file: str, *, overwrite: bool) -> None:
+    if Path(file).exists() and not overwrite:
+        fail(f"{file!r} exists; choose another name, or pass --overwrite")
+
+
+def _write_initial_file(file: str, heard: Heard, settings: OdometrySettings) -> None:
+    """Write the first settings of a robot, by what was heard of it."""
+    from zstate.odometry.cli.initial_file import initial_file
+
+    found = initial_file(heard, file, settings)
+    try:
+        Path(file).write_text(found.text, encoding="utf-8")
+    except OSError as error:
+        fail(f"{file!r} cannot be written: {error.strerror}")
+    for note in found.notes:
+        print_wrapped(note)
+    command = f"zstate odometry {shlex.quote(heard.robot)} --file {shlex.quote(file)}"
+    print_wrapped(f"wrote {file}: look it through, then run `{command}`")
 
 
 def _request(session: Session, robot: str, writer: str, *, reset: bool, place: PlanarPose | None) -> None:
@@ -323,6 +378,7 @@ def _publish(
         listener = opened.enter_context(TransformListener(session, robot))
         base, imu_frame, model = _wait_for_sensors(session, robot, settings, listener)
         estimator = settings.estimator(robot, base, imu_frame, listener.buffer, model)
+        in_map = settings.map_estimator(robot, estimator, listener.buffer)
         node = opened.enter_context(
             OdometryNode(
                 session,
@@ -330,7 +386,7 @@ def _publish(
                 estimator,
                 imu=settings.imu,
                 sensors=[(one.name, one.noise) for one in settings.sensors],
-                in_map=settings.map_estimator(robot, estimator, listener.buffer),
+                in_map=in_map,
                 has_joints=settings.has_joints,
                 planar=settings.planar,
                 writer=writer,
@@ -345,7 +401,7 @@ def _publish(
             if wait_interruptible(node.has_failed, seconds):
                 fail(str(node.failure))
         finally:
-            for line in _end_lines(node):
+            for line in _end_lines(node, in_map):
                 print_wrapped(line)
 
 
@@ -423,12 +479,14 @@ def _sources_text(settings: OdometrySettings) -> str:
     )
 
 
-def _end_lines(node: OdometryNode) -> Iterator[str]:
-    from zstate.odometry.cli.replay import health_text
+def _end_lines(node: OdometryNode, in_map: MapEstimator | None) -> Iterator[str]:
+    from zstate.odometry.cli.replay import health_text, jump_lines
 
     yield f"{count_text(node.published, 'sample')} published"
     for one in node.health():
         yield health_text(one)
+    if in_map is not None:
+        yield from jump_lines(in_map.refused_jumps())
 
 
 def _replay(

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,8 +23,9 @@ from zstate.model.joint_history import JointHistory
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, Datum, MapState, SourceHealth
 from zstate.odometry.cli.delay import Delay, Motions
+from zstate.odometry.cli.heard import recorded_names
 from zstate.odometry.cli.reference import Comparison, Path, ReferenceName, compared, reference_path
-from zstate.odometry.cli.settings_file import OdometrySettings, others_text
+from zstate.odometry.cli.settings_file import WHEEL_KINDS, OdometrySettings, others_text
 from zstate.odometry.estimator import WHEELS
 from zstate.odometry.fusion import STANDSTILL
 from zstate.odometry.health import WINDOW
@@ -32,7 +33,6 @@ from zstate.odometry.messages import Fix, Odometry, Pose
 from zstate.odometry.planar import in_plane, map_in_plane
 from zstate.odometry.sensors import Estimators, add_imu
 from zstate.recording.cli.plot import new_figure
-from zstate.recording.info import recorded_robots
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.streams import StreamName
 from zstate.wire.keys import full_name
@@ -50,10 +50,13 @@ _WIDTH = 80
 _LEGEND = (
     "NIS: mean square of the innovations in sigmas, by number; 1 is right. sigma: the factor on the "
     "sigmas of the source that would make it so. delay: how much later its stamps are than those of the IMU, "
-    "where the motion shows it."
+    "less its delay_s, where the motion shows it."
 )
 _NEAR = 1.5
 """Factors of sigmas between this and its inverse are right: real noise is not white."""
+
+_LEAST_DELAY_S, _DELAY_SIGMAS = 0.01, 3.0
+"""A delay is to be stated if it is longer [s], and than so many of its standard deviations."""
 
 _UNSTEADY = 10.0
 """The 90 % quantile of the NIS over its median, if it was not noise that was wrong but a part of the run."""
@@ -80,9 +83,10 @@ class ReplayedOdometry:
 
     ``health`` is the last one, ``nis`` by source the points of those in between: seconds since the first
     state, mean NIS, and its band from low to high. ``delays`` are those of sources whose stamps the motion
-    determines, ``sigmas`` the medians of the standard deviations of velocities and poses: x y z [m/s], or x y
-    z [m] and the rotation [rad]. ``in_map`` is the last state in the map with the origin ``datum``, if fixes
-    gave one.
+    determines, less the stated ones, and ``fitting_delays`` the keys that would state the sum, where it is to
+    be corrected [s]. ``sigmas`` are the medians of the standard deviations of velocities and poses: x y z
+    [m/s], or x y z [m] and the rotation [rad]. ``in_map`` is the last state in the map with the origin
+    ``datum``, if fixes gave one, and ``refused_jumps`` those of ``MapEstimator``.
     """
 
     base: str
@@ -92,10 +96,12 @@ class ReplayedOdometry:
         default_factory=dict[str, list[tuple[float, float, float, float]]]
     )
     delays: dict[str, Delay] = field(default_factory=dict[str, Delay])
+    fitting_delays: dict[str, float] = field(default_factory=dict[str, float])
     sigmas: dict[str, Floats] = field(default_factory=dict[str, Floats])
     reference: Comparison | None = None
     in_map: MapState | None = None
     datum: Datum | None = None
+    refused_jumps: dict[str, float] = field(default_factory=dict[str, float])
 
     @property
     def positions(self) -> Floats:
@@ -150,29 +156,43 @@ def replay(
     events: list[Event] = [(one.stamp, True, partial(add_imu, estimator, one)) for one in readings]
     motions = Motions(mounts, full_name(robot, base), readings)
     sigmas: dict[str, Floats] = {}
-    delays: dict[str, Delay | None] = {}
+    delays: list[tuple[str, str, float, Delay | None]] = []
+    """The name of a source, the key of its delay, what is stated [s], and that of its stamps."""
     for one, messages in recorded:
         covariances = [known for message in messages if (known := one.covariance(message)) is not None]
         if covariances:
-            sigmas[one.name] = np.median([np.sqrt(np.diag(known)) for known in covariances], axis=0)
-        delays[one.name] = motions.delay_of(one.stream, messages)
+            variances = [np.maximum(np.diag(known), 0.0) for known in covariances]  # -1 is not known
+            sigmas[one.name] = np.sqrt(np.median(variances, axis=0))
+        key, delay = f"[{one.kind.name}.{one.name}] delay_s", motions.delay_of(one.stream, messages)
+        delays.append((one.name, key, one.noise.delay_s, delay))
         events += [(message.stamp, False, partial(one.add, estimators, message)) for message in messages]
     if joints is not None:
         events += [
             (stamp, False, partial(_add_joints, estimator, joints, row))
             for row, stamp in enumerate(joints.stamps.tolist())
         ]
-    replayed = _run(estimators, base, sorted(events, key=itemgetter(0)))  # checks the joints of the wheels
-    if settings.planar:
-        replayed.states = list(map(in_plane, replayed.states))
-        replayed.in_map = None if replayed.in_map is None else map_in_plane(replayed.in_map)
-    if joints is not None and settings.wheels is not None:
-        delays[WHEELS] = motions.delay(*motions.of_wheels(settings.wheels, joints))
+    events.sort(key=itemgetter(0))
+    replayed = _run(estimators, base, events, planar=settings.planar)  # checks the joints of the wheels
+    wheels = settings.wheels
+    if joints is not None and wheels is not None:
+        table = next(kind for kind in WHEEL_KINDS if getattr(settings, kind) is not None)
+        delay = motions.delay(*motions.of_wheels(wheels, joints))
+        delays.append((WHEELS, f"[{table}] noise.delay_s", wheels.noise.delay_s, delay))
     replayed.sigmas = sigmas
-    replayed.delays = {name: delay for name, delay in delays.items() if delay is not None}
+    for name, key, stated_s, delay in delays:
+        if delay is not None:
+            _add_delay(replayed, name, key, stated_s, delay)
     if reference is not None and truth is not None and replayed.states:
         replayed.reference = _against(reference, truth, replayed, mounts)
     return replayed
+
+
+def _add_delay(replayed: ReplayedOdometry, name: str, key: str, stated_s: float, delay: Delay) -> None:
+    """Add what is left of the delay of a source, and what ``key`` should be instead of ``stated_s``."""
+    left_s = delay.delay_s - stated_s
+    replayed.delays[name] = Delay(left_s, delay.sigma_s)
+    if abs(left_s) > max(_LEAST_DELAY_S, _DELAY_SIGMAS * delay.sigma_s):
+        replayed.fitting_delays[key] = delay.delay_s
 
 
 def _messages(recording: Recording, robot: str, stream: StreamName, sensor: str) -> list[Any]:
@@ -184,9 +204,7 @@ def _messages(recording: Recording, robot: str, stream: StreamName, sensor: str)
     found = [one for one in messages if not isinstance(one, Fix) or one.status >= 0]
     if found:
         return sorted(found, key=attrgetter("stamp"))
-    robots = recorded_robots(recording.info)
-    streams = [one for recorded in robots if recorded.name == robot for one in recorded.streams]
-    known = {one.writer for one in streams if one.stream == stream and one.count}
+    known = recorded_names(recording.info, robot, stream)
     raise InvalidInput(
         f"{recording.info.path} has no message on {stream}/{sensor} of {robot!r}{others_text(sensor, known)}"
     )
@@ -228,7 +246,7 @@ def _by_name_if_known(names: Sequence[str], block: Floats | None, row: int) -> d
     return dict(zip(names, block[row].tolist(), strict=True))
 
 
-def _run(estimators: Estimators, frame: str, events: Sequence[Event]) -> ReplayedOdometry:
+def _run(estimators: Estimators, frame: str, events: Sequence[Event], *, planar: bool) -> ReplayedOdometry:
     base, in_map = estimators
     replayed = ReplayedOdometry(frame)
     due = 0
@@ -250,8 +268,12 @@ def _run(estimators: Estimators, frame: str, events: Sequence[Event]) -> Replaye
     if in_map is not None:
         replayed.health += in_map.health()
         replayed.datum = in_map.datum
+        replayed.refused_jumps = in_map.refused_jumps()
         with suppress(NoData):
             replayed.in_map = in_map.state()
+    if planar:
+        replayed.states = list(map(in_plane, replayed.states))
+        replayed.in_map = None if replayed.in_map is None else map_in_plane(replayed.in_map)
     return replayed
 
 
@@ -259,6 +281,7 @@ def report_lines(replayed: ReplayedOdometry) -> Iterator[str]:
     """The table of the sources, what to change of them, the path, its end, and the reference."""
     yield from source_table(replayed).lines(_WIDTH)
     yield _LEGEND
+    yield from (f"would fit: {key} = {delay_s:.3f}" for key, delay_s in replayed.fitting_delays.items())
     yield from _sigma_lines(replayed)
     yield from (one.sentence for one in replayed.health if one.sentence)
     if sentence := _rest_text(replayed):
@@ -292,6 +315,13 @@ def _map_lines(replayed: ReplayedOdometry) -> Iterator[str]:
         f"({sigmas[1]:.2f}), yaw {math.degrees(state.map_from_base.rpy[2]):.1f} deg "
         f"({math.degrees(sigmas[5]):.1f}): {latitude:.7f} {longitude:.7f}"
     )
+    yield from jump_lines(replayed.refused_jumps)
+
+
+def jump_lines(refused_jumps: Mapping[str, float]) -> Iterator[str]:
+    """From which jump on the fixes of each receiver are refused."""
+    for name, jump in refused_jumps.items():
+        yield f"{name}: at its last fix, one that jumps by more than {jump:.2g} m would be refused"
 
 
 def source_table(replayed: ReplayedOdometry) -> Table:
@@ -344,6 +374,7 @@ def _sigma_lines(replayed: ReplayedOdometry) -> Iterator[str]:
         if np.quantile(means, 0.9) > _UNSTEADY * np.median(means):
             continue
         fitting = factor * sigmas
+        fitting = np.where(fitting > 0.0, fitting, fitting.max())  # others are not used
         metres = ", ".join(f"{value:.2g}" for value in fitting[:3])
         if len(fitting) == 3:
             yield f"would fit: [velocity.{one.name}] sigma = [{metres}]"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -41,15 +41,23 @@ from zstate.odometry import (
     Wheels,
 )
 from zstate.odometry.sensors import KINDS, Sensor
-from zstate.odometry.source_noise import SensorNoise
+from zstate.odometry.source_noise import SensorNoise, SourceNoise
 from zstate.transform import Transform
 from zstate.wire.keys import check_writer, full_name
 
 MEMS_NOISE = ImuNoise(gyro=1e-3, accel=2e-2, gyro_bias=2e-5, accel_bias=1e-3)
 """That of an inexpensive IMU, for robots without another setting."""
 
+WHEEL_KINDS = ("diff_drive", "ackermann", "mecanum")
+"""The tables of wheels, of which a robot has one."""
+
 DEFAULT_SPEEDS = SpeedThresholds(touchdown=0.1, liftoff=0.2)
 """Those of the feet of walking robots without another setting."""
+
+_AXES = "axes"
+_WRITTEN = {_AXES: "x+y", "covariance": "dependent"}
+"""Values of keys that are no numbers, on the command line."""
+"""The one key of a sensor that is a list."""
 
 T = TypeVar("T")
 PlanarPose = tuple[float, float, float]
@@ -121,7 +129,7 @@ class OdometrySettings:
         check_writer(self.imu)
         for one in self.sensors:
             one.check()
-        kinds = [kind for kind in ("diff_drive", "ackermann", "mecanum") if getattr(self, kind) is not None]
+        kinds = [kind for kind in WHEEL_KINDS if getattr(self, kind) is not None]
         if len(kinds) > 1:
             raise InvalidInput(f"a robot has wheels of one kind, not of {' and '.join(kinds)}")
         if self.datum is not None:
@@ -241,7 +249,7 @@ def parse_feet(text: str) -> LegSettings:
 
 
 def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
-    """``SENSOR[:sigma=NUMBER,...]``: a sensor of this kind, and what is stated of its noise.
+    """``SENSOR[:sigma=NUMBER,axes=x+y,...]``: a sensor of this kind, and what is stated of its noise.
 
     Raises InvalidInput.
     """
@@ -249,27 +257,29 @@ def parse_sensor(kind_name: str, text: str) -> tuple[str, SensorNoise]:
     name, colon, stated = text.partition(":")
     known = msgspec.inspect.type_info(kind.noise)
     assert isinstance(known, msgspec.inspect.DataclassType)
+    common = {one.name for one in fields(SourceNoise)}
+    names = [one.name for one in known.fields if one.name == _AXES or _is_one_value(one.type)]
+    names.sort(key=common.__contains__)
     texts = {one.name for one in known.fields if isinstance(one.type, msgspec.inspect.LiteralType)}
-    names = [one.name for one in known.fields if one.name in texts or _is_number(one.type)]
-    units = {name: "TEXT" if name in texts else "NUMBER" for name in names}
     values: dict[str, Any] = {}
     for part in stated.split(",") if colon else ():
         key, _, value = part.strip().partition("=")
         if key not in names or key in values:
-            raise InvalidInput(
-                f"{part!r} is not part of SENSOR:"
-                f"{','.join(f'{one}={units[one]}' for one in names)}"
-                f"{did_you_mean(key, names)}"
-            )
-        values[key] = value if key in texts else _number(key, value)
+            written = ",".join(f"{one}={_WRITTEN.get(one, 'NUMBER')}" for one in names)
+            raise InvalidInput(f"{part!r} is not part of SENSOR:{written}{did_you_mean(key, names)}")
+        if key == _AXES:
+            values[key] = tuple(value.split("+"))
+        else:
+            values[key] = value if key in texts else _number(key, value)
     sensor = Sensor(kind, name, kind.noise(**values))
     sensor.check()
     return sensor.name, sensor.noise
 
 
-def _is_number(kind: msgspec.inspect.Type) -> bool:
+def _is_one_value(kind: msgspec.inspect.Type) -> bool:
+    """Whether a number or a word can be written for it on a command line."""
     kinds = kind.types if isinstance(kind, msgspec.inspect.UnionType) else (kind,)
-    return any(isinstance(one, msgspec.inspect.FloatType) for one in kinds)
+    return any(isinstance(one, msgspec.inspect.FloatType | msgspec.inspect.LiteralType) for one in kinds)
 
 
 def _number(key: str, value: str, unit: str = "") -> float:
