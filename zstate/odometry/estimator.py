@@ -484,6 +484,7 @@ class BaseEstimator:
         if known is not None and (known.shape != (6, 6) or not np.isfinite(known).all()):
             raise InvalidInput(f"the covariance of source {source!r} is finite, (6, 6); got {known.tolist()}")
         world = world_from_frame.target
+        self._record(source).has_bounds = True
         reading = RelativePose(check_stamp(stamp), world, matrix, known, noise or RelativeNoise(), mount)
         self._offer(_Event(source, reading, world_from_frame.pose7.tolist()))
 
