@@ -412,9 +412,11 @@ def with_antenna(datum: Datum | None = HUSKY_DATUM) -> MapEstimator:
     return recordings.new_map_estimator(base, datum=datum)
 
 
-def feed(estimator: MapEstimator, fixes: list[Call], end: float, offset_s: float = 0.0) -> None:
+def feed(
+    estimator: MapEstimator, fixes: list[Call], end: float, offset_s: float = 0.0, *, start: float = 0.0
+) -> None:
     for call in merged(circle_calls(), fixes):
-        if call.t < end:
+        if start <= call.t < end:
             to = estimator if call.kind == "fix" else estimator.odometry
             getattr(to, call.kind)(stamp_at(call.t + offset_s), *call.values, **call.options)
 
@@ -602,6 +604,20 @@ def test_an_odometry_that_starts_anew_starts_the_map_anew_around_the_same_datum(
     assert not np.allclose(before, found)
     (health,) = estimator.health()
     assert health.sentence == ""
+
+
+@pytest.mark.parametrize("seconds", [1.0, 10.0], ids=["before the map", "in the map"])
+def test_an_odometry_that_is_placed_by_hand_leaves_the_pose_in_the_map_and_fixes_are_taken(seconds: float):
+    estimator = with_antenna()
+    fixes = antenna_calls(LEVER, "antenna")
+    feed(estimator, fixes, seconds)
+    there = Transform.from_rpy("odom", "base_link", (30.0, -20.0, 0.0), (0.0, 0.0, 2.0))
+    estimator.odometry.set_pose(there)
+    feed(estimator, fixes, CIRCLE_S, start=seconds)
+    error, _ = true_error(estimator)
+    assert np.abs(error[:2]).max() < 0.1
+    (health,) = estimator.health()
+    assert (health.rejected, health.sentence) == (0, "")
 
 
 def test_a_clock_of_the_receiver_that_is_ahead_is_named():

@@ -210,6 +210,8 @@ class BaseEstimator:
         self._initial_pose = initial_pose
         self.epoch = 0
         """How often it has started anew: by ``reset``, or because time went back."""
+        self.placements = 0
+        """How often it was placed by ``set_pose``."""
         self._begin()
 
     def _begin(self) -> None:
@@ -230,7 +232,6 @@ class BaseEstimator:
         self._follower = None
         self._restarts: dict[str, tuple[int, str]] = {}
         """By source, when and why it made the estimate start anew."""
-        self._placements = 0
 
     def reset(self, odom_from_base: Transform | None = None) -> None:
         """Start anew: forget all events, biases and the pose, and align again, at rest.
@@ -298,9 +299,9 @@ class BaseEstimator:
         """
         self._check_placement(odom_from_base)
         stamp = self.state().stamp
-        self._placements += 1
+        self.placements += 1
         reading = Placement(stamp, odom_from_base.matrix, odom_from_base.covariance)
-        self._insert(_Event("", reading, (self._placements,)))
+        self._insert(_Event("", reading, (self.placements,)))
 
     def _check_placement(self, odom_from_base: Transform) -> None:
         if (odom_from_base.target, odom_from_base.source) != (self.odom, self.base):
@@ -485,6 +486,7 @@ class BaseEstimator:
         if known is not None and (known.shape != (6, 6) or not np.isfinite(known).all()):
             raise InvalidInput(f"the covariance of source {source!r} is finite, (6, 6); got {known.tolist()}")
         world = world_from_frame.target
+        self._record(source).has_bounds = True
         reading = RelativePose(check_stamp(stamp), world, matrix, known, noise or RelativeNoise(), mount)
         self._offer(_Event(source, reading, world_from_frame.pose7.tolist()))
 

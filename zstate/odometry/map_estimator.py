@@ -218,7 +218,7 @@ class MapEstimator:
         """When the map began [ns]."""
         self._unaligned = 0
         """Until then the odometry had no pose [ns]."""
-        self._epoch = odometry.epoch
+        self._epoch, self._placements = odometry.epoch, odometry.placements
 
     def fix(
         self,
@@ -376,9 +376,25 @@ class MapEstimator:
             receiver.stamps.clear()
             receiver.last, receiver.is_doubted = None, False
 
+    def _begin_ways_if_odometry_was_placed(self) -> None:
+        """Forget where fixes were in odom, if the odometry was moved there by hand; the map stays."""
+        if self.odometry.placements == self._placements:
+            return
+        self._placements = self.odometry.placements
+        for receiver in self._receivers.values():
+            for kept in (
+                receiver.aligning,
+                receiver.taken,
+                receiver.plane.refused,
+                receiver.height.refused,
+            ):
+                kept.clear()
+            receiver.last = None
+
     def _use_waiting(self) -> None:
         """Use the fixes that the odometry has come up to."""
         self._begin_if_odometry_has()
+        self._begin_ways_if_odometry_was_placed()
         newest = self.odometry.newest
         for name, receiver in self._receivers.items():
             while receiver.waiting and receiver.waiting[0].stamp <= newest:

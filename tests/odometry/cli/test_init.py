@@ -20,7 +20,7 @@ from zstate.odometry.cli.heard import Heard, motion_text, white_density
 from zstate.odometry.cli.initial_file import initial_file
 from zstate.odometry.cli.settings_file import MEMS_NOISE, OdometrySettings, read_settings
 from zstate.odometry.cli.wheel_geometry import proposed_wheels
-from zstate.odometry.messages import Fix, Imu, MagneticField, Pose, Velocity
+from zstate.odometry.messages import Fix, Imu, MagneticField, Pose, Pressure, Velocity
 from zstate.odometry.sensors import KINDS
 from zstate.wire.messages import to_block
 
@@ -147,6 +147,7 @@ def test_every_key_that_is_off_is_a_key_once_it_is_not(tmp_path: Path):
         fix={"gps": [FIX]},
         imu={"imu": imu},
         magnetic_field={"mag": [MagneticField(START, 0, 4, "r1/base_link", to_block([2e-5, 0.0, -4e-5]))]},
+        pressure={"bmp": [Pressure(START, 0, 5, "r1/base_link", 101325.0)]},
     )
     text, _ = written(tmp_path, found)
     used = re.sub(r"^# (\[[a-z]|[a-z_]+ = )", r"\1", text, flags=re.MULTILINE)

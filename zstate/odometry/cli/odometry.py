@@ -51,13 +51,13 @@ def _parse_sensor(kind: str, text: str) -> tuple[str, SensorNoise]:
 
 
 def _sensor_option(
-    kind: str, stated: str, help_text: str
+    kind: str, stated: str, help_text: str, name: str = "SENSOR"
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """``--kind SENSOR[:...]``, repeatable: further sensors, of whose noise ``stated`` may be stated."""
     return click.option(
         f"--{kind}",
-        metavar=f"SENSOR[:{stated}]",
-        type=options.Checked("SENSOR", partial(_parse_sensor, kind)),
+        metavar=f"{name}[:{stated}]",
+        type=options.Checked(name, partial(_parse_sensor, kind)),
         multiple=True,
         help=f"{help_text} Repeatable.",
     )
@@ -102,9 +102,10 @@ _INIT_S = 5.0
 )
 @_sensor_option(
     "relative",
-    "sigma=M,sigma_deg=DEG,scale=PART",
+    "sigma=M,sigma_deg=DEG,scale=PART,...",
     "Another odometry, as of cameras, pose/NAME or odometry/NAME: only its motion counts. sigma and "
     "sigma_deg are those of a metre of its way, scale that of a constant factor.",
+    "STREAM/NAME",
 )
 @_sensor_option(
     "heading",
