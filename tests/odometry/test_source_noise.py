@@ -219,11 +219,11 @@ def test_planar_pose_moves_a_base_in_the_plane_and_leaves_height_and_tilt():
     assert after.covariance.pose[0, 0] < 0.1 * before.covariance.pose[0, 0]
 
 
-def followed(axes: list[str]) -> tuple[BaseState, BaseState, int]:
+def followed(axes: list[str], x: float = 0.5, yaw: float = 0.1) -> tuple[BaseState, BaseState, int]:
     """The states before and after poses that contradict for three seconds, and how often it followed them."""
     base = new_base(history_s=5.0)
     rested(base, 0, 3500)
-    pose = Transform.from_rpy("odom", "base", (0.5, 0.0, 0.0), (0.0, 0.0, 0.1))
+    pose = Transform.from_rpy("odom", "base", (x, 0.0, 0.0), (0.0, 0.0, yaw))
     for ms in range(0, 3501, 50):
         base.velocity(START + ms * MS, [0.0] * 3, sigma=[0.01] * 3)
     before = base.state(START + 500 * MS)
@@ -245,3 +245,11 @@ def test_poses_that_contradict_for_two_seconds_are_followed_in_their_axes_alone(
         if name in {"x", "y", "z"} and name not in axes:
             grown = after.covariance.pose[row, row] / before.covariance.pose[row, row]
             assert grown < 10.0, name
+
+
+@pytest.mark.parametrize("yaw", [0.1, 1.0, 3.0])
+def test_a_pose_that_is_followed_at_last_is_where_the_base_is_however_far_it_had_turned(yaw: float):
+    _, after, reacquired = followed(list(POSE_AXES), 5.0, yaw)
+    assert reacquired == 1
+    np.testing.assert_allclose(after.odom_from_base.translation, [5.0, 0.0, 0.0], atol=0.02)
+    assert after.odom_from_base.rpy[2] == pytest.approx(yaw, abs=0.02)

@@ -88,6 +88,8 @@ STANDSTILL = "standstill"
 """The name of zero-velocity updates as a source."""
 
 _REACQUIRE_NS, _REACQUIRE_COUNT = 2_000_000_000, 10
+_PLACED_STEPS = 4
+"""From a yaw that is wrong by 3 rad to a millimetre."""
 LOST_NS = 1_000_000_000
 """A source is rejected for so long: the estimate is called lost."""
 _REMEMBERED_NS = 30_000_000_000
@@ -494,7 +496,10 @@ class Fusion:
             return _without_velocity(state, residual, seconds)
 
         kept = None if reading.upright is None else partial(_without_yaw_bias, axis=reading.upright)
-        return _gated(estimate, source, measurement, lost, kept=kept, probability=reading.gate)
+        after, outcome = _gated(estimate, source, measurement, lost, kept=kept, probability=reading.gate)
+        if outcome.fate == "reacquired" and reading.is_position:
+            after = _placed_by(after, reading)
+        return after, outcome
 
     def after_pause(
         self, before: Estimate, reading: Displacement, following: Inertia | None
@@ -1315,6 +1320,18 @@ def _with_altimeter(estimate: Estimate, source: str, altimeter: Altimeter) -> Es
     """The estimate with a source of heights that begins, or begins anew."""
     estimate = _with_run(estimate, source, None)
     return estimate._replace(altimeters={**estimate.altimeters, source: altimeter})
+
+
+def _placed_by(estimate: Estimate, reading: Reading) -> Estimate:
+    """The estimate where a pose has it that is followed after all: an update is linear, a large turn is not.
+
+    Each step leaves an error of the second order of the one before.
+    """
+    for _ in range(_PLACED_STEPS):
+        measurement = reading.measure(estimate.state, estimate.rate)
+        state = _without_place(estimate.state, measurement.residual, reading.rows)
+        estimate = _moved(estimate, updated(state, measurement))
+    return estimate
 
 
 def _with_run(estimate: Estimate, source: str, run: Run | None) -> Estimate:
