@@ -172,7 +172,7 @@ def test_fixes_turned_about_the_datum_turn_the_pose_in_the_map_and_nothing_else(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("jump", "seconds"), [(5.0, 10.0), (15.0, 5.0)])
+@pytest.mark.parametrize(("jump", "seconds"), [(5.0, 10.0), pytest.param(15.0, 5.0, marks=pytest.mark.soak)])
 def test_a_jump_for_some_seconds_is_refused_and_named(jump: float, seconds: float):
     end, at = 300.0, 260.0
     track = shifted(between(at, at + seconds, 0.0, jump), end)
@@ -183,7 +183,7 @@ def test_a_jump_for_some_seconds_is_refused_and_named(jump: float, seconds: floa
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("jump", [(15.0, 0.0), (0.0, -15.0)])
+@pytest.mark.parametrize("jump", [(15.0, 0.0), pytest.param((0.0, -15.0), marks=pytest.mark.soak)])
 def test_a_jump_for_good_is_believed_after_some_way(jump: tuple[float, float]):
     """The base drives 20 m, and errors of fixes have become others (20 s): measured, after 20.8 s."""
     end, at = 310.0, 260.0
@@ -199,7 +199,13 @@ def test_a_jump_for_good_is_believed_after_some_way(jump: tuple[float, float]):
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("at", "east", "north"), [(180.0, 0.5, 0.0), (220.0, 0.0, 0.5), (260.0, 0.0, 0.5), (260.0, 0.0, -0.5)]
+    ("at", "east", "north"),
+    [
+        (260.0, 0.0, -0.5),
+        pytest.param(180.0, 0.5, 0.0, marks=pytest.mark.soak),
+        pytest.param(220.0, 0.0, 0.5, marks=pytest.mark.soak),
+        pytest.param(260.0, 0.0, 0.5, marks=pytest.mark.soak),
+    ],
 )
 def test_a_drift_along_the_way_is_named_inside_the_claim_and_ends(at: float, east: float, north: float):
     """0.5 m/s for 60 s; measured, it is named after 13 to 20 s and moves the base by 2.4 to 5.3 m."""
@@ -214,7 +220,7 @@ def test_a_drift_along_the_way_is_named_inside_the_claim_and_ends(at: float, eas
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("east", [0.5, -0.5])
+@pytest.mark.parametrize("east", [0.5, pytest.param(-0.5, marks=pytest.mark.soak)])
 def test_a_drift_across_the_way_is_named_within_a_minute(east: float):
     """It is as a yaw that is wrong; measured, it is named after 37 and 40 s.
 
@@ -438,7 +444,9 @@ def test_an_antenna_anywhere_on_the_robot_shows_where_its_base_is():
 
 @pytest.mark.long
 @pytest.mark.parametrize("gate", [0.999, 1.0 - 1e-9])
-@pytest.mark.parametrize("direction", [0.0, 1.6, 3.2, 4.8])
+@pytest.mark.parametrize(
+    "direction", [0.0, 4.8, *(pytest.param(angle, marks=pytest.mark.soak) for angle in (1.6, 3.2))]
+)
 def test_a_jump_is_refused_from_that_distance_on_which_is_told(direction: float, gate: float):
     """Give or take half of it, for the noise of this fix and of the one before."""
     noise = replace(RTK, gate=gate)

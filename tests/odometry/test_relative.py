@@ -57,10 +57,11 @@ def camera_of(base: BaseEstimator) -> SourceHealth:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("runs", [3, pytest.param(20, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("has_wheels", [False, True])
-def test_errors_are_as_large_as_their_covariances(has_wheels: bool):
-    """Ten drives of 40 s. Constant errors that are part of the claim are an upper limit of the errors."""
-    ends = [driven(seed, 40.0, has_wheels=has_wheels)[0].end for seed in range(10)]
+def test_errors_are_as_large_as_their_covariances(has_wheels: bool, runs: int):
+    """Drives of 40 s. Constant errors that are part of the claim are an upper limit of the errors."""
+    ends = [driven(seed, 40.0, has_wheels=has_wheels)[0].end for seed in range(runs)]
     squares = np.mean([end.squares for end in ends], axis=0)
     for square in squares[:3]:
         assert square < chi_square_quantile(0.999, 3 * len(ends)) / len(ends)
