@@ -193,6 +193,17 @@ def dead_reckoned(recording: Recording, *, start: float = 0.0) -> tuple[Floats, 
     return t, np.column_stack((np.vstack((np.zeros(2), np.cumsum(steps, axis=0))), yaw))
 
 
+def driver_path(recording: Recording) -> Floats:
+    """t [s], x, y, yaw of the dead reckoning of the robot's own driver, by its wheels alone: (T, 4)."""
+    rows, (x, y, yaw), before = list[tuple[float, ...]](), (0.0, 0.0, 0.0), None
+    for t, speed, rate in recording.wheels.tolist():
+        dt_s = 0.0 if before is None else t - before
+        x, y = x + speed * math.cos(yaw) * dt_s, y + speed * math.sin(yaw) * dt_s
+        yaw, before = math.remainder(yaw + rate * dt_s, math.tau), t
+        rows.append((t, x, y, yaw))
+    return np.array(rows)
+
+
 class Track(NamedTuple):
     """What an estimator made of a recording.
 

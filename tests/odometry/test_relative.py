@@ -22,7 +22,7 @@ from helpers.drives import (
     run,
     wandering,
 )
-from helpers.recordings import HUSKY_REST_S, Recording, calls_of, played, score
+from helpers.recordings import HUSKY_REST_S, Recording, calls_of, driver_path, played, score
 
 from zstate import InvalidInput, Transform
 from zstate.odometry import BaseEstimator, DiffDrive, SourceHealth
@@ -246,11 +246,8 @@ def driver_calls(start: float) -> list[Call]:
 
     It has no gyro: on its own it is off by 2.5 m rms from rest, and by 7 m from its start in motion.
     """
-    calls, (x, y, yaw), before = list[Call](), (0.0, 0.0, 0.0), None
-    for t, speed, rate in husky().wheels.tolist():
-        dt_s = 0.0 if before is None else t - before
-        x, y = x + speed * math.cos(yaw) * dt_s, y + speed * math.sin(yaw) * dt_s
-        yaw, before = math.remainder(yaw + rate * dt_s, math.tau), t
+    calls = list[Call]()
+    for t, x, y, yaw in driver_path(husky()).tolist():
         pose = Transform.from_rpy("wheel_odom", "base_link", (x, y, 0.0), (0.0, 0.0, yaw))
         calls.append(Call(t, "relative_pose", (pose,), {"source": "driver"}))
     return [call for call in calls if call.t >= start]
