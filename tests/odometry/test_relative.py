@@ -114,6 +114,22 @@ def test_a_jump_is_rejected_and_named_and_the_way_goes_on_from_there(has_wheels:
     assert found.end.sigmas < 3.0
 
 
+def test_a_turn_that_was_none_is_named_as_a_turn_wherever_the_base_is():
+    """One pose that is turned by 30 degrees on the spot, 300 m from the origin of the odometry frame."""
+    start = Transform.from_rpy("odom", "base_link", (300.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    base, calls = new_estimator(wheels=WHEELS, initial_pose=start), calls_on(1, 6.0)
+    turned = next(n for n, call in enumerate(calls) if call.kind == "relative_pose" and call.t > 5.0)
+    (pose,) = calls[turned].values
+    turn = Transform.from_rpy(pose.source, "turned", (0.0, 0.0, 0.0), (0.0, 0.0, math.radians(30.0)))
+    wrong = Transform.from_pose7(pose.target, pose.source, (pose @ turn).pose7)
+    calls[turned] = calls[turned]._replace(values=(wrong,))
+    run(base, wandering(1, 6.0), calls)
+    words = re.search(r"s, (\S+) m and (\S+) degrees away from", camera_of(base).sentence)
+    assert words
+    assert float(words[1]) < 0.1
+    assert float(words[2]) == pytest.approx(30.0, abs=1.0)
+
+
 def test_the_order_of_arrival_does_not_matter():
     """Poses of the other odometry 0.3 s late, states read all the time."""
     calls = calls_on(2, 8.0)

@@ -666,6 +666,12 @@ class Fusion:
         mount, state = reading.imu_from_frame, estimate.state
         state = carried(state, source, move.moved, move.walk, mount, dt_s=elapsed_s)
         estimate = estimate._replace(state=state)
+        found = tracked_pose(state, source)
+        assert found is not None
+        row, tracked = found
+        # Of the frame itself: the shift in the residual is that of the origin of the world.
+        lever = (tracked.rotation - state.rotation).dot(mount[:3, 3])
+        shift = tracked.position - state.position + lever
         wheels_at = estimate.wheels_at
         is_driven = wheels_at is not None and reading.stamp - wheels_at <= _WHEELS_VALID_NS
         measurement = tracking(state, source, move.spread, mount)
@@ -673,13 +679,13 @@ class Fusion:
             estimate,
             source,
             measurement,
-            lambda state, seconds: _without_velocity(state, measurement.residual[3:] / elapsed_s, seconds),
-            kept=None if is_driven else partial(_without_scale, row=found[0] + 6),
+            lambda state, seconds: _without_velocity(state, shift / elapsed_s, seconds),
+            kept=None if is_driven else partial(_without_scale, row=row + 6),
             is_step=True,
             probability=reading.noise.gate,
         )
         if outcome.fate == "rejected":
-            angle, way = (float(np.linalg.norm(part)) for part in np.split(measurement.residual, 2))
+            way, angle = math.hypot(*shift), math.hypot(*measurement.residual[:3])
             failure = (
                 f"it moved by {move.way:.2g} m in {elapsed_s:.2g} s, {way:.2g} m and "
                 f"{math.degrees(angle):.2g} degrees away from the motion by the other sources"
