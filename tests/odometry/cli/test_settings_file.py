@@ -30,7 +30,9 @@ from zstate.odometry.cli.settings_file import (
     parse_feet,
     parse_sensor,
     read_settings,
+    table_name,
 )
+from zstate.odometry.sensors import KINDS, Sensor
 
 ROVER = """
 imu = "body"
@@ -304,3 +306,14 @@ def test_wheels_of_a_command_line_may_be_several_on_a_side():
 def test_unusable_wheels_are_refused(text: str, error: str):
     with pytest.raises(InvalidInput, match=error):
         parse_diff_drive(text)
+
+
+def test_names_of_tables_are_those_of_a_file(tmp_path: Path):
+    """What --replay prints is to be copied."""
+    path = tmp_path / "r1.toml"
+    named = ("velocity", "wheels"), ("relative", "odometry/driver")
+    sensors = [Sensor(kind, name, kind.noise()) for kind in KINDS for of, name in named if kind.name == of]
+    path.write_text("".join(f"[{table_name(one.kind, one.name)}]\ndelay_s = 0.3\n" for one in sensors))
+    assert [(one.name, one.noise.delay_s) for one in read_settings(str(path)).sensors] == [
+        (name, 0.3) for _, name in named
+    ]

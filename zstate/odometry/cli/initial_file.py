@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
@@ -15,7 +14,7 @@ from zstate._util.format import format_duration
 from zstate.errors import InvalidInput
 from zstate.odometry import ImuNoise, WheelNoise
 from zstate.odometry.cli.heard import Heard, density_at_rest, motion_text
-from zstate.odometry.cli.settings_file import MEMS_NOISE, OdometrySettings
+from zstate.odometry.cli.settings_file import MEMS_NOISE, OdometrySettings, table_name
 from zstate.odometry.cli.wheel_geometry import ProposedWheels, proposed_wheels
 from zstate.odometry.messages import Fix, Imu, Pose, frame_of
 from zstate.odometry.sensors import KINDS, SensorKind
@@ -277,7 +276,7 @@ class _Sensor:
             yield f"# Off: {self._off}."
         about = _stream_text(self._stream, self._name, self._messages, self._heard, self._base)
         name = self._name if len(self.kind.streams) == 1 else f"{self._stream}/{self._name}"
-        yield _table(f"{self.kind.name}.{_name(name)}", about, is_used=self.is_used)
+        yield _table(table_name(self.kind, name), about, is_used=self.is_used)
         seen = self._sigmas()
         for name, default in _defaults(self.kind.noise):
             meaning = _meaning(self.kind.name, name)
@@ -350,10 +349,6 @@ def _rounded(values: Any) -> float | list[float]:
     """One number if all are the same."""
     found = [float(f"{value:.2g}") for value in values]
     return found[0] if len(set(found)) == 1 else found
-
-
-def _name(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)
 
 
 def _table(name: str, about: str, *, is_used: bool = True) -> str:

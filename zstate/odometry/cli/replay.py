@@ -25,7 +25,7 @@ from zstate.odometry import BaseEstimator, BaseState, Datum, MapState, SourceHea
 from zstate.odometry.cli.delay import Delay, Motions
 from zstate.odometry.cli.heard import recorded_names
 from zstate.odometry.cli.reference import Comparison, Path, ReferenceName, compared, reference_path
-from zstate.odometry.cli.settings_file import WHEEL_KINDS, OdometrySettings, others_text
+from zstate.odometry.cli.settings_file import WHEEL_KINDS, OdometrySettings, others_text, table_name
 from zstate.odometry.estimator import WHEELS
 from zstate.odometry.fusion import STANDSTILL
 from zstate.odometry.health import WINDOW
@@ -163,7 +163,7 @@ def replay(
         if covariances:
             variances = [np.maximum(np.diag(known), 0.0) for known in covariances]  # -1 is not known
             sigmas[one.name] = np.sqrt(np.median(variances, axis=0))
-        key, delay = f"[{one.kind.name}.{one.name}] delay_s", motions.delay_of(one.stream, messages)
+        key, delay = f"[{table_name(one.kind, one.name)}] delay_s", motions.delay_of(one.stream, messages)
         delays.append((one.name, key, one.noise.delay_s, delay))
         events += [(message.stamp, False, partial(one.add, estimators, message)) for message in messages]
     if joints is not None:

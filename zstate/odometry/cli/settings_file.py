@@ -6,7 +6,9 @@ is an example.
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -40,7 +42,7 @@ from zstate.odometry import (
     VelocityNoise,
     Wheels,
 )
-from zstate.odometry.sensors import KINDS, Sensor
+from zstate.odometry.sensors import KINDS, Sensor, SensorKind
 from zstate.odometry.source_noise import SensorNoise, SourceNoise
 from zstate.transform import Transform
 from zstate.wire.keys import check_writer, full_name
@@ -233,6 +235,12 @@ def _check_keys(values: object, kind: msgspec.inspect.Type, file: TomlFile, plac
 
 def _table(values: object) -> Mapping[str, Any]:
     return cast("Mapping[str, Any]", values) if isinstance(values, dict) else {}
+
+
+def table_name(kind: SensorKind, sensor: str) -> str:
+    """That of the table of a sensor, as TOML writes it: a name with a stream, as "pose/camera", is quoted."""
+    is_bare = re.fullmatch(r"[A-Za-z0-9_-]+", sensor)
+    return f"{kind.name}.{sensor if is_bare else json.dumps(sensor, ensure_ascii=False)}"
 
 
 def others_text(sensor: str, known: Collection[str]) -> str:
