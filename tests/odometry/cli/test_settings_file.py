@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import math
+import re
+import tomllib
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +36,7 @@ from zstate.odometry.cli.settings_file import (
     table_name,
 )
 from zstate.odometry.sensors import KINDS, Sensor
+from zstate.odometry.source_noise import SourceNoise
 
 ROVER = """
 imu = "body"
@@ -317,3 +321,19 @@ def test_names_of_tables_are_those_of_a_file(tmp_path: Path):
     assert [(one.name, one.noise.delay_s) for one in read_settings(str(path)).sensors] == [
         (name, 0.3) for _, name in named
     ]
+
+
+def test_settings_of_the_rover_explain_every_key(tmp_path: Path):
+    """Those of other robots are comments; without their # it is a file that can be read."""
+    text = (Path(__file__).parents[3] / "models/rover.toml").read_text()
+    path = tmp_path / "rover.toml"
+    path.write_text(re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.MULTILINE))
+    assert len(read_settings(str(path)).sensors) == len(KINDS)
+    tables = tomllib.loads(path.read_text())
+    wheels = {"ackermann", "mecanum"}  # in place of diff_drive
+    assert {one.name for one in fields(OdometrySettings)} - tables.keys() == wheels
+    common = {one.name for one in fields(SourceNoise)}
+    assert common < tables["velocity"]["flow"].keys()
+    for kind in KINDS:
+        (table,) = tables[kind.name].values()
+        assert {one.name for one in fields(kind.noise)} - common - table.keys() == set()
