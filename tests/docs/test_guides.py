@@ -7,11 +7,14 @@ import re
 from pathlib import Path
 
 import pytest
+from helpers.husky_recording import write_husky
 from helpers.pages import blocks, languages, programs
 from helpers.processes import find_free_port
 from helpers.tutorial_terminal import TutorialPage, check_page
 
 ROOT = Path(__file__).parents[2]
+RECORDINGS = {"husky.mcap": write_husky}
+"""What writes the recordings of real robots that guides replay."""
 GUIDES = {path.stem: path.read_text() for path in sorted((ROOT / "docs" / "guides").glob("*.md"))}
 
 # Blocks of the first three run. A block of text says why it cannot, in the sentence before it.
@@ -53,6 +56,9 @@ def test_terminals_print_what_the_guide_shows(
     text = on_this_host(GUIDES[guide])
     for name, content in files(text).items():
         (folder / name).write_text(content)
+    for name, write in RECORDINGS.items():
+        if name in text:
+            write(folder / name)
     check_page(TutorialPage(text), folder)
 
 

@@ -22,7 +22,16 @@ from helpers.drives import (
     run,
     wandering,
 )
-from helpers.recordings import HUSKY_REST_S, Recording, calls_of, driver_path, played, score
+from helpers.recordings import (
+    HUSKY_REST_S,
+    Recording,
+    Score,
+    calls_of,
+    driver_path,
+    error_of,
+    played,
+    score,
+)
 
 from zstate import InvalidInput, Transform
 from zstate.odometry import BaseEstimator, DiffDrive, SourceHealth
@@ -258,10 +267,7 @@ def husky() -> Recording:
 
 
 def driver_calls(start: float) -> list[Call]:
-    """The dead reckoning of the Husky's own driver: the integral of the speed and the turn of its wheels.
-
-    It has no gyro: on its own it is off by 2.5 m rms from rest, and by 7 m from its start in motion.
-    """
+    """The dead reckoning of the Husky's own driver, which has no gyro."""
     calls = list[Call]()
     for t, x, y, yaw in driver_path(husky()).tolist():
         pose = Transform.from_rpy("wheel_odom", "base_link", (x, y, 0.0), (0.0, 0.0, yaw))
@@ -269,12 +275,17 @@ def driver_calls(start: float) -> list[Call]:
     return [call for call in calls if call.t >= start]
 
 
+@cache
+def scored(sources: str, start: float) -> Score:
+    """Of the IMU and some of "wheels", as velocities, and "driver", its odometry; from ``start`` [s] on."""
+    calls = [call for call in calls_of(husky(), start=start) if call.kind == "imu" or "wheels" in sources]
+    return score(husky(), played(husky(), merged(calls, driver_calls(start) if "driver" in sources else [])))
+
+
 @pytest.mark.long
 def test_the_odometry_of_a_real_drivers_wheels_and_the_gyro_are_inside_their_claim():
-    """The Husky from rest: 3.2 m rms by GPS were measured, whose errors are 0.8 to 1.7 m; NEES 0.5."""
-    imu = [call for call in calls_of(husky(), start=HUSKY_REST_S) if call.kind == "imu"]
-    track = played(husky(), merged(imu, driver_calls(HUSKY_REST_S)))
-    found = score(husky(), track)
+    """The errors of the fixes are 0.8 to 1.7 m."""
+    found = scored("driver", HUSKY_REST_S)
     assert found.error < 4.0
     assert found.nees < 2.0
     assert found.end_sigmas < 3.0
@@ -282,8 +293,30 @@ def test_the_odometry_of_a_real_drivers_wheels_and_the_gyro_are_inside_their_cla
 
 @pytest.mark.long
 def test_beside_velocities_of_its_wheels_it_makes_a_real_drive_no_worse():
-    calls = calls_of(husky(), start=HUSKY_REST_S)
-    without = score(husky(), played(husky(), calls))
-    found = score(husky(), played(husky(), merged(calls, driver_calls(HUSKY_REST_S))))
+    without, found = scored("wheels", HUSKY_REST_S), scored("wheels, driver", HUSKY_REST_S)
     assert found.error < 1.1 * without.error
     assert found.nees < 2.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("sources", "start", "error", "nees"),
+    [
+        ("driver", HUSKY_REST_S, 2.7, 0.6),
+        ("wheels", HUSKY_REST_S, 2.2, 1.2),
+        ("wheels, driver", HUSKY_REST_S, 2.3, 1.5),
+        ("driver", 0.0, 8.4, 2.7),
+        ("wheels", 0.0, 2.9, 0.5),
+        ("wheels, driver", 0.0, 7.7, 2.1),
+    ],
+)
+def test_errors_on_a_real_drive_are_those_in_the_guide(sources: str, start: float, error: float, nees: float):
+    found = scored(sources, start)
+    assert (found.error, found.nees) == pytest.approx((error, nees), abs=0.1)
+
+
+@pytest.mark.parametrize(("start", "error"), [(HUSKY_REST_S, 2.5), (0.0, 6.9)])
+def test_errors_of_a_real_drivers_odometry_are_those_in_the_guide(start: float, error: float):
+    path = driver_path(husky())
+    path = path[path[:, 0] >= start]
+    assert error_of(husky(), path[:, 0], path[:, 1:3]) == pytest.approx(error, abs=0.1)
