@@ -40,6 +40,7 @@ from zstate.odometry import (
     PoseNoise,
     PosePublisher,
     PressurePublisher,
+    RelativeNoise,
     SensorListener,
     VelocityNoise,
     VelocityPublisher,
@@ -431,6 +432,16 @@ def test_measured_poses_place_the_base():
 
         until(is_there)
         assert "mocap" in {source.name for source in node.health()}
+
+
+def test_an_odometry_of_the_network_is_no_source_and_the_error_says_how_its_poses_are_one(sessions):
+    """Both would place the base."""
+    mounts = TransformBuffer()
+    mounts.insert_static(Transform(BASE, IMU, (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
+    base = BaseEstimator(odom=ODOM, base=BASE, imu=IMU, buffer=mounts, imu_noise=NOISE)
+    sensors = [("odometry/camera", RelativeNoise())]
+    with pytest.raises(InvalidInput, match=r"publish its poses by PosePublisher, and name pose/camera"):
+        OdometryNode(sessions[1], "r1", base, sensors=sensors)
 
 
 def test_second_node_of_a_name_is_refused_with_the_first():

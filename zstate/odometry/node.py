@@ -221,8 +221,8 @@ class OdometryNode(Closeable):
         self._sensors = tuple(sensor(name, noise) for name, noise in sensors)
         self._contradictions: dict[str, str] = {}
         """Against the datum of the map, by the key of that of another robot."""
-        if any((one.stream, one.writer) == ("odometry", writer) for one in self._sensors):
-            raise InvalidInput(f"the odometry {writer!r} is no source of itself; name one of both otherwise")
+        for one in self._sensors:
+            one.check_live()
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._restart()

@@ -90,6 +90,14 @@ class Sensor(NamedTuple):
     def __str__(self) -> str:
         return self.kind.text.format(self.name)
 
+    def check_live(self) -> None:
+        """Raise InvalidInput for what can be a source in a recording alone."""
+        if self.stream == "odometry":
+            raise InvalidInput(
+                f"{self.name} places a frame as this odometry does, and a frame has one place: publish its "
+                f"poses by PosePublisher, and name pose/{self.writer}; recordings take {self.name} as it is"
+            )
+
     def add(self, estimators: Estimators, message: Any) -> None:
         """Pass ``message`` on, with the stamp of the instant that it measures. Raises InvalidInput."""
         if self.noise.delay_ns:

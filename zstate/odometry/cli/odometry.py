@@ -103,8 +103,8 @@ _INIT_S = 5.0
 @_sensor_option(
     "relative",
     "sigma=M,sigma_deg=DEG,scale=PART,...",
-    "Another odometry, as of cameras, pose/NAME or odometry/NAME: only its motion counts. sigma and "
-    "sigma_deg are those of a metre of its way, scale that of a constant factor.",
+    "Another odometry, as of cameras: pose/NAME, of a recording also odometry/NAME. Only its motion counts. "
+    "sigma and sigma_deg are those of a metre of its way, scale that of a constant factor.",
     "STREAM/NAME",
 )
 @_sensor_option(
@@ -375,6 +375,8 @@ def _publish(
     from zstate.nodes.listener import TransformListener
     from zstate.odometry import OdometryNode
 
+    for one in settings.sensors:
+        one.check_live()
     with ExitStack() as opened:
         listener = opened.enter_context(TransformListener(session, robot))
         base, imu_frame, model = _wait_for_sensors(session, robot, settings, listener)
