@@ -37,6 +37,7 @@ from zstate.odometry import (
     MagnetometerNoise,
     MapEstimator,
     OdometryNode,
+    OdometryPublisher,
     PoseNoise,
     PosePublisher,
     PressurePublisher,
@@ -442,6 +443,38 @@ def test_an_odometry_of_the_network_is_no_source_and_the_error_says_how_its_pose
     sensors = [("odometry/camera", RelativeNoise())]
     with pytest.raises(InvalidInput, match=r"publish its poses by PosePublisher, and name pose/camera"):
         OdometryNode(sessions[1], "r1", base, sensors=sensors)
+
+
+@pytest.mark.parametrize("kind", ["pose", "odometry"])
+def test_sensors_of_ros_and_another_odometry_there_are_sources_of_odometry_for_ros(sessions, kind: str):
+    robot, estimating = sessions
+    mounts = TransformBuffer()
+    mounts.insert_static(Transform(BASE, IMU, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+    start = Transform(ODOM, BASE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    base = BaseEstimator(odom=ODOM, base=BASE, imu=IMU, buffer=mounts, imu_noise=NOISE, initial_pose=start)
+    camera = [(f"{kind}/camera", RelativeNoise())]
+    received: list[tuple[str, Odometry]] = []
+    there = Transform("camera_odom", "base_footprint", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    with (
+        OdometryNode(estimating, "r1", base, sensors=camera, wires="ros2") as node,
+        SensorListener(
+            robot, "r1", {"odometry": lambda name, one: received.append((name, one))}, wire="ros2"
+        ),
+        ImuPublisher(robot, "r1", "imu", "ros2", frame="imu_link") as imu,
+        PosePublisher(robot, "r1", "camera", "ros2") as poses,
+        OdometryPublisher(robot, "r1", "camera", "ros2") as odometry,
+    ):
+
+        def publish() -> bool:
+            imu.publish([0, 0, 0], [0, 0, 9.80665])
+            if kind == "pose":
+                poses.publish(there)
+            else:
+                odometry.publish(there, [0.0] * 3, [0.0] * 3)
+            accepted = {one.name: one.accepted for one in node.health()}
+            return accepted.get(f"{kind}/camera", 0) > 2 and "odometry" in {name for name, _ in received}
+
+        until(publish)
 
 
 def test_second_node_of_a_name_is_refused_with_the_first():

@@ -158,11 +158,13 @@ class _MapPublishers(NamedTuple):
     datum: DatumPublisher
 
     @classmethod
-    def open(cls, opening: ExitStack, session: Session, robot: str, map: str, program: str) -> _MapPublishers:
-        """Open them in ``opening``. Raises SecondWriter."""
+    def open(
+        cls, opening: ExitStack, session: Session, robot: str, map: str, *, wires: Sequence[str], program: str
+    ) -> _MapPublishers:
+        """Open them in ``opening``. Raises SecondWriter. ROS has no form for a datum."""
         return cls(
-            opening.enter_context(TransformPublisher(session, robot, MAP_WRITER, program=program)),
-            opening.enter_context(PosePublisher(session, robot, MAP_WRITER, program=program)),
+            opening.enter_context(TransformPublisher(session, robot, MAP_WRITER, wires, program=program)),
+            opening.enter_context(PosePublisher(session, robot, MAP_WRITER, wires, program=program)),
             opening.enter_context(DatumPublisher(session, robot, map, writer=MAP_WRITER, program=program)),
         )
 
@@ -184,6 +186,9 @@ class OdometryNode(Closeable):
     ``datum/map`` has the datum, latched. For a map that is no frame of the robot itself, that of other robots
     is taken, if ``in_map`` has none yet; if it has another one, InvalidInput is raised, or, for one that is
     published later, a sentence in the health of the receivers says so.
+
+    The sensors and joints are read on the first of ``wires``, and what comes of them is published on all; the
+    datum, and requests, are on the native wire.
 
     ``planar``: z, roll and pitch of what is published, and of ``state``, are zero (``in_plane``).
 
@@ -207,10 +212,12 @@ class OdometryNode(Closeable):
         has_joints: bool = False,
         planar: bool = False,
         writer: str = "odometry",
+        wires: str | Sequence[str] = ("native",),
         rate_hz: float | None = None,
         program: str = "",
         clock: Clock | None = None,
     ) -> None:
+        wires = (wires,) if isinstance(wires, str) else tuple(wires)
         self.base = base
         self._clock = base.clock if clock is None else clock
         self.failure: Exception | None = None
@@ -222,17 +229,19 @@ class OdometryNode(Closeable):
         self._contradictions: dict[str, str] = {}
         """Against the datum of the map, by the key of that of another robot."""
         for one in self._sensors:
-            one.check_live()
+            one.check_live(wires[0])
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._restart()
         self._joints: JointStateListener | None = None
         with ExitStack() as opening:
             self._publisher = opening.enter_context(
-                OdometryPublisher(session, robot, writer, program=program)
+                OdometryPublisher(session, robot, writer, wires, program=program)
             )
             self._map_publishers = (
-                None if in_map is None else _MapPublishers.open(opening, session, robot, in_map.map, program)
+                None
+                if in_map is None
+                else _MapPublishers.open(opening, session, robot, in_map.map, wires=wires, program=program)
             )
             if in_map is not None and frame_owner(in_map.map) != robot:
                 self._share_datum(opening, session)
@@ -240,7 +249,7 @@ class OdometryNode(Closeable):
             request_key = ODOMETRY_REQUEST.key(robot, self._publisher.writer)
             opening.enter_context(Queryable(session, request_key, self._on_request, is_exact=True))
             if has_joints:
-                joints = JointStateListener(session, robot, on_reading=self._on_joints)
+                joints = JointStateListener(session, robot, on_reading=self._on_joints, wire=wires[0])
                 self._joints = opening.enter_context(joints)
             self._listener = opening.enter_context(
                 SensorListener(
@@ -250,6 +259,7 @@ class OdometryNode(Closeable):
                         stream: partial(self._on_message, stream)
                         for stream in ("imu", *(one.stream for one in self._sensors))
                     },
+                    wire=wires[0],
                 )
             )
             self._opened = opening.pop_all()

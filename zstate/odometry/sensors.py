@@ -90,12 +90,16 @@ class Sensor(NamedTuple):
     def __str__(self) -> str:
         return self.kind.text.format(self.name)
 
-    def check_live(self) -> None:
-        """Raise InvalidInput for what can be a source in a recording alone."""
-        if self.stream == "odometry":
+    def check_live(self, wire: str) -> None:
+        """Raise InvalidInput for what can be a source in a recording and not on ``wire``.
+
+        On the native wire odometry is an edge of the tree. In ROS it is a measurement: its edge is on /tf.
+        """
+        if self.stream == "odometry" and wire == "native":
             raise InvalidInput(
                 f"{self.name} places a frame as this odometry does, and a frame has one place: publish its "
-                f"poses by PosePublisher, and name pose/{self.writer}; recordings take {self.name} as it is"
+                f"poses by PosePublisher, and name pose/{self.writer}. Recordings and `--wire ros2` take "
+                f"{self.name} as it is"
             )
 
     def add(self, estimators: Estimators, message: Any) -> None:

@@ -103,8 +103,8 @@ _INIT_S = 5.0
 @_sensor_option(
     "relative",
     "sigma=M,sigma_deg=DEG,scale=PART,...",
-    "Another odometry, as of cameras: pose/NAME, of a recording also odometry/NAME. Only its motion counts. "
-    "sigma and sigma_deg are those of a metre of its way, scale that of a constant factor.",
+    "Another odometry, as of cameras: pose/NAME, or odometry/NAME of ROS or of a recording. Only its motion "
+    "counts. sigma and sigma_deg are those of a metre of its way, scale that of a constant factor.",
     "STREAM/NAME",
 )
 @_sensor_option(
@@ -212,6 +212,7 @@ _INIT_S = 5.0
     type=options.Checked("FILE", _parse_plot),
     help="Of --replay: draw the path with ellipses of 95 %, and the NIS of each source. PNG, SVG or PDF.",
 )
+@options.wires_option
 @options.seconds_option
 @options.session_options
 def odometry_command(
@@ -237,6 +238,7 @@ def odometry_command(
     reference: ReferenceName | None,
     plot: Path | None,
     seconds: float | None,
+    wires: tuple[str, ...],
     network: SessionOptions,
     **sensors: tuple[tuple[str, SensorNoise], ...],
 ) -> None:
@@ -264,6 +266,7 @@ def odometry_command(
     zstate odometry r1 --diff-drive ... --fix gps                  # and map -> odom, by GPS
     zstate odometry r1 --file r1.toml --replay run.mcap --plot run.png
     zstate odometry r1 --file r1.toml --replay run.mcap --reference pose/mocap
+    zstate odometry r1 --file r1.toml --wire ros2 --wire native    # sensors of ROS 2 nodes
     zstate odometry r1 --set-pose 2 1 90                           # the base of the one that runs
     """
     if reset or set_pose is not None:
@@ -315,8 +318,8 @@ def odometry_command(
     if replay is not None:
         _replay(replay, robot, settings, reference, plot)
         return
-    with open_session(network) as session:
-        _publish(session, robot, settings, writer=writer, rate_hz=rate, seconds=seconds)
+    with open_session(network, wires) as session:
+        _publish(session, robot, settings, wires, writer=writer, rate_hz=rate, seconds=seconds)
 
 
 def _check_options(known: Collection[str], purpose: str) -> None:
@@ -365,6 +368,7 @@ def _publish(
     session: Session,
     robot: str,
     settings: OdometrySettings,
+    wires: tuple[str, ...],
     *,
     writer: str,
     rate_hz: float | None,
@@ -376,10 +380,10 @@ def _publish(
     from zstate.odometry import OdometryNode
 
     for one in settings.sensors:
-        one.check_live()
+        one.check_live(wires[0])
     with ExitStack() as opened:
-        listener = opened.enter_context(TransformListener(session, robot))
-        base, imu_frame, model = _wait_for_sensors(session, robot, settings, listener)
+        listener = opened.enter_context(TransformListener(session, robot, wire=wires[0]))
+        base, imu_frame, model = _wait_for_sensors(session, robot, settings, listener, wires[0])
         estimator = settings.estimator(robot, base, imu_frame, listener.buffer, model)
         in_map = settings.map_estimator(robot, estimator, listener.buffer)
         node = opened.enter_context(
@@ -393,6 +397,7 @@ def _publish(
                 has_joints=settings.has_joints,
                 planar=settings.planar,
                 writer=writer,
+                wires=wires,
                 rate_hz=rate_hz,
             )
         )
@@ -409,7 +414,7 @@ def _publish(
 
 
 def _wait_for_sensors(
-    session: Session, robot: str, settings: OdometrySettings, listener: TransformListener
+    session: Session, robot: str, settings: OdometrySettings, listener: TransformListener, wire: str
 ) -> tuple[str, str, RobotModel | None]:
     """The frames of the base and of the IMU, and the model, once each sensor has sent and the mount is known.
 
@@ -460,8 +465,8 @@ def _wait_for_sensors(
 
     listener.add_observer(waiter.notify)
     with (
-        SensorListener(session, robot, {stream: partial(on_message, stream) for stream in heard}),
-        DescriptionSubscriber(session, robot, on_description),
+        SensorListener(session, robot, {stream: partial(on_message, stream) for stream in heard}, wire=wire),
+        DescriptionSubscriber(session, robot, on_description, wire),
     ):
         waiter.wait_for(lambda: not reason(), None, reason)
     for one in settings.sensors:
