@@ -28,8 +28,9 @@ from zstate.odometry.invariant_filter import (
     innovation,
     plain_covariance,
     with_contact,
+    with_tracked,
 )
-from zstate.odometry.measurements import contact
+from zstate.odometry.measurements import contact, tracking
 from zstate.odometry.messages import Pressure
 from zstate.odometry.rotations import rotation_exp
 from zstate.odometry.sensors import Estimators, sensor
@@ -164,6 +165,24 @@ def test_a_gust_is_rejected_and_one_that_stays_for_two_seconds_is_a_new_level():
     assert estimate.state.position[2] == 0.0
     back = standing(5 * S, 0.0, 50.0, estimate)
     assert read(back, 61.0)[0].state.position[2] == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_pose_by_another_odometry_is_raised_with_the_base_and_its_feet():
+    """Else the next displacement would pull the base back down, or turn what the barometer has raised."""
+    foot = "foot", np.array((0.2, 0.0, -0.3)), 1e-4 * np.eye(3)
+    first, _ = read(standing(), 0.0)
+    before = standing(S, 0.0, 50.0, first)
+    before = before._replace(
+        state=with_contact(with_tracked(before.state, "camera", 0.05), *foot), altimeters=first.altimeters
+    )
+    after, _ = read(before, 10.0)
+    raised = after.state.position - before.state.position
+    assert raised[2] == pytest.approx(10.0, abs=0.01)
+    np.testing.assert_allclose(after.state.contacts - before.state.contacts, [raised], atol=1e-9)
+    found = tracking(after.state, "camera", 1e-6 * np.eye(6), MOUNT)
+    np.testing.assert_allclose(found.residual, 0.0, atol=1e-9)
+    spread = found.jacobian @ after.state.covariance @ found.jacobian.T
+    np.testing.assert_allclose(spread, 0.0, atol=1e-8)
 
 
 # With an IMU

@@ -136,7 +136,8 @@ _USERS_OPTION = click.option(
     help="The users that may connect: user:password lines in a file that only you can read; default: all.",
 )
 _CREDENTIALS = ("certs", "identity", "user", "password_file", "users")
-_NETWORK = (*_CREDENTIALS, "mode", "connect", "listen", "config")
+NETWORK = (*_CREDENTIALS, "mode", "connect", "listen", "config")
+"""The parameters that ``network`` is made of."""
 
 
 def session_options(command: Command) -> Command:
@@ -144,7 +145,7 @@ def session_options(command: Command) -> Command:
 
     @functools.wraps(command)
     def with_network(**params: Any) -> Any:
-        own = {name: value for name, value in params.items() if name not in _NETWORK}
+        own = {name: value for name, value in params.items() if name not in NETWORK}
         return command(network=build_network(params), **own)
 
     return plain_session_options(with_network)

@@ -56,6 +56,7 @@ from zstate.odometry.invariant_filter import (
     carried,
     corrected,
     forgotten,
+    height_rows,
     initial_state,
     innovation,
     plain_covariance,
@@ -156,7 +157,7 @@ _YAW = ROTATION.start + 2
 POSE_ROTATION, POSE_YAW = 3, 5
 """The places of the rotation, and of that about z, in the covariance of a pose."""
 _LEVEL = slice(POSITION.start, POSITION.start + 2)
-_UP, _UP_OF_CONTACTS = POSITION.start + 2, slice(17, None, 3)
+_UP = POSITION.start + 2
 
 COASTING_RATE_DENSITY, _COASTING_FORCE_DENSITY = 0.1, 1.0
 """Of the rate by wheels [rad/s/sqrt(Hz)], and of unknown accelerations [m/s^2/sqrt(Hz)]."""
@@ -1299,18 +1300,22 @@ def _raised(
 ) -> FilterState:
     """The state after a height of a frame that was ``residual`` [m] more, with the variance ``noise`` [m^2].
 
-    The part ``gain`` of it raises the base with its contacts, and nothing else: what an error that lasts
-    would say of velocity, tilt and biases is wrong. It is a consider filter, as ``_without_yaw_bias``, with
+    The part ``gain`` of it raises the base with its contacts and tracked poses, and nothing else: what an
+    error that lasts would say of velocity, tilt and biases is wrong. It is a consider filter, as ``_without_yaw_bias``, with
     the covariance of this gain.
     """
     size = len(state.covariance)
     row, up = np.zeros(size), np.zeros(size)
     row[ROTATION], row[_UP] = -skew(state.rotation @ imu_from_frame[:3, 3])[2], 1.0
-    up[_UP] = up[_UP_OF_CONTACTS] = gain
+    up[height_rows(state)] = gain
     rest = np.eye(size) - np.outer(up, row)
     covariance = rest @ plain_covariance(state) @ rest.T + noise * np.outer(up, up)
     raised = np.array((0.0, 0.0, gain * residual))
-    state = state._replace(position=state.position + raised, contacts=state.contacts + raised)
+    state = state._replace(
+        position=state.position + raised,
+        contacts=state.contacts + raised,
+        tracked=tuple(one._replace(position=one.position + raised) for one in state.tracked),
+    )
     return with_plain_covariance(state, covariance)
 
 

@@ -379,6 +379,16 @@ def carried(
     return state._replace(covariance=grown, tracked=tracked)
 
 
+def height_rows(state: FilterState) -> list[int]:
+    """The places of the errors of z in the covariance: of the position, of tracked poses and of contacts."""
+    first = _first_contact_row(state)
+    return [
+        POSITION.start + 2,
+        *range(15 + 5, first, _TRACKED_SIZE),
+        *range(first + 2, len(state.covariance), 3),
+    ]
+
+
 def without_tracked(state: FilterState) -> FilterState:
     """The state without poses by other odometries, as if its own changes but by motion."""
     first = _first_contact_row(state)

@@ -227,3 +227,10 @@ def test_unusable_options_are_explained(tmp_path: Path):
     assert "rover.toml:1: imus: unknown key; did you mean 'imu'?" in failure(
         "odometry", "rover", "--file", str(settings)
     )
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("task", [("--reset",), ("--set-pose", "1", "2", "3"), ("--init", "r1.toml")])
+def test_requests_and_first_files_take_the_options_of_the_network(task: tuple[str, ...]):
+    network = ("--connect", "tcp/127.0.0.1:1", "--log-format", "text")
+    assert "127.0.0.1:1" in failure("odometry", "rover", *task, *network)

@@ -75,10 +75,13 @@ def _parse_plot(file: str) -> Path:
     return plot_file(file)
 
 
-_OF_REQUESTS = ("robot", "writer", "reset", "set_pose", "network")
+_OF_ALL = (*options.NETWORK, "log_format")
+"""The parameters that any run of the command has a use for."""
+
+_OF_REQUESTS = ("robot", "writer", "reset", "set_pose", *_OF_ALL)
 """The parameters of the command that a request to a running odometry has a use for."""
 
-_OF_INIT = ("robot", "imu", "odom", "base", "init", "overwrite", "replay", "seconds", "network")
+_OF_INIT = ("robot", "imu", "odom", "base", "init", "overwrite", "replay", "seconds", *_OF_ALL)
 """Those that the first file of a robot has a use for."""
 
 _INIT_S = 5.0

@@ -57,9 +57,9 @@ DEFAULT_SPEEDS = SpeedThresholds(touchdown=0.1, liftoff=0.2)
 """Those of the feet of walking robots without another setting."""
 
 _AXES = "axes"
+"""The one key of a sensor that is a list."""
 _WRITTEN = {_AXES: "x+y", "covariance": "dependent"}
 """Values of keys that are no numbers, on the command line."""
-"""The one key of a sensor that is a list."""
 
 T = TypeVar("T")
 PlanarPose = tuple[float, float, float]
