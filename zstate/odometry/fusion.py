@@ -1301,8 +1301,8 @@ def _raised(
     """The state after a height of a frame that was ``residual`` [m] more, with the variance ``noise`` [m^2].
 
     The part ``gain`` of it raises the base with its contacts and tracked poses, and nothing else: what an
-    error that lasts would say of velocity, tilt and biases is wrong. It is a consider filter, as ``_without_yaw_bias``, with
-    the covariance of this gain.
+    error that lasts would say of velocity, tilt and biases is wrong. It is a consider filter, as
+    ``_without_yaw_bias``, with the covariance of this gain.
     """
     size = len(state.covariance)
     row, up = np.zeros(size), np.zeros(size)
