@@ -664,25 +664,36 @@ class Fusion:
             return _led(estimate, source, Lead(reading)), Outcome("accepted", math.nan, 0)
         estimate = estimate._replace(offset=estimate.offset._replace(is_turned=True))
         move, elapsed_s = moved_between(lead.last, reading), (reading.stamp - lead.last.stamp) * 1e-9
-        mount, state = reading.imu_from_frame, estimate.state
-        state = carried(state, source, move.moved, move.walk, mount, dt_s=elapsed_s)
-        estimate = estimate._replace(state=state)
+        mount = reading.imu_from_frame
+        state = carried(estimate.state, source, move.moved, move.walk, mount, dt_s=elapsed_s)
         wheels_at = estimate.wheels_at
         is_driven = wheels_at is not None and reading.stamp - wheels_at <= _WHEELS_VALID_NS
         measurement = tracking(state, source, move.spread, mount)
+        # Not the second half of the residual: in that, a turn moves what is away from the world's origin.
+        there = next(one.position for one in state.tracked if one.source == source)
+        apart, angle = there - state.position, math.hypot(*measurement.residual[:3].tolist())
+
+        def lost(state: FilterState, seconds: float) -> FilterState:
+            state = _without_velocity(state, apart / elapsed_s, seconds)
+            # Its turn is not followed, as gyros are right: that is an error about where it has the base.
+            turned, rows = np.vstack((np.eye(3), skew(there))) * angle, slice(found[0], found[0] + 6)
+            covariance = state.covariance.copy()
+            covariance[rows, rows] += turned @ turned.T
+            return state._replace(covariance=covariance)
+
         after, outcome = _gated(
-            estimate,
+            estimate._replace(state=state),
             source,
             measurement,
-            lambda state, seconds: _without_velocity(state, measurement.residual[3:] / elapsed_s, seconds),
+            lost,
             kept=None if is_driven else partial(_without_scale, row=found[0] + 6),
             is_step=True,
             probability=reading.noise.gate,
         )
         if outcome.fate == "rejected":
-            angle, way = (float(np.linalg.norm(part)) for part in np.split(measurement.residual, 2))
+            way = math.hypot(*apart.tolist())
             failure = (
-                f"it moved by {move.way:.2g} m in {elapsed_s:.2g} s, {way:.2g} m and "
+                f"it moved by {round(move.way, 4):.2g} m in {elapsed_s:.2g} s, {way:.2g} m and "
                 f"{math.degrees(angle):.2g} degrees away from the motion by the other sources"
             )
             outcome = outcome._replace(failure=failure)
@@ -1295,8 +1306,8 @@ def _raised(
     """The state after a height of a frame that was ``residual`` [m] more, with the variance ``noise`` [m^2].
 
     The part ``gain`` of it raises the base with its contacts and tracked poses, and nothing else: what an
-    error that lasts would say of velocity, tilt and biases is wrong. It is a consider filter, as ``_without_yaw_bias``, with
-    the covariance of this gain.
+    error that lasts would say of velocity, tilt and biases is wrong. It is a consider filter, as
+    ``_without_yaw_bias``, with the covariance of this gain.
     """
     size = len(state.covariance)
     row, up = np.zeros(size), np.zeros(size)
