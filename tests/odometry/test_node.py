@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 import msgspec
 import numpy as np
 import pytest
+from helpers.drives import new_estimator
 from helpers.processes import DEADLINE_S, until
 from helpers.robots import STAMP
 
@@ -40,6 +41,7 @@ from zstate.odometry import (
     PoseNoise,
     PosePublisher,
     PressurePublisher,
+    RelativeNoise,
     SensorListener,
     VelocityNoise,
     VelocityPublisher,
@@ -57,6 +59,7 @@ from zstate.odometry.sensors import (
     velocity_covariance,
 )
 from zstate.odometry.simulated_rover import SimulatedRover
+from zstate.odometry.source_noise import SensorNoise
 from zstate.rate import Rate
 from zstate.sources.square_drive import WheelPair
 from zstate.transform import Transform
@@ -629,3 +632,20 @@ def test_a_request_places_the_base_or_starts_anew_and_what_is_refused_has_its_re
         assert node.base.epoch == 1
         with pytest.raises(Unreachable, match="is `zstate odometry r1` running"):
             request_odometry(robot, "r1", "reset", writer="other", timeout_s=0.2)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "why"),
+    [
+        ([("w", ImuNoise(gyro=1e-3, accel=1e-2, gyro_bias=0.0, accel_bias=0.0))], "is one of VelocityNoise,"),
+        ([("w", VelocityNoise()), ("w", VelocityNoise(sigma=0.1))], "the velocity 'w' is given twice"),
+        ([("camera", RelativeNoise())], "pose/NAME or odometry/NAME; got 'camera'"),
+        ([("a/b", VelocityNoise())], "the writer name 'a/b' contains '/'"),
+        ([("odometry/odometry", RelativeNoise())], "'odometry' is no source of itself"),
+    ],
+)
+def test_sensors_that_cannot_be_are_refused_at_once(
+    sessions, sensors: list[tuple[str, SensorNoise]], why: str
+):
+    with pytest.raises(InvalidInput, match=why):
+        OdometryNode(sessions[0], "r1", new_estimator(), sensors=sensors)
