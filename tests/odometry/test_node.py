@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 import msgspec
 import numpy as np
 import pytest
+from helpers.drives import new_estimator
 from helpers.processes import DEADLINE_S, until
 from helpers.robots import STAMP
 
@@ -59,6 +60,7 @@ from zstate.odometry.sensors import (
     velocity_covariance,
 )
 from zstate.odometry.simulated_rover import SimulatedRover
+from zstate.odometry.source_noise import SensorNoise
 from zstate.rate import Rate
 from zstate.sources.square_drive import WheelPair
 from zstate.transform import Transform
@@ -421,13 +423,17 @@ def test_poses_have_the_noise_of_their_messages_or_the_stated_one():
 @pytest.mark.long
 def test_measured_poses_place_the_base():
     with (
-        rover_with_odometry(sensors=[("mocap", PoseNoise())]) as (_, node, listener, session),
+        rover_with_odometry(sensors=[("mocap", PoseNoise())]) as (rover, node, listener, session),
         PosePublisher(session, "r1", "mocap") as mocap,
     ):
         measured = Transform(ODOM, BASE, [0.02, 0.0, 0.0], [0, 0, 0, 1]).with_covariance(1e-6 * np.eye(6))
+        published = rover.ticks
 
         def is_there() -> bool:
-            mocap.publish(measured, time.time_ns())
+            nonlocal published
+            if rover.ticks >= published + 10:  # 20 Hz
+                published = rover.ticks
+                mocap.publish(measured, time.time_ns())
             x = listener.buffer.lookup(ODOM, BASE).translation[0]
             return bool(x == pytest.approx(0.02, abs=0.005))
 
@@ -677,3 +683,20 @@ def test_a_request_places_the_base_or_starts_anew_and_what_is_refused_has_its_re
         assert node.base.epoch == 1
         with pytest.raises(Unreachable, match="is `zstate odometry r1` running"):
             request_odometry(robot, "r1", "reset", writer="other", timeout_s=0.2)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "why"),
+    [
+        ([("w", ImuNoise(gyro=1e-3, accel=1e-2, gyro_bias=0.0, accel_bias=0.0))], "is one of VelocityNoise,"),
+        ([("w", VelocityNoise()), ("w", VelocityNoise(sigma=0.1))], "the velocity 'w' is given twice"),
+        ([("camera", RelativeNoise())], "pose/NAME or odometry/NAME; got 'camera'"),
+        ([("a/b", VelocityNoise())], "the writer name 'a/b' contains '/'"),
+        ([("odometry/odometry", RelativeNoise())], "'odometry' is no source of itself"),
+    ],
+)
+def test_sensors_that_cannot_be_are_refused_at_once(
+    sessions, sensors: list[tuple[str, SensorNoise]], why: str
+):
+    with pytest.raises(InvalidInput, match=why):
+        OdometryNode(sessions[0], "r1", new_estimator(), sensors=sensors)

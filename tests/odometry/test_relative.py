@@ -151,6 +151,22 @@ def test_the_order_of_arrival_does_not_matter():
     np.testing.assert_allclose(first.covariance.pose, second.covariance.pose, atol=1e-9)
 
 
+def test_poses_of_one_stamp_that_differ_in_their_covariance_have_one_order():
+    noise, first = RelativeNoise(covariance="independent"), calls_on(2, 5.0)
+    poses = [Transform("camera_odom", "base_link", (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for x in (0.0, 0.3)]
+    found = list[np.ndarray]()
+    for covariances in ((1e-4, 0.4), (0.4, 1e-4)):
+        base = new_estimator(wheels=WHEELS)
+        for call in first:
+            if call.kind != "relative_pose":
+                getattr(base, call.kind)(stamp_at(call.t), *call.values, **call.options)
+        base.relative_pose(stamp_at(4.5), poses[0], 1e-4 * np.eye(6), source="camera", noise=noise)
+        for variance in covariances:
+            base.relative_pose(stamp_at(4.7), poses[1], variance * np.eye(6), source="camera", noise=noise)
+        found.append(base.state().odom_from_base.pose7)
+    np.testing.assert_array_equal(*found)
+
+
 def test_a_base_that_is_placed_stays_there_whatever_its_other_odometry_says():
     _, base = driven(2, 10.0)
     there = Transform.from_rpy("odom", "base_link", (20.0, 5.0, 0.0), (0.0, 0.0, 1.0))
@@ -170,6 +186,28 @@ def test_a_world_of_another_name_is_another_odometry():
     base.relative_pose(base.newest, pose, source="camera", noise=NOISE)
     assert camera_of(base).rejected == 0
     np.testing.assert_allclose(base.state().odom_from_base.translation, before, atol=1e-9)
+
+
+def with_mirrored_yaw(pose: Transform) -> Transform:
+    """As of axes with z down."""
+    return Transform.from_rpy(pose.target, pose.source, pose.translation, (0.0, 0.0, -pose.rpy[2]))
+
+
+def test_turns_that_contradict_the_gyro_do_not_move_a_base_that_is_far_from_the_origin():
+    """Yaws of the wrong sign, 1000 m away: 4 degrees about the origin would be 70 m."""
+    _, base = driven(1, 10.0)
+    base.set_pose(Transform.from_rpy("odom", "base_link", (1000.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    for call in calls_on(1, 20.0):
+        values = map(with_mirrored_yaw, call.values) if call.kind == "relative_pose" else call.values
+        if call.t > 10.0:
+            getattr(base, call.kind)(stamp_at(call.t), *values, **call.options)
+            base.state()
+    words = re.search(r" s, (\S*) m and (\S*) degrees away", camera_of(base).sentence)
+    assert words
+    assert float(words[1]) < 2.0
+    assert float(words[2]) > 1.0
+    way = np.linalg.norm(base.state().odom_from_base.translation - np.array((1000.0, 0.0, 0.0)))
+    assert way < 12.0
 
 
 def pose_of(

@@ -488,7 +488,8 @@ class BaseEstimator:
         world = world_from_frame.target
         self._record(source).has_bounds = True
         reading = RelativePose(check_stamp(stamp), world, matrix, known, noise or RelativeNoise(), mount)
-        self._offer(_Event(source, reading, world_from_frame.pose7.tolist()))
+        variances: list[float] = [] if known is None else known.diagonal().tolist()
+        self._offer(_Event(source, reading, (*world_from_frame.pose7.tolist(), *variances)))
 
     def heading(
         self,

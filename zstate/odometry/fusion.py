@@ -499,7 +499,7 @@ class Fusion:
         kept = None if reading.upright is None else partial(_without_yaw_bias, axis=reading.upright)
         after, outcome = _gated(estimate, source, measurement, lost, kept=kept, probability=reading.gate)
         if outcome.fate == "reacquired" and reading.is_position:
-            after = _placed_by(after, reading)
+            after = _placed_by(after, reading, residual)
         return after, outcome
 
     def after_pause(
@@ -664,31 +664,38 @@ class Fusion:
             return _led(estimate, source, Lead(reading)), Outcome("accepted", math.nan, 0)
         estimate = estimate._replace(offset=estimate.offset._replace(is_turned=True))
         move, elapsed_s = moved_between(lead.last, reading), (reading.stamp - lead.last.stamp) * 1e-9
-        mount, state = reading.imu_from_frame, estimate.state
-        state = carried(state, source, move.moved, move.walk, mount, dt_s=elapsed_s)
-        estimate = estimate._replace(state=state)
-        found = tracked_pose(state, source)
-        assert found is not None
-        row, tracked = found
-        # Of the frame itself: the shift in the residual is that of the origin of the world.
-        lever = (tracked.rotation - state.rotation).dot(mount[:3, 3])
-        shift = tracked.position - state.position + lever
+        mount = reading.imu_from_frame
+        state = carried(estimate.state, source, move.moved, move.walk, mount, dt_s=elapsed_s)
         wheels_at = estimate.wheels_at
         is_driven = wheels_at is not None and reading.stamp - wheels_at <= _WHEELS_VALID_NS
+        is_confirmed = is_driven and not estimate.runs.keys() - {source}
         measurement = tracking(state, source, move.spread, mount)
+        # Of the frame: the second half of the residual is the shift of the world's origin.
+        tracked = next(one for one in state.tracked if one.source == source)
+        there, lever = tracked.position, (tracked.rotation - state.rotation).dot(mount[:3, 3])
+        apart, angle = there - state.position + lever, math.hypot(*measurement.residual[:3].tolist())
+
+        def lost(state: FilterState, seconds: float) -> FilterState:
+            state = _without_velocity(state, apart / elapsed_s, seconds)
+            # Its turn is not followed, as gyros are right: that is an error about where it has the base.
+            turned, rows = np.vstack((np.eye(3), skew(there))) * angle, slice(found[0], found[0] + 6)
+            covariance = state.covariance.copy()
+            covariance[rows, rows] += turned @ turned.T
+            return state._replace(covariance=covariance)
+
         after, outcome = _gated(
-            estimate,
+            estimate._replace(state=state),
             source,
             measurement,
-            lambda state, seconds: _without_velocity(state, shift / elapsed_s, seconds),
-            kept=None if is_driven else partial(_without_scale, row=row + 6),
+            None if is_confirmed else lost,
+            kept=None if is_driven else partial(_without_scale, row=found[0] + 6),
             is_step=True,
             probability=reading.noise.gate,
         )
         if outcome.fate == "rejected":
-            way, angle = math.hypot(*shift), math.hypot(*measurement.residual[:3])
+            way = math.hypot(*apart.tolist())
             failure = (
-                f"it moved by {move.way:.2g} m in {elapsed_s:.2g} s, {way:.2g} m and "
+                f"it moved by {round(move.way, 4):.2g} m in {elapsed_s:.2g} s, {way:.2g} m and "
                 f"{math.degrees(angle):.2g} degrees away from the motion by the other sources"
             )
             outcome = outcome._replace(failure=failure)
@@ -1333,14 +1340,15 @@ def _with_altimeter(estimate: Estimate, source: str, altimeter: Altimeter) -> Es
     return estimate._replace(altimeters={**estimate.altimeters, source: altimeter})
 
 
-def _placed_by(estimate: Estimate, reading: Reading) -> Estimate:
+def _placed_by(estimate: Estimate, reading: Reading, residual: Floats) -> Estimate:
     """The estimate where a pose has it that is followed after all: an update is linear, a large turn is not.
 
-    Each step leaves an error of the second order of the one before.
+    Each step leaves an error of the second order of the one before. The place is as unsure before each as by
+    the ``residual`` of the first, and as sure after it as the pose.
     """
     for _ in range(_PLACED_STEPS):
         measurement = reading.measure(estimate.state, estimate.rate)
-        state = _without_place(estimate.state, measurement.residual, reading.rows)
+        state = _without_place(estimate.state, residual, reading.rows)
         estimate = _moved(estimate, updated(state, measurement))
     return estimate
 

@@ -34,7 +34,7 @@ from zstate.odometry.messages import SENSOR_STREAMS, Imu, MapDatum, SensorMessag
 from zstate.odometry.planar import in_plane, map_in_plane
 from zstate.odometry.publishers import DatumPublisher, OdometryPublisher, PosePublisher
 from zstate.odometry.requests import apply_request
-from zstate.odometry.sensors import Estimators, add_imu, sensor
+from zstate.odometry.sensors import Estimators, Sensor, add_imu, sensor
 from zstate.odometry.source_noise import SensorNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.streams import StreamName
@@ -169,6 +169,19 @@ class _MapPublishers(NamedTuple):
         )
 
 
+def _check_sensors(sensors: Sequence[Sensor], wire: str, writer: str, *, has_map: bool) -> None:
+    """Raise InvalidInput for a sensor that is there twice, or is published by this odometry itself."""
+    own = {("odometry", writer), *([("pose", MAP_WRITER)] if has_map else ())}
+    for place, one in enumerate(sensors):
+        if (one.stream, one.writer) in own:
+            raise InvalidInput(
+                f"the {one.stream} {one.writer!r} is no source of itself; name one of both otherwise"
+            )
+        if any((one.kind, one.name) == (other.kind, other.name) for other in sensors[:place]):
+            raise InvalidInput(f"the {one.kind.name} {one.name!r} is given twice; state its noise once")
+        one.check_live(wire)
+
+
 class OdometryNode(Closeable):
     """Feeds ``base`` with the sensors of ``robot``, and publishes its odometry as ``writer``.
 
@@ -196,7 +209,8 @@ class OdometryNode(Closeable):
     clock of this host, or none if that of the buffer of ``base`` is simulated. If time goes back, the node
     publishes from there on, which is a new epoch for listeners. It also obeys ``request_odometry``.
 
-    Raises SecondWriter as ``OdometryPublisher``. While it runs, that becomes its ``failure``, and
+    Raises InvalidInput for a sensor that is given twice, that has no such noise, or that it publishes itself,
+    and SecondWriter as ``OdometryPublisher``. While it runs, that becomes its ``failure``, and
     ``has_failed`` is set. A context manager.
     """
 
@@ -228,8 +242,7 @@ class OdometryNode(Closeable):
         self._sensors = tuple(sensor(name, noise) for name, noise in sensors)
         self._contradictions: dict[str, str] = {}
         """Against the datum of the map, by the key of that of another robot."""
-        for one in self._sensors:
-            one.check_live(wires[0])
+        _check_sensors(self._sensors, wires[0], writer, has_map=in_map is not None)
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._lock = fork_safe(threading.Lock())
         self._restart()

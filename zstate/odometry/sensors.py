@@ -350,5 +350,13 @@ _BY_NOISE = {kind.noise: kind for kind in KINDS}
 
 
 def sensor(name: str, noise: SensorNoise) -> Sensor:
-    """The sensor ``name`` of the kind that has such a noise."""
-    return Sensor(_BY_NOISE[type(noise)], name, noise)
+    """The sensor ``name`` of the kind that has such a noise.
+
+    Raises InvalidInput for another noise, and for a name that no sensor of this kind can have.
+    """
+    if type(noise) not in _BY_NOISE:
+        known = ", ".join(kind.__name__ for kind in _BY_NOISE)
+        raise InvalidInput(f"the noise of the sensor {name!r} is one of {known}; got {noise!r}")
+    found = Sensor(_BY_NOISE[type(noise)], name, noise)
+    found.check()
+    return found

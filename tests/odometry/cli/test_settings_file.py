@@ -337,3 +337,19 @@ def test_settings_of_the_rover_explain_every_key(tmp_path: Path):
     for kind in KINDS:
         (table,) = tables[kind.name].values()
         assert {one.name for one in fields(kind.noise)} - common - table.keys() == set()
+
+
+def test_what_is_wrong_with_a_source_whose_name_is_quoted_has_its_line(tmp_path: Path):
+    file = tmp_path / "r1.toml"
+    file.write_text('imu = "imu"\n\n[relative."pose/camera"]\nsigma = 0.1\ngate = 1\nsigm = 2\n')
+    with pytest.raises(ConfigError, match=r"r1.toml:6: relative.pose/camera.sigm: unknown key; did you mean"):
+        read_settings(str(file))
+
+
+def test_a_word_that_a_key_does_not_know_is_answered_with_those_that_it_knows(tmp_path: Path):
+    file = tmp_path / "r1.toml"
+    file.write_text('[relative."pose/camera"]\ncovariance = "dependant"\n')
+    with pytest.raises(
+        ConfigError, match=r"r1.toml:2: .*dependent, independent, stated, not 'dependant'; did"
+    ):
+        read_settings(str(file))

@@ -32,8 +32,8 @@ _NO_TABLES = {
     "wait": "its NAMEs would be the names of a loop; write [[program]] with run = 'zstate wait ...'",
 }
 
-_PLACE = re.compile(r"(?P<table>\w+)(?:\[(?P<number>\d+)\])?(?:\.(?P<key>[\w-]+))?(?:\.(?P<inner>[\w-]+))?")
-_HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)")
+_PLACE = re.compile(r"(?P<table>\w+)(?:\[(?P<number>\d+)\])?(?:\.(?P<key>[\w/-]+))?(?:\.(?P<inner>[\w-]+))?")
+_HEADER = re.compile(r"\s*\[\[?\s*([\w./-]+)")
 _REFERENCE = re.compile(r"\$?\$\{(?P<name>[^{}:]*)(?::-(?P<default>[^{}]*))?\}")
 _TRUE = ("true", "yes", "on", "1")
 _FALSE = ("false", "no", "off", "0", "")
@@ -76,9 +76,11 @@ class TomlFile:
         if match is None:
             return None
         lines = self._text.splitlines()
-        headers = [_HEADER.match(line) for line in lines]
+        headers = [_HEADER.match(line.replace('"', "")) for line in lines]
         table, key = match["table"], match["key"]
-        if any(one and one[1] == f"{table}.{key}" for one in headers):  # [velocity.wheels]
+        if any(
+            one and one[1] == f"{table}.{key}" for one in headers
+        ):  # [velocity.wheels], [relative."pose/camera"]
             table, key = f"{table}.{key}", match["inner"]
         tables = [at for at, one in enumerate(headers, 1) if one and one[1] == table]
         begin = next(iter(tables[int(match["number"] or 0) :]), None)

@@ -220,8 +220,17 @@ def _converted(values: object, kind: type[T], file: TomlFile, place: str) -> T:
 
 
 def _check_keys(values: object, kind: msgspec.inspect.Type, file: TomlFile, place: str) -> None:
-    """Raise ConfigError for the first unknown key, which msgspec ignores in what becomes a dataclass."""
-    if isinstance(kind, msgspec.inspect.UnionType):
+    """Raise ConfigError for the first unknown key, which msgspec ignores in what becomes a dataclass.
+
+    Also for a word that is none of those there are, which msgspec does not list.
+    """
+    if isinstance(kind, msgspec.inspect.LiteralType):
+        words = list(map(str, kind.values))
+        if isinstance(values, str) and values not in words:
+            raise file.error(
+                place, f"it is one of {', '.join(words)}, not {values!r}{did_you_mean(values, words)}"
+            )
+    elif isinstance(kind, msgspec.inspect.UnionType):
         for one in kind.types:
             _check_keys(values, one, file, place)
     elif isinstance(kind, msgspec.inspect.DataclassType):
