@@ -139,6 +139,22 @@ def test_a_turn_that_was_none_is_named_as_a_turn_wherever_the_base_is():
     assert float(words[2]) == pytest.approx(30.0, abs=1.0)
 
 
+def frozen(calls: list[Call]) -> list[Call]:
+    """The other odometry repeats its first pose, with new stamps."""
+    first = next(call for call in calls if call.kind == "relative_pose")
+    return [call._replace(values=first.values) if call.kind == first.kind else call for call in calls]
+
+
+@pytest.mark.long
+def test_one_that_lies_steadily_is_not_followed_beside_wheels_that_nothing_contradicts():
+    base = new_estimator(wheels=WHEELS)
+    found = run(base, wandering(1, 30.0), frozen(calls_on(1, 30.0)))
+    camera = camera_of(base)
+    assert (camera.reacquired, camera.rejected > 100) == (0, True)
+    assert "readings could not be used: it moved by 0 m" in camera.sentence
+    assert max(error.sigmas for error in found.errors) < 3.0
+
+
 def test_the_order_of_arrival_does_not_matter():
     """Poses of the other odometry 0.3 s late, states read all the time."""
     calls = calls_on(2, 8.0)
