@@ -264,8 +264,6 @@ class MapDatum(StampedMessage, frozen=True, array_like=True, gc=False):
 
 
 SensorMessage: TypeAlias = Imu | Velocity | Pose | Fix | MagneticField | Pressure | Odometry
-SENSOR_STREAMS = ("imu", "velocity", "pose", "fix", "magnetic_field", "pressure", "odometry")
-"""The streams of these messages."""
 
 _Measurement = TypeVar("_Measurement", bound=SensorMessage)
 

@@ -30,11 +30,11 @@ from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.health import SourceHealth
 from zstate.odometry.map_estimator import MapEstimator
-from zstate.odometry.messages import SENSOR_STREAMS, Imu, MapDatum, SensorMessage, with_full_names
+from zstate.odometry.messages import Imu, MapDatum, SensorMessage, with_full_names
 from zstate.odometry.planar import in_plane, map_in_plane
 from zstate.odometry.publishers import DatumPublisher, OdometryPublisher, PosePublisher
 from zstate.odometry.requests import apply_request
-from zstate.odometry.sensors import Estimators, Sensor, add_imu, sensor
+from zstate.odometry.sensors import SENSOR_STREAMS, Estimators, Sensor, add_imu, sensor
 from zstate.odometry.source_noise import SensorNoise
 from zstate.sources import JointReading, JointStateListener
 from zstate.streams import StreamName

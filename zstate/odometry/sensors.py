@@ -346,6 +346,9 @@ KINDS = (
     SensorKind("barometer", ("pressure",), BarometerNoise, add_pressure, barometer_covariance),
 )
 
+SENSOR_STREAMS = tuple(dict.fromkeys(("imu", *(stream for kind in KINDS for stream in kind.streams))))
+"""Those that an odometry may read."""
+
 _BY_NOISE = {kind.noise: kind for kind in KINDS}
 
 

@@ -22,7 +22,8 @@ from zstate.model.robot import RobotModel, coordinate_names
 from zstate.model.urdf import parse_urdf
 from zstate.odometry.fusion import MOST_BIAS, is_still
 from zstate.odometry.invariant_filter import GRAVITY
-from zstate.odometry.messages import SENSOR_STREAMS, Imu
+from zstate.odometry.messages import Imu
+from zstate.odometry.sensors import SENSOR_STREAMS
 from zstate.streams import StreamName
 from zstate.wire.messages import RobotDescription, from_block
 
