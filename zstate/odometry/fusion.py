@@ -71,7 +71,7 @@ from zstate.odometry.invariant_filter import (
 from zstate.odometry.legs import Foot, Legs, Stance, stance_after, updated_by_feet
 from zstate.odometry.magnetism import EarthField, UsualField, usual_after
 from zstate.odometry.measurements import heading, height, tracking, yaw_rate, zero_velocity
-from zstate.odometry.relative import RelativePose, moved_between
+from zstate.odometry.relative import RelativePose, moved_between, way_of
 from zstate.odometry.rotations import rotation_exp, skew
 from zstate.odometry.turning import (
     COMPARED_S,
@@ -695,7 +695,7 @@ class Fusion:
         if outcome.fate == "rejected":
             way = math.hypot(*apart.tolist())
             failure = (
-                f"it moved by {round(move.way, 4):.2g} m in {elapsed_s:.2g} s, {way:.2g} m and "
+                f"it moved by {round(way_of(move.moved), 4):.2g} m in {elapsed_s:.2g} s, {way:.2g} m and "
                 f"{math.degrees(angle):.2g} degrees away from the motion by the other sources"
             )
             outcome = outcome._replace(failure=failure)

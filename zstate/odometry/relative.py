@@ -53,16 +53,16 @@ class Move(NamedTuple):
     spread: Floats
     is_stated: bool
 
-    @property
-    def way(self) -> float:
-        """The length of its translation [m]."""
-        return math.sqrt(float(self.moved[:3, 3] @ self.moved[:3, 3]))
+
+def way_of(moved: Floats) -> float:
+    """The length of the translation of a displacement, (4, 4) [m]."""
+    return math.sqrt(float(moved[:3, 3] @ moved[:3, 3]))
 
 
 def moved_between(first: RelativePose, second: RelativePose) -> Move:
     """What a source says of the way from the first pose to the second one."""
     moved, noise = _inverse(first.pose).dot(second.pose), second.noise
-    way = math.sqrt(float(moved[:3, 3] @ moved[:3, 3]))
+    way = way_of(moved)
     turn = math.hypot(*se3.rotation_vector(se3.quaternion_from_matrix(moved[:3, :3]), se3.SCALARS))
     floor = np.diag(np.repeat((math.radians(noise.floor_deg) ** 2, noise.floor**2), 3))
     known = first.covariance is not None and second.covariance is not None

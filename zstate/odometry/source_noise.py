@@ -231,14 +231,15 @@ class RelativeNoise(SourceNoise):
     """The noise of another odometry, of which only the motion between two poses counts; one for a source.
 
     Of a displacement, ``sigma`` [m per square root of a metre] and ``sigma_deg`` [degrees, likewise] are the
-    standard deviations by its way, and ``floor`` [m] and ``floor_deg`` [degrees] those of any, also at rest.
+    standard deviations by its way; ``floor`` [m] and ``floor_deg`` [degrees] are those of each pose, also at
+    rest.
     ``scale`` is that of the logarithm of a constant factor of its translations: 0.05 for stereo cameras, 0.5
     for an unknown device, 3 for one camera.
 
     ``covariance`` says what the covariances of its poses are: "stated", of no use, as those of most drivers,
     which send zeros or constants; "dependent", of dead reckoning, which only grow; "independent", of poses
-    that are each measured, as by matching scans with a map. What they say of a displacement is added to the
-    floor in place of the sigmas. Raises InvalidInput for anything else.
+    that are each measured, as by matching scans with a map. What they say is added to the floor, in place of
+    the sigmas. Raises InvalidInput for anything else.
     """
 
     sigma: float = 0.05
