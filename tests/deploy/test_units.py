@@ -10,11 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import published_robot
+from helpers.cli_runner import published_robot, run_cli
 from helpers.deployment import DEPLOY
-from helpers.processes import Child, find_free_port, until
+from helpers.processes import DEADLINE_S, Child, find_free_port, until
 from helpers.programs import router
+from helpers.systemd import SystemManager
 
+from zstate import connect
+from zstate.driving import Commander
+from zstate.driving.messages import DriverState
 from zstate.recording.info import read_info
 
 UNITS = sorted(path.name for path in DEPLOY.glob("*.service"))
@@ -49,7 +53,8 @@ def test_unit_restarts_and_has_few_permissions(name: str):
 
 
 @pytest.mark.parametrize(
-    "name", ["zstate-router.service", "zstate-publish@.service", "zstate-drive@.service"]
+    "name",
+    ["zstate-router.service", "zstate-publish@.service", "zstate-drive@.service", "zstate-up@.service"],
 )
 def test_a_program_that_exits_is_restarted_after_one_second(name: str):
     assert unit(name)["Service"]["RestartSec"] == "1"
@@ -59,8 +64,9 @@ def test_a_recording_has_a_part_every_500_mb():
     assert "--split-size 500 " in unit("zstate-record.service")["Service"]["ExecStart"]
 
 
-def test_the_unit_of_a_driver_may_open_devices_and_keeps_the_stops():
-    service = unit("zstate-drive@.service")["Service"]
+@pytest.mark.parametrize("name", ["zstate-drive@.service", "zstate-up@.service"])
+def test_a_unit_with_drivers_may_open_devices_and_keeps_the_stops(name: str):
+    service = unit(name)["Service"]
     assert service["PrivateDevices"] == "false"
     assert "ProtectClock" not in service, "it allows one device, and by that no other"
     assert "AF_CAN" in service["RestrictAddressFamilies"].split()
@@ -152,3 +158,71 @@ def test_environment_files_in_the_readme_have_the_variables_of_the_units(name: s
     environments = re.findall(r"```ini\n(.*?)```", text, re.DOTALL)
     assert f"${{{variable}}}" in unit(name)["Service"]["ExecStart"]
     assert sum(f"{variable}=" in environment for environment in environments) == 1
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> SystemManager:
+    return SystemManager(tmp_path)
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return f"tcp/127.0.0.1:{find_free_port()}"
+
+
+def restarted_driver(commander: Commander, before: DriverState) -> DriverState:
+    """The first state of the driver that follows that of ``before``, once its loop runs."""
+
+    def runs() -> bool:
+        driver = commander.driver
+        return driver is not None and driver.session != before.session and driver.state != "off"
+
+    until(runs)
+    return commander.wait_for_driver()
+
+
+@pytest.mark.booted
+def test_systemd_starts_a_killed_driver_again_which_stays_stopped_until_the_release(
+    manager: SystemManager, endpoint: str
+):
+    (manager.etc / "zstate/r1.env").write_text(
+        f"ROBOT_DRIVER=sim\nROBOT_MODEL=rrbot\nDRIVE_OPTIONS=--plant=mirror\nZSTATE_CONNECT={endpoint}\n"
+    )
+    name = "zstate-drive@r1.service"
+    with (
+        router(endpoint),
+        manager,
+        connect(mode="client", endpoints=endpoint) as session,
+        Commander(session, "r1") as commander,
+    ):
+        manager.systemctl("start", name)
+        first = commander.wait_for_driver(DEADLINE_S)
+        assert run_cli("stop", "r1", "--reason", "door", "--connect", endpoint).code == 0
+        manager.systemctl("kill", "--signal=KILL", name)
+        second = restarted_driver(commander, first)
+        assert (manager.property(name, "NRestarts"), second.state) == ("1", "stopped")
+        commander.release(DEADLINE_S)
+        until(lambda: commander.driver is not None and commander.driver.state == "ready")
+        manager.systemctl("stop", name)
+        assert manager.property(name, "Result") == "success"
+
+
+@pytest.mark.booted
+def test_systemd_ends_and_restarts_a_cell_with_all_its_processes(manager: SystemManager, endpoint: str):
+    (manager.etc / "zstate/hall.toml").write_text(
+        f'[router]\nlisten = ["{endpoint}"]\n[network]\nmode = "client"\nconnect = ["{endpoint}"]\n'
+        '[[drive]]\ndriver = "sim"\nrobot = "rrbot"\nname = "r1"\nplant = "mirror"\n'
+        '[[record]]\nfile = "/var/lib/zstate/%Y%m%d-%H%M%S.mcap"\n'
+    )
+    name = "zstate-up@hall.service"
+    with manager:
+        manager.systemctl("start", name)
+        with connect(mode="client", endpoints=endpoint) as session, Commander(session, "r1") as commander:
+            first = commander.wait_for_driver(DEADLINE_S)
+            manager.systemctl("kill", "--kill-whom=main", "--signal=KILL", name)
+            second = restarted_driver(commander, first)
+            assert (manager.property(name, "NRestarts"), second.state) == ("1", "ready")
+        manager.systemctl("stop", name)
+        assert manager.property(name, "Result") == "success"
+        last = max((manager.state / "zstate").glob("*.mcap"))
+        assert read_info(last).complete

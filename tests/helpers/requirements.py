@@ -71,6 +71,14 @@ REQUIREMENTS = {
         "run as root, where file systems may be mounted",
     ),
     "systemd": Requirement(lambda: has_programs("systemd-analyze"), "apt-get install systemd"),
+    "booted": Requirement(
+        lambda: (
+            has_programs("systemctl")
+            and debian_imports("venv")
+            and is_permitted("unshare", "--mount", "--pid", "--fork", "--mount-proc", "true")
+        ),
+        "apt-get install systemd; run as root, where PID namespaces are permitted, on Debian 12",
+    ),
     "tf2": Requirement(
         lambda: is_permitted(DEBIAN_PYTHON, "-c", "import tf2_py"), "apt-get install python3-tf2"
     ),
