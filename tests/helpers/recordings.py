@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from copy import copy, deepcopy
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from helpers.drives import Call, new_estimator
+from helpers.drives import Call, copy_of, new_estimator
 from helpers.plaza import aligned_error, best_turn
 
 from zstate import InFuture, InPast, NoData, Transform
@@ -152,12 +152,6 @@ class MapTrack(NamedTuple):
 def new_map_estimator(base: BaseEstimator, datum: Datum | None = HUSKY_DATUM) -> MapEstimator:
     """An estimator of a map, with the mounts that ``base`` knows."""
     return MapEstimator(base, map="map", buffer=base._buffer, datum=datum)
-
-
-def copy_of(estimator: MapEstimator) -> MapEstimator:
-    """An estimator that knows the same, and goes on by itself with the same mounts."""
-    buffer = estimator.odometry._buffer
-    return deepcopy(estimator, {id(buffer): buffer})
 
 
 class MapPlayer:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from helpers import recordings
 from helpers.base_motion import stamp_at, tilted_mount
-from helpers.drives import Call, Drive, imu_calls, legs_of, merged, new_estimator, velocity_calls
+from helpers.drives import Call, Drive, copy_of, imu_calls, legs_of, merged, new_estimator, velocity_calls
 from helpers.recordings import (
     HUSKY_DATUM,
     HUSKY_REST_S,
@@ -23,7 +23,6 @@ from helpers.recordings import (
     MapTrack,
     Recording,
     calls_of,
-    copy_of,
     fix_calls,
 )
 
@@ -79,8 +78,10 @@ def _undisturbed(end: float, at: float) -> MapTrack:
 
 
 def undisturbed(end: float) -> MapTrack:
-    """The states until ``end`` [s] by the fixes of the recording: of one run for the tests that begin the map,
-    and one for those of the map later on."""
+    """The states until ``end`` [s] by the fixes of the recording.
+
+    They are of two runs: one for the tests that begin the map, and one for those of the map later on.
+    """
     whole = _undisturbed(EARLY_END, START) if end <= EARLY_END else _undisturbed(LATE_END, AT)
     rows = whole.t < end - 0.5
     return whole._replace(t=whole.t[rows], places=whole.places[rows], covariances=whole.covariances[rows])
