@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from helpers.base_motion import mounted, stamp_at, tilted_mount
@@ -19,6 +20,7 @@ from zstate import InFuture, InPast, InvalidInput, NoData, Transform
 from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, ImuNoise, LegNoise, Legs, WheelNoise, Wheels
 from zstate.odometry.invariant_filter import GRAVITY, Floats
+from zstate.odometry.map_estimator import MapEstimator
 
 STEP_S = 0.002
 IMU_HZ, JOINTS_HZ = 100, 20
@@ -36,6 +38,7 @@ class Call(NamedTuple):
 
 
 Profile = Callable[[Floats], Floats]
+EstimatorT = TypeVar("EstimatorT", BaseEstimator, MapEstimator)
 
 
 @dataclass
@@ -499,6 +502,12 @@ def new_estimator(mount: Transform | None = None, **options: Any) -> BaseEstimat
         imu_noise=options.pop("imu_noise", NOISE),
         **options,
     )
+
+
+def copy_of(estimator: EstimatorT) -> EstimatorT:
+    """An estimator that knows the same, and goes on by itself with the same mounts."""
+    base = estimator if isinstance(estimator, BaseEstimator) else estimator.odometry
+    return deepcopy(estimator, {id(base._buffer): base._buffer})
 
 
 def _integral(row: Floats) -> Floats:

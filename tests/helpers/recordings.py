@@ -6,14 +6,15 @@ Frames and times are those of the recordings: t = 0 is the first sample of the I
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from helpers.drives import Call, new_estimator
+from helpers.drives import Call, copy_of, new_estimator
 from helpers.plaza import aligned_error, best_turn
 
 from zstate import InFuture, InPast, NoData, Transform
@@ -127,17 +128,16 @@ def fix_calls(
 
 
 class MapTrack(NamedTuple):
-    """What a MapEstimator made of a recording: its states, and sentences of its health with their times [s].
+    """What a MapEstimator made of a recording.
 
-    ``t`` [s], ``places`` x, y, yaw in the map, (N, 3), their ``covariances``, (N, 3, 3).
+    ``t`` [s], ``places`` x, y, yaw in the map, (N, 3), their ``covariances``, (N, 3, 3); ``sentences`` of its
+    health with their times [s].
     """
 
     t: Floats
     places: Floats
     covariances: Floats
-    states: list[MapState]
     sentences: dict[str, float]
-    estimator: MapEstimator
 
     def at(self, t: float) -> int:
         """The row of the first state at or after ``t`` [s]."""
@@ -154,31 +154,55 @@ def new_map_estimator(base: BaseEstimator, datum: Datum | None = HUSKY_DATUM) ->
     return MapEstimator(base, map="map", buffer=base._buffer, datum=datum)
 
 
-def played_in_map(recording: Recording, calls: Sequence[Call], times: Floats) -> MapTrack:
-    """Feed ``calls``, also of fixes, in their order; states at ``times`` [s] are read 0.4 s after them."""
-    base = new_estimator(recording.mount)
-    estimator = new_map_estimator(base)
-    states, sentences, due = list[MapState](), dict[str, float](), 0
-    for call in calls:
-        to = estimator if call.kind == "fix" else base
-        getattr(to, call.kind)(recording.stamp(call.t), *call.values, **call.options)
-        while call.kind != "fix" and due < len(times) and times[due] <= call.t - 0.4:
-            due += 1
-            with suppress(NoData, InPast):
-                states.append(estimator.state(recording.stamp(times[due - 1])))
-            for source in estimator.health():
-                if source.sentence:
-                    sentences.setdefault(source.sentence, call.t)
-    places = [(*one.map_from_base.translation[:2].tolist(), one.map_from_base.rpy[2]) for one in states]
-    rows = np.ix_((0, 1, 5), (0, 1, 5))
-    return MapTrack(
-        np.array([(one.stamp - recording.start) * 1e-9 for one in states]),
-        np.array(places),
-        np.array([one.covariance[rows] for one in states]),
-        states,
-        sentences,
-        estimator,
-    )
+class MapPlayer:
+    """A MapEstimator that is fed a recording, with the states at ``times`` [s], read 0.4 s after them."""
+
+    def __init__(self, recording: Recording, times: Floats) -> None:
+        self._recording, self._times = recording, times
+        self._estimator = new_map_estimator(new_estimator(recording.mount))
+        self._states, self._sentences, self._due = list[MapState](), dict[str, float](), 0
+
+    def copied(self) -> MapPlayer:
+        """One that has been fed the same, and goes on by itself."""
+        other = copy(self)
+        other._estimator = copy_of(self._estimator)
+        other._states, other._sentences = list(self._states), dict(self._sentences)
+        return other
+
+    def feed(self, calls: Iterable[Call]) -> None:
+        """Calls of both estimators, in their order of arrival."""
+        for call in calls:
+            to = self._estimator if call.kind == "fix" else self._estimator.odometry
+            getattr(to, call.kind)(self._recording.stamp(call.t), *call.values, **call.options)
+            while call.kind != "fix" and self._due < len(self._times):
+                due = float(self._times[self._due])
+                if due > call.t - 0.4:
+                    break
+                self._due += 1
+                with suppress(NoData, InPast):
+                    self._states.append(self._estimator.state(self._recording.stamp(due)))
+                for source in self._estimator.health():
+                    if source.sentence:
+                        self._sentences.setdefault(source.sentence, call.t)
+
+    @property
+    def track(self) -> MapTrack:
+        """What it has made of its calls so far."""
+        states, rows = self._states, np.ix_((0, 1, 5), (0, 1, 5))
+        places = [(*one.map_from_base.translation[:2].tolist(), one.map_from_base.rpy[2]) for one in states]
+        return MapTrack(
+            np.array([(one.stamp - self._recording.start) * 1e-9 for one in states]),
+            np.array(places),
+            np.array([one.covariance[rows] for one in states]),
+            dict(self._sentences),
+        )
+
+
+def played_in_map(recording: Recording, calls: Iterable[Call], times: Floats) -> MapTrack:
+    """The track of a ``MapPlayer`` of ``calls``."""
+    player = MapPlayer(recording, times)
+    player.feed(calls)
+    return player.track
 
 
 def dead_reckoned(recording: Recording, *, start: float = 0.0) -> tuple[Floats, Floats]:

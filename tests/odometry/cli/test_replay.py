@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -53,7 +54,7 @@ SETTINGS = OdometrySettings(
     imu_noise=NOISE,
     diff_drive=DiffDrive("left_wheel_joint", "right_wheel_joint", radius=0.08, track=0.32),
 )
-SECONDS = 14
+SECONDS = 10
 FLOW_SIGMA, MOCAP_SIGMA = 0.04, 0.02
 FLOW_DELAY_MS, JOINT_DELAY_MS = 60, 0
 MAP_FROM_ODOM = 3.0, -2.0, 2.0
@@ -61,6 +62,9 @@ MAP_FROM_ODOM = 3.0, -2.0, 2.0
 MAGNET_T = 2e-5
 """The level field, towards x at the start."""
 DATUM = Datum(48.1, 11.5, 560.0)
+
+
+Recorded = Callable[..., str]
 
 
 class Drive(NamedTuple):
@@ -77,6 +81,14 @@ def drive_mount() -> Transform:
     return Transform.from_pose7("base_footprint", "imu_link", poses[MODEL.links.index("imu_link")])
 
 
+def at_100_hz(readings: list[ImuReading]) -> Iterator[ImuReading]:
+    """The means of two readings each."""
+    for one, other in zip(readings[::2], readings[1::2], strict=True):
+        yield ImuReading(
+            (one.stamp + other.stamp) // 2, 0.5 * (one.gyro + other.gyro), 0.5 * (one.accel + other.accel)
+        )
+
+
 @cache
 def drive() -> Drive:
     """A rest of 3 s, then a new speed and turn each second."""
@@ -90,7 +102,7 @@ def drive() -> Drive:
             rover.drive(wheels.roll(random.uniform(0.1, 0.8), random.uniform(-1.0, 1.0)))
         before = rover.pose
         found.joints.append((stamp, rover.joints(stamp).positions.tolist()))
-        found.imu.extend(rover.imu(stamp))
+        found.imu.extend(at_100_hz(rover.imu(stamp)))
         x, y, yaw = rover.pose
         along = (x - before.x) * math.cos(yaw) + (y - before.y) * math.sin(yaw)
         found.flow.append((stamp - 10 * MS, along / 0.02 + random.gauss(0.0, FLOW_SIGMA)))
@@ -104,7 +116,19 @@ def in_map(x: float, y: float, yaw: float) -> tuple[float, float, float]:
     return at_x + cosine * x - sine * y, at_y + sine * x + cosine * y, yaw + turn
 
 
-def recorded(path: Path, *, covariance: float = 0.0) -> Path:
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """``recorded(covariance=0.0)`` is the path of a recording of the drive, written once per process."""
+    folder = tmp_path_factory.mktemp("drive")
+
+    @cache
+    def path_of(covariance: float = 0.0) -> str:
+        return str(record(folder / f"{covariance}.mcap", covariance))
+
+    return path_of
+
+
+def record(path: Path, covariance: float) -> Path:
     """The drive with the flow sensor late; both have that variance in their messages."""
     random = Random(2)
     with RecordingBuilder(path) as builder:
@@ -147,9 +171,9 @@ def recorded(path: Path, *, covariance: float = 0.0) -> Path:
 
 
 @pytest.mark.long
-def test_table_has_used_rejected_nis_sigma_and_delay_of_each_source(tmp_path: Path):
+def test_table_has_used_rejected_nis_sigma_and_delay_of_each_source(recorded: Recorded):
     settings = replace(SETTINGS, velocity={"flow": VelocityNoise(sigma=0.5 * FLOW_SIGMA, scale=0.0)})
-    replayed = replay(str(recorded(tmp_path / "r.mcap")), "r1", settings)
+    replayed = replay(recorded(), "r1", settings)
     lines = list(report_lines(replayed))
     assert lines[0].split("  ")[0] == "source"
     assert max(map(len, lines[: 1 + len(replayed.health)])) <= 80
@@ -166,9 +190,9 @@ def test_table_has_used_rejected_nis_sigma_and_delay_of_each_source(tmp_path: Pa
 
 
 @pytest.mark.long
-def test_delay_that_would_fit_is_a_setting_and_none_is_left_with_it(tmp_path: Path):
+def test_delay_that_would_fit_is_a_setting_and_none_is_left_with_it(recorded: Recorded):
     settings = replace(SETTINGS, velocity={"flow": VelocityNoise(sigma=FLOW_SIGMA)})
-    path, key = str(recorded(tmp_path / "r.mcap")), "would fit: [velocity.flow] delay_s = "
+    path, key = recorded(), "would fit: [velocity.flow] delay_s = "
     late = replay(path, "r1", settings)
     (line,) = [line for line in report_lines(late) if "delay_s" in line and line.startswith("would fit")]
     assert line.startswith(key)
@@ -186,11 +210,11 @@ def test_delay_that_would_fit_is_a_setting_and_none_is_left_with_it(tmp_path: Pa
 
 
 @pytest.mark.long
-def test_delay_of_wheels_is_a_setting_of_their_noise(tmp_path: Path):
+def test_delay_of_wheels_is_a_setting_of_their_noise(recorded: Recorded):
     late = DiffDrive(
         "left_wheel_joint", "right_wheel_joint", 0.08, 0.32, noise=WheelNoise(delay_s=-0.05)
     )  # which is not so
-    replayed = replay(str(recorded(tmp_path / "r.mcap")), "r1", replace(SETTINGS, diff_drive=late))
+    replayed = replay(recorded(), "r1", replace(SETTINGS, diff_drive=late))
     assert replayed.delays["wheels"].delay_s == pytest.approx(0.05, abs=5e-3)
     (delay_s,) = replayed.fitting_delays.values()
     assert delay_s == pytest.approx(0.0, abs=5e-3)
@@ -198,12 +222,12 @@ def test_delay_of_wheels_is_a_setting_of_their_noise(tmp_path: Path):
 
 
 @pytest.mark.long
-def test_sigma_that_would_fit_is_that_of_the_sensor(tmp_path: Path):
+def test_sigma_that_would_fit_is_that_of_the_sensor(recorded: Recorded):
     """A sensor of x alone, in time: its y and z are exact, so that the mean of three numbers is 1/3 of x."""
     settings = replace(
         SETTINGS, velocity={"flow": VelocityNoise(sigma=(0.2 * FLOW_SIGMA, 1.0, 1.0), scale=0.0)}
     )
-    replayed = replay(str(recorded(tmp_path / "r.mcap")), "r1", settings)
+    replayed = replay(recorded(), "r1", settings)
     flow = next(one for one in replayed.health if one.name == "flow")
     factor = sigma_factor(replayed, flow)
     assert factor is not None
@@ -215,8 +239,8 @@ def test_sigma_that_would_fit_is_that_of_the_sensor(tmp_path: Path):
 
 @pytest.mark.parametrize("stream", ["pose/mocap", "odometry/laser"])
 @pytest.mark.long
-def test_reference_gives_ate_error_at_the_end_and_nees(tmp_path: Path, stream: str):
-    path = str(recorded(tmp_path / "r.mcap"))
+def test_reference_gives_ate_error_at_the_end_and_nees(recorded: Recorded, stream: str):
+    path = recorded()
     name = ReferenceName(*stream.split("/"), sigma=MOCAP_SIGMA)
     replayed = replay(path, "r1", SETTINGS, name)
     found = replayed.reference
@@ -238,8 +262,10 @@ def test_reference_gives_ate_error_at_the_end_and_nees(tmp_path: Path, stream: s
 
 
 @pytest.mark.long
-def test_compass_that_lies_is_a_source_with_a_sentence_and_does_not_turn_the_odometry(tmp_path: Path):
-    path = str(recorded(tmp_path / "r.mcap"))
+def test_compass_that_lies_is_a_source_with_a_sentence_and_does_not_turn_the_odometry(
+    recorded: Recorded,
+):
+    path = recorded()
     without = replay(path, "r1", SETTINGS)
     replayed = replay(path, "r1", replace(SETTINGS, heading={"imu": HeadingNoise(sigma_deg=2.0)}))
     (compass,) = [one for one in replayed.health if one.name == "imu heading"]
@@ -249,9 +275,9 @@ def test_compass_that_lies_is_a_source_with_a_sentence_and_does_not_turn_the_odo
 
 
 @pytest.mark.long
-def test_a_barometer_is_a_row_of_the_table_and_is_no_reason_to_change_its_noise(tmp_path: Path):
+def test_a_barometer_is_a_row_of_the_table_and_is_no_reason_to_change_its_noise(recorded: Recorded):
     settings = replace(SETTINGS, barometer={"bmp": BarometerNoise()})
-    replayed = replay(str(recorded(tmp_path / "r.mcap", covariance=MOCAP_SIGMA**2)), "r1", settings)
+    replayed = replay(recorded(MOCAP_SIGMA**2), "r1", settings)
     (bmp,) = [one for one in replayed.health if one.name == "bmp"]
     assert (bmp.accepted > 20, bmp.rejected, bmp.sentence) == (True, 0, "")
     assert replayed.sigmas["bmp"] == pytest.approx([0.28], abs=0.01)  # 3 Pa
@@ -259,8 +285,8 @@ def test_a_barometer_is_a_row_of_the_table_and_is_no_reason_to_change_its_noise(
 
 
 @pytest.mark.long
-def test_magnetometer_is_a_source_with_a_row_and_one_in_gauss_is_refused(tmp_path: Path):
-    path = str(recorded(tmp_path / "r.mcap"))
+def test_magnetometer_is_a_source_with_a_row_and_one_in_gauss_is_refused(recorded: Recorded):
+    path = recorded()
     replayed = replay(path, "r1", replace(SETTINGS, magnetometer={"mag": MagnetometerNoise()}))
     (field,) = [one for one in replayed.health if one.name == "mag field"]
     assert (field.accepted > 20, field.rejected, field.sentence) == (True, 0, "")
@@ -272,10 +298,12 @@ def test_magnetometer_is_a_source_with_a_row_and_one_in_gauss_is_refused(tmp_pat
 
 
 @pytest.mark.long
-def test_fixes_of_a_receiver_give_the_end_of_the_drive_in_the_map_and_on_the_earth(tmp_path: Path):
+def test_fixes_of_a_receiver_give_the_end_of_the_drive_in_the_map_and_on_the_earth(
+    recorded: Recorded,
+):
     datum = (DATUM.latitude, DATUM.longitude, DATUM.altitude)
     settings = replace(SETTINGS, fix={"gps": FixNoise()}, datum=datum)
-    replayed = replay(str(recorded(tmp_path / "r.mcap", covariance=MOCAP_SIGMA**2)), "r1", settings)
+    replayed = replay(recorded(MOCAP_SIGMA**2), "r1", settings)
     state = replayed.in_map
     assert state is not None
     x, y, yaw = in_map(*drive().poses[-1][1])
@@ -286,7 +314,7 @@ def test_fixes_of_a_receiver_give_the_end_of_the_drive_in_the_map_and_on_the_ear
     (line,) = [line for line in lines if line.startswith("in 'r1/map', x east and y north of")]
     latitude, longitude, _ = DATUM.geodetic(state.map_from_base.translation)
     assert line.endswith(f"{latitude:.7f} {longitude:.7f}")
-    level = replay(str(tmp_path / "r.mcap"), "r1", replace(settings, planar=True))
+    level = replay(recorded(MOCAP_SIGMA**2), "r1", replace(settings, planar=True))
     assert level.in_map is not None
     assert level.in_map.map_from_base.translation[:2].tolist() == state.map_from_base.translation[:2].tolist()
     assert level.in_map.map_from_base.translation[2] == np.abs(level.positions[:, 2]).max() == 0.0
@@ -339,14 +367,14 @@ def test_bag_of_ros_has_sources_and_references_by_the_names_of_their_topics(tmp_
 
 
 @pytest.mark.long
-def test_reference_without_noise_has_no_errors_in_sigmas(tmp_path: Path):
-    path = str(recorded(tmp_path / "r.mcap"))
+def test_reference_without_noise_has_no_errors_in_sigmas(recorded: Recorded):
+    path = recorded()
     replayed = replay(path, "r1", SETTINGS, ReferenceName("pose", "mocap"))
     assert replayed.reference is not None
     assert replayed.reference.nees is None
     assert any("--reference pose/mocap:sigma=METRES" in line for line in report_lines(replayed))
     stated = replay(
-        str(recorded(tmp_path / "s.mcap", covariance=MOCAP_SIGMA**2)),
+        recorded(MOCAP_SIGMA**2),
         "r1",
         SETTINGS,
         ReferenceName("pose", "mocap"),
@@ -384,10 +412,10 @@ def test_reference_without_noise_has_no_errors_in_sigmas(tmp_path: Path):
     ],
 )
 def test_sensor_without_messages_or_noise_is_refused(
-    tmp_path: Path, settings: OdometrySettings, reference: ReferenceName | None, error: str
+    recorded: Recorded, settings: OdometrySettings, reference: ReferenceName | None, error: str
 ):
     with pytest.raises(InvalidInput, match=error):
-        replay(str(recorded(tmp_path / "r.mcap")), "r1", settings, reference)
+        replay(recorded(), "r1", settings, reference)
 
 
 def test_source_does_not_judge_itself(tmp_path: Path):
