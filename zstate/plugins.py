@@ -52,6 +52,8 @@ class Plugin:
 
     - ``streams``
     - ``commands`` of the command line by name: a ``Command``, or only its ``place``.
+    - ``synonyms``: commands of other tools, in lower case with underscores, and the commands to call instead,
+      separated by " | ": ``{"rosbag": "record | replay"}``. A hint shows them.
     - ``checks``: ``"module:class"`` of what `zstate doctor` checks, a subclass of
       ``zstate.cli.doctor.plugin_checks.PluginChecks``.
     - ``needs``: of zstate itself, the folders of other plugins without which it does not work.
@@ -60,6 +62,7 @@ class Plugin:
     name: str
     streams: tuple[Stream, ...] = ()
     commands: Mapping[str, str | Command] = field(default_factory=lambda: MappingProxyType({}))
+    synonyms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     checks: str = ""
     needs: tuple[str, ...] = ()
 
