@@ -56,6 +56,8 @@ class Plugin:
       separated by " | ": ``{"rosbag": "record | replay"}``. A hint shows them.
     - ``checks``: ``"module:class"`` of what `zstate doctor` checks, a subclass of
       ``zstate.cli.doctor.plugin_checks.PluginChecks``.
+    - ``metrics``: of zstate itself, ``"module:class"`` of what `zstate monitor --metrics` serves of its
+      streams, a subclass of ``zstate.cli.metrics.PluginMetrics``.
     - ``needs``: of zstate itself, the folders of other plugins without which it does not work.
     """
 
@@ -64,6 +66,7 @@ class Plugin:
     commands: Mapping[str, str | Command] = field(default_factory=lambda: MappingProxyType({}))
     synonyms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     checks: str = ""
+    metrics: str = ""
     needs: tuple[str, ...] = ()
 
     def command(self, name: str) -> Command:

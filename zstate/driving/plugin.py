@@ -74,4 +74,5 @@ PLUGIN = Plugin(
         "ros2_control_node": "drive",
     },
     checks="zstate.driving.cli.checks:DriverChecks",
+    metrics="zstate.driving.cli.metrics:DriverMetrics",
 )
