@@ -17,7 +17,7 @@ from helpers.prometheus_text import collected, row
 
 from zstate import StreamListener, StreamPublisher, plugins
 from zstate.errors import InvalidInput, SecondWriter
-from zstate.metrics.collectors import PublisherMetrics, WriterMetrics
+from zstate.metrics.collectors import add_publishers, add_writers
 from zstate.net.presence import discover
 from zstate.net.session import Session
 from zstate.streams import Stream
@@ -218,11 +218,10 @@ def test_a_frame_that_the_robot_does_not_have_is_a_finding_and_is_echoed(
 
 def test_metrics_count_its_messages_and_writers(sessions: tuple[Session, Session], battery_plugin: Stream):
     with StreamPublisher(sessions[0], "panda", battery_plugin, name="main") as publisher:
-        published = PublisherMetrics([publisher])
         publisher.publish(voltage=24.1, charge=0.8)
         samples = row("zstate_publisher_samples_total", robot="panda", wire="native", stream="battery")
-        assert collected(published)[samples] == 1
-        writers = collected(WriterMetrics(lambda: discover(sessions[1])))
+        assert collected(lambda families: add_publishers(families, [publisher]))[samples] == 1
+        writers = collected(lambda families: add_writers(families, discover(sessions[1])))
         assert writers[row("zstate_writers", robot="panda", stream="battery")] == 1
 
 

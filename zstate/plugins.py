@@ -52,15 +52,21 @@ class Plugin:
 
     - ``streams``
     - ``commands`` of the command line by name: a ``Command``, or only its ``place``.
+    - ``synonyms``: commands of other tools, in lower case with underscores, and the commands to call instead,
+      separated by " | ": ``{"rosbag": "record | replay"}``. A hint shows them.
     - ``checks``: ``"module:class"`` of what `zstate doctor` checks, a subclass of
       ``zstate.cli.doctor.plugin_checks.PluginChecks``.
+    - ``metrics``: of zstate itself, ``"module:class"`` of what `zstate monitor --metrics` serves of its
+      streams, a subclass of ``zstate.cli.metrics.PluginMetrics``.
     - ``needs``: of zstate itself, the folders of other plugins without which it does not work.
     """
 
     name: str
     streams: tuple[Stream, ...] = ()
     commands: Mapping[str, str | Command] = field(default_factory=lambda: MappingProxyType({}))
+    synonyms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     checks: str = ""
+    metrics: str = ""
     needs: tuple[str, ...] = ()
 
     def command(self, name: str) -> Command:

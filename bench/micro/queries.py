@@ -20,7 +20,7 @@ import numpy as np
 from bench.micro.processes import running_command, use_own_rendezvous
 from bench.process import free_ports
 from zstate import TransformListener, connect, load_model
-from zstate.metrics.collectors import ListenerMetrics
+from zstate.metrics.collectors import Collector, add_listeners
 from zstate.metrics.endpoint import MetricsEndpoint
 from zstate.model.robot import RobotModel
 from zstate.net.clock_offset import measure_offsets
@@ -68,7 +68,7 @@ def measure(session: Session, model: RobotModel, times: int) -> Iterator[tuple[s
     yield "reported uncertainty of the clock offset", "us", [one.uncertainty_ns * 1e-3 for one in offsets]
     with (
         TransformListener(session, robot) as listener,
-        MetricsEndpoint([ListenerMetrics(lambda: [listener])]) as endpoint,
+        MetricsEndpoint([Collector(lambda families: add_listeners(families, [listener]))]) as endpoint,
     ):
         spent = [elapsed_s(lambda: urlopen(endpoint.url).read()) for _ in range(times)]
         yield "scrape of a listener's metrics", "ms", [seconds * 1e3 for seconds in spent]

@@ -19,6 +19,7 @@ from zstate.cli.commands import own_commands
 from zstate.cli.processes import orderly_exit
 from zstate.cli.signals import CHECKED_AFTER_S, SignalExit
 from zstate.model.pinocchio_solver import load_pinocchio
+from zstate.plugins import built_in_plugins
 from zstate.sources import JointStateListener
 
 
@@ -56,6 +57,7 @@ def test_mistyped_command_gets_the_nearest_one():
         ("rviz2", "use `zstate view`"),
         ("list", "use `zstate ls`"),
         ("bag", "use `zstate record` or `zstate replay` or `zstate info`"),
+        ("rqt", "use `zstate graph` or `zstate plot` or `zstate view`"),
         ("launch", "use `zstate up FILE.toml`"),
         ("static-transform-publisher", "use `zstate static`"),
         ("quxquux", "`zstate help` lists the commands"),
@@ -66,10 +68,13 @@ def test_commands_of_ros_lead_to_their_equivalents(word: str, hint: str):
 
 
 def test_every_synonym_leads_to_commands_that_exist():
-    for commands in main._SYNONYMS.values():
-        for command in commands.split(" | "):
-            assert command.split()[0] in own_commands(), command
-    assert not set(main._SYNONYMS) & set(own_commands())
+    for owner, table in (("", main._SYNONYMS), *((one.name, one.synonyms) for one in built_in_plugins())):
+        for commands in table.values():
+            for command in commands.split(" | "):
+                assert own_commands()[command.split()[0]].place.startswith(f"zstate.{owner or 'cli'}."), (
+                    command
+                )
+        assert not set(table) & set(own_commands())
 
 
 def test_help_is_a_command_too():

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import socket
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from helpers.cli_runner import (
@@ -20,22 +18,8 @@ from helpers.cli_runner import (
     run_watched,
     started,
 )
-from helpers.processes import Child, until
-from helpers.prometheus_text import Row, row, scraped
-
-
-def url_of(command: Child | Command) -> str:
-    until(lambda: "metrics at " in command.stderr)
-    match = re.search(r"metrics at (http://127\.0\.0\.1:\d+/metrics)", command.stderr)
-    assert match
-    return match[1]
-
-
-def grown(url: str, grows: Row) -> dict[Row, float]:
-    """A scrape that finds ``grows`` larger than one before."""
-    first = scraped(url)[grows]
-    until(lambda: scraped(url)[grows] > first)
-    return scraped(url)
+from helpers.processes import until
+from helpers.prometheus_text import grown, row, scraped, url_of
 
 
 @pytest.mark.processes
@@ -65,47 +49,6 @@ def test_listener_serves_its_counts():
         until(lambda: scraped(url)[row("zstate_robots")] == 0)
 
     run_watched(scrape, "monitor", "--robots", "--robot", "rrbot", "--json", "--metrics", "0")
-
-
-def test_router_serves_its_connections_and_writers(free_port: int):
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-
-    def scrape(command: Command) -> None:
-        url = url_of(command)
-        assert scraped(url)[row("zstate_router_sessions", mode="client")] == 0
-        with published_robot(router=endpoint):
-            until(lambda: scraped(url).get(row("zstate_writers", robot="rrbot", stream="joint_states")) == 1)
-            rows = scraped(url)
-        assert rows[row("zstate_router_sessions", mode="client")] == 1
-        assert rows[row("zstate_router_links", protocol="tcp")] == 1
-
-    run_watched(scrape, "router", "--listen", endpoint, "--metrics", "0")
-
-
-def test_recorder_serves_its_metrics(tmp_path: Path):
-    def scrape(command: Command) -> None:
-        url = url_of(command)
-        messages = row("zstate_recorder_messages_total", robot="rrbot", stream="joint_states")
-        until(lambda: messages in scraped(url))
-        rows = grown(url, messages)
-        assert rows[row("zstate_recorder_files")] == 1
-        assert rows[row("zstate_recorder_size_bytes")] > 0
-
-    with published_robot():
-        run_watched(scrape, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0")
-
-
-def test_bridge_serves_the_carried_robots(ros_router: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.delenv("ZSTATE_CONNECT")
-    monkeypatch.delenv("ZSTATE_WIRE")
-
-    def scrape(command: Command) -> None:
-        url = url_of(command)
-        carried = row("zstate_bridge_carried", robot="rrbot", way="native to ROS")
-        until(lambda: scraped(url).get(carried) == 1)
-
-    with published_robot():
-        run_watched(scrape, "bridge", "rrbot", "--ros", ros_router, "--metrics", "0")
 
 
 def test_busy_port_and_invalid_address_are_reported():

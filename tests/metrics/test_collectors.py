@@ -6,22 +6,20 @@ import time
 from dataclasses import replace
 
 import pytest
-from helpers.processes import DEADLINE_S, repeated, until
+from helpers.processes import until
 from helpers.prometheus_text import collected, row
 from helpers.robots import RRBOT, wait_for_stream_readers
 from prometheus_client.core import CounterMetricFamily
 
-from zstate.driving import Commander
-from zstate.driving.driver_state import DriverStateListener
 from zstate.errors import InFuture, InvalidInput
 from zstate.metrics.collectors import (
     MAX_ROBOTS,
-    ConnectionMetrics,
-    DriverMetrics,
-    ListenerMetrics,
+    Collector,
     MetricFamilies,
-    PublisherMetrics,
-    WriterMetrics,
+    add_connections,
+    add_listeners,
+    add_publishers,
+    add_writers,
 )
 from zstate.metrics.endpoint import MetricsEndpoint
 from zstate.net.presence import RobotInfo, connections, discover, local_writer
@@ -44,7 +42,7 @@ def test_publisher_samples_suppressed_and_refused_are_counted(sessions):
             publisher.publish([0.0, 0.0])
         with pytest.raises(InvalidInput):
             publisher.publish([0.0])
-        rows = collected(PublisherMetrics([publisher]))
+        rows = collected(lambda families: add_publishers(families, [publisher]))
         size = publisher.stats.streams["native", "joint_states"].bytes
     assert rows[row("zstate_publisher_samples_total", **JOINTS)] == 3
     assert rows[row("zstate_publisher_bytes_total", **JOINTS)] == size > 3 * 2 * 8
@@ -58,7 +56,7 @@ def test_publisher_samples_suppressed_and_refused_are_counted(sessions):
 def test_publisher_with_a_rate_reports_late_and_skipped_ticks(sessions):
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         report = publisher.run(SineSource(RRBOT), 200.0, seconds=0.05)
-        rows = collected(PublisherMetrics([publisher]))
+        rows = collected(lambda families: add_publishers(families, [publisher]))
     assert rows[row("zstate_publisher_commanded_hertz", robot="r1")] == 200.0
     assert rows[row("zstate_publisher_ticks_total", robot="r1")] == report.ticks
     assert rows[row("zstate_publisher_late_ticks_total", robot="r1")] == report.late
@@ -78,7 +76,7 @@ def test_an_endpoint_does_not_slow_a_publisher_down(sessions):
         served: list[float] = []
         for _ in range(15):
             alone.append(tick_ns())
-            with MetricsEndpoint([PublisherMetrics([publisher])]):
+            with MetricsEndpoint([Collector(lambda families: add_publishers(families, [publisher]))]):
                 served.append(tick_ns())
     # The fastest of each, alternating: other load of the machine is in neither.
     assert min(served) < 1.5 * min(alone)
@@ -99,7 +97,7 @@ def test_listener_stats_age_latency_and_lookups_are_reported(sessions):
         listener.buffer.lookup("base", "lower")
         with pytest.raises(InFuture):
             listener.buffer.lookup("base", "lower", time.time_ns() + 10**9)
-        rows = collected(ListenerMetrics(lambda: [listener]))
+        rows = collected(lambda families: add_listeners(families, [listener]))
     assert rows[row("zstate_listener_received_total", robot="r1")] == 4
     for lost in ("dropped", "missed", "late"):
         assert rows[row(f"zstate_listener_{lost}_total", robot="r1")] == 0
@@ -127,7 +125,7 @@ def test_listener_of_all_robots_reports_the_age_of_each(sessions):
             )
 
         until(all_received)
-        rows = collected(ListenerMetrics(lambda: [listener]))
+        rows = collected(lambda families: add_listeners(families, [listener]))
     assert {labels for name, labels in rows if name == "zstate_listener_age_seconds"} == {
         frozenset({("robot", "r1")}),
         frozenset({("robot", "r2")}),
@@ -139,15 +137,18 @@ def test_restarts_of_a_writer_add_no_rows(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", InstrumentedBuffer(), history_on_join=False) as listener:
         wait_for_stream_readers(writer, "r1")
-        metrics = ListenerMetrics(lambda: [listener])
-        writers = WriterMetrics(lambda: discover(reader))
+
+        def add(families: MetricFamilies) -> None:
+            add_listeners(families, [listener])
+            add_writers(families, discover(reader))
+
         seen: list[set[object]] = []
         for number in range(1, 6):
             with StatePublisher(writer, RRBOT, "r1") as publisher:
                 until(lambda: discover(reader))
                 publisher.publish([0.0, 0.0])
                 until(lambda: listener.stats.received == number)  # noqa: B023 - called in this round
-                seen.append(set(collected(metrics)) | set(collected(writers)))
+                seen.append(set(collected(add)))
     assert all(rows == seen[0] for rows in seen)
 
 
@@ -157,14 +158,14 @@ def test_robots_beyond_the_limit_are_counted_without_rows():
         RobotInfo(f"r{number:04}", (("joint_states", replace(writer, session=number)),))
         for number in range(MAX_ROBOTS + 3)
     ]
-    rows = collected(WriterMetrics(lambda: robots))
+    rows = collected(lambda families: add_writers(families, robots))
     assert rows[row("zstate_robots")] == MAX_ROBOTS + 3
     assert len([name for name, _ in rows if name == "zstate_writers"]) == MAX_ROBOTS
 
 
 def test_two_writers_of_a_stream_count_as_two():
     writers = (("tf_static", local_writer(1)), ("tf_static", local_writer(2)))
-    rows = collected(WriterMetrics(lambda: [RobotInfo("r1", writers)]))
+    rows = collected(lambda families: add_writers(families, [RobotInfo("r1", writers)]))
     assert rows[row("zstate_writers", robot="r1", stream="tf_static")] == 2
 
 
@@ -182,31 +183,7 @@ def test_router_reports_its_sessions_and_links(free_port: int):
     with connect(mode="router", listen=endpoint) as router:
         with connect(mode="client", endpoints=endpoint), connect(mode="peer", endpoints=endpoint):
             until(lambda: connections(router).sessions == {"client": 1, "peer": 1, "router": 0})
-            rows = collected(ConnectionMetrics(router))
+            rows = collected(lambda families: add_connections(families, router))
             assert rows[row("zstate_router_sessions", mode="client")] == 1
             assert rows[row("zstate_router_links", protocol="tcp")] == 2
         until(lambda: not any(connections(router).sessions.values()))
-
-
-def test_a_driver_has_its_state_refused_commands_and_the_age_of_the_newest(sessions, host_driver):
-    host = host_driver()
-    with (
-        DriverStateListener(sessions[1], "*") as drivers,
-        Commander(sessions[1], "arm") as commander,
-    ):
-        commander.wait_for_driver(DEADLINE_S)
-        with repeated(lambda: commander.send({"elbow": 0.1})):
-            until(lambda: host.state == "active")
-        publisher = KeyPublisher(sessions[1], "zstate/arm/joint_commands", encoding_of(JointState))
-        until(lambda: publisher.put(b"") or host.report().refused.get("foreign"))
-        until(lambda: "foreign" in drivers.states()["arm"].state.refused)
-        rows = collected(DriverMetrics(drivers))
-        host.close()
-        until(lambda: drivers.states()["arm"].state.state == "off")
-        ended = collected(DriverMetrics(drivers))
-    assert rows[row("zstate_driver_refused_total", robot="arm", reason="foreign")] >= 1.0
-    assert rows[row("zstate_driver_ticks_total", robot="arm")] > 0.0
-    assert rows[row("zstate_driver_command_age_seconds", robot="arm")] > 0.0
-    assert 0.0 <= rows[row("zstate_driver_transit_excess_seconds", robot="arm")] < 1.0
-    states = [value for (name, _), value in ended.items() if name == "zstate_driver_state"]
-    assert sorted(states) == [0.0] * 6 + [1.0]

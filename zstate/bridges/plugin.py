@@ -14,5 +14,8 @@ PLUGIN = Plugin(
             "zstate.bridges.cli.ros1:ros1_command", "Run", "A bridge to ROS 1, in either direction."
         ),
     },
+    synonyms={
+        "ros1_bridge": "ros1",
+    },
     needs=("odometry",),
 )

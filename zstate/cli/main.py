@@ -26,58 +26,35 @@ from zstate.cli.commands import SECTIONS, load_command, load_other_command, own_
 from zstate.cli.output import logs
 from zstate.cli.signals import Ending
 from zstate.errors import ZStateError
+from zstate.plugins import built_in_plugins, other_plugins
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from zstate.net.session import Session
 
-# Commands of other tools, and the equivalent ones of zstate, separated by bars.
+# Commands of other tools, and the equivalent ones of the core; see ``Plugin.synonyms``.
 _SYNONYMS = {
-    "bag": "record | replay | info",
     "check_urdf": "check",
-    "controller_manager": "drive",
     "dummy_joint_states": "joints",
-    "dummy_laser": "scan ROBOT --frame FRAME --dummy",
-    "dummy_map_server": "map FILE.yaml",
-    "ekf_node": "odometry",
-    "foxglove_bridge": "foxglove",
     "info_urdf": "check",
     "joint_state_publisher": "joints",
-    "joint_state_publisher_gui": "view ROBOT --sliders",
-    "joint_trajectory_controller": "move",
-    "laser": "scan ROBOT --frame FRAME --simulate MAP.yaml",
     "launch": "up FILE.toml",
-    "lichtblick": "foxglove",
-    "lidar": "scan ROBOT --frame FRAME --simulate MAP.yaml",
     "list": "ls",
-    "map_server": "map FILE.yaml",
     "models": "robots",
-    "navsat_transform": "odometry",
     "node": "ls",
     "node_list": "ls",
     "nodes": "ls",
     "param": "config",
-    "play": "replay",
     "pub": "joints | publish | static",
     "rate": "hz",
-    "rmw_zenohd": "router --ros2",
-    "robot_localization": "odometry",
     "robot_state_publisher": "publish",
-    "ros1_bridge": "ros1",
-    "ros2_bag": "record | replay | info",
-    "ros2_control": "drive | move | stop",
-    "ros2_control_node": "drive",
-    "rosbag": "record | replay | info",
     "roslaunch": "up FILE.toml",
     "rostopic": "ls | echo | hz",
-    "rqt": "view | graph | plot",
+    "rqt": "graph",
     "rqt_graph": "graph",
-    "rqt_plot": "plot",
     "rqt_tf_tree": "tree",
     "run": "up FILE.toml",
-    "rviz": "view",
-    "rviz2": "view",
     "start": "up FILE.toml | publish | demo",
     "state_publisher": "publish",
     "static_transform_publisher": "static",
@@ -92,7 +69,6 @@ _SYNONYMS = {
     "transform_broadcaster": "transform",
     "view_frames": "tree --svg",
     "wtf": "doctor",
-    "zenohd": "router",
 }
 
 COMPLETION_VARIABLE = "_ZSTATE_COMPLETE"
@@ -310,9 +286,11 @@ def group(ctx: click.Context, until_eof: bool) -> None:
 
 def command_hint(name: str, commands: Iterable[str]) -> str:
     """A suggestion for ``name``, which is none of ``commands``."""
-    same = _SYNONYMS.get(name.lower().replace("-", "_"))
+    word = name.lower().replace("-", "_")
+    tables = [_SYNONYMS, *(plugin.synonyms for plugin in (*built_in_plugins(), *other_plugins()))]
+    same = [command for table in tables if word in table for command in table[word].split(" | ")]
     if same:
-        return "use " + " or ".join(f"`zstate {command}`" for command in same.split(" | "))
+        return "use " + " or ".join(f"`zstate {command}`" for command in same)
     from difflib import get_close_matches
 
     near = get_close_matches(name, list(commands), n=1)

@@ -67,5 +67,12 @@ PLUGIN = Plugin(
             "Stop a robot that has a driver, until that is released.",
         ),
     },
+    synonyms={
+        "controller_manager": "drive",
+        "joint_trajectory_controller": "move",
+        "ros2_control": "drive | move | stop",
+        "ros2_control_node": "drive",
+    },
     checks="zstate.driving.cli.checks:DriverChecks",
+    metrics="zstate.driving.cli.metrics:DriverMetrics",
 )

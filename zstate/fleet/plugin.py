@@ -15,4 +15,8 @@ PLUGIN = Plugin(
             "Certificates for tests: an authority and identities.",
         ),
     },
+    synonyms={
+        "rmw_zenohd": "router --ros2",
+        "zenohd": "router",
+    },
 )

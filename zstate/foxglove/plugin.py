@@ -7,5 +7,9 @@ PLUGIN = Plugin(
     commands={
         "foxglove": Command("zstate.foxglove.cli:foxglove_command", "Look", "The robots, live in Foxglove."),
     },
+    synonyms={
+        "foxglove_bridge": "foxglove",
+        "lichtblick": "foxglove",
+    },
     needs=("recording",),
 )

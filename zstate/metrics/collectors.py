@@ -1,6 +1,7 @@
-"""Prometheus collectors of publishers, listeners, writers, drivers, connections, recorders and bridges.
+"""Metrics for Prometheus: their rows, and those of publishers, listeners, writers and connections.
 
-Each reads existing counters at a scrape. Their rates are for PromQL to compute, by ``rate(...[10s])``.
+Functions add rows from existing counters at a scrape. Rates are for PromQL to compute, by ``rate(...[10s])``.
+Plugins have functions of their own, in the module ``metrics`` of their ``cli``.
 """
 
 from __future__ import annotations
@@ -18,20 +19,21 @@ from zstate.wire.keys import ANY
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
-    from zstate.bridges.ros2 import Bridge
-    from zstate.driving.driver_state import DriverStateListener
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
     from zstate.nodes.sample_publisher import SamplePublisher
-    from zstate.recording.recorder import Recorder
 
 MAX_ROBOTS = 500
 """Robots with their own rows. Names come from the network, so further robots are only counted."""
-_MAX_STREAMS = 5 * MAX_ROBOTS
 
 
 class MetricFamilies:
-    """Metric rows grouped by name. Rows with the same name and labels are added."""
+    """Metric rows grouped by name. Rows with the same name and labels are added.
+
+    Of robots ``max_robots`` have rows of their own: their names come from the network.
+    """
+
+    max_robots = MAX_ROBOTS
 
     def __init__(self) -> None:
         self._rows: dict[tuple[str, str, str], dict[tuple[tuple[str, str], ...], float]] = {}
@@ -76,35 +78,40 @@ class MetricFamilies:
             yield family
 
 
-class PublisherMetrics:
-    """Metrics of publishers."""
+class Collector:
+    """A collector of prometheus-client: the rows that ``add`` adds at each scrape."""
 
-    def __init__(self, publishers: Sequence[SamplePublisher]) -> None:
-        self._publishers = publishers
+    def __init__(self, add: Callable[[MetricFamilies], None]) -> None:
+        self._add = add
 
     def collect(self) -> Iterable[Metric]:
         families = MetricFamilies()
-        count, gauge = families.count, families.gauge
-        for publisher in self._publishers:
-            robot, stats = publisher.robot, publisher.stats
-            if not stats.streams:
-                continue
-            for (wire, stream), counts in stats.streams.items():
-                labels = {"robot": robot, "wire": wire, "stream": stream}
-                count("zstate_publisher_samples", "Samples published.", counts.samples, **labels)
-                count("zstate_publisher_bytes", "Their payloads [bytes].", counts.bytes, **labels)
-                text = "Samples not published because the stream has no reader."
-                count("zstate_publisher_suppressed", text, counts.suppressed, **labels)
-            text = "Samples that could not be published."
-            count("zstate_publisher_refused", text, stats.refused, robot=robot)
-            if (rate := stats.rate) is not None:
-                text = "The commanded rate."
-                gauge("zstate_publisher_commanded_hertz", text, rate.commanded_hz, robot=robot)
-                count("zstate_publisher_ticks", "Ticks of that rate.", rate.ticks, robot=robot)
-                count("zstate_publisher_late_ticks", "Ticks over a period late.", rate.late, robot=robot)
-                text = "Ticks skipped after a long delay."
-                count("zstate_publisher_skipped_ticks", text, rate.skipped, robot=robot)
+        self._add(families)
         return families
+
+
+def add_publishers(families: MetricFamilies, publishers: Sequence[SamplePublisher]) -> None:
+    """Rows of publishers."""
+    count, gauge = families.count, families.gauge
+    for publisher in publishers:
+        robot, stats = publisher.robot, publisher.stats
+        if not stats.streams:
+            continue
+        for (wire, stream), counts in stats.streams.items():
+            labels = {"robot": robot, "wire": wire, "stream": stream}
+            count("zstate_publisher_samples", "Samples published.", counts.samples, **labels)
+            count("zstate_publisher_bytes", "Their payloads [bytes].", counts.bytes, **labels)
+            text = "Samples not published because the stream has no reader."
+            count("zstate_publisher_suppressed", text, counts.suppressed, **labels)
+        text = "Samples that could not be published."
+        count("zstate_publisher_refused", text, stats.refused, robot=robot)
+        if (rate := stats.rate) is not None:
+            text = "The commanded rate."
+            gauge("zstate_publisher_commanded_hertz", text, rate.commanded_hz, robot=robot)
+            count("zstate_publisher_ticks", "Ticks of that rate.", rate.ticks, robot=robot)
+            count("zstate_publisher_late_ticks", "Ticks over a period late.", rate.late, robot=robot)
+            text = "Ticks skipped after a long delay."
+            count("zstate_publisher_skipped_ticks", text, rate.skipped, robot=robot)
 
 
 class Listened(Protocol):
@@ -118,40 +125,33 @@ class Listened(Protocol):
     def buffer(self) -> TransformBuffer: ...
 
 
-class ListenerMetrics:
-    """Metrics of the listeners that ``listeners()`` returns at a scrape.
+def add_listeners(families: MetricFamilies, listeners: Sequence[Listened]) -> None:
+    """Rows of listeners.
 
     Counts are those of each listener: for one of all robots they are totals with the robot "*". Latency and
     lookups need an InstrumentedBuffer.
     """
-
-    def __init__(self, listeners: Callable[[], Sequence[Listened]]) -> None:
-        self._listeners = listeners
-
-    def collect(self) -> Iterable[Metric]:
-        families = MetricFamilies()
-        listeners = sorted(self._listeners(), key=lambda listener: listener.robot)
-        for listener in listeners[:MAX_ROBOTS]:
-            robot, counts, buffer = listener.robot, asdict(listener.stats), listener.buffer
-            text = "Messages that could not be used."
-            for reason, count in counts.pop("refused").items():
-                families.count("zstate_listener_refused", text, count, robot=robot, reason=reason)
-            for name, count in counts.items():
-                text = f"Samples {name.replace('_', ' ')}, as TransformListener.stats counts them."
-                families.count(f"zstate_listener_{name}", text, count, robot=robot)
-            _add_ages(families, listener)
-            if isinstance(buffer, InstrumentedBuffer):
-                text = "Time from a sample's stamp until it could be looked up."
-                latency = buffer.latency_of(robot)
-                families.histogram("zstate_listener_latency_seconds", text, latency, robot=robot)
-                text = "Lookups in the buffer."
-                families.count("zstate_listener_lookups", text, buffer.lookups, robot=robot)
-                for kind, count in buffer.failures.items():
-                    text = "Failed lookups by the kind of the error."
-                    families.count("zstate_listener_lookup_errors", text, count, robot=robot, kind=kind)
-        left_out = max(0, len(listeners) - MAX_ROBOTS)
-        families.gauge("zstate_listener_robots_left_out", "Robots without their own rows.", left_out)
-        return families
+    listeners = sorted(listeners, key=lambda listener: listener.robot)
+    for listener in listeners[:MAX_ROBOTS]:
+        robot, counts, buffer = listener.robot, asdict(listener.stats), listener.buffer
+        text = "Messages that could not be used."
+        for reason, count in counts.pop("refused").items():
+            families.count("zstate_listener_refused", text, count, robot=robot, reason=reason)
+        for name, count in counts.items():
+            text = f"Samples {name.replace('_', ' ')}, as TransformListener.stats counts them."
+            families.count(f"zstate_listener_{name}", text, count, robot=robot)
+        _add_ages(families, listener)
+        if isinstance(buffer, InstrumentedBuffer):
+            text = "Time from a sample's stamp until it could be looked up."
+            latency = buffer.latency_of(robot)
+            families.histogram("zstate_listener_latency_seconds", text, latency, robot=robot)
+            text = "Lookups in the buffer."
+            families.count("zstate_listener_lookups", text, buffer.lookups, robot=robot)
+            for kind, count in buffer.failures.items():
+                text = "Failed lookups by the kind of the error."
+                families.count("zstate_listener_lookup_errors", text, count, robot=robot, kind=kind)
+    left_out = max(0, len(listeners) - MAX_ROBOTS)
+    families.gauge("zstate_listener_robots_left_out", "Robots without their own rows.", left_out)
 
 
 def _add_ages(families: MetricFamilies, listener: Listened) -> None:
@@ -167,105 +167,18 @@ def _add_ages(families: MetricFamilies, listener: Listened) -> None:
         families.gauge("zstate_listener_age_seconds", text, age_s, robot=robot)
 
 
-class WriterMetrics:
-    """Number of writers of each stream, for the robots that ``robots()`` returns at a scrape."""
-
-    def __init__(self, robots: Callable[[], Sequence[RobotInfo]]) -> None:
-        self._robots = robots
-
-    def collect(self) -> Iterable[Metric]:
-        families, robots = MetricFamilies(), self._robots()
-        families.gauge("zstate_robots", "Robots with a writer.", len(robots))
-        for robot in robots[:MAX_ROBOTS]:
-            for stream, _ in robot.writers:
-                families.gauge("zstate_writers", "Live writers.", 1, robot=robot.name, stream=stream)
-        return families
+def add_writers(families: MetricFamilies, robots: Sequence[RobotInfo]) -> None:
+    """The number of writers of each stream of ``robots``."""
+    families.gauge("zstate_robots", "Robots with a writer.", len(robots))
+    for robot in robots[:MAX_ROBOTS]:
+        for stream, _ in robot.writers:
+            families.gauge("zstate_writers", "Live writers.", 1, robot=robot.name, stream=stream)
 
 
-_DRIVER_STATES = ("off", "ready", "active", "holding", "stopped", "fault", "silent")
-
-
-class DriverMetrics:
-    """Metrics of the drivers whose states ``listener`` receives."""
-
-    def __init__(self, listener: DriverStateListener) -> None:
-        self._listener = listener
-
-    def collect(self) -> Iterable[Metric]:
-        families = MetricFamilies()
-        count, gauge = families.count, families.gauge
-        for robot, received in list(self._listener.states().items())[:MAX_ROBOTS]:
-            state = received.state
-            present = state.state if received.is_live else "silent"
-            text = "1 for the present state of a driver; silent if it does not publish any."
-            for name in _DRIVER_STATES:
-                gauge("zstate_driver_state", text, name == present, robot=robot, state=name)
-            gauge("zstate_driver_rate_hertz", "The rate of its loop.", state.rate_hz, robot=robot)
-            count("zstate_driver_ticks", "Ticks of its loop.", state.ticks, robot=robot)
-            count("zstate_driver_skipped_ticks", "Ticks that were missed.", state.skipped, robot=robot)
-            count("zstate_driver_faults", "Calls of the driver that failed.", state.faults, robot=robot)
-            for reason, number in state.refused.items():
-                text = "Commands that were refused."
-                count("zstate_driver_refused", text, number, robot=robot, reason=reason)
-            if state.command_age is not None:
-                age_s = state.command_age * 1e-9 + received.age_s
-                text = "The time since the newest command arrived."
-                gauge("zstate_driver_command_age_seconds", text, age_s, robot=robot)
-            if state.transit_excess is not None:
-                text = "How much longer the newest command was under way than the fastest of its session."
-                excess_s = state.transit_excess * 1e-9
-                gauge("zstate_driver_transit_excess_seconds", text, excess_s, robot=robot)
-        return families
-
-
-class ConnectionMetrics:
-    """Number of connections of a session: for a router its clients, peers and other routers."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-
-    def collect(self) -> Iterable[Metric]:
-        families, current = MetricFamilies(), connections(self._session)
-        for mode, count in current.sessions.items():
-            families.gauge("zstate_router_sessions", "Connected sessions.", count, mode=mode)
-        for protocol, count in current.links.items():
-            families.gauge("zstate_router_links", "Links to them.", count, protocol=protocol)
-        return families
-
-
-class RecorderMetrics:
-    """Metrics of a recorder."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
-
-    def collect(self) -> Iterable[Metric]:
-        families, stats = MetricFamilies(), self._recorder.stats
-        count = families.count
-        for (robot, stream), number in sorted(stats.messages.items())[:_MAX_STREAMS]:
-            count("zstate_recorder_messages", "Messages written.", number, robot=robot, stream=stream)
-        families.gauge("zstate_recorder_size_bytes", "Size of all files.", stats.bytes)
-        families.gauge("zstate_recorder_files", "Files of the recording.", len(stats.files))
-        for name in ("dropped", "missed", "unwritten"):
-            text = f"Samples {name}, as Recorder.stats counts them."
-            count(f"zstate_recorder_{name}", text, getattr(stats, name))
-        for reason, number in stats.refused.items():
-            count("zstate_recorder_refused", "Messages that cannot be written.", number, reason=reason)
-        return families
-
-
-class BridgeMetrics:
-    """Metrics of a bridge."""
-
-    def __init__(self, bridge: Bridge) -> None:
-        self._bridge = bridge
-
-    def collect(self) -> Iterable[Metric]:
-        families = MetricFamilies()
-        for carrier in sorted(self._bridge.carriers, key=lambda carrier: carrier.robot)[:MAX_ROBOTS]:
-            robot, way, text = carrier.robot, carrier.source.direction, "Bridged robots by direction."
-            families.gauge("zstate_bridge_carried", text, carrier.has_model, robot=robot, way=way)
-            for reason, count in carrier.refused.items():
-                text = "Messages that could not be bridged."
-                families.count("zstate_bridge_refused", text, count, robot=robot, reason=reason)
-        return families
+def add_connections(families: MetricFamilies, session: Session) -> None:
+    """The number of connections of a session: for a router its clients, peers and other routers."""
+    current = connections(session)
+    for mode, count in current.sessions.items():
+        families.gauge("zstate_router_sessions", "Connected sessions.", count, mode=mode)
+    for protocol, count in current.links.items():
+        families.gauge("zstate_router_links", "Links to them.", count, protocol=protocol)

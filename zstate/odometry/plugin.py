@@ -89,5 +89,10 @@ PLUGIN = Plugin(
             "Publish where the base of a robot is, from its IMU and its wheels.",
         ),
     },
+    synonyms={
+        "ekf_node": "odometry",
+        "navsat_transform": "odometry",
+        "robot_localization": "odometry",
+    },
     checks="zstate.odometry.cli.checks:DatumChecks",
 )

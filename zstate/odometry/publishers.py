@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from operator import index
+from typing import ClassVar
 
 from numpy.typing import ArrayLike
 
@@ -27,17 +28,40 @@ from zstate.odometry.messages import (
     Pressure,
     Velocity,
 )
+from zstate.streams import StreamName
 from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
 from zstate.wire.keys import check_writer, full_name
 from zstate.wire.messages import to_block
 
 
-class ImuPublisher(MeasurementPublisher):
+class _SensorPublisher(MeasurementPublisher):
+    """Base of the publishers of one sensor that measures in the axes of ``frame``."""
+
+    _stream: ClassVar[StreamName]
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        sensor: str | None = None,
+        wires: str | Sequence[str] = ("native",),
+        *,
+        frame: str | None = None,
+        clock: Clock | None = None,
+        program: str = "",
+    ) -> None:
+        sensor = self._stream if sensor is None else sensor
+        self.frame = sensor if frame is None else frame
+        full_name(robot, self.frame)  # raises here, where the mistake is made
+        super().__init__(session, robot, self._stream, sensor, wires=wires, clock=clock, program=program)
+
+
+class ImuPublisher(_SensorPublisher):
     """Publishes the readings of one inertial measurement unit of a robot.
 
-    ``sensor`` is its name, in ROS its topic. Its axes are those of ``frame``, by default a frame of the
-    sensor's name; a bare name is the robot's own. The covariances of its numbers, (3, 3), are published with
-    each reading if they are given.
+    ``sensor`` is its name, in ROS its topic; by default that of the stream. Its axes are those of ``frame``,
+    by default a frame of the sensor's name; a bare name is the robot's own. The covariances of its numbers,
+    (3, 3), are published with each reading if they are given.
 
     Under congestion readings are dropped, and joining listeners receive none from the past. On the native
     wire each sensor has one writer: SecondWriter, which names the first one, is raised if another writer
@@ -45,11 +69,13 @@ class ImuPublisher(MeasurementPublisher):
     script's name by default. A context manager; safe from any thread.
     """
 
+    _stream = "imu"
+
     def __init__(
         self,
         session: Session,
         robot: str,
-        sensor: str = "imu",
+        sensor: str | None = None,
         wires: str | Sequence[str] = ("native",),
         *,
         frame: str | None = None,
@@ -58,13 +84,11 @@ class ImuPublisher(MeasurementPublisher):
         clock: Clock | None = None,
         program: str = "",
     ) -> None:
-        self.frame = sensor if frame is None else frame
         self._covariances = (
             _covariance(gyro_covariance, "gyro_covariance", 3),
             _covariance(accel_covariance, "accel_covariance", 3),
         )
-        full_name(robot, self.frame)  # raises here, where the mistake is made
-        super().__init__(session, robot, "imu", sensor, wires=wires, clock=clock, program=program)
+        super().__init__(session, robot, sensor, wires, frame=frame, clock=clock, program=program)
 
     def publish(
         self,
@@ -90,27 +114,14 @@ class ImuPublisher(MeasurementPublisher):
             self._send(Imu(stamp, 0, 0, self.frame, *vectors, turn, *self._covariances, turn_covariance))
 
 
-class VelocityPublisher(MeasurementPublisher):
+class VelocityPublisher(_SensorPublisher):
     """Publishes the velocities that one sensor of a robot measures: optical flow, a Doppler log, a leg.
 
     A velocity is that of ``frame`` relative to the world, in its own axes. Sensors, frames, writers and
     threads are those of ``ImuPublisher``.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        robot: str,
-        sensor: str = "velocity",
-        wires: str | Sequence[str] = ("native",),
-        *,
-        frame: str | None = None,
-        clock: Clock | None = None,
-        program: str = "",
-    ) -> None:
-        self.frame = sensor if frame is None else frame
-        full_name(robot, self.frame)
-        super().__init__(session, robot, "velocity", sensor, wires=wires, clock=clock, program=program)
+    _stream = "velocity"
 
     def publish(
         self,
@@ -172,27 +183,14 @@ class PosePublisher(MeasurementPublisher):
             self._send(Pose(stamp, 0, 0, parent, child, pose, triangle))
 
 
-class FixPublisher(MeasurementPublisher):
+class FixPublisher(_SensorPublisher):
     """Publishes the positions of one satellite receiver (GPS, GNSS) of a robot on the Earth.
 
     A position is that of the antenna, the origin of ``frame``. Sensors, frames, writers and threads are those
     of ``ImuPublisher``.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        robot: str,
-        sensor: str = "fix",
-        wires: str | Sequence[str] = ("native",),
-        *,
-        frame: str | None = None,
-        clock: Clock | None = None,
-        program: str = "",
-    ) -> None:
-        self.frame = sensor if frame is None else frame
-        full_name(robot, self.frame)
-        super().__init__(session, robot, "fix", sensor, wires=wires, clock=clock, program=program)
+    _stream = "fix"
 
     def publish(
         self,
@@ -229,26 +227,13 @@ class FixPublisher(MeasurementPublisher):
             )
 
 
-class PressurePublisher(MeasurementPublisher):
+class PressurePublisher(_SensorPublisher):
     """Publishes the readings of one barometer of a robot.
 
     Sensors, frames, writers and threads are those of ``ImuPublisher``.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        robot: str,
-        sensor: str = "pressure",
-        wires: str | Sequence[str] = ("native",),
-        *,
-        frame: str | None = None,
-        clock: Clock | None = None,
-        program: str = "",
-    ) -> None:
-        self.frame = sensor if frame is None else frame
-        full_name(robot, self.frame)
-        super().__init__(session, robot, "pressure", sensor, wires=wires, clock=clock, program=program)
+    _stream = "pressure"
 
     def publish(self, pressure: float, stamp: int | None = None, *, variance: float | None = None) -> None:
         """Publish one absolute ``pressure`` [Pa] at ``stamp`` [ns]; default: now.
@@ -294,18 +279,20 @@ class DatumPublisher(ValuePublisher):
             self.datum = datum
 
 
-class MagneticFieldPublisher(MeasurementPublisher):
+class MagneticFieldPublisher(_SensorPublisher):
     """Publishes the magnetic fields that one magnetometer of a robot measures, in the axes of ``frame``.
 
     ``covariance`` [T^2], (3, 3), is published with each of them if it is given. Sensors, frames, writers and
     threads are those of ``ImuPublisher``.
     """
 
+    _stream = "magnetic_field"
+
     def __init__(
         self,
         session: Session,
         robot: str,
-        sensor: str = "magnetic_field",
+        sensor: str | None = None,
         wires: str | Sequence[str] = ("native",),
         *,
         frame: str | None = None,
@@ -313,10 +300,8 @@ class MagneticFieldPublisher(MeasurementPublisher):
         clock: Clock | None = None,
         program: str = "",
     ) -> None:
-        self.frame = sensor if frame is None else frame
         self._covariance = _covariance(covariance, "covariance", 3)
-        full_name(robot, self.frame)
-        super().__init__(session, robot, "magnetic_field", sensor, wires=wires, clock=clock, program=program)
+        super().__init__(session, robot, sensor, wires, frame=frame, clock=clock, program=program)
 
     def publish(self, field: ArrayLike, stamp: int | None = None) -> None:
         """Publish one field at ``stamp`` [ns]; default: now.

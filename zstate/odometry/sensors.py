@@ -1,12 +1,14 @@
 """The kinds of sensors that an odometry takes: their streams, and how a message is passed to the estimators.
 
 Live odometry (``node.py``), recordings and the command line know no kind by name: they go through ``KINDS``.
+What its noise is and may be is in ``source_noise.py``, and its option is in the command.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +45,19 @@ class Estimators(NamedTuple):
     in_map: MapEstimator | None = None
 
 
-class SensorKind(NamedTuple):
+class MeasuredMotion(NamedTuple):
+    """What messages show of the motion of a base, each (n,): its yaw or the rate of that, its speed ahead."""
+
+    yaw: Floats | None = None
+    """[rad]"""
+    yaw_rate: Floats | None = None
+    """[rad/s]"""
+    speed: Floats | None = None
+    """[m/s]"""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorKind:
     """What makes the messages of ``streams`` a source.
 
     ``name`` is that of its option and of its table of settings, which have the fields of ``noise``. A sensor
@@ -52,6 +66,13 @@ class SensorKind(NamedTuple):
     that of its numbers, None if only the estimator knows it. Both raise InvalidInput, with what to do, if
     the noise is not known, and for a message that measures nothing. ``is_enough``: with an IMU and nothing
     else it keeps the place from drifting by metres in seconds. ``text`` tells of a source, by its sensor.
+
+    ``motion(messages, base_from)`` is what they show of the motion of the base; ``base_from(frame)`` is the
+    rotation of a frame on it, (3, 3).
+
+    In a first file of settings, ``left_out(messages, odom)`` is why it is not used by default: empty if it
+    is, None if the messages are not of this kind. ``variances(message)`` are those that a message states,
+    None if it does not, and ``sigmas`` makes settings of their roots; ``usual`` are settings in their place.
     """
 
     name: str
@@ -61,6 +82,11 @@ class SensorKind(NamedTuple):
     covariance: Callable[[str, Any, Any], Floats | None] | None = None
     is_enough: bool = False
     text: str = "{!r}"
+    motion: Callable[[Sequence[Any], Callable[[str], Floats]], MeasuredMotion] | None = None
+    left_out: Callable[[Sequence[Any], str], str | None] = lambda messages, odom: ""
+    variances: Callable[[Any], Floats | None] = lambda message: None
+    sigmas: Callable[[Floats], Mapping[str, Floats]] = lambda sigmas: {"sigma": sigmas}
+    usual: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 class Sensor(NamedTuple):
@@ -151,6 +177,15 @@ def add_velocity(estimators: Estimators, sensor: str, noise: VelocityNoise, mess
     )
 
 
+def velocity_motion(messages: Sequence[Velocity], base_from: Callable[[str], Floats]) -> MeasuredMotion:
+    """Their speed, and the rate of their yaw if all of them measure it."""
+    rotation = base_from(messages[0].frame)
+    speed = (np.array([from_block(one.linear) for one in messages]) @ rotation.T)[:, 0]
+    rates = [from_block(one.angular) for one in messages if one.angular is not None]
+    yaw_rate = (np.array(rates) @ rotation.T)[:, 2] if len(rates) == len(messages) else None
+    return MeasuredMotion(yaw_rate=yaw_rate, speed=speed)
+
+
 def pose_covariance(sensor: str, noise: PoseNoise, message: Pose) -> Floats:
     """That of a pose, (6, 6), as of ``Transform.covariance``: by ``noise``, else of the message.
 
@@ -183,6 +218,25 @@ def add_pose(estimators: Estimators, sensor: str, noise: PoseNoise, message: Pos
     )
 
 
+def pose_motion(messages: Sequence[Pose | Odometry], base_from: object) -> MeasuredMotion:
+    """Their yaw."""
+    blocks = [one.poses if isinstance(one, Odometry) else one.pose for one in messages]
+    x, y, z, w = np.array([from_block(block)[3:] for block in blocks]).T
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return MeasuredMotion(yaw=np.unwrap(yaw))
+
+
+def _parents(messages: Sequence[Pose | Odometry]) -> set[str]:
+    """The frames in which measured poses are."""
+    return {one.parent for one in messages if isinstance(one, Pose)}
+
+
+def _pose_left_out(messages: Sequence[Pose], odom: str) -> str:
+    if (parents := _parents(messages)) == {odom}:
+        return ""
+    return f"its poses are in {', '.join(sorted(parents))}, not in {odom}; see [relative]"
+
+
 def heading_covariance(sensor: str, noise: HeadingNoise, message: Imu) -> Floats:
     """That of the yaw of an orientation [rad^2], (1, 1): by ``noise``, else of the message.
 
@@ -213,6 +267,12 @@ def add_heading(estimators: Estimators, sensor: str, noise: HeadingNoise, messag
     )
 
 
+def _heading_left_out(messages: Sequence[Imu], odom: str) -> str | None:
+    if all(one.orientation is None for one in messages):
+        return None
+    return "motors and floors turn a compass; see the guide"
+
+
 def relative_covariance(sensor: str, noise: RelativeNoise, message: Pose | Odometry) -> None:
     """None: that of a displacement is by two poses. Raises InvalidInput for covariances that are needed."""
     known = message.covariances if isinstance(message, Odometry) else message.covariance
@@ -235,6 +295,12 @@ def add_relative(estimators: Estimators, sensor: str, noise: RelativeNoise, mess
     pose = Transform.from_pose7(world, frame or base.base, from_block(numbers))
     covariance = None if known is None else covariance_matrix(known)
     base.relative_pose(message.stamp, pose, covariance, source=sensor, noise=noise)
+
+
+def _relative_left_out(messages: Sequence[Pose | Odometry], odom: str) -> str | None:
+    if all(isinstance(one, Pose) and one.parent == odom for one in messages):
+        return None
+    return "for another odometry, of which only the motion counts; not for a pose in a map by GPS"
 
 
 def magnetometer_covariance(sensor: str, noise: MagnetometerNoise, message: MagneticField) -> Floats:
@@ -287,6 +353,14 @@ def add_fix(estimators: Estimators, sensor: str, noise: FixNoise, message: Fix) 
     )
 
 
+def fix_variances(message: Fix) -> Floats | None:
+    """Those of x, y and z [m^2] that a fix states; None unless all are above zero."""
+    if message.covariance is None:
+        return None
+    variances = np.diag(covariance_matrix(message.covariance))
+    return variances if (variances > 0.0).all() else None
+
+
 def barometer_covariance(sensor: str, noise: BarometerNoise, message: Pressure) -> Floats:
     """That of the height [m^2], (1, 1), without what weather does: by ``noise``, else of the message.
 
@@ -319,9 +393,49 @@ def _unknown(covariance: Floats | None) -> str:
     return "no covariance" if covariance is None else "a covariance with variances that are not above zero"
 
 
+def _variances_by(
+    covariance: Callable[[str, Any, Any], Floats], noise: SensorNoise
+) -> Callable[[Any], Floats | None]:
+    """The variances that a message states: without any, ``covariance`` refuses it with such a ``noise``."""
+
+    def variances(message: Any) -> Floats | None:
+        try:
+            return np.diag(covariance("", noise, message))
+        except InvalidInput:
+            return None
+
+    return variances
+
+
+def _see_the_guide(messages: object, odom: object) -> str:
+    return "see the guide"
+
+
 KINDS = (
-    SensorKind("velocity", ("velocity",), VelocityNoise, add_velocity, velocity_covariance, is_enough=True),
-    SensorKind("pose", ("pose",), PoseNoise, add_pose, pose_covariance, is_enough=True),
+    SensorKind(
+        "velocity",
+        ("velocity",),
+        VelocityNoise,
+        add_velocity,
+        velocity_covariance,
+        is_enough=True,
+        motion=velocity_motion,
+        variances=_variances_by(velocity_covariance, VelocityNoise()),
+        usual={"sigma": 0.05},
+    ),
+    SensorKind(
+        "pose",
+        ("pose",),
+        PoseNoise,
+        add_pose,
+        pose_covariance,
+        is_enough=True,
+        motion=pose_motion,
+        left_out=_pose_left_out,
+        variances=_variances_by(pose_covariance, PoseNoise()),
+        sigmas=lambda sigmas: {"sigma": sigmas[:3], "sigma_deg": np.degrees(sigmas[3:])},
+        usual={"sigma": 0.02, "sigma_deg": 1.0},
+    ),
     SensorKind(
         "relative",
         ("pose", "odometry"),
@@ -330,9 +444,20 @@ KINDS = (
         relative_covariance,
         is_enough=True,
         text="the motion by {!r}",
+        motion=pose_motion,
+        left_out=_relative_left_out,
     ),
     SensorKind(
-        "heading", ("imu",), HeadingNoise, add_heading, heading_covariance, text="the heading of {!r}"
+        "heading",
+        ("imu",),
+        HeadingNoise,
+        add_heading,
+        heading_covariance,
+        text="the heading of {!r}",
+        left_out=_heading_left_out,
+        variances=_variances_by(heading_covariance, HeadingNoise()),
+        sigmas=lambda sigmas: {"sigma_deg": np.degrees(sigmas)},
+        usual={"sigma_deg": 5.0},
     ),
     SensorKind(
         "magnetometer",
@@ -341,9 +466,27 @@ KINDS = (
         add_magnetic_field,
         magnetometer_covariance,
         text="the magnetometer {!r}",
+        left_out=_see_the_guide,
     ),
-    SensorKind("fix", ("fix",), FixNoise, add_fix),
-    SensorKind("barometer", ("pressure",), BarometerNoise, add_pressure, barometer_covariance),
+    SensorKind(
+        "fix",
+        ("fix",),
+        FixNoise,
+        add_fix,
+        variances=fix_variances,
+        sigmas=lambda sigmas: {"sigma": np.array((sigmas[:2].max(), sigmas[2]))},
+        usual={"sigma": 2.5},
+    ),
+    SensorKind(
+        "barometer",
+        ("pressure",),
+        BarometerNoise,
+        add_pressure,
+        barometer_covariance,
+        left_out=_see_the_guide,
+        variances=_variances_by(barometer_covariance, BarometerNoise()),
+        usual={"sigma": 0.5},
+    ),
 )
 
 SENSOR_STREAMS = tuple(dict.fromkeys(("imu", *(stream for kind in KINDS for stream in kind.streams))))

@@ -33,4 +33,12 @@ PLUGIN = Plugin(
             "Joint positions, or the path of a frame, over time.",
         ),
     },
+    synonyms={
+        "bag": "record | replay | info",
+        "play": "replay",
+        "ros2_bag": "record | replay | info",
+        "rosbag": "record | replay | info",
+        "rqt": "plot",
+        "rqt_plot": "plot",
+    },
 )

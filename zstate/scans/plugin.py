@@ -39,5 +39,12 @@ PLUGIN = Plugin(
         ),
         "map": Command("zstate.scans.cli.map:map_command", "Write", "Publish the map of a place."),
     },
+    synonyms={
+        "dummy_laser": "scan ROBOT --frame FRAME --dummy",
+        "dummy_map_server": "map FILE.yaml",
+        "laser": "scan ROBOT --frame FRAME --simulate MAP.yaml",
+        "lidar": "scan ROBOT --frame FRAME --simulate MAP.yaml",
+        "map_server": "map FILE.yaml",
+    },
     checks="zstate.scans.cli.checks:MapChecks",
 )

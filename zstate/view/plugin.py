@@ -9,5 +9,11 @@ PLUGIN = Plugin(
             "zstate.view.cli:view_command", "Look", "The robots, drawn in a browser, and moved from there."
         ),
     },
+    synonyms={
+        "joint_state_publisher_gui": "view ROBOT --sliders",
+        "rqt": "view",
+        "rviz": "view",
+        "rviz2": "view",
+    },
     needs=("driving", "recording", "scans"),
 )

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
+from zstate.bridges.cli.metrics import bridge_rows
 from zstate.cli import options
-from zstate.cli.metrics import bridge_collector, serve_metrics
+from zstate.cli.metrics import serve_metrics
 from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import Unreachable
@@ -73,7 +74,7 @@ def bridge_command(
         print_wrapped(f"bridging {names} between native and {wire} at {ros}")
         with (
             Bridge(native, session, wire, robots, on_change=print_change) as bridge,
-            serve_metrics(metrics, bridge_collector(bridge)),
+            serve_metrics(metrics, bridge_rows(bridge)),
         ):
             print_status("a robot is carried once its robot_description arrives")
             wait_interruptible(threading.Event())

@@ -175,10 +175,7 @@ def _rover(xacro_args: Mapping[str, str]) -> Demo:
         model,
         rover.ROVER_ODOM,
         (rover.ROVER_LASER, "left_wheel", "right_wheel"),
-        {
-            "wheels": ("demo", "--program", "wheels"),
-            "odometry": ("odometry", _ROVER, "--file", str(rover.settings_file())),
-        },
+        rover.programs(),
         ("joint_states", "transforms"),
         advice="it drives a square until it is commanded: zstate move rover --keys {connect}",
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli import options
-from zstate.cli.metrics import publisher_collector, serve_metrics
+from zstate.cli.metrics import publisher_rows, serve_metrics
 from zstate.cli.options import load_robot
 from zstate.cli.output.console import count_text, print_wrapped
 from zstate.cli.output.wire_text import messages_for
@@ -81,6 +81,6 @@ def joints_command(
             )
             shown = f"on {count_text(len(model.joint_names), 'joint')}"
             place = messages_for(wire).place(robot_name, ("joint_states",))
-        with publisher, serve_metrics(metrics, publisher_collector(publisher)):
+        with publisher, serve_metrics(metrics, publisher_rows(publisher)):
             print_wrapped(f"{robot_name}: a sine {shown}, {rate:g} Hz, on {place}")
             run_publisher(publisher, SineSource(publisher.model), rate, seconds)

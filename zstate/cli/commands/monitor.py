@@ -13,7 +13,7 @@ import click
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.cli import options
-from zstate.cli.metrics import driver_collector, listener_collector, serve_metrics, writer_collector
+from zstate.cli.metrics import listener_rows, plugin_rows, serve_metrics, writer_rows
 from zstate.cli.options import open_clock
 from zstate.cli.output.console import (
     fail,
@@ -130,10 +130,10 @@ def monitor_command(
     ):
         if robots:
             monitor = opened.enter_context(RobotMonitor(session, directory, robot, wire, selected_clock))
-            collectors = [listener_collector(monitor.robots), writer_collector(directory)]
-            if monitor.drivers is not None:
-                collectors.append(driver_collector(monitor.drivers))
-            opened.enter_context(serve_metrics(metrics, *collectors))
+            if metrics is not None:
+                rows = [listener_rows(monitor.robots), writer_rows(directory)]
+                rows += opened.enter_context(plugin_rows(session, robot))
+                opened.enter_context(serve_metrics(metrics, *rows))
             _report_robots(monitor, once_s, as_json=as_json)
             return
         listener = opened.enter_context(

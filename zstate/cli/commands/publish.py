@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import click
 
 from zstate.cli import options
-from zstate.cli.metrics import publisher_collector, serve_metrics
+from zstate.cli.metrics import publisher_rows, serve_metrics
 from zstate.cli.options import load_robot, open_clock
 from zstate.cli.output.console import count_text, fail, print_status, print_wrapped, report_text
 from zstate.cli.output.wire_text import is_ros, messages_for
@@ -120,7 +120,7 @@ def publish_command(
             session, model, robot_name, derived_wires, streams=_DERIVED, clock=time, takeover=takeover
         ) as derived,
         StatePublisher(session, model, robot_name, whole_wires, clock=time, takeover=takeover) as whole,
-        serve_metrics(metrics, publisher_collector(derived, whole)),
+        serve_metrics(metrics, publisher_rows(derived, whole)),
     ):
         places = [messages_for(wire).place(robot_name, _DERIVED) for wire in derived_wires]
         places += [messages_for(wire).place(robot_name, _EVERYTHING) for wire in whole_wires]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from zstate.cli import options
-from zstate.cli.metrics import publisher_collector, serve_metrics
+from zstate.cli.metrics import publisher_rows, serve_metrics
 from zstate.cli.output.console import count_text, print_status, print_wrapped
 from zstate.cli.output.wire_text import messages_for
 from zstate.cli.session import SessionOptions, open_session
@@ -108,7 +108,7 @@ def _publish_pose(  # noqa: PLR0917 - one use, in the order of the options
     with (
         open_session(network, (wire,)) as session,
         _open_publisher(session, wire, robot, writer, edge) as publisher,
-        serve_metrics(metrics, publisher_collector(publisher)),
+        serve_metrics(metrics, publisher_rows(publisher)),
     ):
         publisher.publish([edge])
         print_wrapped(f"{pose_text(edge)}, {rate_hz:g} Hz, {_place_text(publisher, wire)}")
@@ -137,7 +137,7 @@ def _publish_lines(
             if first is not None:
                 with (
                     _open_publisher(session, wire, robot, writer, first) as publisher,
-                    serve_metrics(metrics, publisher_collector(publisher)),
+                    serve_metrics(metrics, publisher_rows(publisher)),
                 ):
                     print_wrapped(
                         f"publishing the transforms of standard input {_place_text(publisher, wire)}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli import options
-from zstate.cli.metrics import connection_collector, serve_metrics, writer_collector
+from zstate.cli.metrics import connection_rows, serve_metrics, writer_rows
 from zstate.cli.output.console import fail, print_result, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
@@ -138,7 +138,7 @@ def _run(
     with (
         open_session(network) as session,
         RobotDirectory(session) as directory,
-        serve_metrics(metrics, connection_collector(session), writer_collector(directory)),
+        serve_metrics(metrics, connection_rows(session), writer_rows(directory)),
     ):
         place = ", ".join(listen) or f"the endpoints in {file!r}"
         print_wrapped(f"router {session.zid} listens at {place}")

@@ -23,8 +23,8 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import Floats
 from zstate.model.joint_history import JointHistory
 from zstate.odometry import Wheels
-from zstate.odometry.messages import Imu, Odometry, Pose, Velocity
-from zstate.streams import StreamName
+from zstate.odometry.messages import Imu
+from zstate.odometry.sensors import SensorKind
 from zstate.wire.messages import StampedMessage, from_block
 
 _REACH_S, _STEP_S = 0.5, 0.01
@@ -72,32 +72,20 @@ class Motions:
         )
         self._yaw, self._speed = _integrated(seconds, gyro[:, 2]), _integrated(seconds, accel[:, 0])
 
-    def delay_of(self, stream: StreamName, messages: Sequence[Any]) -> Delay | None:
-        """That of a sensor whose messages show a yaw or a speed; None for one of another stream."""
-        if stream == "velocity":
-            return self.delay(*self.of_velocities(messages))
-        return self.delay(self.of_poses(messages), None) if stream in ("pose", "odometry") else None
+    def delay_of(self, kind: SensorKind, messages: Sequence[Any]) -> Delay | None:
+        """That of a sensor whose messages show a yaw or a speed; None for one of another kind."""
+        if kind.motion is None:
+            return None
+        motion, seconds = kind.motion(messages, self._rotation), self._times(messages)
+        yaw = None if motion.yaw is None else Series(seconds, motion.yaw)
+        if motion.yaw_rate is not None:
+            yaw = _integrated(seconds, motion.yaw_rate)
+        return self.delay(yaw, None if motion.speed is None else Series(seconds, motion.speed))
 
     def delay(self, yaw: Series | None, speed: Series | None) -> Delay | None:
         """That of a source with this yaw and this speed, where it has them."""
         pairs = ((self._yaw, yaw), (self._speed, speed))
         return _surest_delay((imu, source) for imu, source in pairs if source is not None)
-
-    def of_velocities(self, messages: Sequence[Velocity]) -> tuple[Series | None, Series]:
-        """Their yaw, if they measure it, and their speed."""
-        rotation, seconds = self._rotation(messages[0].frame), self._times(messages)
-        speed = Series(seconds, (np.array([from_block(one.linear) for one in messages]) @ rotation.T)[:, 0])
-        rates = [from_block(one.angular) for one in messages if one.angular is not None]
-        if len(rates) < len(messages):
-            return None, speed
-        return _integrated(seconds, (np.array(rates) @ rotation.T)[:, 2]), speed
-
-    def of_poses(self, messages: Sequence[Pose | Odometry]) -> Series:
-        """Their yaw."""
-        blocks = [one.poses if isinstance(one, Odometry) else one.pose for one in messages]
-        x, y, z, w = np.array([from_block(block)[3:] for block in blocks]).T
-        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        return Series(self._times(messages), np.unwrap(yaw))
 
     def of_wheels(self, wheels: Wheels, joints: JointHistory) -> tuple[Series, Series]:
         """Their yaw at the readings, and their speed in the middle between two of them."""

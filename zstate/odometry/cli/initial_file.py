@@ -11,17 +11,15 @@ from typing import Any
 import numpy as np
 
 from zstate._util.format import format_duration
-from zstate.errors import InvalidInput
 from zstate.odometry import ImuNoise, WheelNoise
 from zstate.odometry.cli.heard import Heard, density_at_rest, motion_text
 from zstate.odometry.cli.settings_file import MEMS_NOISE, OdometrySettings, table_name
 from zstate.odometry.cli.wheel_geometry import ProposedWheels, proposed_wheels
-from zstate.odometry.messages import Fix, Imu, Pose, frame_of
+from zstate.odometry.messages import Imu, frame_of
 from zstate.odometry.sensors import KINDS, SensorKind
 from zstate.odometry.source_noise import SourceNoise
 from zstate.streams import StreamName
 from zstate.wire.keys import full_name
-from zstate.wire.messages import covariance_matrix
 
 _COLUMN = 30
 """The width of keys before their comments [letters]."""
@@ -69,15 +67,6 @@ MEANINGS = {
     "wheels.scale": "a constant relative error of the radius",
 }
 """What a key means, by itself or with its table."""
-
-_USUAL = {
-    "velocity": {"sigma": 0.05},
-    "pose": {"sigma": 0.02, "sigma_deg": 1.0},
-    "heading": {"sigma_deg": 5.0},
-    "fix": {"sigma": 2.5},
-    "barometer": {"sigma": 0.5},
-}
-"""Noise that is stated for sensors whose messages have none, until the user does."""
 
 
 @dataclass(frozen=True)
@@ -239,41 +228,25 @@ class _Sensor:
         self.kind = kind
         self._stream, self._name, self._heard, self._base = stream, name, heard, settings.base
         self._messages = heard.messages[stream][name]
-        self._odom = full_name(heard.robot, settings.odom)
-        self._off = self._reason_off()
-        self.is_used = not self._off
+        self._left_out = kind.left_out(self._messages, full_name(heard.robot, settings.odom))
+        if self._left_out is not None and not self._messages:
+            self._left_out = "it is announced, and silent"
 
     @property
     def is_possible(self) -> bool:
         """Whether it is such a sensor at all: not every IMU has an orientation."""
-        if self.kind.name == "heading":
-            return any(one.orientation is not None for one in self._messages)
-        if self.kind.name == "relative" and self._stream == "pose":
-            return bool(self._worlds - {self._odom})
-        return True
+        return self._left_out is not None
 
     @property
-    def _worlds(self) -> set[str]:
-        """The frames in which its poses are."""
-        return {one.parent for one in self._messages if isinstance(one, Pose)}
-
-    def _reason_off(self) -> str:
-        """Why it is not used; empty if it is."""
-        if not self._messages:
-            return "it is announced, and silent"
-        if self.kind.name == "pose" and self._worlds != {self._odom}:
-            return f"its poses are in {', '.join(sorted(self._worlds))}, not in {self._odom}; see [relative]"
-        if self.kind.name == "relative":
-            return "for another odometry, of which only the motion counts; not for a pose in a map by GPS"
-        if self.kind.name == "heading":
-            return "motors and floors turn a compass; see the guide"
-        return "" if self.kind.name in {"velocity", "pose", "fix"} else "see the guide"
+    def is_used(self) -> bool:
+        """Whether it is a source by default."""
+        return self._left_out == ""
 
     def lines(self) -> Iterator[str]:
         """Its table."""
         yield ""
-        if self._off:
-            yield f"# Off: {self._off}."
+        if self._left_out:
+            yield f"# Off: {self._left_out}."
         about = _stream_text(self._stream, self._name, self._messages, self._heard, self._base)
         name = self._name if len(self.kind.streams) == 1 else f"{self._stream}/{self._name}"
         yield _table(table_name(self.kind, name), about, is_used=self.is_used)
@@ -285,38 +258,22 @@ class _Sensor:
             elif name == "place":
                 yield _key(name, _PLACE, meaning, is_used=False)
             elif default is None:
-                value = _USUAL[self.kind.name][name]
-                yield _key(name, value, f"{meaning}; messages have none: state it", is_used=self.is_used)
+                yield _key(
+                    name,
+                    self.kind.usual[name],
+                    f"{meaning}; messages have none: state it",
+                    is_used=self.is_used,
+                )
             else:
                 yield _key(name, default, meaning, is_used=False)
 
     def _sigmas(self) -> dict[str, Any]:
         """The medians of the standard deviations that its messages state, as values of keys."""
-        found = [known for one in self._messages if (known := self._variances(one)) is not None]
+        found = [known for one in self._messages if (known := self.kind.variances(one)) is not None]
         if not found:
             return {}
-        sigmas = np.sqrt(np.median(found, axis=0))
-        if self.kind.name == "fix":
-            return {"sigma": _rounded((max(sigmas[:2]), sigmas[2]))}
-        if self.kind.name == "heading":
-            return {"sigma_deg": _rounded(np.degrees(sigmas))}
-        metres = {"sigma": _rounded(sigmas[:3])}
-        return metres if len(sigmas) == 3 else {**metres, "sigma_deg": _rounded(np.degrees(sigmas[3:]))}
-
-    def _variances(self, message: Any) -> Any:
-        """Those of the numbers of a message; None if it does not state them."""
-        if isinstance(message, Fix):
-            known = message.covariance
-            variances = np.zeros(3) if known is None else np.diag(covariance_matrix(known))
-            return variances if (variances > 0.0).all() else None
-        noise = self.kind.noise()
-        if self.kind.covariance is None or getattr(noise, "sigma_deg", None) is not None:
-            return None  # what messages state is of no use for it
-        try:
-            known = self.kind.covariance(self._name, noise, message)
-        except InvalidInput:
-            return None
-        return None if known is None else np.diag(known)
+        sigmas = self.kind.sigmas(np.sqrt(np.median(found, axis=0)))
+        return {key: _rounded(values) for key, values in sigmas.items()}
 
 
 def _stream_text(stream: str, name: str, messages: Sequence[Any], heard: Heard, base: str | None) -> str:

@@ -163,7 +163,7 @@ def replay(
         if covariances:
             variances = [np.maximum(np.diag(known), 0.0) for known in covariances]  # -1 is not known
             sigmas[one.name] = np.sqrt(np.median(variances, axis=0))
-        key, delay = f"[{table_name(one.kind, one.name)}] delay_s", motions.delay_of(one.stream, messages)
+        key, delay = f"[{table_name(one.kind, one.name)}] delay_s", motions.delay_of(one.kind, messages)
         delays.append((one.name, key, one.noise.delay_s, delay))
         events += [(message.stamp, False, partial(one.add, estimators, message)) for message in messages]
     if joints is not None:

@@ -59,6 +59,14 @@ def settings_file() -> Path:
     return _file("rover.toml")
 
 
+def programs() -> dict[str, tuple[str, ...]]:
+    """The arguments of the `zstate` processes that publish the rover, by name."""
+    return {
+        "wheels": ("demo", "--program", "wheels"),
+        "odometry": ("odometry", ROVER, "--file", str(settings_file())),
+    }
+
+
 def load_room() -> Grid | None:
     """The room of the rover; None without the libraries that read maps."""
     from zstate.scans import load_map

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli import options
-from zstate.cli.metrics import recorder_collector, serve_metrics, writer_collector
+from zstate.cli.metrics import serve_metrics, writer_rows
 from zstate.cli.output.console import (
     count_text,
     fail,
@@ -25,6 +25,7 @@ from zstate.cli.output.console import (
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput
+from zstate.recording.cli.metrics import recorder_rows
 
 if TYPE_CHECKING:
     from zstate.clock import Clock
@@ -143,7 +144,7 @@ def record_command(
         with (
             recorder,
             RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as directory,
-            serve_metrics(metrics, recorder_collector(recorder), writer_collector(directory)),
+            serve_metrics(metrics, recorder_rows(recorder), writer_rows(directory)),
         ):
             progress = RecordProgress(recorder, directory, robots, retention)
             try:

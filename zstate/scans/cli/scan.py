@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli import options
-from zstate.cli.metrics import publisher_collector, serve_metrics
+from zstate.cli.metrics import publisher_rows, serve_metrics
 from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.cli.output.wire_text import messages_for
 from zstate.cli.session import SessionOptions, open_session
@@ -128,7 +128,7 @@ def scan_command(
             frame=frame,
         )
         opened.enter_context(publisher)
-        opened.enter_context(serve_metrics(metrics, publisher_collector(publisher)))
+        opened.enter_context(serve_metrics(metrics, publisher_rows(publisher)))
         places = [messages_for(wire).place(robot, ("scan",)) for wire in wires]
         places = [f"{one}/{sensor}" if one.startswith("zstate/") else one for one in places]
         print_wrapped(f"{robot}: scans in {frame}, {rate:g} Hz, on {' and on '.join(places)}")
