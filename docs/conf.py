@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
 import tomllib
 from dataclasses import is_dataclass
 from pathlib import Path
@@ -19,13 +18,10 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.inspect import TypeAliasForwardRef
 
+import zstate
+
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
-sys.path.insert(0, str(DOCS))
-
-from command_reference import command_reference  # noqa: E402
-
-import zstate  # noqa: E402
 
 project = "zstate"
 author = "the zstate authors"
@@ -134,8 +130,6 @@ def _with_links(text: str, file: Path, page: Path) -> str:
 
 def _read_page(app: Sphinx, name: str, content: list[str]) -> None:
     page = Path(app.env.doc2path(name))
-    if name == "commands":
-        content[0] = command_reference()
     if page.suffix == ".ipynb":
         book = json.loads(content[0])
         book["cells"][0]["source"] += ["\n\n", f"{{download}}`Download this notebook <{page.name}>`"]

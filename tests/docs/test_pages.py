@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,13 @@ def test_terminals_of_the_concepts_print_what_the_page_shows(tmp_path: Path) -> 
     for name, program in programs(CONCEPTS).items():
         (tmp_path / name).write_text(program)
     check_page(TutorialPage(CONCEPTS), tmp_path)
+
+
+def test_generated_pages_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    for page, text in import_module("generate").PAGES.items():
+        stored = (ROOT / "docs" / page).read_text()
+        assert stored == text() + "\n", f"docs/{page} is not current: run `python docs/generate.py`"
 
 
 def test_files_named_in_the_architecture_exist() -> None:
