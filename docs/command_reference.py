@@ -1,4 +1,4 @@
-"""The command reference: Markdown, generated from the click commands."""
+"""The command reference: Markdown, generated from the click commands by docs/generate.py."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def command_reference() -> str:
         parts.append(f"## {section}")
         for name in named:
             parts += _command_parts(contexts[name], "###")
-    return "\n\n".join([*parts, _NETWORK_OPTIONS, *_option_parts("zstate", _network_options())])
+    return "\n\n".join([*parts, _NETWORK_OPTIONS, *_option_parts(_network_options())])
 
 
 def _context(group: click.Group, name: str, parent: click.Context) -> click.Context:
@@ -54,7 +54,7 @@ def _command_parts(context: click.Context, heading: str) -> Iterator[str]:
     for paragraph in inspect.cleandoc(command.help or "").split("\n\n"):
         yield _block(paragraph[2:]) if paragraph.startswith("\b\n") else _escaped(paragraph)
     options = _options(context)
-    yield from _option_parts(context.command_path, [one for one in options if not _is_network(one)])
+    yield from _option_parts([one for one in options if not _is_network(one)])
     if any(map(_is_network, options)):
         yield "And the [network options](#network-options)."
     if isinstance(command, click.Group):
@@ -86,10 +86,9 @@ def _is_network(option: Option) -> bool:
     return option in _network_options()
 
 
-def _option_parts(program: str, options: list[Option]) -> Iterator[str]:
-    yield f"```{{program}} {program}\n```"
-    for names, text in options:
-        yield f"````{{option}} {names}\n\n{_escaped(text)}\n````"
+def _option_parts(options: list[Option]) -> Iterator[str]:
+    if options:
+        yield "\n".join(f"- `{names}`: {_escaped(text)}" for names, text in options)
 
 
 def _escaped(text: str) -> str:

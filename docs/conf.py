@@ -9,22 +9,19 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
 import tomllib
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.inspect import TypeAliasForwardRef
 
+import zstate
+
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
-sys.path.insert(0, str(DOCS))
-
-from command_reference import command_reference  # noqa: E402
-
-import zstate  # noqa: E402
 
 project = "zstate"
 author = "the zstate authors"
@@ -42,7 +39,6 @@ myst_heading_anchors = 4
 smartquotes = False  # they turn -- of options into dashes
 # Aliases of types; they are shown by name.
 _ALIASES = (
-    "ArrayLike",
     "ConfigSource",
     "Floats",
     "Group",
@@ -53,17 +49,16 @@ _ALIASES = (
     "StreamName",
 )
 nitpicky = True
-# Inventories of other projects are on other hosts, so that names of theirs are no links.
 nitpick_ignore_regex = [
-    ("py:.*", r"(collections|numpy|os|pathlib|threading|zenoh)\..*"),
-    ("py:class", "|".join(("NDArray", "msgspec.Meta", r"(.*\.)?(S|M|_\w+|\w+Like)", *_ALIASES))),
+    ("py:.*", r"(collections|os|pathlib|threading)\..*"),
+    ("py:class", "|".join(("msgspec.Meta", r"(.*\.)?(S|M|_\w+|\w+Like)", *_ALIASES))),
 ]
 
 # With members of base classes, up to those named here.
 _BASES = "BaseException,ImportError,LookupFailed,OSError,Struct,ZStateError,object,str,tuple"
 autodoc_default_options = {"members": True, "member-order": "bysource", "inherited-members": _BASES}
 autodoc_typehints_format = "short"
-autodoc_type_aliases = {name: name for name in _ALIASES}
+autodoc_type_aliases = {name: name for name in ("ArrayLike", *_ALIASES)}
 TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # as printed in a union, such as Floats | None
 python_maximum_signature_line_length = 88
 
@@ -88,6 +83,17 @@ PAGES = {
     "models/tutorial/DRIVING.md": "driving.md",
     "models/tutorial/README.md": "ros2.md",
 }
+
+
+# Types of other projects: their inventories are on other hosts, and the build makes no requests.
+_NUMPY = "https://numpy.org/doc/stable/reference"
+_ELSEWHERE = {
+    r"numpy\.(ndarray|dtype)": _NUMPY + r"/generated/numpy.\1.html",
+    r"numpy\.(\w+)": _NUMPY + r"/arrays.scalars.html#numpy.\1",
+    r"(ArrayLike|NDArray)": _NUMPY + r"/typing.html#numpy.typing.\1",
+    r"zenoh\.(\w+)": r"https://zenoh-python.readthedocs.io/en/latest/api_reference.html#zenoh.\1",
+}
+"""By pattern of a name, the address of its description."""
 
 
 def _target(file: Path, link: str) -> Path | None:
@@ -124,8 +130,6 @@ def _with_links(text: str, file: Path, page: Path) -> str:
 
 def _read_page(app: Sphinx, name: str, content: list[str]) -> None:
     page = Path(app.env.doc2path(name))
-    if name == "commands":
-        content[0] = command_reference()
     if page.suffix == ".ipynb":
         book = json.loads(content[0])
         book["cells"][0]["source"] += ["\n\n", f"{{download}}`Download this notebook <{page.name}>`"]
@@ -136,6 +140,15 @@ def _read_page(app: Sphinx, name: str, content: list[str]) -> None:
 def _read_included(app: Sphinx, included: Path, parent: str, content: list[str]) -> None:
     page = Path(app.env.doc2path(app.env.docname))
     content[0] = _with_links(content[0], Path(os.path.normpath(DOCS / included)), page)
+
+
+def _link_elsewhere(*event: Any) -> nodes.reference | None:
+    """A type of another project as a link; None for other names."""
+    _, _, node, content = event
+    for pattern, address in _ELSEWHERE.items():
+        if found := re.fullmatch(pattern, node["reftarget"]):
+            return nodes.reference("", "", content, internal=False, refuri=found.expand(address))
+    return None
 
 
 def _shorten_signature(*event: Any) -> tuple[str, str] | None:
@@ -155,3 +168,4 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", _read_page)
     app.connect("include-read", _read_included)
     app.connect("autodoc-process-signature", _shorten_signature)
+    app.connect("missing-reference", _link_elsewhere)

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from zstate import errors as errors
     from zstate.buffer.buffer import TransformBuffer
     from zstate.errors import (
         AccessDenied,
@@ -126,22 +127,24 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> object:
-    if name == "errors":
-        return import_module("zstate.errors")
-    if name not in __all__:
-        from pathlib import Path  # noqa: PLC0415 - as below
+if not TYPE_CHECKING:  # type checkers would take any name for one of the package
 
-        folder = Path(__file__).parent
-        if name.startswith("_") or (folder / f"{name}.py").exists():
-            # ``from zstate import se3`` looks for this attribute, and then imports the module.
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from zstate._util.other_names import missing_name  # noqa: PLC0415 - for mistakes alone
+    def __getattr__(name: str) -> object:
+        if name == "errors":
+            return import_module("zstate.errors")
+        if name not in __all__:
+            from pathlib import Path  # noqa: PLC0415 - as below
 
-        raise missing_name(__name__, folder, name)
-    value: object = getattr(import_module(f"{__name__}.{_HOMES.get(name, 'errors')}"), name)
-    globals()[name] = value
-    return value
+            folder = Path(__file__).parent
+            if name.startswith("_") or (folder / f"{name}.py").exists():
+                # ``from zstate import se3`` looks for this attribute, and then imports the module.
+                raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+            from zstate._util.other_names import missing_name  # noqa: PLC0415 - for mistakes alone
+
+            raise missing_name(__name__, folder, name)
+        value: object = getattr(import_module(f"{__name__}.{_HOMES.get(name, 'errors')}"), name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

@@ -23,6 +23,12 @@ from zstate.extension import kernel
 Array: TypeAlias = NDArray[np.float64]
 Kind: TypeAlias = Literal["static", "exact", "interpolated", "predicted"]
 F = TypeVar("F", bound="TransformFields")
+MaybeNone: TypeAlias = Any
+"""None if nothing between the frames moves, which no type checker can know of two names.
+
+``int | MaybeNone`` is an int to them that may be compared with None: users of moving frames narrow nothing.
+The term is that of typeshed, where ``re.Match.group`` returns ``str | MaybeNone``.
+"""
 
 # By decreasing certainty: the kind of a product is the later one of its factors.
 KINDS: tuple[Kind, ...] = ("static", "exact", "interpolated", "predicted")
@@ -62,7 +68,7 @@ if TYPE_CHECKING or kernel == "reference":
 
         target: str
         source: str
-        stamp: int | None
+        stamp: int | MaybeNone
         kind: Kind
         predicted_s: float
         _pose: tuple[float, ...]
@@ -112,9 +118,10 @@ class Transform(TransformFields):
     """The pose of frame ``source`` in frame ``target``, at one instant or for ever.
 
     ``translation`` is x y z [m] in target axes, ``rotation`` the unit quaternion x y z w, ``stamp``
-    nanoseconds since the Unix epoch or None if it holds at any time. ``kind`` is "static", "exact",
-    "interpolated" or "predicted", the last ``predicted_s`` seconds beyond the newest sample. Immutable,
-    and so are its arrays. Raises InvalidInput if the numbers are not a pose or a name is not a frame name.
+    nanoseconds since the Unix epoch, or None if it holds at any time; to type checkers it is an int.
+    ``kind`` is "static", "exact", "interpolated" or "predicted", the last ``predicted_s`` seconds beyond the
+    newest sample. Immutable, and so are its arrays. Raises InvalidInput if the numbers are not a pose or a
+    name is not a frame name.
 
     ``transform @ points`` is ``apply``: ``p_a = a_from_b @ p_b``. ``np.asarray(transform)`` is ``matrix``.
 
@@ -519,6 +526,8 @@ class Twist:
     """
 
     __slots__ = ("angular", "frame", "linear", "reference", "stamp")
+
+    stamp: int | MaybeNone
 
     def __init__(
         self, frame: str, reference: str, linear: ArrayLike, angular: ArrayLike, stamp: int | None

@@ -80,7 +80,6 @@ class Reader(Closeable):
             ]
 
     def _answer(self, ends: tuple[str, str], robot: int, newest: Transform) -> None:
-        assert newest.stamp is not None
         self._buffer.lookup(*ends, newest.stamp)
         self._answered(newest.stamp, robot)
 

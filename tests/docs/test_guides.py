@@ -8,9 +8,23 @@ from pathlib import Path
 
 import pytest
 from helpers.husky_recording import write_husky
-from helpers.pages import blocks, languages, programs
+from helpers.pages import blocks, languages, programs, section
 from helpers.processes import find_free_port
 from helpers.tutorial_terminal import TutorialPage, check_page
+
+from zstate import errors
+from zstate.errors import (
+    AmbiguousFrame,
+    ClockMismatch,
+    Disconnected,
+    InFuture,
+    InPast,
+    LookupFailed,
+    NoData,
+    NotFinite,
+    Stale,
+    UnknownFrame,
+)
 
 ROOT = Path(__file__).parents[2]
 RECORDINGS = {"husky.mcap": write_husky}
@@ -78,3 +92,53 @@ def test_sentences_in_the_guide_of_odometry_are_those_of_the_code() -> None:
         split = re.split(r"\d[\d.]*(?: s\b| readings?)?|'\w+'|\.\.\.|[,;:]", sentence)
         words = [part.strip(" .,:'") for part in split]
         assert [part for part in words if part and not any(part in text for text in written)] == [], sentence
+
+
+def lookup_failures() -> list[LookupFailed]:
+    """An error for each kind of message."""
+    frames, edge, second = ("map", "tool"), ("map", "base"), 1_000_000_000
+    samples = {"edge": edge, "oldest": 10 * second, "newest": 20 * second}
+    one_sample = samples | {"newest": 10 * second}
+    edges, robots = (edge, ("base", "tool")), ("r1", "r2")
+    withdrawn = Disconnected(*frames, roots=frames, edge=edge)
+    withdrawn.gone_s = 5.0
+    recorded = InPast(*frames, **samples, requested=second)
+    recorded.is_recorded = True
+    return [
+        UnknownFrame(*frames, name="tool"),
+        UnknownFrame(*frames, name="tool", frame_count=3),
+        UnknownFrame(*frames, name="tool", frame_count=3, near_misses=("tool0",)),
+        AmbiguousFrame(*frames, name="tool", candidates=("r1/tool", "r2/tool")),
+        withdrawn,
+        NoData(*frames, edge=edge),
+        NoData(*frames),
+        InFuture(*frames, **samples, requested=30 * second),
+        InFuture(*frames, **one_sample, requested=30 * second),
+        InPast(*frames, **samples, requested=second),
+        InPast(*frames, **one_sample, requested=second),
+        recorded,
+        Stale(*frames, **samples, age_s=2.0, max_age_s=0.1),
+        Stale(*frames, **samples, age_s=20.0, other_newest=40 * second),
+        Stale(*frames, **samples, age_s=2e9, other_newest=2 * 10**9 * second),
+        ClockMismatch(*frames, edges=edges, robots=robots, domains=("system", "simulated")),
+        ClockMismatch(*frames, edges=edges[:1], robots=robots[:1], domains=("system", "simulated")),
+        NotFinite(*frames, edge=edge),
+    ]
+
+
+def test_messages_in_the_guide_of_lookups_lead_to_the_sections_of_their_errors() -> None:
+    text = section(GUIDES["lookup"], "## When a lookup fails")
+    rows = re.findall(r"^\| ([^|]+) \| \[(\w+)\]\(#(\w+)\) \|$", text, re.MULTILINE)
+    failures = lookup_failures()
+    for message, name, anchor in rows:
+        assert anchor == name.lower()
+        assert any(message in str(one) for one in failures if type(one).__name__ == name), message
+    unlisted = [one for one in failures if not any(message in str(one) for message, _, _ in rows)]
+    assert unlisted == []
+    sections = set(re.findall(r"^### (\w+)$", text, re.MULTILINE))
+    assert sections == {name for _, name, _ in rows}
+    classes = [
+        one for one in vars(errors).values() if isinstance(one, type) and issubclass(one, LookupFailed)
+    ]
+    public = {one.__name__ for one in classes if not one.__name__.startswith("_")}
+    assert sections == public - {"LookupFailed", "WaitTimeout"}  # the base, and what a wait adds to a class

@@ -114,6 +114,14 @@ def test_pose_arrives_as_it_was_published(sessions):
     assert (poses[-1].stamp, from_block(poses[-1].pose)[0]) == (7, 2.0)
 
 
+def test_stamps_are_integers_of_numpy_as_well(sessions):
+    writer, reader = sessions
+    poses, odometry = Messages(reader, "pose"), Messages(reader, "odometry")
+    with PosePublisher(writer, "r1", "mocap") as mocap, OdometryPublisher(writer, "r1") as wheels:
+        assert poses.first(lambda: mocap.publish(base(1.0), np.int64(5))).stamp == 5
+        assert odometry.first(lambda: wheels.publish(base(1.0), *STILL, np.int64(6))).stamp == 6
+
+
 @pytest.mark.parametrize("wire", ["native", "ros2"])
 def test_fix_arrives_as_it_was_published_and_so_does_that_there_is_none(sessions, wire: str):
     writer, reader = sessions

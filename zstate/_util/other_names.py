@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import ast
 import pkgutil
+import re
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 
 TF2_CLASSES: Mapping[str, str] = {
     "Buffer": "TransformBuffer",
+    "BufferClient": "TransformListener",
     "BufferCore": "TransformBuffer",
+    "BufferInterface": "TransformBuffer",
     "ConnectivityException": "Disconnected",
     "ExtrapolationException": "InFuture or zstate.InPast",
     "InvalidArgumentException": "InvalidInput",
     "LookupException": "UnknownFrame",
+    "MessageFilter": "TransformBuffer.join",
     "StaticTransformBroadcaster": "StaticPublisher",
+    "TimeoutException": "LookupFailed",
     "TransformBroadcaster": "TransformPublisher",
     "TransformException": "LookupFailed",
     "TransformStamped": "Transform",
@@ -36,9 +41,13 @@ TF2_METHODS: Mapping[str, str] = {
     "set_transform": "insert(transform)",
     "set_transform_static": "insert_static(transform)",
     "transform": "lookup(target, source, at) @ points",
+    "wait_for_transform": "wait(target, source, at, timeout_s)",
     "wait_for_transform_async": "wait_async(target, source, at)",
 }
-"""The method of ``TransformBuffer`` for one of tf2_ros.Buffer; stamps ``at`` are integers [ns]."""
+"""The method of ``TransformBuffer`` for one of tf2_ros.Buffer; stamps ``at`` are integers [ns].
+
+Those of tf in ROS 1, and of C++, are the same in camelCase.
+"""
 
 
 def missing_name(package: str, folder: Path, name: str) -> AttributeError:
@@ -54,10 +63,14 @@ def missing_name(package: str, folder: Path, name: str) -> AttributeError:
     return AttributeError(f"module {package!r} has no attribute {name!r}{hint}")
 
 
-def missing_method(owner: object, name: str) -> AttributeError:
-    """The error for a ``name`` that a transform buffer does not have."""
-    instead = TF2_METHODS.get(name)
-    hint = f"; tf2's {name} is {instead} here, with stamps in integer nanoseconds" if instead else ""
+def missing_method(owner: object, name: str, buffer: object = None) -> AttributeError:
+    """The error for a ``name`` that a transform buffer does not have, or a listener that fills ``buffer``."""
+    place = "" if buffer is None else "buffer."
+    hint = ""
+    if instead := TF2_METHODS.get(re.sub(r"(?=[A-Z])", "_", name).lower()):
+        hint = f"; tf2's {name} is {place}{instead} here, with stamps in integer nanoseconds"
+    elif buffer is not None and hasattr(buffer, name):
+        hint = f"; it is {place}{name}"
     return AttributeError(f"{type(owner).__name__!r} object has no attribute {name!r}{hint}")
 
 
@@ -68,8 +81,8 @@ def _place_of(package: str, folder: Path, name: str) -> str:
     if hasattr(import_module(f"{package}.errors"), name):
         return f"{package}.errors"
     for module in pkgutil.iter_modules([str(folder)]):
-        source = folder / module.name / "__init__.py"
-        if module.ispkg and source.exists() and name in _exports(source):
+        source = folder / (f"{module.name}/__init__.py" if module.ispkg else f"{module.name}.py")
+        if source.exists() and name in _exports(source):
             return f"{package}.{module.name}"
     return ""
 

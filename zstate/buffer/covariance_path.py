@@ -88,7 +88,6 @@ class CovariancePath(TransformPath):
 
     def _with_covariance(self, transform: Transform, views: Views) -> Transform:
         """The transform with its covariance, which is computed when it is used; without one if unknown."""
-        assert transform.stamp is not None
         brackets: list[Bracket] = []
         for view in views:
             now = bracket_at(view, transform.stamp)

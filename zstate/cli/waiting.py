@@ -243,7 +243,6 @@ class PoseWaiter:
     def no_sample_text(self) -> str:
         """Why no newer pose arrives: the edge with the oldest samples."""
         transform = self._listener.buffer.lookup(*self._frames)
-        assert transform.stamp is not None
         reason = self._listener.buffer.explain(*self._frames, transform.stamp + 1)
         edge = writer = ""
         if isinstance(reason, LookupFailed):

@@ -6,6 +6,7 @@ import os
 import weakref
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
+from typing import TYPE_CHECKING, NoReturn
 
 from zstate._util.closeable import Closeable
 from zstate._util.format import did_you_mean
@@ -123,6 +124,13 @@ class TransformListener(Closeable):
         robots, received = len(self.robots()), self.stats.received
         names = ", ".join(map(repr, self._robots))
         return f"<TransformListener of {names}: {robots} robots, {received} samples received>"
+
+    if not TYPE_CHECKING:  # type checkers report such names themselves
+
+        def __getattr__(self, name: str) -> NoReturn:
+            from zstate._util.other_names import missing_method  # noqa: PLC0415 - for mistakes alone
+
+            raise missing_method(self, name, self.__dict__.get("buffer"))
 
     @property
     def stats(self) -> ListenerStats:

@@ -127,7 +127,7 @@ class BaseState:
     """
 
     stamp: int
-    odom_from_base: Transform
+    odom_from_base: PoseWithCovariance
     twist: BaseTwist
     covariance: BaseCovariance
     gyro_bias: Floats

@@ -174,7 +174,7 @@ class PosePublisher(MeasurementPublisher):
         with self._refusals:
             if stamp is None:
                 stamp = self._clock.now() if parent_from_child.stamp is None else parent_from_child.stamp
-            check_stamp(stamp)
+            stamp = check_stamp(stamp)
             parent, child = parent_from_child.target, parent_from_child.source
             for frame in (parent, child):
                 full_name(self.robot, frame)
@@ -357,7 +357,7 @@ class OdometryPublisher(EdgePublisher):
         with self._refusals:
             if stamp is None:
                 stamp = self._clock.now() if odom_from_base.stamp is None else odom_from_base.stamp
-            check_stamp(stamp)
+            stamp = check_stamp(stamp)
             pose, names = to_block(odom_from_base.pose7), ((odom_from_base.target, odom_from_base.source),)
             twist = _numbers(linear, "linear", 3) + _numbers(angular, "angular", 3)
             covariances = covariance_block([odom_from_base])

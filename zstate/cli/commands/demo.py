@@ -404,7 +404,6 @@ class DemoTable:
                 if with_angles
                 else ()
             )
-            assert one.stamp is not None
             table.add_row(_link(one), xyz, *rpy, format_duration(time.time_ns() - one.stamp))
         return table
 
