@@ -191,7 +191,7 @@ class FrameTree:
         self.domain = domain or ClockDomain()
         self.frames: dict[str, Edge | None] = {}
         self.robots: dict[str, JointTrack | None] = {}
-        self.hint: Callable[[], str] | None = None
+        self.hint: Callable[[int], str] | None = None
         """The end of errors about unknown frames as long as there is no frame."""
         self.names = FrameNameIndex()
         # By child: when its edge was removed, by a monotonic clock [s], the edge's names and its writer.
