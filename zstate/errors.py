@@ -365,7 +365,7 @@ class UnknownFrame(LookupFailed):
         name: str,
         near_misses: Sequence[str] | Callable[[], Sequence[str]] = (),
         frame_count: int = 0,
-        hint: Callable[[], str] | None = None,
+        hint: Callable[[int], str] | None = None,
         **facts: Any,
     ) -> None:
         super().__init__(target, source, **facts)
@@ -378,7 +378,7 @@ class UnknownFrame(LookupFailed):
         else:
             self.near_misses = tuple(near_misses)
 
-    _hint: Callable[[], str] | None = None
+    _hint: Callable[[int], str] | None = None
 
     @cached_property
     def near_misses(self) -> tuple[str, ...]:
@@ -393,8 +393,8 @@ class UnknownFrame(LookupFailed):
 
     @cached_property
     def hint(self) -> str:
-        """Why the buffer has received no frame, as its listener knows it; empty without a listener."""
-        return "" if self.frame_count or self._hint is None else self._hint()
+        """Why the buffer has no such frame, as its listener knows it; empty without a listener."""
+        return "" if self._hint is None else self._hint(self.frame_count)
 
     def message(self) -> str:
         if not self.frame_count:
@@ -404,7 +404,8 @@ class UnknownFrame(LookupFailed):
             return f"the frame {self.name!r} is unknown; did you mean {_choices(self.near_misses)}?"
         return (
             f"the frame {self.name!r} is unknown among {self.frame_count} frames; "
-            "`buffer.frames()` or `zstate tree` lists them"
+            + (f"{self.hint}; " if self.hint else "")
+            + "`buffer.frames()` or `zstate tree` lists them"
         )
 
 

@@ -218,6 +218,18 @@ def test_unknown_frames_come_with_near_misses() -> None:
     assert isinstance(failure(TransformBuffer(), "x", "x"), UnknownFrame)
 
 
+def test_beginning_of_a_bare_name_that_two_robots_have_leads_to_both_frames() -> None:
+    buffer = filled(*(static(f"{robot}/world", f"{robot}/base_link") for robot in ("r1", "r2")))
+    for name in ("bas", "base_lnk"):
+        error = failure(buffer, "r1/world", name)
+        assert isinstance(error, UnknownFrame)
+        assert error.near_misses == ("r1/base_link", "r2/base_link")
+    buffer.insert_static(static("r1/world", "r1/camera"))
+    error = failure(buffer, "r1/world", "cam")
+    assert isinstance(error, UnknownFrame)
+    assert error.near_misses == ("camera",)
+
+
 def test_frames_in_two_trees_are_disconnected_with_both_roots() -> None:
     buffer = filled(static("a", "b"), static("b", "c"), static("x", "y"))
     error = failure(buffer, "c", "y")

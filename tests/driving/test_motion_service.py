@@ -142,7 +142,18 @@ def test_times_that_are_no_list_are_refused_with_an_example(sessions):
         with pytest.raises(InvalidInput, match=r"such as times_s=\[2\.0\] for one point; got 2\.0"):
             arm.move({"elbow": 1.0}, times_s=2.0)
         with pytest.raises(InvalidInput, match="points have a number for each of the 2 times; 'elbow' has"):
-            arm.move({"elbow": 1.0}, [1.0, 2.0])
+            arm.move({"elbow": [1.0]}, [1.0, 2.0])
+
+
+def test_points_that_are_not_by_joint_or_no_lists_are_refused_with_an_example(sessions):
+    with Commander(sessions[0], "arm") as arm:
+        for times in (None, [2.0]):
+            with pytest.raises(InvalidInput, match=r"points are given by joint, such as .*, not as list"):
+                arm.move([0.1, 0.2], times)
+        with pytest.raises(InvalidInput, match="velocities are given by joint"):
+            arm.move({"elbow": [0.1]}, [1.0], velocities=[0.0])
+        with pytest.raises(InvalidInput, match=r"1 times; 'elbow' is one number, not a list: \[1\.0\]"):
+            arm.move({"elbow": 1.0}, times_s=[2.0])
 
 
 def test_a_motion_that_exceeds_limits_is_refused_with_every_finding_or_stretched(sessions):

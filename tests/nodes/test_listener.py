@@ -377,6 +377,20 @@ def test_lookup_of_a_robot_that_is_not_announced_names_it_and_the_one_that_is(se
             assert pickle.loads(pickle.dumps(raised.value)).hint == hint
 
 
+def test_lookup_of_a_robot_that_the_listener_does_not_receive_names_those_that_it_does(sessions):
+    writer, reader = sessions
+    with (
+        TransformListener(reader, "myarm") as listener,
+        StatePublisher(writer, RRBOT, "myarm") as publisher,
+        StatePublisher(writer, RRBOT, "other"),
+    ):
+        publisher.publish([0.0, 0.0])
+        listener.buffer.lookup("myarm/world", "tool", timeout_s=DEADLINE_S)
+        with pytest.raises(UnknownFrame, match="; this listener receives 'myarm' alone; ") as raised:
+            listener.buffer.lookup("world", "gripper_of_other")
+        assert pickle.loads(pickle.dumps(raised.value)).hint == "this listener receives 'myarm' alone"
+
+
 @pytest.mark.parametrize("robot", ["*", "myarm"])
 def test_lookup_before_the_first_frame_of_an_announced_robot_names_the_robot(sessions, robot):
     writer, reader = sessions

@@ -68,7 +68,9 @@ def test_unknown_robot_error_lists_the_robots(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         for robot in ("a", "b"):
             bag.joints(START, {"shoulder": 0.0}, f"/{robot}/joint_states")
-    with pytest.raises(InvalidInput, match="of one robot; it has those of 'a', 'b': name one of them"):
+    with pytest.raises(
+        InvalidInput, match="of one robot; it has those of 'a', 'b'; name one of them as ROBOT"
+    ):
         RecordedSource(tmp_path / "bag", None, RRBOT)
 
 

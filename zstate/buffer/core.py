@@ -104,8 +104,8 @@ class BufferCore:
         """No more samples will come: waits fail at once, and errors name the reason. Lookups go on."""
         self._stop_reason = self._stop_reason or reason
 
-    def explain_emptiness(self, hint: Callable[[], str] | None) -> None:
-        """Let errors about unknown frames end with ``hint()`` as long as no frame has been received."""
+    def explain_unknown(self, hint: Callable[[int], str] | None) -> None:
+        """Let errors about unknown frames end with ``hint(count)``, of the number of frames; "" is none."""
         self._tree.hint = hint
 
     def add_robot(self, model: RobotModel, prefix: str = "") -> JointTrack:

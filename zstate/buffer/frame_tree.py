@@ -6,8 +6,8 @@ It knows no stamps; samples are in the tracks behind the edges.
 from __future__ import annotations
 
 import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -23,6 +23,8 @@ from zstate.checks import name_problem
 from zstate.errors import AmbiguousFrame, ClockMismatch, Disconnected, InsertRefused, UnknownFrame
 
 EdgeKind = Literal["joint", "pose", "static"]
+
+_SUGGESTIONS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,16 +163,25 @@ class FrameNameIndex:
         count = len(self._all)
 
         def search() -> list[str]:
-            candidates = self._all[:count]
-            if "/" not in name:
-                bares = Counter(map(_bare, candidates))
-                candidates = [
-                    bare if (bare := _bare(full)) and bares[bare] == 1 else full for full in candidates
-                ]
-            near = get_close_matches(name, candidates, n=3, cutoff=0.7)
-            return near or sorted(one for one in candidates if one.startswith(name))[:3]
+            known = self._all[:count]
+            if "/" in name:
+                return _similar(name, known)
+            fulls: dict[str, list[str]] = {}
+            for full in known:
+                fulls.setdefault(_bare(full) or full, []).append(full)
+            return [
+                one
+                for bare in _similar(name, fulls)
+                for one in ((bare,) if len(fulls[bare]) == 1 else sorted(fulls[bare]))
+            ][:_SUGGESTIONS]
 
         return search
+
+
+def _similar(name: str, candidates: Collection[str]) -> list[str]:
+    """The most similar of ``candidates``, best first, else those that begin with ``name``."""
+    near = get_close_matches(name, candidates, n=_SUGGESTIONS, cutoff=0.7)
+    return near or sorted(one for one in candidates if one.startswith(name))[:_SUGGESTIONS]
 
 
 def _bare(name: str) -> str:
@@ -191,7 +202,7 @@ class FrameTree:
         self.domain = domain or ClockDomain()
         self.frames: dict[str, Edge | None] = {}
         self.robots: dict[str, JointTrack | None] = {}
-        self.hint: Callable[[], str] | None = None
+        self.hint: Callable[[int], str] | None = None
         """The end of errors about unknown frames as long as there is no frame."""
         self.names = FrameNameIndex()
         # By child: when its edge was removed, by a monotonic clock [s], the edge's names and its writer.

@@ -32,7 +32,7 @@ from zstate.driving.messages import (
     state_text,
     with_echo,
 )
-from zstate.driving.motion import Motion, Points, rows_block
+from zstate.driving.motion import Motion, Points, check_by_joint, rows_block
 from zstate.driving.transit import REQUEST_TTL_NS, CommandWindow, DriverClock
 from zstate.errors import (
     Closed,
@@ -258,6 +258,7 @@ class Commander(Closeable):
         if times.ndim != 1:
             example = "; such as times_s=[2.0] for one point" if times.ndim == 0 else ""
             raise InvalidInput(f"times_s has one number for each point{example}; got {times_s!r}")
+        check_by_joint(points, "points")
         names = tuple(points)
         rates, changes = (
             None if rows is None else rows_block(rows, names, times, what)
@@ -523,11 +524,7 @@ def _is_repeated(sent: JointTrajectory | MotionCancel | None, answer: MotionRepl
 
 def _by_joint(values: Mapping[str, float], mode: Mode) -> dict[str, float]:
     """The numbers of joints. Raises InvalidInput for anything else."""
-    if not isinstance(values, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]  # callers may err
-        raise InvalidInput(
-            f"commands are given by joint, such as {{'elbow': 0.4}}, not as {type(values).__name__}: a list "
-            "does not say which joint is which"
-        )
+    check_by_joint(values, "commands")
     try:
         return {name: float(value) for name, value in values.items()}
     except (TypeError, ValueError) as error:
@@ -536,6 +533,7 @@ def _by_joint(values: Mapping[str, float], mode: Mode) -> dict[str, float]:
 
 def _one_point(points: Points | Mapping[str, float]) -> Points:
     """One position for each joint as points. Raises InvalidInput for several of them."""
+    check_by_joint(points, "points")
     columns = {name: real_numbers(values, f"points of {name!r}") for name, values in points.items()}
     if several := [name for name, column in columns.items() if column.size != 1]:
         raise InvalidInput(

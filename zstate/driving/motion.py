@@ -107,8 +107,18 @@ class Motion:
             self._has_ended.set()
 
 
+def check_by_joint(values: object, what: str) -> None:
+    """Raise InvalidInput unless ``values`` are by joint."""
+    if not isinstance(values, Mapping):
+        raise InvalidInput(
+            f"{what} are given by joint, such as {{'elbow': 0.4}}, not as {type(values).__name__}: that "
+            "does not name the joints"
+        )
+
+
 def rows_block(numbers: Points, names: Sequence[str], times: ArrayLike, what: str) -> bytes:
     """The block of ``numbers``, (T, n) in the order of ``names``. Raises InvalidInput for other ones."""
+    check_by_joint(numbers, what)
     if not names or set(numbers) != set(names):
         raise InvalidInput(
             f"{what} are of {', '.join(map(repr, numbers)) or 'no joints'}; a motion has one list for each "
@@ -118,6 +128,8 @@ def rows_block(numbers: Points, names: Sequence[str], times: ArrayLike, what: st
     count = np.shape(times)
     wrong = [
         f"{name!r} has shape {column.shape}"
+        if column.ndim
+        else f"{name!r} is one number, not a list: [{column}]"
         for name, column in zip(names, columns, strict=True)
         if column.shape != count
     ]

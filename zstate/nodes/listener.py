@@ -117,7 +117,7 @@ class TransformListener(Closeable):
                 )
             )
             self._opened = opening.pop_all()
-        self.buffer.explain_emptiness(self._explain_emptiness)
+        self.buffer.explain_unknown(self._explain_unknown)
         _LISTENERS.add(self)
 
     def __repr__(self) -> str:
@@ -169,16 +169,20 @@ class TransformListener(Closeable):
     def close(self) -> None:
         """Stop listening; the buffer keeps its samples. A second call does nothing."""
         _LISTENERS.discard(self)
-        self.buffer.explain_emptiness(None)
+        self.buffer.explain_unknown(None)
         self._opened.close()
 
-    def _explain_emptiness(self) -> str:
-        """Why no frame has been received, for an error: the robots that are missing, and similar names.
+    def _explain_unknown(self, frame_count: int) -> str:
+        """Why a frame is unknown among ``frame_count``, for an error.
 
-        Queries the tokens of all robots if one is missing, which takes up to a second.
+        Without any frame these are the robots that are missing, and similar names: queries the tokens of all
+        robots if one is missing, which takes up to a second.
         """
         if self._wire.shared:
             return ""
+        if frame_count:
+            robots = ", ".join(map(repr, self._robots))
+            return "" if ANY in self._robots else f"this listener receives {shortened(robots)} alone"
         present = {robot for robot, _ in list(self._reader.ingests.writers)}
         missing = [name for name in self._robots if name not in (ANY, *present)]
         if missing:

@@ -422,7 +422,7 @@ def robot_with_joint_states(
         return robots[0]
     there = ", ".join(map(repr, robots)) or "none"
     what = f"joint_states of {robot!r}" if robot else "the joint_states of one robot"
-    advice = ": name one of them" if robot is None and robots else ""
+    advice = f"; name one of them as ROBOT, in Python robot={robots[0]!r}" if robot is None and robots else ""
     raise InvalidInput(f"the recording does not hold {what}; it has those of {there}{advice}")
 
 

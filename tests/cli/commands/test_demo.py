@@ -6,10 +6,19 @@ import re
 import signal
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, missing_library, run_cli, started
-from helpers.processes import Child, until
+from helpers.cli_runner import (
+    RRBOT,
+    Spawn,
+    failure,
+    interrupted,
+    missing_library,
+    published_robot,
+    run_cli,
+    started,
+)
+from helpers.processes import DEADLINE_S, Child, until
 
-from zstate import Kinematics, load_model
+from zstate import Kinematics, TransformListener, connect, load_model
 from zstate.model import catalog
 from zstate.odometry import DiffDrive, WheelNoise
 from zstate.odometry.cli.rover import ROVER_BASE, ROVER_JOINTS, ROVER_MODEL, ROVER_WHEELS, settings_file
@@ -113,7 +122,7 @@ def test_rover_shows_its_odometry_and_places_the_scans_of_its_room(spawn: Spawn)
         r"joint states [\d.]+ Hz, odometry samples [\d.]+ Hz, .*; lidar_link in odom: xyz \[.* 0\.\d+\] m, .*"
     )
     assert re.fullmatch(pattern, line)
-    assert "it drives a square until it is commanded: zstate move rover --keys --connect tcp/" in demo.stderr
+    assert "it drives a square until it is commanded: zstate move rover --keys\n" in demo.stderr
     interrupted(demo)
     pattern = (
         r"\d+ joint states and \d+ odometry samples received in [\d.]+ s: [\d.]+ and [\d.]+ Hz, 0 missed, .*"
@@ -136,12 +145,10 @@ def test_a_program_of_the_rover_that_dies_ends_the_demo(spawn: Spawn, number: in
 
 
 @pytest.mark.processes
-def test_other_commands_follow_the_rover_at_the_printed_address(spawn: Spawn):
+def test_other_commands_see_the_rover_and_its_room_without_an_option(spawn: Spawn):
     demo = started(spawn, "demo", "rover")
-    until(lambda: "--connect " in demo.stderr)
-    address = re.search(r"--connect (\S+);", demo.stderr)
-    assert address
-    robots = json.loads(run_cli("ls", "--json", "--connect", address[1]).stdout)
+    until(lambda: "receiving 'rover'" in demo.stderr)
+    robots = json.loads(run_cli("ls", "--json").stdout)
     room, rover = robots
     writers = {(one["stream"], one["program"]) for one in rover["writers"]}
     assert (room["robot"], rover["robot"]) == ("room", "rover")
@@ -189,11 +196,9 @@ def test_laser_of_the_arm_sweeps_a_room(spawn: Spawn):
     )
     assert match
     demo.line()
-    address = re.search(r"--connect (\S+);", demo.stderr)
-    assert address
 
     def streams() -> set[tuple[str, str]]:
-        robots = json.loads(run_cli("ls", "--json", "--connect", address[1]).stdout)
+        robots = json.loads(run_cli("ls", "--json").stdout)
         return {(robot["robot"], one["stream"]) for robot in robots for one in robot["writers"]}
 
     until(lambda: {("rrbot", "scan"), ("rrbot", "joint_states"), ("room", "map")} <= streams())
@@ -211,10 +216,70 @@ def test_only_the_arm_has_a_room():
 
 
 @pytest.mark.processes
-def test_demo_is_isolated_with_its_publisher_in_any_environment(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("ZENOH_CONFIG", "/nowhere.json5")
-    monkeypatch.setenv("ZSTATE_MODE", "client")
-    assert run_cli("demo", RRBOT, "--seconds", "0.5").code == 0
+def test_pose_of_the_demo_is_that_of_its_joints_for_a_listener_of_the_same_network(spawn: Spawn):
+    demo = started(spawn, "demo", RRBOT)
+    demo.line()
+    with connect() as session, TransformListener(session, "rrbot") as listener:
+        pose = listener.buffer.lookup("world", "tool", timeout_s=DEADLINE_S)
+        assert pose.stamp is not None
+        joints, _ = listener.buffer.joint_positions("rrbot", pose.stamp)
+    links = Kinematics(load_model(RRBOT)).link_poses(joints)
+    expected = links[load_model(RRBOT).links.index("tool")]
+    assert pose.translation == pytest.approx(expected[:3], abs=1e-9)
+    interrupted(demo)
+
+
+@pytest.mark.processes
+def test_a_demo_takes_another_name_than_a_robot_that_is_published(spawn: Spawn):
+    with published_robot("rrbot"):
+        demo = started(spawn, "demo", RRBOT)
+        assert demo.line().startswith("rrbot-2 (2 joints, 7 links): process ")
+        assert "lower in world" in demo.line()
+        assert (
+            "'rrbot' is announced by another program already; that of this demo is 'rrbot-2'" in demo.stderr
+        )
+        interrupted(demo)
+
+
+@pytest.mark.processes
+def test_demos_that_start_at_once_take_names_of_their_own(spawn: Spawn):
+    demos = [started(spawn, "demo", RRBOT) for _ in range(3)]
+    first_lines = sorted(demo.line() for demo in demos)
+    assert [line.partition(" ")[0] for line in first_lines] == ["rrbot", "rrbot-2", "rrbot-3"]
+    for demo in demos:
+        assert "lower in world" in demo.line()
+        interrupted(demo)
+
+
+@pytest.mark.processes
+def test_second_rover_and_its_room_have_names_of_their_own(spawn: Spawn):
+    demos = [started(spawn, "demo", "rover") for _ in range(2)]
+    for demo in demos:
+        until(lambda demo=demo: "it drives a square" in demo.stderr)
+    names = {robot["robot"] for robot in json.loads(run_cli("ls", "--json").stdout)}
+    assert names == {"rover", "rover-2", "room", "room-2"}
+    for demo in demos:
+        interrupted(demo)
+
+
+@pytest.mark.processes
+def test_demo_joins_the_network_of_its_options_and_of_the_environment(
+    spawn: Spawn, free_port: int, monkeypatch: pytest.MonkeyPatch
+):
+    router = f"tcp/127.0.0.1:{free_port}"
+    monkeypatch.setenv("ZSTATE_WIRE", "ros2")  # a demo is on the native wire
+    with connect(mode="router", listen=router):
+        assert run_cli("demo", RRBOT, "--seconds", "0.5", "--connect", router).code == 0
+        monkeypatch.setenv("ZSTATE_CONNECT", router)
+        demo = started(spawn, "demo", RRBOT)
+        demo.line()
+        demo.line()
+        assert [
+            robot["robot"] for robot in json.loads(run_cli("ls", "--json", "--wire", "native").stdout)
+        ] == ["rrbot"]
+        monkeypatch.delenv("ZSTATE_CONNECT")
+        assert run_cli("ls", "--json", "--wire", "native").stdout == "[]\n"
+        interrupted(demo)
 
 
 def test_unknown_robot_error_names_one_that_always_works():

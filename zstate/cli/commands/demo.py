@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
-import socket
+import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from math import degrees
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import click
 
@@ -28,7 +30,7 @@ from zstate.cli.output.console import (
     rate_text,
     terminal_width,
 )
-from zstate.cli.session import SessionOptions, open_session
+from zstate.cli.session import open_session
 from zstate.errors import LookupFailed, UnknownModel, format_duration
 
 if TYPE_CHECKING:
@@ -44,14 +46,8 @@ if TYPE_CHECKING:
 
 _DEFAULT = "panda"
 _START_WITHIN_S = 20.0
-_USERS_NETWORK = (
-    "ZENOH_CONFIG",
-    "ZSTATE_MODE",
-    "ZSTATE_CONNECT",
-    "ZSTATE_LISTEN",
-    "ZSTATE_CONFIG",
-    "ZSTATE_WIRE",
-)
+_TURN_POLL_S = 0.05
+_NOT_OF_DEMOS = ("ZSTATE_WIRE", "ZSTATE_CLOCK")
 _REFRESH_S = 0.1
 # Rate and latency shown are those of the last second.
 _RECENT_NS = 1_000_000_000
@@ -71,7 +67,7 @@ class Demo(NamedTuple):
 
     ``programs`` publish it: the arguments of each `zstate` process, by name. ``kinds`` are those of their
     samples. ``world`` are processes that publish the robot's surroundings, which are ``world_text``.
-    ``advice`` has a command to try, with ``{connect}`` for the options of the network.
+    ``advice`` has a command to try.
     """
 
     robot: str
@@ -91,9 +87,9 @@ class Demo(NamedTuple):
 @click.option("--world", is_flag=True, help="Put rrbot into a room, which its laser sweeps.")
 @options.rate_option
 @options.seconds_option
-# Of the process with the hardware that `zstate demo rover` starts.
+# Of the process with the hardware that `zstate demo rover` starts; its ROBOT is the name of the rover.
 @click.option("--program", type=click.Choice(("wheels",)), hidden=True, allow_from_autoenv=False)
-@click.option("--connect", "endpoint", hidden=True, allow_from_autoenv=False)
+@options.plain_session_options
 def demo_command(
     *,
     robot: str | None,
@@ -102,19 +98,19 @@ def demo_command(
     rate: float,
     seconds: float | None,
     program: Literal["wheels"] | None,
-    endpoint: str | None,
+    **session_options: Any,
 ) -> None:
     """Publish ROBOT (default: panda) in one process and look up its transforms in another, over Zenoh.
 
     ROBOT is a name that `zstate robots` lists, such as panda, or a URDF or xacro file; NAME:=VALUE are
-    xacro arguments. If panda is not installed, the default is rrbot, which comes with zstate. The two
-    processes use a port of their own and do not affect other sessions; other commands reach them with the
-    printed --connect.
+    xacro arguments. If panda is not installed, the default is rrbot, which comes with zstate. The demo is on
+    the network of all other commands, so that `zstate view`, `zstate tf` and `zstate doctor` in another
+    terminal see it. If a robot of this name is announced there, the demo takes another one, such as panda-2.
 
     `zstate demo rover` is a mobile robot with simulated wheels, IMU and laser in a room. One process is its
     hardware, another one `zstate odometry`, which estimates odom -> base_footprint. It drives a square until
-    its first command, such as by `zstate move rover --keys` in another terminal with the printed --connect.
-    The room and the laser need pip install 'zstate[maps]'.
+    its first command, such as by `zstate move rover --keys` in another terminal. The room and the laser need
+    pip install 'zstate[maps]'.
 
     `zstate demo rrbot --world` has four processes: two more publish the map of a room, and the scans of the
     laser on the arm, simulated in that map. `zstate view` draws all of it. Needs pip install 'zstate[maps]'.
@@ -127,27 +123,97 @@ def demo_command(
     """
     from zstate.model.catalog import example_name
 
-    if program is not None and endpoint is not None:
-        with open_session(SessionOptions(connect=(endpoint,))) as session:
-            from zstate.odometry.cli.rover import run_rover
+    network = options.build_network(session_options)
+    if program is not None:
+        from zstate.odometry.cli.rover import run_rover
 
-            run_rover(session, rate)
+        with open_session(network) as session:
+            run_rover(session, rate, robot or _ROVER)
         return
     source = robot or (_ARM if world else example_name())
-    if world:
-        if source != _ARM or xacro_args:
-            raise click.UsageError(f"--world is for {_ARM!r} alone; got {source!r}")
-        _run(_robot_in_room(), rate, seconds)
-        return
-    if not robot and source != _DEFAULT:
+    if world and (source != _ARM or xacro_args):
+        raise click.UsageError(f"--world is for {_ARM!r} alone; got {source!r}")
+    if source == _ROVER and xacro_args:
+        raise click.UsageError(f"{_ROVER!r} takes no xacro arguments; got {', '.join(xacro_args)}")
+    if not (robot or world) and source != _DEFAULT:
         print_status(
             f"{_DEFAULT!r} is not installed (pip install 'zstate[robots]'), so this shows {source!r}"
         )
-    demo = _rover(xacro_args) if source == _ROVER else _swinging_robot(source, xacro_args)
-    _run(demo, rate, seconds)
+    for variable in _NOT_OF_DEMOS:
+        os.environ.pop(variable, None)
+    with open_session(network) as session, _Turn() as turn:
+        names = _Names(session)
+        if world:
+            demo = _robot_in_room(names)
+        elif source == _ROVER:
+            demo = _rover(names)
+        else:
+            demo = _swinging_robot(source, xacro_args, names)
+        _run(session, demo, _environment(session_options), rate, seconds, on_pose=turn.close)
 
 
-def _swinging_robot(source: str, xacro_args: Mapping[str, str]) -> Demo:
+class _Turn(Closeable):
+    """Held by a demo from the choice of its names until its robot moves.
+
+    So each of several demos that one user starts at the same time sees the names of those before it.
+    """
+
+    def __init__(self) -> None:
+        from zstate.clock import wait_interruptible
+
+        self._held = ExitStack()
+        path = Path(tempfile.gettempdir(), f"zstate-demo-{os.getuid()}.lock")
+        with suppress(OSError):  # no folder for temporary files: no turns
+            lock = self._held.enter_context(path.open("a"))
+            deadline = time.monotonic() + _START_WITHIN_S
+            while not _is_locked(lock.fileno()) and time.monotonic() < deadline:
+                wait_interruptible(threading.Event(), _TURN_POLL_S)
+
+    def close(self) -> None:
+        self._held.close()
+
+
+def _is_locked(file: int) -> bool:
+    """Lock ``file`` for this process, unless another one has it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+class _Names:
+    """The names that are free on the network of ``session``."""
+
+    def __init__(self, session: Session) -> None:
+        from zstate.cli.processes import BackgroundCall
+        from zstate.net.presence import discover
+
+        # Without any robot it takes a second, in which the model is loaded.
+        self._robots = BackgroundCall("zstate discovery", lambda: discover(session))
+
+    def free(self, name: str) -> str:
+        """``name``, or ``name-2`` and so on if a robot or place of that name is announced."""
+        taken = {robot.name for robot in self._robots.result()}
+        found, number = name, 1
+        while found in taken:
+            number += 1
+            found = f"{name}-{number}"
+        if found != name:
+            print_status(f"{name!r} is announced by another program already; that of this demo is {found!r}")
+        return found
+
+
+def _environment(session_options: Mapping[str, Any]) -> dict[str, str]:
+    """The session options as the variables from which the processes of a demo read them."""
+    texts = {
+        name: " ".join(value) if isinstance(value, tuple) else value  # pyright: ignore
+        for name, value in session_options.items()
+    }
+    return {f"ZSTATE_{name.upper()}": text for name, text in texts.items() if text}
+
+
+def _swinging_robot(source: str, xacro_args: Mapping[str, str], names: _Names) -> Demo:
     """A robot whose joints swing, published by one program."""
     from zstate.model.robot import representative_links
 
@@ -158,64 +224,70 @@ def _swinging_robot(source: str, xacro_args: Mapping[str, str]) -> Demo:
     links = representative_links(model)
     if not links:
         fail(f"no link of {name!r} moves, so there is nothing to show; `zstate check` shows its links")
+    name = names.free(name)
     arguments = ["publish", source, *(f"{argument}:={value}" for argument, value in xacro_args.items())]
     arguments += ["--source", "sine", "--name", name]
     return Demo(name, model, model.root, links, {"publisher": arguments})
 
 
-def _rover(xacro_args: Mapping[str, str]) -> Demo:
+def _rover(names: _Names) -> Demo:
     """A mobile robot: one program is its hardware, another one its odometry, and one publishes the room."""
     from zstate.odometry.cli import rover
 
-    if xacro_args:
-        raise click.UsageError(f"{_ROVER!r} takes no xacro arguments; got {', '.join(xacro_args)}")
     model, _ = load_robot(rover.ROVER_MODEL, None)
+    name = names.free(_ROVER)
     demo = Demo(
-        _ROVER,
+        name,
         model,
         rover.ROVER_ODOM,
         (rover.ROVER_LASER, "left_wheel", "right_wheel"),
-        rover.programs(),
+        rover.programs(name),
         ("joint_states", "transforms"),
-        advice="it drives a square until it is commanded: zstate move rover --keys {connect}",
+        advice=f"it drives a square until it is commanded: zstate move {name} --keys",
     )
     if rover.load_room() is None:
         print_status("without a room and its laser, which need pip install 'zstate[maps]'")
         return demo
-    room = {"map": ("map", str(rover.room_file()), "--frame", f"{_ROVER}/{rover.ROVER_ODOM}")}
+    room = {"map": _map_arguments(rover.room_file(), f"{name}/{rover.ROVER_ODOM}", names)}
     return demo._replace(world=room, world_text=f"the map of a room, which {rover.ROVER_LASER} measures")
 
 
-def _robot_in_room() -> Demo:
+def _robot_in_room(names: _Names) -> Demo:
     """The arm in a room: the map is one program, the laser that measures it another one."""
     from zstate.model.catalog import find_entry
     from zstate.scans import load_map
 
-    demo = _swinging_robot(_ARM, {})
+    demo = _swinging_robot(_ARM, {}, names)
     file = find_entry(_ARM).path.with_name(_ROOM)
     load_map(file)  # reports missing libraries before anything starts
-    world = {
-        "map": ("map", str(file), "--frame", f"{_ARM}/{demo.root}"),
-        "laser": ("scan", _ARM, "--frame", _LASER, "--sensor", "laser", "--simulate", str(file)),
-    }
+    laser = ("scan", demo.robot, "--frame", _LASER, "--sensor", "laser", "--simulate", str(file))
+    world = {"map": _map_arguments(file, f"{demo.robot}/{demo.root}", names), "laser": laser}
     return demo._replace(world=world, world_text=f"the map of a room and the scans of {_LASER} in it")
 
 
-def _run(demo: Demo, rate_hz: float, seconds: float | None) -> None:
-    """Run the programs, isolated from the user's network, and show the transforms in this process."""
+def _map_arguments(file: Path, frame: str, names: _Names) -> Sequence[str]:
+    name = names.free(options.place_name(str(file)))
+    return ("map", str(file), "--name", name, "--frame", frame)
+
+
+def _run(
+    session: Session,
+    demo: Demo,
+    environment: Mapping[str, str],
+    rate_hz: float,
+    seconds: float | None,
+    *,
+    on_pose: Callable[[], None],
+) -> None:
+    """Run the programs, and show the transforms in this process."""
     from zstate.cli.processes import ChildProcess
 
-    for variable in _USERS_NETWORK:
-        os.environ.pop(variable, None)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     ended = threading.Event()
     programs = {name: (*arguments, "--rate", repr(rate_hz)) for name, arguments in demo.programs.items()}
     with ExitStack() as running:
         children = [
             running.enter_context(
-                ChildProcess(name, [*arguments, "--connect", endpoint], on_end=lambda _: ended.set())
+                ChildProcess(name, arguments, on_end=lambda _: ended.set(), environment=environment)
             )
             for name, arguments in {**programs, **demo.world}.items()
         ]
@@ -227,7 +299,7 @@ def _run(demo: Demo, rate_hz: float, seconds: float | None) -> None:
         print_wrapped(f"{demo.robot} ({size}): {processes} it at {rate_hz:g} Hz, this one looks it up")
         if demo.world:
             print_wrapped(f"{_named(children[len(programs) :])} {demo.world_text}")
-        _show_transforms(endpoint, demo, ended, seconds)
+        _show_transforms(session, demo, ended, seconds, on_pose)
         for child in children:
             if child.exit_code is not None:
                 fail(f"the process {child.name!r} ended with exit code {child.exit_code}: {child.last_error}")
@@ -239,13 +311,19 @@ def _named(children: Sequence[ChildProcess]) -> str:
     return f"process {names} publishes" if len(children) == 1 else f"processes {names} publish"
 
 
-def _show_transforms(endpoint: str, demo: Demo, ended: threading.Event, seconds: float | None) -> None:
+def _show_transforms(
+    session: Session,
+    demo: Demo,
+    ended: threading.Event,
+    seconds: float | None,
+    on_pose: Callable[[], None],
+) -> None:
+    """Show transforms from the first pose on, when ``on_pose()`` is called."""
     from zstate.nodes.listener import TransformListener
     from zstate.nodes.metered_buffer import MeteredBuffer
 
     buffer = MeteredBuffer()
     with (
-        open_session(SessionOptions(listen=(endpoint,))) as session,
         TransformListener(session, demo.robot, buffer, history_on_join=False) as listener,
         _PlacedScans(session, demo, buffer) if demo.world else nullcontext() as scans,
     ):
@@ -257,11 +335,13 @@ def _show_transforms(endpoint: str, demo: Demo, ended: threading.Event, seconds:
                 return
             if time.monotonic() > deadline:
                 fail(f"no pose arrived in {_START_WITHIN_S:g} s: {reason}")
+        on_pose()
         print_status(
-            f"receiving {demo.robot!r}; other commands do so with --connect {endpoint}; Ctrl-C ends this"
+            f"receiving {demo.robot!r}; in another terminal: zstate view, zstate doctor, "
+            f"zstate tf {' '.join(frames)}; Ctrl-C ends this"
         )
         if demo.advice:
-            print_status(demo.advice.format(connect=f"--connect {endpoint}"))
+            print_status(demo.advice)
         table = DemoTable(listener, buffer, demo)
         try:
             table.show(ended, seconds)

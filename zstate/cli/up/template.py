@@ -25,7 +25,7 @@ LOOP_KEYS = ("names", "count", "when")
 # Commands that are no tables, and why.
 _NO_TABLES = {
     "up": 'include = ["FILE.toml"] starts the processes of another file',
-    "demo": 'it has a network of its own; [[robot]] with source = "sine" is a robot that moves',
+    "demo": 'it starts processes of its own; [[robot]] with source = "sine" is a robot that moves',
     "init": "it writes a file, which `zstate up` then runs",
     "completion": "it is for a shell",
     "robots": "it prints names of models; a robot is [[robot]]",

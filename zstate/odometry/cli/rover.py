@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from zstate.net.session import Session
     from zstate.odometry import ImuPublisher
     from zstate.odometry.simulated_rover import SimulatedRover, WheelRates
-    from zstate.scans import Grid, Scan, SimulatedLaser
+    from zstate.scans import Grid, Scan, ScanPublisher, SimulatedLaser
     from zstate.sources.square_drive import WheelPair
     from zstate.transform import Transform
 
@@ -59,11 +59,11 @@ def settings_file() -> Path:
     return _file("rover.toml")
 
 
-def programs() -> dict[str, tuple[str, ...]]:
-    """The arguments of the `zstate` processes that publish the rover, by name."""
+def programs(robot: str) -> dict[str, tuple[str, ...]]:
+    """The arguments of the `zstate` processes that publish the rover ``robot``, by name."""
     return {
-        "wheels": ("demo", "--program", "wheels"),
-        "odometry": ("odometry", ROVER, "--file", str(settings_file())),
+        "wheels": ("demo", robot, "--program", "wheels"),
+        "odometry": ("odometry", robot, "--file", str(settings_file())),
     }
 
 
@@ -77,8 +77,8 @@ def load_room() -> Grid | None:
         return None
 
 
-def run_rover(session: Session, rate_hz: float) -> None:
-    """Host the driver of the rover's wheels, and publish its IMU and its laser, until a signal."""
+def run_rover(session: Session, rate_hz: float, robot: str = ROVER) -> None:
+    """Host the driver of the wheels of the rover ``robot``, publish its IMU and its laser, until a signal."""
     from zstate.driving import DriverHost, Limits
     from zstate.driving.cli.drive import run_host
     from zstate.nodes.listener import TransformListener
@@ -99,19 +99,19 @@ def run_rover(session: Session, rate_hz: float) -> None:
     )
     with ExitStack() as opened:
         stop = threading.Event()
-        listener = opened.enter_context(TransformListener(session, ROVER, history_on_join=False))
-        autopilot = _Autopilot(rover, wheels, listener.buffer)
+        listener = opened.enter_context(TransformListener(session, robot, history_on_join=False))
+        autopilot = _Autopilot(rover, wheels, robot, listener.buffer)
         driver = SimulatedWheels(rover, ROVER_JOINTS, autopilot.rates)
         limits = Limits.of(model, acceleration=_ACCELERATION)
         host = opened.enter_context(
-            DriverHost(session, driver, model, ROVER, rate_hz=rate_hz, limits=limits, program="rover-wheels")
+            DriverHost(session, driver, model, robot, rate_hz=rate_hz, limits=limits, program="rover-wheels")
         )
-        imu = opened.enter_context(ImuPublisher(session, ROVER, "imu", frame=ROVER_IMU, program="rover-imu"))
+        imu = opened.enter_context(ImuPublisher(session, robot, "imu", frame=ROVER_IMU, program="rover-imu"))
         opened.callback(stop.set)
         _in_thread("rover imu", partial(_publish_imu, imu, rover, stop))
         room = load_room()
         if room is not None:
-            _start_laser(session, room, rover, mounts[ROVER_LASER], opened)
+            opened.enter_context(_start_laser(session, robot, room, rover, mounts[ROVER_LASER]))
         run_host(host, None)
 
 
@@ -146,8 +146,8 @@ def _publish_imu(publisher: ImuPublisher, rover: SimulatedRover, stop: threading
 
 
 def _start_laser(
-    session: Session, room: Grid, rover: SimulatedRover, mount: Transform, opened: ExitStack
-) -> None:
+    session: Session, robot: str, room: Grid, rover: SimulatedRover, mount: Transform
+) -> ScanPublisher:
     from zstate.scans import ScanPublisher, SimulatedLaser
 
     increment, ray_ns = math.tau / _RAY_COUNT, round(1e9 / (_SCAN_HZ * _RAY_COUNT))
@@ -164,7 +164,7 @@ def _start_laser(
     )
     publisher = ScanPublisher(
         session,
-        ROVER,
+        robot,
         "laser",
         angle_min=-math.pi,
         angle_increment=increment,
@@ -174,8 +174,8 @@ def _start_laser(
         frame=ROVER_LASER,
         program="rover-laser",
     )
-    opened.enter_context(publisher)
     _in_thread("rover laser", partial(publisher.run, _RoverLaser(laser, rover, mount), _SCAN_HZ))
+    return publisher
 
 
 class _RoverLaser:
@@ -202,10 +202,11 @@ class _RoverLaser:
 class _Autopilot:
     """Keeps the rover on a square, as soon as its odometry is in ``buffer``: where that begins."""
 
-    def __init__(self, rover: SimulatedRover, wheels: WheelPair, buffer: TransformBuffer) -> None:
+    def __init__(self, rover: SimulatedRover, wheels: WheelPair, robot: str, buffer: TransformBuffer) -> None:
         from zstate.sources.square_drive import SquareDrive
 
         self._rover, self._wheels, self._buffer = rover, wheels, buffer
+        self._frames = f"{robot}/{ROVER_ODOM}", f"{robot}/{ROVER_BASE}"
         self._square = SquareDrive(wheels)
         self._start: int | None = None
 
@@ -214,7 +215,7 @@ class _Autopilot:
         from zstate.odometry.simulated_rover import tracking_twist
 
         if self._start is None:
-            if not self._buffer.can_lookup(f"{ROVER}/{ROVER_ODOM}", f"{ROVER}/{ROVER_BASE}"):
+            if not self._buffer.can_lookup(*self._frames):
                 return 0.0, 0.0
             self._start = stamp + _REST_NS
         if stamp < self._start:
