@@ -27,9 +27,7 @@ project = "zstate"
 author = "the zstate authors"
 project_copyright = author
 version = release = zstate.__version__
-_URLS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
-SITE, REPOSITORY = _URLS["Documentation"], _URLS["Homepage"]
-RAW = REPOSITORY.replace("github.com", "raw.githubusercontent.com") + "/main"
+REPOSITORY = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]["Homepage"]
 
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
 nb_execution_mode = "off"  # notebooks are shown with the outputs that they hold
@@ -80,8 +78,6 @@ PAGES = {
     "README.md": "index.md",
     "bench/README.md": "benchmarks.md",
     "deploy/README.md": "deploy.md",
-    "models/tutorial/DRIVING.md": "driving.md",
-    "models/tutorial/README.md": "ros2.md",
 }
 
 
@@ -99,11 +95,6 @@ _ELSEWHERE = {
 def _target(file: Path, link: str) -> Path | None:
     """The file of the repository that ``link`` in ``file`` leads to; None for others."""
     path = link.partition("#")[0]
-    if path.startswith(f"{SITE}/en/latest/"):
-        return DOCS / Path(path).relative_to(f"{SITE}/en/latest").with_suffix(".md")
-    for base in (RAW, f"{REPOSITORY}/blob/main"):
-        if path.startswith(f"{base}/"):
-            return ROOT / Path(path).relative_to(base)
     target = Path(os.path.normpath(file.parent / path))
     return target if path and target.exists() and target.is_relative_to(ROOT) else None
 
@@ -116,7 +107,7 @@ def _for_page(file: Path, page: Path, link: str) -> str:
     _, hash_, anchor = link.partition("#")
     inside = target.relative_to(ROOT).as_posix()
     target = DOCS / PAGES[inside] if inside in PAGES else target
-    is_shown = target.suffix in (".png", ".svg") or (
+    is_shown = target.suffix in (".png", ".svg", ".webp") or (
         target.suffix in (".md", ".ipynb") and target.is_relative_to(DOCS)
     )
     if is_shown:

@@ -9,6 +9,7 @@ import tomllib
 import zipfile
 from itertools import chain
 from pathlib import Path
+from runpy import run_path
 
 import pytest
 from packaging.requirements import Requirement
@@ -16,9 +17,8 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
 FILES_ON_GITHUB = (
-    r"https://(?:github\.com/zstate/zstate/(?:blob|tree)|raw\.githubusercontent\.com/zstate/zstate)/main/"
+    r"https://(?:github\.com/zstate/zstate/(?:blob|tree)|raw\.githubusercontent\.com/zstate/zstate)/v1\.0/"
 )
-DOCUMENTATION = r"https://zstate\.readthedocs\.io/en/latest/"
 
 
 def build(kind: str, source: Path, folder: Path) -> Path:
@@ -130,21 +130,36 @@ def test_lock_has_a_version_of_each_requirement_within_its_bounds():
         )
 
 
-def test_readme_on_pypi_has_only_absolute_links_and_they_lead_somewhere():
+def test_readme_of_a_release_has_only_absolute_links_and_they_lead_to_files(tmp_path: Path):
     from readme_renderer import markdown
 
-    page = markdown.render((ROOT / "README.md").read_text())
+    readme = Path(shutil.copy(ROOT / "README.md", tmp_path))
+    subprocess.run([sys.executable, ROOT / ".ci" / "absolute_links.py", "v1.0", readme], check=True)
+    page = markdown.render(readme.read_text())
     assert page
     headings = set(re.findall(r'id="user-content-([^"]*)"', page))
+    in_repository = []
     for target in re.findall(r'(?:href|src)="([^"]*)"', page):
         if target.startswith("#"):
             assert target.removeprefix("#user-content-") in headings, target
             continue
         assert target.startswith("https://"), f"{target} is relative, which PyPI cannot show"
-        in_repository = re.fullmatch(rf"{FILES_ON_GITHUB}([^#]*)(?:#.*)?", target)
-        assert not in_repository or (ROOT / in_repository[1]).exists(), target
-        in_documentation = re.fullmatch(rf"{DOCUMENTATION}([^#]*)\.html(?:#.*)?", target)
-        assert not in_documentation or list((ROOT / "docs").glob(f"{in_documentation[1]}.*")), target
+        in_repository += re.findall(rf"{FILES_ON_GITHUB}([^#]*)(?:#.*)?", target)
+    assert len(in_repository) > 10
+    assert [path for path in in_repository if not (ROOT / path).exists()] == []
+
+
+@pytest.mark.robots
+def test_licences_page_lists_the_packages_that_zstate_installs():
+    required = run_path(str(ROOT / ".ci" / "licences.py"))["required"]
+    page = (ROOT / "docs" / "licences.md").read_text()
+    rows = dict(re.findall(r"^\| ([a-z0-9-]+) \| ([^|]*) \|", page, re.MULTILINE))
+    del rows["package"]
+    missing = {name for extra in ((), ("all",), ("mujoco",)) for name in required(extra)} - rows.keys()
+    assert missing == set(), "run python .ci/licences.py"
+    assert {name: licence for name, licence in rows.items() if licence in ("", "UNKNOWN")} == {}
+    lines = (ROOT / ".ci" / "constraints.txt").read_text().splitlines()
+    assert rows.keys() <= {Requirement(line).name for line in lines if not line.startswith("#")}
 
 
 def test_install_page_lists_the_extras_and_the_base_without_pinocchio():

@@ -18,6 +18,7 @@ from helpers.pages import blocks
 from helpers.processes import Child
 from helpers.tutorial_terminal import FOLDER, TutorialPage, check_page
 
+DOCS = FOLDER.parents[1] / "docs"
 ARM, SWING, CELL = ((FOLDER / name).read_text() for name in ("arm.urdf", "swing.py", "cell.toml"))
 """A robot; its driver, which publishes only joint states; and a cell that computes its transforms."""
 
@@ -99,18 +100,18 @@ def test_the_driver_is_a_dozen_lines():
 @pytest.mark.parametrize(
     ("page", "files"),
     [
-        ("README.md", {"xml": "arm.urdf", "python": "swing.py", "toml": "cell.toml"}),
-        ("DRIVING.md", {"xml": "arm.urdf", "python": "wave.py"}),
+        ("tutorial.md", {"xml": "arm.urdf", "python": "swing.py", "toml": "cell.toml"}),
+        ("driving.md", {"xml": "arm.urdf", "python": "wave.py"}),
     ],
 )
-def test_the_pages_show_the_files_of_their_folder(page: str, files: dict[str, str]):
+def test_the_pages_show_the_files_of_the_tutorial(page: str, files: dict[str, str]):
     for language, name in files.items():
-        assert blocks(language, (FOLDER / page).read_text()) == [(FOLDER / name).read_text()]
+        assert blocks(language, (DOCS / page).read_text()) == [(FOLDER / name).read_text()]
 
 
 @pytest.mark.long
 def test_the_terminal_blocks_match_real_output(folder: Path, without_xacro: None):
-    check_page(TutorialPage((FOLDER / "README.md").read_text()), folder)
+    check_page(TutorialPage((DOCS / "tutorial.md").read_text()), folder)
 
 
 @pytest.mark.long
@@ -118,7 +119,7 @@ def test_the_terminals_of_driving_match_real_output(tmp_path: Path, monkeypatch:
     for name in ("tutorial", "drivers"):
         shutil.copytree(FOLDER.parent / name, tmp_path / name)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    check_page(TutorialPage((FOLDER / "DRIVING.md").read_text()), tmp_path / "tutorial")
+    check_page(TutorialPage((DOCS / "driving.md").read_text()), tmp_path / "tutorial")
 
 
 @pytest.mark.processes

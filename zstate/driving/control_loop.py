@@ -432,7 +432,7 @@ class ControlLoop:
         self._stop_and_latch(reason)
         self._change("fault", reason)
         raise DriverFault(
-            f"{self._robot!r} is stopped: {reason}; mend it, restart, then release the "
+            f"{self._robot!r} is stopped: {reason}; repair it, restart, then release the "
             f"stop: `zstate stop {self._robot} --release`",
             robot=self._robot,
         ) from fault

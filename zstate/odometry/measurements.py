@@ -253,7 +253,7 @@ def checked_noise(
     standard deviations from ``MIN_SIGMA`` to ``MAX_SIGMA``; numbers of other rows may be any.
     """
     if (sigma is None) == (covariance is None):
-        raise InvalidInput(f"the noise of source {source!r} is given by sigma or by covariance, one of both")
+        raise InvalidInput(f"the noise of source {source!r} is given either by sigma or by covariance")
     if sigma is not None:
         sigmas = real_numbers(sigma, f"the sigma of source {source!r}")
         used = sigmas[rows] if sigmas.shape == (size,) else np.zeros(1)

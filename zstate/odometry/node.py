@@ -175,7 +175,7 @@ def _check_sensors(sensors: Sequence[Sensor], wire: str, writer: str, *, has_map
     for place, one in enumerate(sensors):
         if (one.stream, one.writer) in own:
             raise InvalidInput(
-                f"the {one.stream} {one.writer!r} is no source of itself; name one of both otherwise"
+                f"the {one.stream} {one.writer!r} is no source of itself; name one of the two otherwise"
             )
         if any((one.kind, one.name) == (other.kind, other.name) for other in sensors[:place]):
             raise InvalidInput(f"the {one.kind.name} {one.name!r} is given twice; state its noise once")

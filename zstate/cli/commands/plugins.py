@@ -15,8 +15,8 @@ from zstate.cli.output.console import print_json, print_result, print_status, pr
 def plugins_command(*, as_json: bool) -> None:
     """List the packages that add streams and commands to zstate, and what cannot be used of them.
 
-    A package does so by an entry point in the group zstate.plugins; "Add a stream of your own" in the guides
-    shows one. The exit code is 1 if something cannot be used.
+    A package does so by an entry point in the group zstate.plugins; "Add your own stream" in the guides shows
+    one. The exit code is 1 if something cannot be used.
 
     \b
     zstate plugins

@@ -105,7 +105,7 @@ _LIMIT = options.Checked("[JOINT=]V", _parse_limit)
 @click.option(
     "--plant",
     type=click.Choice(["mirror", "lag", "dynamics"]),
-    help="Of sim: joints are at their setpoints, follow with a lag of 50 ms, or are rigid bodies with the "
+    help="With sim: joints are at their setpoints, follow with a lag of 50 ms, or are rigid bodies with the "
     "inertias and effort limits of the URDF; default: lag.",
 )
 @click.option(

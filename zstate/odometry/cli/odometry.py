@@ -106,8 +106,9 @@ _INIT_S = 5.0
 @_sensor_option(
     "relative",
     "sigma=M,sigma_deg=DEG,scale=PART,...",
-    "Another odometry, as of cameras: pose/NAME, or odometry/NAME of ROS or of a recording. Only its motion "
-    "counts. sigma and sigma_deg are those of a metre of its way, scale that of a constant factor.",
+    "Another odometry, such as that of cameras: pose/NAME, or odometry/NAME of ROS or of a recording. Only "
+    "its motion counts. sigma and sigma_deg are those of a metre of its way, scale is that of a constant "
+    "factor.",
     "STREAM/NAME",
 )
 @_sensor_option(
@@ -163,7 +164,7 @@ _INIT_S = 5.0
     metavar="FILE.toml",
     help="Write the first such file, by what ROBOT publishes in --seconds, by default 5, or by --replay.",
 )
-@click.option("--overwrite", is_flag=True, help="Of --init: replace an existing FILE.toml.")
+@click.option("--overwrite", is_flag=True, help="With --init: replace an existing FILE.toml.")
 @click.option("--odom", metavar="FRAME", help="The frame of the odometry; default: odom.")
 @click.option(
     "--base", metavar="FRAME", help="The frame that is placed in it; default: the root of the model."
@@ -207,13 +208,13 @@ _INIT_S = 5.0
     "--reference",
     metavar="pose/SENSOR[:sigma=M]",
     type=options.Checked("REFERENCE", _parse_reference),
-    help="Of --replay: compare with poses in the recording, or with odometry/WRITER: ATE, the error at the "
+    help="With --replay: compare with poses in the recording, or with odometry/WRITER: ATE, the error at the "
     "end, NEES. Its noise is that of its messages, or sigma.",
 )
 @click.option(
     "--plot",
     type=options.Checked("FILE", _parse_plot),
-    help="Of --replay: draw the path with ellipses of 95 %, and the NIS of each source. PNG, SVG or PDF.",
+    help="With --replay: draw the path with ellipses of 95 %, and the NIS of each source. PNG, SVG or PDF.",
 )
 @options.wires_option
 @options.seconds_option

@@ -130,7 +130,7 @@ def replay(
     """
     mounts, model = TransformBuffer(HISTORY_S), None
     if reference is not None and reference.stream == "pose" and reference.sensor in settings.pose:
-        raise InvalidInput(f"{reference} is a source: it would judge itself; leave out one of both")
+        raise InvalidInput(f"{reference} is a source: it would judge itself; leave one of the two out")
     with Recording(path, robot) as recording:
         for _, message, _ in recording.fill(mounts):
             if isinstance(message, RobotDescription) and model is None:

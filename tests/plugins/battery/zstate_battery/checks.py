@@ -1,4 +1,4 @@
-"""What `zstate doctor` says of batteries."""
+"""The checks of batteries in `zstate doctor`."""
 
 from collections.abc import Iterator
 
