@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import ast
-import pkgutil
 import re
-from collections.abc import Mapping, Sequence
-from importlib import import_module
+from collections.abc import Iterable, Mapping, Sequence
+from inspect import getattr_static
 from pathlib import Path
+from typing import NoReturn, TypeVar
 
 TF2_CLASSES: Mapping[str, str] = {
     "Buffer": "TransformBuffer",
@@ -50,6 +49,37 @@ Those of tf in ROS 1, and of C++, are the same in camelCase.
 """
 
 
+_Class = TypeVar("_Class")
+
+
+class _Tf2Method:
+    """An attribute that raises the error for a method of tf2_ros.Buffer."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, buffer: object, owner: type) -> NoReturn:
+        raise missing_method(owner if buffer is None else buffer, self._name)
+
+
+def with_tf2_methods(cls: type[_Class]) -> type[_Class]:
+    """``cls``, whose missing methods of tf2_ros.Buffer raise an error with the name here.
+
+    A ``__getattr__`` says the same, but makes Python 3.11 find every other attribute more slowly.
+    """
+    for name in TF2_METHODS:
+        camel = re.sub(r"_(.)", lambda match: match[1].upper(), name)
+        for spelling in (name, camel):
+            setattr(cls, spelling, _Tf2Method(spelling))
+
+    def names(self: object) -> Iterable[str]:
+        found = object.__dir__(self)
+        return [name for name in found if not isinstance(getattr_static(self, name, None), _Tf2Method)]
+
+    cls.__dir__ = names
+    return cls
+
+
 def missing_name(package: str, folder: Path, name: str) -> AttributeError:
     """The error for a ``name`` that ``package``, in ``folder``, does not export, with where it is.
 
@@ -76,6 +106,9 @@ def missing_method(owner: object, name: str, buffer: object = None) -> Attribute
 
 def _place_of(package: str, folder: Path, name: str) -> str:
     """The module of ``package`` that exports ``name``, without loading it; empty without one."""
+    import pkgutil  # noqa: PLC0415 - for mistakes alone
+    from importlib import import_module  # noqa: PLC0415
+
     if name.startswith("_"):
         return ""
     if hasattr(import_module(f"{package}.errors"), name):
@@ -89,6 +122,8 @@ def _place_of(package: str, folder: Path, name: str) -> str:
 
 def _exports(source: Path) -> Sequence[str]:
     """The names in ``__all__`` of a module."""
+    import ast  # noqa: PLC0415 - for mistakes alone
+
     for statement in ast.parse(source.read_text(encoding="utf-8")).body:
         if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "__all__":
             return ast.literal_eval(statement.value)

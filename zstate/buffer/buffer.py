@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate._util.other_names import with_tf2_methods
 from zstate.buffer.core import BufferCore
 from zstate.buffer.history import HistoryView
 from zstate.buffer.path import Plan, TransformPath, transforms_at_one_moment
@@ -69,6 +70,7 @@ class Query(NamedTuple):
     max_age_s: float | None = None
 
 
+@with_tf2_methods
 class TransformBuffer(BufferCore):
     """The recent history of frames, and exact lookups in it.
 
@@ -89,13 +91,6 @@ class TransformBuffer(BufferCore):
         named = f" of {', '.join(robots[:3])}{more}" if robots else ""
         kept = "of a recording" if self.is_recording else f"{self.history_s:g} s of history"
         return f"<TransformBuffer: {len(self._tree.frames)} frames{named}, {kept}>"
-
-    if not TYPE_CHECKING:  # type checkers report such names themselves
-
-        def __getattr__(self, name: str) -> NoReturn:
-            from zstate._util.other_names import missing_method  # noqa: PLC0415 - for mistakes alone
-
-            raise missing_method(self, name)
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
