@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from zstate import Transform, se3
+from zstate import Transform
 from zstate.buffer.buffer import TransformBuffer
 from zstate.odometry import ImuNoise
 from zstate.odometry.invariant_filter import GRAVITY, Floats
@@ -53,12 +53,14 @@ class Motion:
 
     def rotation(self, t: Floats) -> Floats:
         """world_from_base: (T, 3, 3)."""
-        angles = self.coordinates(t)[:, 3:]
-        matrices: list[Floats] = []
-        for roll, pitch, yaw in angles.tolist():
-            pose = (0.0, 0.0, 0.0, *se3.quaternion_from_rpy(roll, pitch, yaw))
-            matrices.append(se3.to_matrix(pose)[:3, :3])
-        return np.array(matrices)
+        angles = self.coordinates(t)[:, 3:].T
+        (sr, sp, sy), (cr, cp, cy) = np.sin(angles), np.cos(angles)
+        rows = (
+            (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+            (-sp, cp * sr, cp * cr),
+        )
+        return np.moveaxis(np.array(rows), 2, 0)
 
     def truth(self, t: Floats) -> tuple[Floats, Floats, Floats]:
         """world_from_base, velocity and position in the world."""

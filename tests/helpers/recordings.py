@@ -100,7 +100,7 @@ def calls_of(
             }
             calls.append(Call(t, "velocity", ((speed, 0.0, 0.0),), options))
     if has_compass:
-        for t, yaw in recording.compass.tolist():
+        for t, yaw in recording.compass[::imu_step].tolist():  # that of the IMU
             calls.append(Call(t, "heading", (yaw, COMPASS_SIGMA), {"source": "compass"}))
     return sorted((call for call in calls if call.t >= start), key=lambda call: call.t)
 

@@ -59,7 +59,7 @@ class Fault:
     bound: float
     along: Callable[[Floats], Floats] = ROUND
     turning: Callable[[Floats], Floats] = ROUND_TURNS
-    seconds: float = 45.0
+    seconds: float = 26.0
     change: Callable[[list[Call]], list[Call]] = list
     distort: Callable[[float, Floats, Floats], None] | None = None
     wheels: DiffDrive = WHEELS
@@ -201,21 +201,21 @@ MOVED_SHORT = legs_of([(5.0, 0.0), (15.0, 0.5), (24.0, 0.0), (29.0, 0.5), (38.0,
 FAULTS: dict[str, Fault] = {
     "none": Fault(bound=1.0),
     # shocks and absurd samples
-    "one sample of 16 g ahead": Fault(bound=1.0, change=imu_where(once(20.0), add(force=(160.0, 0, 0)))),
-    "one sample of 16 g up": Fault(bound=1.0, change=imu_where(once(20.0), add(force=(0, 0, 160.0)))),
-    "one sample of 8 g aside": Fault(bound=1.0, change=imu_where(once(20.0), add(force=(0, 80.0, 0)))),
+    "one sample of 16 g ahead": Fault(bound=1.0, change=imu_where(once(12.0), add(force=(160.0, 0, 0)))),
+    "one sample of 16 g up": Fault(bound=1.0, change=imu_where(once(12.0), add(force=(0, 0, 160.0)))),
+    "one sample of 8 g aside": Fault(bound=1.0, change=imu_where(once(12.0), add(force=(0, 80.0, 0)))),
     "three samples of 16 g, which swing back": Fault(
-        bound=1.0, change=imu_where(between(20.0, 20.025), add(force=(0, 0, 160.0)))
+        bound=1.0, change=imu_where(between(12.0, 12.025), add(force=(0, 0, 160.0)))
     ),
     "one gyro sample of 35 rad/s about x": Fault(
-        bound=1.0, change=imu_where(once(20.0), add(rate=(35.0, 0, 0)))
+        bound=1.0, change=imu_where(once(12.0), add(rate=(35.0, 0, 0)))
     ),
     "one gyro z sample of 100 rad/s, straight": Fault(
-        bound=5.0, along=STRAIGHT, turning=NO_TURNS, change=imu_where(once(20.0), add(rate=(0, 0, 100.0)))
+        bound=5.0, along=STRAIGHT, turning=NO_TURNS, change=imu_where(once(12.0), add(rate=(0, 0, 100.0)))
     ),
-    "one gyro sample of 1e154": Fault(bound=1.0, change=imu_where(once(20.0), set_to(rate=1e154))),
-    "one gyro sample of 1e200": Fault(bound=1.0, change=imu_where(once(20.0), set_to(rate=1e200))),
-    "one accel sample of 1e308": Fault(bound=1.0, change=imu_where(once(20.0), set_to(force=1e308))),
+    "one gyro sample of 1e154": Fault(bound=1.0, change=imu_where(once(12.0), set_to(rate=1e154))),
+    "one gyro sample of 1e200": Fault(bound=1.0, change=imu_where(once(12.0), set_to(rate=1e200))),
+    "one accel sample of 1e308": Fault(bound=1.0, change=imu_where(once(12.0), set_to(force=1e308))),
     "accelerometer reads zeros for the first 3 s": Fault(
         bound=1.5, change=imu_where(between(-1.0, 3.0), set_to(force=0.0))
     ),
@@ -223,27 +223,31 @@ FAULTS: dict[str, Fault] = {
         bound=math.inf, change=imu_where(between(-1.0, 1e3), set_to(force=0.0)), named=True
     ),
     # stamps
-    "one IMU stamp an hour ahead": Fault(bound=1.0, stamp_of=shifted(first_of("imu", 20.0), 3600.0)),
-    "one joints stamp an hour ahead": Fault(bound=1.0, stamp_of=shifted(first_of("joints", 20.0), 3600.0)),
-    "one joints stamp 3 s ahead": Fault(bound=1.0, stamp_of=shifted(first_of("joints", 20.0), 3.0)),
+    "one IMU stamp an hour ahead": Fault(bound=1.0, stamp_of=shifted(first_of("imu", 12.0), 3600.0)),
+    "one joints stamp an hour ahead": Fault(bound=1.0, stamp_of=shifted(first_of("joints", 12.0), 3600.0)),
+    "one joints stamp 3 s ahead": Fault(bound=1.0, stamp_of=shifted(first_of("joints", 12.0), 3.0)),
     "clock of the wheels 1.1 s ahead": Fault(
         bound=math.inf, stamp_of=shifted(lambda call: call.kind == "joints", 1.1), named=True
     ),
     # gyro
     "mirrored gyro": Fault(
-        bound=math.inf, change=imu_where(between(-1, 1e3), lambda w, f: (w * (1, 1, -1), f)), named=True
+        bound=math.inf,
+        seconds=36.0,
+        change=imu_where(between(-1, 1e3), lambda w, f: (w * (1, 1, -1), f)),
+        named=True,
     ),
-    "frozen IMU from 20 s on": Fault(bound=10.0, change=held("imu", 20.0, 1e3), named=True),
-    "frozen IMU for 5 s": Fault(bound=3.0, change=held("imu", 20.0, 25.0), named=True),
+    "frozen IMU from 12 s on": Fault(bound=10.0, change=held("imu", 12.0, 1e3), named=True),
+    "frozen IMU for 5 s": Fault(bound=3.0, change=held("imu", 12.0, 17.0), named=True),
     "gyro jumps by 0.02 rad/s": Fault(
         # Wheels show it in the mean of some ten seconds.
         bound=5.0,
-        change=imu_where(between(20.0, 1e3), add(rate=(0, 0, 0.02))),
+        seconds=40.0,
+        change=imu_where(between(12.0, 1e3), add(rate=(0, 0, 0.02))),
         within_s=15.0,
     ),
     "IMU at 10 Hz": Fault(bound=1.5, change=every(10)),
     "IMU at 20 Hz": Fault(bound=1.5, change=every(5)),
-    "IMU silent for 5 s": Fault(bound=3.0, change=without(["imu"], 20.0, 25.0), named=True),
+    "IMU silent for 5 s": Fault(bound=3.0, change=without(["imu"], 12.0, 17.0), named=True),
     "mount wrong by 5 degrees": Fault(
         bound=2.0,
         change=imu_where(
@@ -251,24 +255,24 @@ FAULTS: dict[str, Fault] = {
         ),
     ),
     # wheels
-    "wheels spin for 5 s while driving": Fault(bound=4.0, distort=spinning(27.0, 32.0, 0.7), named=True),
+    "wheels spin for 5 s while driving": Fault(bound=4.0, distort=spinning(14.0, 19.0, 0.7), named=True),
     "wheels spin for 5 s at rest": Fault(
         bound=4.0,
-        distort=spinning(46.0, 51.0, 0.7),
-        along=legs_of([(5.0, 0.0), (40.0, 0.5)]),
-        turning=legs_of([(8.0, 0.0), (38.0, 0.2)]),
-        seconds=60.0,
+        distort=spinning(22.0, 27.0, 0.7),
+        along=legs_of([(5.0, 0.0), (17.0, 0.5)]),
+        turning=legs_of([(8.0, 0.0), (15.0, 0.2)]),
+        seconds=34.0,
         named=True,
     ),
-    "wheels blocked for 5 s": Fault(bound=4.0, distort=blocked(27.0, 32.0), named=True),
-    "encoders frozen from 30 s on": Fault(bound=math.inf, change=held("joints", 30.0, 1e3), named=True),
-    "wheels silent for 5 s": Fault(bound=3.0, change=without(["joints"], 20.0, 25.0)),
+    "wheels blocked for 5 s": Fault(bound=4.0, distort=blocked(14.0, 19.0), named=True),
+    "encoders frozen from 15 s on": Fault(bound=math.inf, change=held("joints", 15.0, 1e3), named=True),
+    "wheels silent for 5 s": Fault(bound=3.0, change=without(["joints"], 12.0, 17.0)),
     # sigmas that are wider than the speed
     "0.3 m/s with sigma 0.5": Fault(
-        bound=2.5, along=legs_of([(5.0, 0.0), (35.0, 0.3)]), velocity=(0.002, 0.5)
+        bound=2.5, along=legs_of([(5.0, 0.0), (20.0, 0.3)]), velocity=(0.002, 0.5)
     ),
     "0.15 m/s with sigma 0.2": Fault(
-        bound=1.5, along=legs_of([(5.0, 0.0), (35.0, 0.15)]), velocity=(0.002, 0.2)
+        bound=1.5, along=legs_of([(5.0, 0.0), (20.0, 0.15)]), velocity=(0.002, 0.2)
     ),
     "0.03 m/s with sigma 0.032": Fault(
         bound=0.5, along=legs_of([(5.0, 0.0), (55.0, 0.03)]), turning=NO_TURNS, velocity=(0.001, 0.032)
@@ -291,9 +295,9 @@ FAULTS: dict[str, Fault] = {
     # compass
     "compass with a hard iron of 42 degrees, straight, then turns": Fault(
         bound=1.5,
-        along=legs_of([(5.0, 0.0), (117.0, 0.5)]),
-        turning=legs_of([(80.0, 0.0), (100.0, 0.3), (115.0, -0.3)]),
-        seconds=120.0,
+        along=legs_of([(5.0, 0.0), (67.0, 0.5)]),
+        turning=legs_of([(30.0, 0.0), (50.0, 0.3), (65.0, -0.3)]),
+        seconds=70.0,
         compass=math.radians(42.0),
         named=True,
     ),
@@ -320,19 +324,22 @@ FAULTS: dict[str, Fault] = {
 }
 
 SIMILAR = {
+    "none",
     "one sample of 16 g up",
     "one sample of 8 g aside",
     "one gyro sample of 1e200",
+    "one accel sample of 1e308",
     "one IMU stamp an hour ahead",
     "frozen IMU for 5 s",
     "IMU at 20 Hz",
+    "0.3 m/s with sigma 0.5",
     "0.15 m/s with sigma 0.2",
     "a turn of 0.04 rad/s from the start while the wheels stand",
     "pause of 100 s at rest",
     "pause of 5 s while driving straight",
     "pause of 13 s in which the base was moved",
 }
-"""Faults of a kind that another row has as well."""
+"""Faults of a kind that another row or test has as well."""
 
 UNSEEN = {
     "radius 20 % wrong": Fault(bound=math.inf, wheels=DiffDrive("left", "right", radius=0.12, track=0.4))
@@ -399,22 +406,24 @@ def findings(fault: Fault, found: Run) -> list[str]:
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.soak if name in SIMILAR else ()) for name in FAULTS]
 )
-@pytest.mark.parametrize("longer_s", [0.0, pytest.param(15.0, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("longer_s", [0.0, pytest.param(30.0, marks=pytest.mark.soak)])
 def test_a_fault_leaves_the_estimate_inside_its_claim_or_is_named(name: str, longer_s: float):
     fault = replace(FAULTS[name], seconds=FAULTS[name].seconds + longer_s)
     assert findings(fault, played(fault)) == []
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.long
-def test_a_base_without_faults_has_no_sentence(seed: int):
-    assert played(FAULTS["none"], seed).sentences == {}
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (1, 2))])
+def test_a_base_without_faults_has_no_sentence_and_is_inside_its_claim(seed: int):
+    found = played(FAULTS["none"], seed)
+    assert found.sentences == {}
+    assert findings(FAULTS["none"], found) == []
 
 
 @pytest.mark.long
 def test_stamps_that_go_back_begin_anew():
-    """A recording that is played in a loop: each source goes back by 30 s, all the same."""
-    drive = Drive(30.0, ROUND, ROUND_TURNS)
+    """A recording that is played in a loop: each source goes back by 20 s, all the same."""
+    drive = Drive(20.0, ROUND, ROUND_TURNS)
     base = new_estimator(MOUNT, wheels=WHEELS)
     for seed in range(2):
         random = np.random.default_rng(seed)
@@ -426,7 +435,7 @@ def test_stamps_that_go_back_begin_anew():
     assert all(source.too_late < 200 for source in base.health())  # those of 1 s, until the loop is certain
     state = base.state()
     assert np.isfinite(state.odom_from_base.pose7).all()
-    assert abs(state.stamp - stamp_at(30.0)) < 1e9
+    assert abs(state.stamp - stamp_at(20.0)) < 1e9
 
 
 def test_headings_of_an_axis_that_passes_the_vertical_leave_the_estimator_alive():

@@ -117,8 +117,10 @@ SOFT_IRON = np.diag((1.0 + math.sin(math.radians(20.0)), 1.0 - math.sin(math.rad
 @pytest.mark.long
 @pytest.mark.parametrize(
     "distorted",
-    [lambda t, field: field + HARD_IRON, lambda t, field: SOFT_IRON @ field],
-    ids=["hard iron", "soft iron"],
+    [
+        pytest.param(lambda t, field: field + HARD_IRON, id="hard iron"),
+        pytest.param(lambda t, field: SOFT_IRON @ field, id="soft iron", marks=pytest.mark.soak),
+    ],
 )
 def test_iron_on_the_robot_takes_the_weight_of_its_magnetometer(
     distorted: Callable[[float, Floats], Floats],

@@ -96,7 +96,7 @@ def check(ends: Sequence[Errors], bound: float, *, has_exact_noise: bool) -> Non
     ],
 )
 def test_vibration_leaves_the_end_inside_its_claim(kind: str, name: str):
-    check([end_of(kind, 0, 30.0, VIBRATIONS[name])], END_SIGMAS, has_exact_noise=False)
+    check([end_of(kind, 0, 20.0, VIBRATIONS[name])], END_SIGMAS, has_exact_noise=False)
 
 
 @pytest.mark.long
@@ -110,7 +110,7 @@ def test_a_start_in_motion_with_much_vibration_is_inside_its_claim_on_the_way_ba
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_end_of_a_drive_is_inside_its_claim(kind: str):
     rest_s = 0.0 if kind == "velocity" else 3.0
-    check([end_of(kind, 0, 30.0, None, rest_s=rest_s)], END_SIGMAS, has_exact_noise=False)
+    check([end_of(kind, 0, 20.0, None, rest_s=rest_s)], END_SIGMAS, has_exact_noise=False)
 
 
 @pytest.mark.soak
