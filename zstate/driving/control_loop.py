@@ -268,7 +268,7 @@ class ControlLoop:
     def _accept_commands(self, now: int) -> None:
         for command in self._receive():
             self._accept(command, now)
-        self.motions.adopt(now)
+        self.motions.calls.run_waiting(now)
 
     def _accept(self, command: Command, now: int) -> None:
         """Take the targets of ``command``, or count the reason against it."""

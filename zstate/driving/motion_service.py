@@ -20,8 +20,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection
-from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures import TimeoutError as NotDone
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -32,11 +31,11 @@ from numpy.typing import NDArray
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.checks import Floats
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, Targets
 from zstate.driving.limits import Limits
+from zstate.driving.loop_calls import LoopCalls
 from zstate.driving.messages import (
     MOTION_POINTS,
     JointTrajectory,
@@ -64,7 +63,6 @@ if TYPE_CHECKING:
 
 _Findings: TypeAlias = tuple[str, ...]
 
-_TICK_WITHIN_S = 1.0
 _NAMES_BYTES = 64_000
 _MOST_PLANS = 8
 """Requests that wait for their plan. More get no reply, and are repeated by their commanders."""
@@ -203,11 +201,8 @@ class MotionExecutor:
         self._check, self._name_of, self._on_change = check, name_of, on_change
         self._nodes: set[int] = set()
         """The sessions of announced ROS nodes."""
-        self._requests = fork_safe_lock()
-        """Held while a request waits for the loop."""
-        self._lock = fork_safe_lock()
-        self._waiting: tuple[Future[None], Callable[[int], None]] | None = None
-        """What the loop is to do at its next tick, with the present instant."""
+        self.calls = LoopCalls()
+        """What the loop is to do at its next tick for requests, which are answered by other threads."""
         self._motion: _Underway | None = None
         self._newest: BoundedDict[int, int] = BoundedDict()
         """The number of the last motion that was started, by session."""
@@ -230,39 +225,6 @@ class MotionExecutor:
         if motion is None:
             return None, 0.0
         return (motion.request.session, motion.request.seq), motion.progress
-
-    def call(self, action: Callable[[int], None]) -> None:
-        """Let the loop call ``action`` at its next tick. Raises MessageError, also that of ``action``."""
-        done: Future[None] = Future()
-        with self._requests:
-            with self._lock:
-                self._waiting = (done, action)
-            try:
-                done.result(_TICK_WITHIN_S)
-            except NotDone:
-                if done.cancel():
-                    text = f"the control loop has not begun a tick within {_TICK_WITHIN_S:g} s"
-                    raise MessageError(text, reason="no tick") from None
-                done.result()
-
-    def adopt(self, now: int) -> None:
-        """Start or cancel what was requested since the last tick."""
-        if self._waiting is None:
-            return
-        with self._lock:
-            waiting, self._waiting = self._waiting, None
-        assert waiting is not None, "only this thread takes it away"
-        done, action = waiting
-        if not done.set_running_or_notify_cancel():
-            return
-        try:
-            action(now)
-        except BaseException as error:
-            done.set_exception(error)
-            if not isinstance(error, MessageError):
-                raise
-        else:
-            done.set_result(None)
 
     def renew(self, command: Command) -> None:
         """Keep the motion of ``command`` valid; does nothing if it has ended."""
@@ -484,7 +446,7 @@ class MotionService(Closeable):
 
     def _cancel(self, payload: bytes) -> _Findings:
         cancel = decode(payload, encoding_of(MotionCancel), MotionCancel)
-        self._executor.call(lambda _: self._executor.cancel(cancel))
+        self._executor.calls.call(lambda _: self._executor.cancel(cancel))
         return ()
 
     def _take(self, payload: bytes, encoding: str, arrived: int) -> _Findings | None:
@@ -507,7 +469,7 @@ class MotionService(Closeable):
         """The same for a message of a ROS node."""
         session, sent, request = controller.decode_trajectory(sample)
         if request is None:
-            self._executor.call(lambda _: self._executor.cancel_of(session))
+            self._executor.calls.call(lambda _: self._executor.cancel_of(session))
             return ()
         arrived = time.monotonic_ns()
         return self._plan_and_start(without_past(request, time.time_ns()), sent, arrived)
@@ -533,13 +495,13 @@ class MotionService(Closeable):
         self._check_in_loop(request)  # first: to plan takes time from the control loop
         planned = plan(request, self._executor.limits, self._executor.present(), time.time_ns())
         if not planned.findings:
-            self._executor.call(start)
+            self._executor.calls.call(start)
         return planned.findings
 
     def _check_in_loop(self, request: JointTrajectory) -> None:
         """Raise MessageError if ``request`` must not start now, or if the joints are not known."""
         try:
-            self._executor.call(lambda now: self._executor.check_request(request, now))
+            self._executor.calls.call(lambda now: self._executor.check_request(request, now))
         except MessageError:
             self._executor.present()  # its reason is the better one
             raise

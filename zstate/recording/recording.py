@@ -19,7 +19,6 @@ a withdrawn static edge                     the edge, until another writer place
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -36,7 +35,7 @@ from zstate.errors import InvalidInput
 from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest, TransformIngest
+from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
 from zstate.plugins import stream_named
@@ -54,19 +53,17 @@ from zstate.recording.decode import (
 )
 from zstate.recording.info import RecordingInfo, read_info
 from zstate.recording.joint_parts import MergedJointStateReader, RecordedJoints, has_parts
-from zstate.recording.joint_states import DELAYED_NS, RecordedJointReader
+from zstate.recording.joint_states import RecordedJointReader
 from zstate.recording.reader import RecordingReader
+from zstate.recording.transforms import EdgeEpochs, RecordedTransformIngest, children_of
 from zstate.streams import JOINT_STREAMS, StreamName
-from zstate.wire.keys import MODEL_WRITER, full_name
+from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
     Edges,
     JointState,
     RobotDescription,
-    Sample,
     StaticTransforms,
     TransformSample,
-    covariances_of,
-    poses_from_block,
 )
 
 if TYPE_CHECKING:
@@ -451,7 +448,7 @@ class RecordingLoader:
         rest = self._filter.filter_statics(robot, statics)
         self._remove_withdrawn(robot, rest.edges)
         if before is not None and edge_writer is not None:
-            self._withdrawn |= _children(robot, before.edges) - _children(robot, statics.edges)
+            self._withdrawn |= children_of(robot, before.edges) - children_of(robot, statics.edges)
         name = edge_writer or writer.program or _UNNAMED
         ingest = StaticTransformIngest(robot, name, self._ownership)
         self._statics.setdefault(key, ingest).add(rest)
@@ -464,95 +461,6 @@ class RecordingLoader:
     def _remove_withdrawn(self, robot: str, edges: Edges) -> None:
         """Remove withdrawn edges whose child is placed again."""
         if self._withdrawn:
-            for child in self._withdrawn & _children(robot, edges):
+            for child in self._withdrawn & children_of(robot, edges):
                 self._withdrawn.discard(child)
                 self._ownership.remove_child(child)
-
-
-def _children(robot: str, edges: Edges) -> set[str]:
-    children: set[str] = set()
-    for _, child in edges:
-        with suppress(InvalidInput):  # refused and counted when it is inserted
-            children.add(full_name(robot, child))
-    return children
-
-
-class RecordedTransformIngest(TransformIngest):
-    """Inserts the edges of one writer, or of all writers of a shared topic; each edge has its own epochs."""
-
-    def __init__(self, robot: str, ownership: FrameOwnership, epochs: EdgeEpochs) -> None:
-        super().__init__(robot, ownership)
-        self._epochs = epochs
-        self._children: set[str] = set()
-
-    def _insert(self, sample: Sample) -> bool | None:
-        assert isinstance(sample, TransformSample)
-        assert sample.edges is not None
-        edges = self._named(sample.edges)
-        children = [child for _, child in edges]
-        if self._epochs.is_delayed(sample, children):
-            return False
-        self._children.update(children)
-        if self._epochs.is_new_epoch(sample, children):
-            self._drop_edges(set(children))
-        poses, covariances = poses_from_block(sample.poses), covariances_of(sample)
-        inserted = self._buffer.insert_many(
-            edges, sample.stamp, poses, covariances=covariances, writer=self.writer
-        )
-        self._epochs.add(sample, children)
-        return inserted
-
-    def _drop_edges(self, children: set[str]) -> None:
-        for frame in self._buffer.frames():
-            if frame.kind == "pose" and frame.name in children:
-                self._buffer.withdraw(frame.name)
-        self._epochs.remove(children)
-        text = f"the clock of {sorted(children)[0]!r} went back: its history restarts"
-        self._counters.warn_once(f"{self.robot} back", text)
-
-    def _drop_history(self) -> None:
-        self._drop_edges(self._children)
-        self._newest_by_order.clear()
-
-
-class EdgeEpochs:
-    """The newest stamp of each edge, by its child, and the sessions that published it."""
-
-    def __init__(self) -> None:
-        self._newest: dict[str, int] = {}
-        self._delayed: dict[str, int] = {}
-        self._sessions: set[tuple[int, str]] = set()
-
-    def is_delayed(self, sample: Sample, children: list[str]) -> bool:
-        """Whether it is a single old sample, after which stamps may continue as before."""
-        limit = sample.stamp + DELAYED_NS
-        if not any(limit < self._newest.get(child, limit) for child in children):
-            self._delayed.pop(children[0], None)
-            return False
-        before = self._delayed.pop(children[0], None)
-        if before is not None and before < sample.stamp:
-            return False
-        self._delayed[children[0]] = sample.stamp
-        return True
-
-    def is_new_epoch(self, sample: Sample, children: list[str]) -> bool:
-        """Whether the clock went back: with a second old sample, or with another writer."""
-        for child in children:
-            newest = self._newest.get(child)
-            if newest is not None and sample.stamp <= newest:
-                is_new_writer = (sample.session, child) not in self._sessions
-                if is_new_writer or sample.stamp < newest - DELAYED_NS:
-                    return True
-        return False
-
-    def add(self, sample: Sample, children: list[str]) -> None:
-        """Add an inserted sample."""
-        for child in children:
-            if sample.stamp > self._newest.get(child, sample.stamp - 1):
-                self._newest[child] = sample.stamp
-            self._sessions.add((sample.session, child))
-
-    def remove(self, children: set[str]) -> None:
-        """Remove edges whose history restarts."""
-        for child in children:
-            self._newest.pop(child, None)

@@ -71,13 +71,8 @@ class PlacedScan:
         return f"<PlacedScan of {self.sensor!r} in {self.target!r}: {self.valid.sum()} points{rigid}>"
 
 
-def _size(scan: Scan) -> int:
-    """The bytes of the numbers of ``scan``."""
-    return scan.ranges.nbytes + (0 if scan.intensities is None else scan.intensities.nbytes)
-
-
 def _placed_size(placed: PlacedScan) -> int:
-    return _size(placed.scan) + placed.points.nbytes + placed.valid.nbytes
+    return placed.scan.nbytes + placed.points.nbytes + placed.valid.nbytes
 
 
 class _SensorScans(Closeable):
@@ -87,7 +82,7 @@ class _SensorScans(Closeable):
         self._place = place
         # The thread ends with the listener, not with its session.
         self._waiting: Inbox[tuple[Scan, float]] = Inbox(
-            _CAPACITY, lambda: None, max_bytes=_WAITING_BYTES, size_of=lambda waiting: _size(waiting[0])
+            _CAPACITY, lambda: None, max_bytes=_WAITING_BYTES, size_of=lambda waiting: waiting[0].nbytes
         )
         threading.Thread(target=self._run, name=f"zstate scans of {sensor}", daemon=True).start()
 

@@ -129,6 +129,11 @@ class Scan:
         return self.ray_ns == 0
 
     @property
+    def nbytes(self) -> int:
+        """The bytes of its ranges and intensities."""
+        return self.ranges.nbytes + (0 if self.intensities is None else self.intensities.nbytes)
+
+    @property
     def end_stamp(self) -> int:
         """The instant of the last ray [ns]."""
         return self.stamp + self.ray_ns * (len(self.ranges) - 1)

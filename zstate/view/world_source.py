@@ -129,7 +129,7 @@ class SensorScans:
         now_s = self.clock()
         self._deadline.on_sample(now_s)
         with self._lock:
-            lost = self._waiting.append((scan, now_s + _TIMEOUT_S), _size(scan))
+            lost = self._waiting.append((scan, now_s + _TIMEOUT_S), scan.nbytes)
             self.dropped += lost
             self._has_overflowed |= lost > 0
 
@@ -184,7 +184,7 @@ class SensorScans:
     def _keep(self, scan: Scan) -> None:
         if self._scans and scan.stamp < self._scans[-1].stamp - TIME_JUMP_NS:
             self._scans.clear()  # the clock was set back, or a replay has begun again
-        self._scans.append(scan, _size(scan))
+        self._scans.append(scan, scan.nbytes)
 
     def latest(self, count: int, at: int | None = None) -> Sequence[Scan]:
         """The last ``count`` scans that ended until ``at`` [ns]; None: of all. The oldest first."""
@@ -195,11 +195,6 @@ class SensorScans:
             if at is None or scan.end_stamp <= at:
                 found.append(scan)
         return found[::-1]
-
-
-def _size(scan: Scan) -> int:
-    """The bytes of the rays of a scan."""
-    return scan.ranges.nbytes + (0 if scan.intensities is None else scan.intensities.nbytes)
 
 
 class WorldSource(Closeable):
