@@ -1,6 +1,7 @@
 """The public surface, pinned: a change here is a change for every user, and belongs in CHANGELOG.md."""
 
 import inspect
+import re
 import subprocess
 import sys
 from importlib import metadata, resources
@@ -277,3 +278,12 @@ def test_the_version_is_that_of_the_package():
 
 def test_the_package_says_that_it_is_typed():
     assert (resources.files("zstate") / "py.typed").is_file()
+
+
+def test_each_parameter_of_a_call_with_more_than_three_is_described():
+    for path in SIGNATURES:
+        parameters = inspect.signature(named(path)).parameters.keys() - {"self", "session"}
+        text = inspect.getdoc(named(path)) or ""
+        if len(parameters) > 3:
+            unnamed = [name for name in parameters if not re.search(rf"``[^`]*\b{name}\b[^`]*``", text)]
+            assert unnamed == [], path

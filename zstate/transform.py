@@ -160,7 +160,7 @@ class Transform(TransformFields):
 
     @classmethod
     def from_pose7(cls, target: str, source: str, pose7: ArrayLike, stamp: int | None = None) -> Transform:
-        """From x y z [m], qx qy qz qw."""
+        """The pose of ``source`` in ``target`` at ``stamp``, from ``pose7``: x y z [m], qx qy qz qw."""
         check_names(target, source)
         pose = check_pose(pose7, f"{target!r} from {source!r}")
         stamp = None if stamp is None else check_stamp(stamp)
@@ -168,7 +168,10 @@ class Transform(TransformFields):
 
     @classmethod
     def from_matrix(cls, target: str, source: str, matrix: ArrayLike, stamp: int | None = None) -> Transform:
-        """From a homogeneous (4, 4) matrix whose rotation is orthonormal within 1e-3."""
+        """The pose of ``source`` in ``target`` at ``stamp``, from a homogeneous ``matrix``, (4, 4).
+
+        Raises InvalidInput if its rotation is off orthonormal by more than 1e-3.
+        """
         array = real_numbers(matrix, "a transform's matrix")
         if array.shape != (4, 4):
             raise InvalidInput(f"a transform's matrix has shape (4, 4); got {array.shape}")
@@ -187,7 +190,7 @@ class Transform(TransformFields):
 
     @classmethod
     def from_se3(cls, target: str, source: str, placement: Any, stamp: int | None = None) -> Transform:
-        """From a ``pinocchio.SE3``, the placement of ``source`` in ``target``.
+        """From a ``pinocchio.SE3``, the ``placement`` of ``source`` in ``target``, at ``stamp``.
 
         ``oMi`` is ``from_se3("o", "i", oMi)``. Raises InvalidInput for other types, and if its rotation is
         off orthonormal by more than 1e-3.
@@ -203,8 +206,9 @@ class Transform(TransformFields):
     def from_rpy(
         cls, target: str, source: str, translation: ArrayLike, rpy: ArrayLike, stamp: int | None = None
     ) -> Transform:
-        """From x y z [m] and roll pitch yaw [rad] as in URDF: about the fixed x, then y, then z.
+        """The pose of ``source`` in ``target`` at ``stamp``, from a ``translation`` x y z [m] and ``rpy``.
 
+        These are roll pitch yaw [rad] as in URDF: about the fixed x, then y, then z.
         Raises InvalidInput for an angle beyond 2 pi, which is degrees more often than a full turn.
         """
         angles = real_numbers(rpy, "rpy")

@@ -103,6 +103,12 @@ def pages_without_link(site: Path) -> list[str]:
     return [str(page) for page in pages if f'href="{page}"' not in contents and page.stem != "index"]
 
 
+def linked_elsewhere(site: Path) -> set[str]:
+    """Types of other projects that the API pages link to their descriptions."""
+    pages = "".join(page.read_text() for page in (site / "api").glob("*.html"))
+    return set(re.findall(r'href="https://(?:numpy\.org|zenoh-python)[^"]*?(\w+\.\w+)(?:\.html)?"', pages))
+
+
 @pytest.mark.long
 def test_site_is_complete_and_loads_nothing_from_other_hosts(tmp_path: Path) -> None:
     build(tmp_path)
@@ -112,3 +118,6 @@ def test_site_is_complete_and_loads_nothing_from_other_hosts(tmp_path: Path) -> 
     assert commands_without_reference(tmp_path) == []
     assert "%j;" in (tmp_path / "commands.html").read_text()  # begins a line of help; a comment in MyST
     assert pages_without_link(tmp_path) == []
+    assert {"numpy.ndarray", "numpy.float64", "typing.ArrayLike", "zenoh.Session"} <= linked_elsewhere(
+        tmp_path
+    )

@@ -110,10 +110,12 @@ class TransformBuffer(BufferCore):
     ) -> Transform:
         """The pose of ``source`` in ``target`` at the stamp ``at`` [ns].
 
-        ``at=None`` is the newest instant that every moving edge between the frames has reached; on a path
-        of static edges only, the transform then has no stamp. ``timeout_s`` waits for frames and samples
-        that are missing. An older transform than ``max_age_s`` is an error. ``predict_s`` allows instants up
-        to so long after the newest sample, from published velocities; its transforms are of kind "predicted".
+        - ``at``: the stamp [ns]; None: the newest instant that every moving edge between the frames has
+          reached. On a path of static edges only, the transform then has no stamp.
+        - ``timeout_s``: how long to wait for frames and samples that are missing.
+        - ``max_age_s``: an older transform is an error, Stale.
+        - ``predict_s``: how long after the newest sample an instant may be, from published velocities; such
+          transforms are of kind "predicted".
 
         The transform has a ``covariance`` if its path has edges whose samples have covariances, and all other
         edges are exact: static, or joints of a model. A moving edge without a covariance leaves it None:
@@ -142,7 +144,7 @@ class TransformBuffer(BufferCore):
     def lookup_between(
         self, target: str, target_at: int | None, source: str, source_at: int | None, fixed: str
     ) -> Transform:
-        """The pose of ``source`` at one instant in ``target`` at another (tf2's advanced form).
+        """The pose of ``source`` at ``source_at`` in ``target`` at ``target_at`` (tf2's advanced form).
 
         ``fixed`` is assumed not to move between the two. None for an instant is the newest of that side. The
         transform has the target side's stamp, and no covariance: the errors of one edge at two instants are
@@ -152,7 +154,7 @@ class TransformBuffer(BufferCore):
         for name in (target, source, fixed):
             self._tree.resolve(name, target, source)
         # A missing connection, or two clocks, are reported before a bad time, on either side.
-        of_source, _, of_target = self.paths((fixed, source), (target, source), (target, fixed))
+        of_source, _, of_target = self._paths_of((fixed, source), (target, source), (target, fixed))
         target_at = None if target_at is None else check_stamp(target_at)
         source_at = None if source_at is None else check_stamp(source_at)
         try:
@@ -182,7 +184,7 @@ class TransformBuffer(BufferCore):
     def place(
         self, points: ArrayLike, stamps: ArrayLike, source: str, target: str
     ) -> tuple[Points, NDArray[np.bool_]]:
-        """Points of ``source``, each in ``target`` at its own stamp: (N, 3), and which are valid: (N,).
+        """``points`` of ``source``, each in ``target`` at its own stamp: (N, 3), and which are valid: (N,).
 
         ``points`` are (N, 3) x y z [m], float32 or float64, as is the result. ``stamps`` [ns] are (N,) in any
         order, or one for all. A scan of a moving lidar is placed without distortion::
@@ -240,7 +242,7 @@ class TransformBuffer(BufferCore):
         return None
 
     def wait(self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0) -> Transform:
-        """``lookup`` as soon as it succeeds; waits for unknown and unconnected frames, too.
+        """``lookup(target, source, at)`` once it succeeds; waits for unknown and unconnected frames, too.
 
         Raises at once if waiting cannot help: InPast for an ``at`` more than ``history_s`` before the
         newest sample of an edge, and every error in a process forked from that of the listener which fills
@@ -254,7 +256,10 @@ class TransformBuffer(BufferCore):
     async def wait_async(
         self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0
     ) -> Transform:
-        """``wait`` for asyncio: it does not block the loop, and cancelling the task ends it."""
+        """``wait(target, source, at, timeout_s)`` for asyncio: it does not block the loop.
+
+        Cancelling the task ends it.
+        """
         import asyncio  # noqa: PLC0415  # a caller has it already, and others do not need it
 
         query = self._query(target, source, at)
@@ -386,10 +391,11 @@ class TransformBuffer(BufferCore):
         translation_m: float | None = None,
         rotation_rad: float | None = None,
     ) -> TransformWatch:
-        """Call ``callback(transform)`` with each newest ``target_from_source``, until the watch is closed.
+        """Call ``callback(transform)`` with each newest pose of ``source`` in ``target``.
 
-        With thresholds, only once the source has moved or rotated so far since the last call. The frames need
-        not exist yet. The callback runs on the thread that inserts: keep it short.
+        That ends when the watch is closed. With ``translation_m`` or ``rotation_rad``, only once the source
+        has moved or rotated so far since the last call. The frames need not exist yet. The callback runs on
+        the thread that inserts: keep it short.
         """
         if self._stop_reason:
             raise Closed(self._stop_reason)

@@ -95,11 +95,6 @@ class BufferCore:
     def is_recording(self, value: bool) -> None:
         self._owner.is_recording = value
 
-    @property
-    def version(self) -> int:
-        """Grows whenever a frame is added, or the edge that places one changes."""
-        return self._tree.version
-
     def stop(self, reason: str) -> None:
         """No more samples will come: waits fail at once, and errors name the reason. Lookups go on."""
         self._stop_reason = self._stop_reason or reason
@@ -219,13 +214,13 @@ class BufferCore:
     def insert_joints(
         self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
     ) -> bool:
-        """One instant of a robot: positions (and velocities) in the order of its ``joint_names``.
+        """One instant ``stamp`` [ns] of a robot, whose ``track`` is what ``add_robot`` returned.
 
-        ``positions`` may also be a block: the same as float64, little-endian, in bytes.
-        True, or False if it is older than the history reaches, which ``ignored`` counts. A second
-        sample of one stamp replaces the first. Raises InvalidInput for wrong counts, NaN and infinity,
-        and for a floating joint's quaternion that is not of length one; InsertRefused for the track of a
-        robot that was removed, or of another buffer.
+        ``positions`` and ``velocities`` are in the order of its ``joint_names``. Positions may also be a
+        block: the same as float64, little-endian, in bytes. True, or False if it is older than the history
+        reaches, which ``ignored`` counts. A second sample of one stamp replaces the first. Raises
+        InvalidInput for wrong counts, NaN and infinity, and for a floating joint's quaternion that is not of
+        length one; InsertRefused for the track of a robot that was removed, or of another buffer.
         """
         with self._lock:
             if track.owner is not self._owner:
@@ -427,11 +422,11 @@ class BufferCore:
         covariances: ArrayLike | None = None,
         writer: str | None = None,
     ) -> bool:
-        """One instant of many moving edges, all or nothing: row i is ``parent_from_child`` of edges[i].
+        """One instant of many moving edges, all or nothing: row i is ``parent_from_child`` of ``edges[i]``.
 
-        ``poses`` is (N, 7), x y z [m], qx qy qz qw; or a block: the same as float64, little-endian, in
-        bytes. ``covariances``, if known, is (N, 21): the upper triangle of ``Transform.covariance`` row by
-        row, or a row of NaN. Otherwise as ``insert``.
+        ``stamp`` [ns] is that of all. ``poses`` is (N, 7), x y z [m], qx qy qz qw; or a block: the same as
+        float64, little-endian, in bytes. ``covariances``, if known, is (N, 21): the upper triangle of
+        ``Transform.covariance`` row by row, or a row of NaN. ``writer`` and all else as in ``insert``.
         """
         if covariances is None and isinstance(poses, bytes) and isinstance(edges, tuple):
             with self._lock:
@@ -603,7 +598,7 @@ class BufferCore:
             edges = self._tree.path(target, source)
             return compile_path_with_covariances(target, source, edges, self._read_views, compiled=False)
 
-    def paths(self, *pairs: tuple[str, str]) -> list[TransformPath]:
+    def _paths_of(self, *pairs: tuple[str, str]) -> list[TransformPath]:
         """The paths between pairs of frames, all of them of one state of the tree."""
         version = self._tree.version
         paths = [self.path(*pair) for pair in pairs]

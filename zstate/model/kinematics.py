@@ -77,7 +77,8 @@ class Kinematics:
         """The velocity of ``link`` in ``reference`` (None: the root): (6,).
 
         The rate of ``reference_from_link``: linear velocity of the link's origin [m/s], then angular
-        velocity [rad/s], both in the axes of ``reference``. Velocities as ``model.check_velocities``.
+        velocity [rad/s], both in the axes of ``reference``. ``positions`` and ``velocities`` as
+        ``model.check_positions`` and ``model.check_velocities`` take them.
         """
         frame = self._row(link)
         seen_from = self._row(self.model.root if reference is None else reference)

@@ -121,10 +121,10 @@ class Joint:
 
 @dataclass(frozen=True)
 class RobotModel:
-    """A robot: links and joints in the order of the URDF, which is kept as text.
+    """A robot: ``links`` and ``joints`` in the order of the URDF, which is kept as text, ``urdf``.
 
-    ``root`` is the link without a parent. ``findings`` are the validator's warnings.
-    ``load_model`` returns consistent models; the constructor checks nothing.
+    ``name`` is that in the URDF, ``root`` is the link without a parent. ``findings`` are the validator's
+    warnings. ``load_model`` returns consistent models; the constructor checks nothing.
     """
 
     name: str

@@ -28,36 +28,38 @@ from zstate.wire.registry import get_wire
 class TransformListener(Closeable):
     """Fills ``buffer`` with the transforms of one robot, of several, or of all robots with ``robot="*"``.
 
-    On the native wire ``robot`` may be a sequence of names. Nothing of other robots crosses the link, and
-    the named robots share the threads of one listener; its attribute ``robot`` is then ``"*"``. Raises
-    InvalidInput if the sequence is empty, or contains ``"*"``, an invalid name or a name twice; on the ROS
-    wires if it has more than one name.
+    - ``robot``: a name, ``"*"``, or on the native wire a sequence of names. Nothing of other robots crosses
+      the link, and the named robots share the threads of one listener; its attribute ``robot`` is then
+      ``"*"``.
+    - ``buffer``: the one to fill; default: a new one with ``history_s`` [s] of history and ``clock``.
+    - ``wire``: where the robots are, "native", or "ros2" with options.
+    - ``follow``: "joint_states" subscribes to joint positions and the model and computes the kinematics here;
+      "tf" subscribes to transforms and needs no model.
+    - ``clock``: the one that ages are measured with; default: the system's. For simulated robots a
+      ``SimulatedClock``.
+    - ``history_on_join``: the buffer also gets the samples that publishers of the native wire cached in the
+      seconds before (their ``cache_s``).
+    - ``on_event``: is called, with a ``WriterEvent``, on a thread of its own when a writer joins, leaves, is
+      restarted, is cut off or comes back, falls silent, or conflicts with another one.
+    - ``placers``: the robots whose writers may place the roots of others, in their frames; None: every robot.
+      A frame ``robot/...`` is placed by that robot's own writers.
 
-    Frames are named ``robot/frame`` in the buffer; bare names work while they are unique.
-    ``follow="joint_states"`` subscribes to joint positions and the model and computes the kinematics here;
-    ``follow="tf"`` subscribes to transforms and needs no model. Joint positions may come from several
-    drivers, each with its own joints (``PartialStatePublisher``, in ROS any node): each joint is interpolated
-    between the samples of its own driver, and one that stops leaves exactly its own links behind. The edges
-    of other writers of the robot, of a ``StaticPublisher``, a ``TransformPublisher`` or an
-    ``OdometryPublisher``, come in either way;
-    on the ROS wires these are all edges of /tf and /tf_static but those of a model, which
-    robot_state_publisher repeats. With ``history_on_join``
-    the buffer also gets the samples that publishers of the native wire cached in the seconds before (their
-    ``cache_s``). A context manager.
+    Raises InvalidInput if a sequence of robots is empty, or contains ``"*"``, an invalid name or a name
+    twice; on the ROS wires if it has more than one name.
+
+    Frames are named ``robot/frame`` in the buffer; bare names work while they are unique. Joint positions may
+    come from several drivers, each with its own joints (``PartialStatePublisher``, in ROS any node): each
+    joint is interpolated between the samples of its own driver, and one that stops leaves exactly its own
+    links behind. The edges of other writers of the robot, of a ``StaticPublisher``, a ``TransformPublisher``
+    or an ``OdometryPublisher``, come in either way; on the ROS wires these are all edges of /tf and
+    /tf_static but those of a model, which robot_state_publisher repeats. A context manager.
 
     The clock domain of each robot is the one in its description, and robots of different domains may share
-    the buffer; a lookup across two of them raises ClockMismatch. ``clock`` is the one that ages are measured
-    with (default: the system clock); for simulated robots pass a ``SimulatedClock``. Input that cannot be
-    used is counted in ``stats``, logged once through ``logging``, and never stops the stream.
+    the buffer; a lookup across two of them raises ClockMismatch. Input that cannot be used is counted in
+    ``stats``, logged once through ``logging``, and never stops the stream.
 
     In a forked process nothing fills the buffer: it answers from the samples it has, waits end at once, and
     errors name this as the reason.
-
-    A frame ``robot/...`` is placed by that robot's own writers; its root may also be placed by writers of
-    other robots, in their frames. ``placers`` names the robots that may; None: every robot.
-
-    ``on_event(event)`` is called on a thread of its own when a writer joins, leaves, is restarted, is cut off
-    or comes back, falls silent, or conflicts with another one: see ``WriterEvent``.
     """
 
     def __init__(  # noqa: PLR0917 - the order is that of the published contract

@@ -26,19 +26,27 @@ from zstate.wire.messages import JointState, order_digest, to_block
 class PartialStatePublisher(SamplePublisher):
     """Publishes the joint states of some ``joints`` of a robot; other drivers publish the rest.
 
-    ``model`` is the whole robot's. Listeners interpolate each joint between the samples of its own driver;
+    Listeners interpolate each joint between the samples of its own driver;
     ``zstate publish`` and ``JointStateListener`` merge the drivers' newest values into whole readings. Model,
     fixed edges and transforms come from ``zstate publish``, or from a ``StatePublisher`` with those streams.
-    ``writer`` is the name of this part of the robot; default: the program, its process id and a random
-    number. ``program`` is the script's name by default.
+
+    - ``model``: that of the whole robot.
+    - ``joints``: those that this publisher has, by name; their order is that of its samples.
+    - ``robot``: the name on the network; default: the model's name.
+    - ``wires``: what it publishes on, "native", "ros2" with options, or several.
+    - ``writer``: the name of this part of the robot; default: the program, its process id and a random
+      number.
+    - ``clock``: gives the stamps of samples without one; default: the system's.
+    - ``program``: the writer's name for others; default: the script's name.
+    - ``cache_s``: the last seconds of samples that joining listeners of the native wire receive; 0: only the
+      newest sample.
 
     On the native wire each joint has one writer: SecondWriter, which names both, is raised if another active
     writer publishes one of the joints, or all joints of the robot, or has the same name. If two open at once,
     ``publish`` of the later one may raise it, and closes that publisher. In ROS a part is a JointState with
     fewer joints on /joint_states, where every node may write.
 
-    On the native wire the last ``cache_s`` seconds of samples are cached for joining listeners (0: only the
-    newest sample), and the status is published once a second while it has a reader. A context manager; safe
+    On the native wire the status is published once a second while it has a reader. A context manager; safe
     from any thread.
     """
 

@@ -118,20 +118,26 @@ class StatePublisher(SamplePublisher):
     The model (``robot_description``) and its fixed edges (``tf_static``) are latched, so that listeners
     receive them whenever they join. Transforms are computed by Pinocchio, whose model is built on opening and
     compared with zstate's closed forms; these serve, with a warning, if Pinocchio cannot be loaded
-    (``stats.kinematics``). Without the stream ``tf`` it is not loaded. ``robot`` is the name on the network;
-    default: the model's name. ``streams`` lists what this publisher writes, if another program writes the
-    rest. ``program`` is the writer's name for others; default: the script's name.
+    (``stats.kinematics``). Without the stream ``tf`` it is not loaded.
 
-    Raises SecondWriter, which names the first writer, if another writer of one of its streams is active
-    on the native wire. If two open at once, ``publish`` of the later one raises it and closes that
-    publisher. With ``takeover`` it publishes nevertheless, and listeners use the newest writer. Raises
-    ModelError, which names the joint, if Pinocchio and the closed forms differ.
+    - ``robot``: the name on the network; default: the model's name.
+    - ``wires``: what it publishes on, "native", "ros2" with options, or several.
+    - ``streams``: what this publisher writes, if another program writes the rest.
+    - ``clock``: gives the stamps of samples without one, and its domain is that of the robot; default: the
+      system's. A ``SimulatedClock`` for robots of a simulation.
+    - ``program``: the writer's name for others; default: the script's name.
+    - ``takeover``: publish even if another writer is active; listeners use the newest writer.
+    - ``cache_s``: the last seconds of samples that joining listeners of the native wire receive
+      (``zstate.net.sample_history``); 0 for none.
 
-    On the native wire it publishes its status once a second while that has a reader
-    (``zstate.net.status``), caches the last ``cache_s`` seconds of samples for joining listeners
-    (``zstate.net.sample_history``; 0 for none), and answers lookups of its own frames on
-    ``zstate/<robot>/lookup`` from that cache, or from the newest sample without one
-    (``zstate.nodes.lookup_service``). A context manager; safe from any thread.
+    Raises SecondWriter, which names the first writer, if another writer of one of its streams is active on
+    the native wire. If two open at once, ``publish`` of the later one raises it and closes that publisher.
+    Neither with ``takeover``. Raises ModelError, which names the joint, if Pinocchio and the closed forms
+    differ.
+
+    On the native wire it publishes its status once a second while that has a reader (``zstate.net.status``),
+    and answers lookups of its own frames on ``zstate/<robot>/lookup`` from the cache, or from the newest
+    sample without one (``zstate.nodes.lookup_service``). A context manager; safe from any thread.
     """
 
     def __init__(

@@ -51,8 +51,13 @@ class StaticPublisher(ValuePublisher):
     Bare frame names are the robot's own; other frames have full names, ``robot/frame``. All edges of a
     writer travel together, and a new value replaces the previous one everywhere. ``close()`` withdraws
     them; the ROS wires cannot express that, so there only later joiners no longer receive them.
-    ``writer`` distinguishes this publisher from others; default: the program, its process id and a
-    random number. ``program`` is the script's name by default.
+
+    - ``robot``: the robot that the writer belongs to.
+    - ``writer``: distinguishes this publisher from others; default: the program, its process id and a random
+      number.
+    - ``wires``: what it publishes on, "native", "ros2" with options, or several.
+    - ``program``: the writer's name for others; default: the script's name.
+    - ``takeover``: publish even if another writer has the name or places the frame.
 
     On the native wire SecondWriter, which names the first writer, is raised if another active writer has
     the same name, and by ``set`` if another static writer of any robot places the same frame. If two do

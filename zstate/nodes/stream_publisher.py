@@ -17,11 +17,15 @@ from zstate.wire.native import new_message
 class StreamPublisher(MeasurementPublisher):
     """Publishes the messages of one writer on ``stream``, a row or its name.
 
-    ``name`` is that of the sensor or program on a stream whose writers have names, and empty on others. On
-    the native wire one writer has it: SecondWriter, which names the first one, is raised if another writer
-    publishes, or by ``publish`` if both opened at once, which closes the later one. Under congestion
-    messages are dropped, and joining listeners receive none from the past. ``program`` is the script's name
-    by default.
+    - ``robot``: the robot that the writer belongs to.
+    - ``name``: that of the sensor or program on a stream whose writers have names; empty on others.
+    - ``wires``: what it publishes on, "native", "ros2" with options, or several.
+    - ``clock``: gives the stamps of messages without one; default: the system's.
+    - ``program``: the writer's name for others; default: the script's name.
+
+    On the native wire one writer has a name: SecondWriter, which names the first one, is raised if another
+    writer publishes, or by ``publish`` if both opened at once, which closes the later one. Under congestion
+    messages are dropped, and joining listeners receive none from the past.
 
     Raises InvalidInput for a stream that no installed package brings, that is no measurement (joints, edges
     and drivers have publishers of their own), or that one of ``wires`` does not carry. A context manager;

@@ -130,8 +130,16 @@ class TransformPublisher(EdgePublisher):
 
     A robot may have several such writers, and a ``StatePublisher``; listeners receive the edges of all.
     Bare frame names are the robot's own; other frames have full names, ``robot/frame``. One sample is one
-    instant of the edges in it. ``writer`` distinguishes this publisher from others; default: the program,
-    its process id and a random number. ``program`` is the script's name by default.
+    instant of the edges in it.
+
+    - ``robot``: the robot that the writer belongs to.
+    - ``writer``: distinguishes this publisher from others; default: the program, its process id and a random
+      number.
+    - ``wires``: what it publishes on, "native", "ros2" with options, or several.
+    - ``clock``: gives the stamps of samples without one; default: the system's.
+    - ``program``: the writer's name for others; default: the script's name.
+    - ``cache_s``: the last seconds of samples that joining listeners of the native wire receive; 0: only the
+      newest sample.
 
     On the native wire each edge has one writer. SecondWriter, which names the first writer, is raised if
     another active writer has the same name, and by ``publish`` if another writer of any robot places the
@@ -139,8 +147,7 @@ class TransformPublisher(EdgePublisher):
     while the other took it over, the later one to start raises it and is closed. The ROS wires publish on
     /tf, where every node may write.
 
-    On the native wire the last ``cache_s`` seconds of samples are cached for joining listeners (0: only the
-    newest sample), and the status is published once a second while it has a reader. A context manager; safe
+    On the native wire the status is published once a second while it has a reader. A context manager; safe
     from any thread.
     """
 

@@ -213,7 +213,7 @@ class Recording(Closeable):
     def place(
         self, points: ArrayLike, stamps: ArrayLike, source: str, target: str
     ) -> tuple[Points, NDArray[np.bool_]]:
-        """``buffer(around=stamps).place``: each point in ``target``, (N, 3), and which are valid, (N,).
+        """``buffer(around=stamps).place(points, stamps, source, target)``: (N, 3), and which are valid, (N,).
 
         Reads the file in each call; place many scans by one ``buffer()``.
         Raises UnknownFrame, AmbiguousFrame and Disconnected, and InvalidInput as the buffer does.
