@@ -297,6 +297,53 @@ def ellipse() -> Figure:
     return figure
 
 
+def odometry_sources() -> Figure:
+    """What each source of the odometry measures, and which edge it moves."""
+    figure = Figure(720, 300, "Sources of the odometry")
+    rows = (
+        ("IMU", "rates, accelerations: predict"),
+        ("wheels, --velocity", "velocities"),
+        ("feet, --relative", "displacements"),
+        ("--pose", "poses in odom"),
+        ("--heading", "changes of the yaw"),
+        ("--barometer", "changes of the height"),
+    )
+    for n, (name, what) in enumerate(rows):
+        y = 16 + 38 * n
+        figure.box(16, y, (200, 32), name, "fa")
+        figure.text(226, y + 21, what, "s t", "start")
+        figure.path(((400, y + 16), (448, 102 + 4 * n)), "m", ">")
+    figure.box(450, 78, (110, 66), "estimator", "box")
+    figure.arrow((560, 111), (588, 111))
+    figure.box(590, 88, (116, 46), "odom -> base\ncontinuous", "fc")
+    figure.box(16, 250, (200, 32), "--fix", "fb")
+    figure.text(226, 271, "positions on the earth", "s t", "start")
+    figure.arrow((400, 266), (588, 266), "and odom -> base")
+    figure.box(590, 243, (116, 46), "map -> odom\nmay jump", "fb")
+    return figure
+
+
+def pose_in_odom() -> Figure:
+    """How the published pose follows a measured one that differs."""
+    figure = Figure(720, 240, "A measured pose moves odom -> base slowly")
+    figure.path(((60, 196), (690, 196)), "m", ">")
+    figure.path(((60, 196), (60, 24)), "m", ">")
+    figure.text(690, 216, "time", "s t", "end")
+    figure.text(68, 32, "x in odom", "s t", "start")
+    speed, follow, step = 0.30, 0.2, 0.6  # [m/s], [m/s], [m]
+    times = np.linspace(0.0, 8.0, 81)
+    estimate = speed * times + np.where(times >= 2.5, step, 0.0)
+    behind = np.where(times >= 2.5, np.maximum(step - follow * (times - 2.5), 0.0), 0.0)
+    best = [(60 + 76 * t, 190 - 48 * x) for t, x in zip(times, estimate, strict=True)]
+    published = [(60 + 76 * t, 190 - 48 * (x - b)) for t, x, b in zip(times, estimate, behind, strict=True)]
+    figure.path(best, "b dash")
+    figure.path(published, "a")
+    figure.text(240, 60, "best estimate: jumps\nwith the measurement", "s tb")
+    figure.text(420, 160, "published: follows at 0.2 m/s;\nthe difference is in its covariance", "s ta")
+    figure.caption(226, "Differences of poses stay motions of the robot.")
+    return figure
+
+
 def scan() -> Figure:
     """A scan of a turning robot, placed with one pose and with a pose for each ray."""
     figure = Figure(720, 300, "A wall, measured while the robot turns")
@@ -522,8 +569,19 @@ def foxglove() -> Figure:
 
 
 FIGURES: Sequence[Callable[[], Figure]] = (
-    *(arrays, chain, dataset, drivers, driving, ellipse, foxglove, network, panels, recordings, ros, scan),
-    *(simulated_time, streams, streams_of_a_publisher, timeline, tree, wires),
+    *(arrays, chain, dataset, drivers, driving, ellipse, foxglove, network, odometry_sources, panels),
+    *(
+        pose_in_odom,
+        recordings,
+        ros,
+        scan,
+        simulated_time,
+        streams,
+        streams_of_a_publisher,
+        timeline,
+        tree,
+        wires,
+    ),
 )
 
 
