@@ -54,7 +54,7 @@ def calls_on(seed: int, seconds: float, *, has_wheels: bool = True, **options: A
     random, drive = np.random.default_rng(seed), wandering(seed, seconds)
     wheels = joint_calls(drive, WHEELS, random) if has_wheels else []
     others = other_odometry_calls(drive, random, **{"noise": NOISE, **options})
-    return merged(imu_calls(drive, tilted_mount(), random), wheels, others)
+    return merged(imu_calls(drive, tilted_mount(), random)[::2], wheels, others)  # at 50 Hz, for speed
 
 
 @cache
@@ -93,6 +93,7 @@ def test_with_an_imu_it_is_enough_to_know_where_the_base_is():
     assert camera_of(base).sentence == ""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [0.7, 1.3])
 def test_a_scale_that_is_off_is_found_by_the_wheels_and_named(scale: float):
     found, base = driven(1, scale=scale)
@@ -116,7 +117,7 @@ def test_a_scale_that_nothing_shows_is_a_part_of_the_claim():
     assert "times as long" not in camera_of(base).sentence
 
 
-@pytest.mark.parametrize("has_wheels", [False, True])
+@pytest.mark.parametrize("has_wheels", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_a_jump_is_rejected_and_named_and_the_way_goes_on_from_there(has_wheels: bool):
     jumps = ((10.0, 2.0, 1.0), (14.0, -5.0, 0.0))
     right, _ = driven(1, has_wheels=has_wheels)

@@ -704,7 +704,10 @@ class BaseEstimator:
 
     def _offer(self, event: _Event, *, is_shared: bool = True) -> None:
         self._offer_reading(
-            event.source, event.reading.stamp, lambda base: base._insert(copy(event)), is_shared=is_shared
+            event.source,
+            event.reading.stamp,
+            lambda base: base._insert(event if base is self else copy(event)),
+            is_shared=is_shared,
         )
 
     def _offer_reading(

@@ -232,7 +232,7 @@ def predict(
         white = white_noise(noise)
     effects = transition[:, 9:15] - _constant_biases(size)
     added = walks * dt_s
-    added[POSITION] = white[3:].max() * dt_s**3 / 12.0
+    added[POSITION] = max(white[3:].tolist()) * dt_s**3 / 12.0
 
     covariance: Floats = transition.dot(state.covariance).dot(transition.T)
     covariance += (effects * (white / dt_s)).dot(effects.T)

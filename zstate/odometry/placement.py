@@ -61,8 +61,8 @@ def placed(estimate: Estimate, placement: Placement, imu_from_base: Floats) -> E
 
 def is_finite(state: FilterState) -> bool:
     """Whether all numbers of the state are finite, and its variances bounded."""
-    vectors = (state.velocity @ state.velocity) * (state.position @ state.position)
-    biases = (state.gyro_bias @ state.gyro_bias) * (state.accel_bias @ state.accel_bias)
+    vectors = state.velocity.dot(state.velocity) * state.position.dot(state.position)
+    biases = state.gyro_bias.dot(state.gyro_bias) * state.accel_bias.dot(state.accel_bias)
     variances = float(state.covariance.trace())
     total = float(vectors + biases + state.rotation.sum() + state.covariance.sum())
     return math.isfinite(total) and 0.0 <= variances <= _LARGEST
